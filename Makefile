@@ -1,0 +1,36 @@
+# chebsplat: `make help` lists the targets. Everything is set up inside .venv on first use; nothing global changes.
+SHELL := /bin/bash
+PY := .venv/bin/python
+READY := .venv/.ready
+unexport PYTHONDONTWRITEBYTECODE
+
+.DEFAULT_GOAL := help
+.PHONY: help setup test test-all lint lock plan
+
+help:  ## list the targets
+	@grep -hE '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed -E 's/:.*## /\t/' | expand -t 14
+
+setup: $(READY)  ## create .venv and install the lock (done on first use by every target)
+
+$(READY): requirements.lock pyproject.toml pipelines/setup.sh
+	@bash pipelines/setup.sh
+	@touch $@
+
+test: $(READY)  ## the tests, in parallel, without the slow ones
+	@$(PY) -m pytest -q -n auto -m "not slow and not gpu" $(args)
+
+test-all: $(READY)  ## all tests, the slow ones too
+	@$(PY) -m pytest -q -n auto -m "not gpu" $(args)
+
+lint: $(READY)  ## ruff (lint, format)
+	@$(PY) -m ruff check . && $(PY) -m ruff format --check .
+
+plan: $(READY)  ## what would run for scene=NAME, what is fresh, what is left out and why
+	@.venv/bin/chebsplat plan $(scene) $(if $(set),--set $(set)) $(if $(ablation),--ablation $(ablation))
+
+lock: $(READY)  ## resolve requirements.lock anew
+	@links="$$($(PY) -m pip config get global.find-links 2>/dev/null || true)"; \
+	{ echo "# Exact versions for Python 3.11, resolved together; \`make lock\` writes this file."; \
+	  $(PY) -m uv pip compile pyproject.toml --group dev --python-version 3.11 --no-header --no-annotate \
+	    $${links:+--find-links $$links} -q | sed 's/^torch==.*/torch==2.13.0/'; } > requirements.lock.new
+	@mv requirements.lock.new requirements.lock

@@ -1,0 +1,25 @@
+"""Typed errors and their process exit codes; the one module that every layer may import."""
+
+
+class ChebsplatError(Exception):
+    """Base of every error whose message is meant for the user."""
+
+    exit_code = 1
+
+
+class ConfigError(ChebsplatError):
+    """A configuration or a command line that cannot be used."""
+
+    exit_code = 2
+
+
+class InputError(ChebsplatError):
+    """An input that is missing, damaged or of a wrong schema; the message names the file and the remedy."""
+
+    exit_code = 3
+
+
+class DataFailure(ChebsplatError):
+    """Well-formed data that the method cannot work with, or a numerical failure."""
+
+    exit_code = 4

@@ -1,0 +1,1 @@
+"""Differentiable Gaussian rasterization behind one signature, in the words of gsplat."""

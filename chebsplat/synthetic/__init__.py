@@ -1,0 +1,1 @@
+"""Procedural indoor scenes: layout, meshes, textures, shading, camera paths."""

@@ -1,0 +1,1 @@
+"""What runs: configuration to keys to a DAG, freshness, and the `chebsplat` command."""

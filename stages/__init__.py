@@ -1,0 +1,1 @@
+"""One command each: read artifacts, call the maths, publish one artifact."""

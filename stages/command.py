@@ -1,0 +1,151 @@
+"""The thin wrapper that turns `run(job)` into a command: inputs checked, one artifact published, exit codes."""
+
+from __future__ import annotations
+
+import json
+import logging
+import os
+import sys
+import time
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import click
+from chebsplat.formats import artifact
+from chebsplat.formats.artifact import Manifest
+from chebsplat.stages import config as configs
+from chebsplat.stages.progress import Progress
+from chebsplat.stages.registry import STAGES
+
+from chebsplat.errors import ChebsplatError
+
+log = logging.getLogger("chebsplat")
+
+
+@dataclass
+class Job:
+    """All that a stage may touch.
+
+    `out` is the directory to fill; it becomes the artifact when `run` returns. `scratch` survives a kill, for
+    stages that resume. `facts` end up in the manifest: what was found, chosen, and left out and why.
+    """
+
+    inputs: dict[str, Path]
+    config: configs.Config
+    out: Path
+    scratch: Path
+    device: str = "cpu"
+    progress: Progress = field(default_factory=Progress)
+    facts: dict[str, Any] = field(default_factory=dict)
+
+    def left_out(self, what: str, why: str) -> None:
+        """Record that this scene does not need `what`."""
+        self.facts.setdefault("left_out", {})[what] = why
+        log.info("left out: %s (%s)", what, why)
+
+
+def command(name: str, run: Callable[[Job], None]) -> click.Command:
+    """The click command of stage `name`: explicit inputs, one config, one output."""
+    stage = STAGES[name]
+
+    def invoke(**options: Any) -> None:
+        sys.exit(execute(name, run, options))
+
+    params: list[click.Parameter] = [
+        click.Option([f"--in-{role}"], type=click.Path(path_type=Path), required=(role, of) in stage.inputs,
+                     help=f"artifact of `{of}`" + ("" if (role, of) in stage.inputs else " (optional)"))
+        for role, of in (*stage.inputs, *stage.optional)
+    ] + [
+        click.Option(["--config"], type=click.Path(path_type=Path), help="TOML or JSON; defaults otherwise"),
+        click.Option(["--out"], type=click.Path(path_type=Path), required=True, help="the artifact's directory"),
+        click.Option(["--key"], help="identity given by the planner; the content's digest otherwise"),
+        click.Option(["--code"], hidden=True, help="code identity given by the planner (JSON)"),
+        click.Option(["--device"], type=click.Choice(["auto", "cpu", "cuda"]), default="auto"),
+        click.Option(["--force"], is_flag=True, help="run even if the artifact exists, and replace it"),
+        click.Option(["--progress/--no-progress"], default=None, help="default: when stderr is a terminal"),
+        click.Option(["--log-level"], default="info",
+                     type=click.Choice(["debug", "info", "warning", "error"])),
+    ]  # fmt: skip
+    return click.Command(name, params=params, callback=invoke, help=stage.help)
+
+
+def execute(name: str, run: Callable[[Job], None], options: dict[str, Any]) -> int:
+    """Run one stage; returns the exit code. stdout gets the artifact's path and nothing else."""
+    logging.basicConfig(stream=sys.stderr, format=f"%(asctime)s {name}: %(message)s", datefmt="%H:%M:%S",
+                        level=options["log_level"].upper(), force=True)  # fmt: skip
+    out = Path(options["out"]).absolute()
+    try:
+        if artifact.is_published(out) and not options["force"]:
+            artifact.read_manifest(out, STAGES[name].schema)
+            log.info("already there")
+        else:
+            _run(name, run, options, out)
+    except ChebsplatError as error:
+        log.error("%s", error)
+        return error.exit_code
+    except KeyboardInterrupt:
+        log.error("interrupted; nothing was published")
+        return 1
+    except Exception:
+        log.exception("crashed; nothing was published")
+        return 1
+    print(out)
+    return 0
+
+
+def _run(name: str, run: Callable[[Job], None], options: dict[str, Any], out: Path) -> None:
+    stage = STAGES[name]
+    config = configs.load(options["config"]) if options["config"] else configs.Config()
+    inputs = {role: Path(options[f"in_{role}"]).absolute() for role in stage.roles if options.get(f"in_{role}")}
+    schemas = {role: STAGES[of].schema for role, of in stage.roles.items()}
+    found = {role: artifact.read_manifest(path, schemas[role]) for role, path in inputs.items()}
+    settings = config.sections(stage.sections)
+    sources = {role: {"key": m.key, "schema": m.schema} for role, m in found.items()}
+    key = options["key"] or artifact.digest({"stage": name, "config": settings, "inputs": sources})
+    seed = next((settings[s]["seed"] for s in reversed(stage.sections) if "seed" in settings[s]), None)
+    device = resolve_device(options["device"])
+    manifest = Manifest(stage.schema, key, name, sources, settings, seed, device=device, threads=os.cpu_count() or 1,
+                        code=json.loads(options["code"] or "{}"))  # fmt: skip
+    progress = Progress(options["progress"])
+    scratch = out.parent / f".part-{out.name}"
+    began = time.perf_counter()
+    if options["force"]:
+        artifact.discard(out)
+    with artifact.publish(out, manifest) as tmp:
+        job = Job(inputs, config, tmp, scratch, device, progress, manifest.facts)
+        with progress.log_to(tmp / "log.jsonl"):
+            run(job)
+        manifest.seconds = round(time.perf_counter() - began, 3)
+        manifest.versions = _versions()
+    artifact.discard(scratch)
+    log.info("done in %.1f s", manifest.seconds)
+
+
+def resolve_device(wanted: str) -> str:
+    """`cpu` or `cuda`; `auto` takes a GPU only where one is present, without importing torch on a CPU machine."""
+    if wanted == "auto":
+        wanted = "cuda" if Path("/proc/driver/nvidia/version").exists() else "cpu"
+    return wanted
+
+
+def _versions() -> dict[str, str]:
+    """Versions of the packages that the stage really loaded."""
+    from importlib import metadata
+
+    names = {
+        "torch",
+        "numpy",
+        "scipy",
+        "numba",
+        "pycolmap",
+        "open3d",
+        "zarr",
+        "onnxruntime",
+        "fpsample",
+        "PIL",
+    }
+    distributions = {"open3d": "open3d-cpu", "PIL": "pillow"}
+    loaded = sorted(names & set(sys.modules))
+    return {n: metadata.version(distributions.get(n, n)) for n in loaded} | {"python": sys.version.split()[0]}

@@ -1,0 +1,210 @@
+"""Every setting of every stage, checked. Values are part of an artifact's key; this module's code is not."""
+
+from __future__ import annotations
+
+import difflib
+import json
+import tomllib
+from pathlib import Path
+from typing import Any, Literal
+
+from pydantic import BaseModel, ConfigDict, Field, ValidationError
+
+from chebsplat.errors import ConfigError
+
+
+class _Section(BaseModel):
+    model_config = ConfigDict(extra="forbid", frozen=True)
+
+
+class SceneSection(_Section):
+    name: str = "scene"
+
+
+class SourceSection(_Section):
+    """Where the photos come from. `named` is Replica's scene when REPLICA_ROOT has it, else the generated one."""
+
+    kind: Literal["named", "generated", "colmap", "transforms", "photos", "replica", "scannet"] = "named"
+    path: str | None = None
+    seed: int = 0  # of a generated scene
+    preset: Literal["office", "room", "toy"] = "office"
+    class_names: tuple[str, ...] | None = None  # overrides the source's own
+
+
+class IngestSection(_Section):
+    protocol: str = "labels"
+    test_every: int = Field(8, ge=2)
+    test_offset: int = Field(0, ge=0)
+    max_side: int = Field(640, ge=16)  # images are reduced to this; never enlarged
+    max_views: int | None = Field(None, ge=2)
+    min_views: int = Field(3, ge=1)
+
+
+class SfmSection(_Section):
+    max_points: int = Field(20_000, ge=16)
+    n_neighbors: int = Field(16, ge=4)
+    peak_threshold: float = Field(0.001, gt=0)
+    min_registered: float = Field(0.5, gt=0, le=1)  # fraction of views a reconstruction must register
+    seed: int = 0
+
+
+class TeacherSection(_Section):
+    """`auto`: an ONNX model if given, pseudo labels if the capture has labels, otherwise left out."""
+
+    kind: Literal["auto", "labels", "onnx", "none"] = "auto"
+    n_channels: int = Field(13, ge=2)
+    downscale: int = Field(4, ge=1)
+    confusion: float = Field(0.3, ge=0, le=1)  # p of METHOD.md section 9
+    blur: float = Field(1.0, ge=0)  # sigma in feature pixels
+    noise: float = Field(0.1, ge=0)
+    seed: int = 0
+    model: str | None = None  # .onnx, [1,3,H,W] -> [1,C,h,w]
+    labels: str | None = None  # .npz with names and embeddings
+    mean: tuple[float, float, float] = (0.5, 0.5, 0.5)
+    std: tuple[float, float, float] = (0.5, 0.5, 0.5)
+    size: tuple[int, int] | None = None  # (H, W) the model wants; None: the image's own
+
+
+class DescribeSection(_Section):
+    """METHOD.md section 2; shared by the describe stage and the refresh inside training."""
+
+    spectrum: Literal["full", "taper", "hard"] = "full"
+    n_angles: int = Field(4, ge=1)  # J
+    max_degree: int = Field(8, ge=2)  # D
+    n_eigs: int = Field(16, ge=1)  # K, for taper and hard
+    anisotropy: float = Field(30.0, ge=0)
+    bandwidth: float = Field(0.7, gt=0)
+    region_size: int = Field(32, ge=4, le=64)  # Gaussians in a region, at most
+    n_regions: int = Field(768, ge=1)
+    seed: int = 0
+
+
+class TrainSection(_Section):
+    steps: int = Field(3000, ge=1)
+    seed: int = 0
+    device: Literal["auto", "cpu", "cuda"] = "auto"
+    # what is built
+    semantics: bool = True
+    encoder: Literal["transformer", "mlp", "off"] = "transformer"  # mlp: the paper's "no TLE"
+    albo: bool = True  # false: the paper's "no AGCD"
+    prune: bool = True
+    prune_semantic: bool = True  # false: "no semantic guidance"
+    densify: Literal["region", "classic", "off"] = "region"
+    sh_prune: bool = True
+    # sizes
+    sh_degree: int = Field(3, ge=0, le=3)
+    max_gaussians: int = Field(40_000, ge=16)
+    min_gaussians: int = Field(64, ge=1)
+    width: int = Field(32, ge=4)
+    n_layers: int = Field(2, ge=1)
+    n_heads: int = Field(4, ge=1)
+    regions_per_step: int = Field(64, ge=1)
+    # schedule, as fractions of `steps`
+    coarse_until: float = Field(0.1, ge=0, le=1)  # half resolution until here
+    encode_from: float = Field(0.3, ge=0, le=1)
+    densify_from: float = Field(0.05, ge=0, le=1)
+    densify_until: float = Field(0.6, ge=0, le=1)
+    n_densify: int = Field(12, ge=0)
+    prune_from: float = Field(0.4, ge=0, le=1)
+    sh_freeze: float = Field(0.8, ge=0, le=1)
+    refresh_every: int = Field(200, ge=1)  # steps between descriptor refreshes
+    # rates
+    lr_means: float = 1.6e-4
+    lr_scales: float = 5e-3
+    lr_quats: float = 1e-3
+    lr_opacities: float = 5e-2
+    lr_sh0: float = 2.5e-3
+    lr_features: float = 3e-3
+    lr_encoder: float = 1e-3
+    lr_masks: float = 1e-2
+    # weights
+    weight_ssim: float = Field(0.2, ge=0, le=1)
+    weight_features: float = Field(1.0, ge=0)
+    weight_mask: float = Field(5e-4, ge=0)
+    weight_sh: float = Field(3.3e-4, ge=0)
+    weight_basis: float = Field(1.0, ge=0)
+    warm_start: bool = True  # start the encoder from the basis' stored weights
+
+
+class ExportSection(_Section):
+    split_by_degree: bool = True
+
+
+class OnnxSection(_Section):
+    opset: int = Field(18, ge=18)
+    tolerance: float = Field(1e-5, gt=0)
+
+
+class CksSection(_Section):
+    energy: float = Field(0.96, gt=0, le=1)
+    tolerance: float = Field(0.2, gt=0)
+    max_rank: float = Field(0.5, gt=0, lt=1)  # of the projection's width
+    energy_rule: Literal["total", "residual"] = "total"
+
+
+class EvaluateSection(_Section):
+    boundary: int = Field(5, ge=1)  # pixels, half width of the boundary band
+    timing_repeats: int = Field(3, ge=1)
+    lpips_weights: str | None = None
+
+
+class ReportSection(_Section):
+    n_pictures: int = Field(4, ge=1)
+
+
+class Config(_Section):
+    scene: SceneSection = SceneSection()
+    source: SourceSection = SourceSection()
+    ingest: IngestSection = IngestSection()
+    sfm: SfmSection = SfmSection()
+    teacher: TeacherSection = TeacherSection()
+    describe: DescribeSection = DescribeSection()
+    train: TrainSection = TrainSection()
+    export: ExportSection = ExportSection()
+    onnx: OnnxSection = OnnxSection()
+    cks: CksSection = CksSection()
+    evaluate: EvaluateSection = EvaluateSection()
+    report: ReportSection = ReportSection()
+
+    def sections(self, names: tuple[str, ...]) -> dict[str, Any]:
+        """The named sections as plain JSON-able values."""
+        return {name: getattr(self, name).model_dump(mode="json") for name in names}
+
+
+def load(path: Path) -> Config:
+    """A config from a TOML or JSON file; sections that are not given keep their defaults."""
+    try:
+        text = Path(path).read_text()
+        values = json.loads(text) if Path(path).suffix == ".json" else tomllib.loads(text)
+    except OSError as error:
+        raise ConfigError(f"{path}: {error.strerror}; pass --config with a TOML file") from None
+    except ValueError as error:
+        raise ConfigError(f"{path} does not parse: {error}") from None
+    return build(values, str(path))
+
+
+def build(values: dict[str, Any], origin: str) -> Config:
+    """A checked config. Raises ConfigError naming the first bad key, with the nearest known name."""
+    try:
+        return Config.model_validate(values)
+    except ValidationError as error:
+        first = error.errors()[0]
+        where = ".".join(str(part) for part in first["loc"])
+        raise ConfigError(f"{origin}: {where}: {_advice(first)}") from None
+
+
+def known_keys() -> list[str]:
+    return [f"{s}.{k}" for s, f in Config.model_fields.items() for k in f.annotation.model_fields]  # type: ignore[union-attr]
+
+
+def _advice(error: Any) -> str:
+    if error["type"] != "extra_forbidden":
+        return f"{error['msg']} (got {error['input']!r})"
+    loc = [str(part) for part in error["loc"]]
+    if len(loc) == 1:
+        near = difflib.get_close_matches(loc[0], list(Config.model_fields), 1)
+    else:
+        elsewhere = [key for key in known_keys() if key.endswith("." + loc[-1])]
+        own = [key.split(".")[1] for key in known_keys() if key.startswith(loc[0] + ".")]
+        near = elsewhere or difflib.get_close_matches(loc[-1], own, 1)
+    return "no such key" + (f"; did you mean {near[0]}?" if near else "")

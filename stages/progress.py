@@ -1,0 +1,56 @@
+"""Progress of long work: a bar with rate and ETA on a terminal, plain lines elsewhere, `log.jsonl` always."""
+
+from __future__ import annotations
+
+import json
+import logging
+import sys
+import time
+from collections.abc import Iterable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any, TextIO, TypeVar
+
+log = logging.getLogger("chebsplat")
+T = TypeVar("T")
+
+
+class Progress:
+    """`show` forces or forbids the bar; by default it follows whether stderr is a terminal."""
+
+    def __init__(self, show: bool | None = None, every: float = 10.0):
+        self.show = sys.stderr.isatty() if show is None else show
+        self.every = every  # seconds between plain lines
+        self._log: TextIO | None = None
+
+    @contextmanager
+    def log_to(self, path: Path) -> Iterator[None]:
+        with path.open("w") as self._log:
+            try:
+                yield
+            finally:
+                self._log = None
+
+    def record(self, **values: Any) -> None:
+        """One line of `log.jsonl`."""
+        if self._log is not None:
+            self._log.write(json.dumps(values) + "\n")
+
+    def track(self, items: Iterable[T], total: int, what: str, start: int = 0) -> Iterator[tuple[T, dict[str, Any]]]:
+        """Yield (item, status); what the caller puts into `status` is shown beside rate and ETA."""
+        status: dict[str, Any] = {}
+        began = last = time.perf_counter()
+        for done, item in enumerate(items, start=1):
+            yield item, status
+            now = time.perf_counter()
+            if now - last >= (0.2 if self.show else self.every) or done + start == total:
+                last = now
+                rate = done / max(now - began, 1e-9)
+                eta = (total - start - done) / rate
+                notes = "".join(f"  {k} {v}" for k, v in status.items())
+                line = f"{what} {done + start}/{total}{notes}  {rate:.1f}/s  ETA {eta:.0f} s"
+                if self.show:
+                    end = "\n" if done + start == total else ""
+                    print(f"\r\x1b[K{line}", end=end, file=sys.stderr, flush=True)
+                else:
+                    log.info("%s", line)

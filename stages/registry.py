@@ -1,0 +1,51 @@
+"""The stages and what each reads: the one table behind the commands, the planner and the Snakefile."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+
+@dataclass(frozen=True)
+class Stage:
+    """One stage. `inputs` map a role (`--in-<role>`) to the stage that makes it."""
+
+    name: str
+    schema: str
+    sections: tuple[str, ...]  # the parts of the config it reads, and nothing else
+    inputs: tuple[tuple[str, str], ...] = ()
+    optional: tuple[tuple[str, str], ...] = ()
+    help: str = ""
+
+    @property
+    def roles(self) -> dict[str, str]:
+        return dict(self.inputs + self.optional)
+
+
+STAGES: dict[str, Stage] = {
+    stage.name: stage
+    for stage in (
+        Stage("ingest", "chebsplat.capture/1", ("scene", "source", "ingest"),
+              help="Read a source into a capture: images, cameras and, where given, depth and labels."),
+        Stage("sfm", "chebsplat.points/1", ("sfm",), (("capture", "ingest"),),
+              help="Cameras and points with normals and local anisotropic covariances."),
+        Stage("teacher", "chebsplat.features/1", ("teacher",), (("capture", "ingest"),),
+              help="Per-view semantic features of a 2D teacher."),
+        Stage("describe", "chebsplat.descriptors/1", ("describe",), (("points", "sfm"),),
+              help="Anisotropic Chebyshev descriptors of the initial Gaussians (Eqs 1-6)."),
+        Stage("train", "chebsplat.gaussians/1", ("describe", "train"),
+              (("capture", "ingest"), ("points", "sfm")),
+              (("features", "teacher"), ("descriptors", "describe"), ("basis", "cks")),
+              help="Train the semantic Gaussian scene (Eqs 7-13)."),
+        Stage("export", "chebsplat.scene/1", ("export",), (("gaussians", "train"),), (("features", "teacher"),),
+              help="Write PLY files, ragged zarr, the label dictionary and the summary."),
+        Stage("onnx", "chebsplat.encoder/1", ("onnx",), (("gaussians", "train"),),
+              help="Export the local encoder to ONNX and check it against torch."),
+        Stage("cks", "chebsplat.basis/1", ("cks",), (("gaussians", "train"),), (("basis", "cks"),),
+              help="Update the core knowledge space with a trained scene (Eqs 14-15)."),
+        Stage("evaluate", "chebsplat.evaluation/1", ("evaluate",), (("capture", "ingest"), ("scene", "export")),
+              (("features", "teacher"),), help="Measure the exported scene on the test views."),
+        Stage("report", "chebsplat.report/1", ("report",), (("evaluation", "evaluate"), ("gaussians", "train")),
+              (("scene", "export"), ("encoder", "onnx"), ("basis", "cks")),
+              help="One self-contained HTML page with pictures, tables and error against run time."),
+    )
+}  # fmt: skip

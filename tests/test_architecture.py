@@ -1,0 +1,42 @@
+"""Imports run one way: pipelines -> stages -> {chebsplat, formats}."""
+
+import ast
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).parents[1]
+LAYERS = ("chebsplat", "formats", "stages", "pipelines")
+MAY_IMPORT = {
+    "chebsplat": {"chebsplat"},
+    "formats": {"formats"},
+    "stages": {"stages", "chebsplat", "formats"},
+    "pipelines": set(LAYERS),
+}
+SOURCES = [p for layer in LAYERS for p in sorted((ROOT / layer).rglob("*.py"))]
+
+
+def imported_modules(path):
+    for node in ast.walk(ast.parse(path.read_text())):
+        if isinstance(node, ast.Import):
+            yield from (alias.name for alias in node.names)
+        elif isinstance(node, ast.ImportFrom):
+            assert node.level == 0, f"{path}: relative import"
+            yield from (f"{node.module}.{alias.name}" for alias in node.names)
+
+
+@pytest.mark.parametrize("path", SOURCES, ids=lambda p: p.relative_to(ROOT).as_posix())
+def test_imports_run_one_way(path):
+    layer = path.relative_to(ROOT).parts[0]
+    for name in imported_modules(path):
+        first, _, rest = name.partition(".")
+        assert first not in LAYERS[1:], f"{path}: bare import of {name}"
+        if first == "chebsplat" and not rest.startswith("errors"):
+            target = rest.split(".")[0]
+            target = target if target in LAYERS[1:] else "chebsplat"
+            assert target in MAY_IMPORT[layer], f"{path}: {layer} must not import {name}"
+
+
+def test_formats_know_no_torch():
+    for path in (ROOT / "formats").rglob("*.py"):
+        assert not any(name.split(".")[0] == "torch" for name in imported_modules(path)), path

@@ -1,0 +1,45 @@
+"""A configuration is checked whole, and a misspelt key suggests the nearest name."""
+
+import json
+
+import pytest
+from chebsplat.stages import config
+from chebsplat.stages.registry import STAGES
+
+from chebsplat.errors import ConfigError
+
+
+@pytest.mark.parametrize(
+    ("values", "hint"),
+    [
+        ({"train": {"stpes": 5}}, "train.stpes: no such key; did you mean steps?"),
+        ({"trian": {}}, "trian: no such key; did you mean train?"),
+        ({"train": {"n_angles": 5}}, "did you mean describe.n_angles?"),
+        ({"train": {"steps": 0}}, "train.steps"),
+        ({"describe": {"spectrum": "ful"}}, "describe.spectrum"),
+    ],
+)
+def test_bad_key_or_value_is_named(values, hint):
+    with pytest.raises(ConfigError) as error:
+        config.build(values, "x.toml")
+    assert hint in str(error.value)
+
+
+def test_missing_and_malformed_files_are_config_errors(tmp_path):
+    with pytest.raises(ConfigError, match=r"none\.toml"):
+        config.load(tmp_path / "none.toml")
+    (tmp_path / "bad.toml").write_text("[train\n")
+    with pytest.raises(ConfigError, match=r"bad\.toml"):
+        config.load(tmp_path / "bad.toml")
+
+
+def test_json_and_toml_give_the_same_config(tmp_path):
+    (tmp_path / "a.toml").write_text("[train]\nsteps = 7\n")
+    (tmp_path / "a.json").write_text(json.dumps({"train": {"steps": 7}}))
+    assert config.load(tmp_path / "a.toml") == config.load(tmp_path / "a.json")
+
+
+def test_every_stage_reads_known_sections_and_known_stages():
+    for stage in STAGES.values():
+        config.Config().sections(stage.sections)
+        assert set(stage.roles.values()) <= set(STAGES)
