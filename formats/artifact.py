@@ -91,15 +91,15 @@ def read_manifest(path: Path, schema: str | None = None) -> Manifest:
         manifest = Manifest(**json.loads(file.read_text()))
         entries = {name: int(entry["bytes"]) for name, entry in manifest.files.items()}
     except (ValueError, TypeError, KeyError, AttributeError) as error:
-        raise InputError(f"{file} is damaged ({error}); {_remedy(path)}") from None
+        raise InputError(f"{file} is damaged ({error}); {remedy(path)}") from None
     if schema is not None and manifest.schema != schema:
         raise InputError(f"{file} has schema {manifest.schema}, expected {schema}; pass the right artifact")
     for name, size in entries.items():
         member = path / name
         if not member.is_file():
-            raise InputError(f"{member} is missing; {_remedy(path)}")
+            raise InputError(f"{member} is missing; {remedy(path)}")
         if member.stat().st_size != size:
-            raise InputError(f"{member} has {member.stat().st_size} bytes, expected {size}; {_remedy(path)}")
+            raise InputError(f"{member} has {member.stat().st_size} bytes, expected {size}; {remedy(path)}")
     return manifest
 
 
@@ -111,7 +111,7 @@ def verify(path: Path, schema: str | None = None) -> Manifest:
         checked(path, manifest, name)
     extra = sorted(set(_file_table(path, hashed=False)) - set(manifest.files) - {MANIFEST})
     if extra:
-        raise InputError(f"{path / extra[0]} is not listed in {MANIFEST} ({len(extra)} such); {_remedy(path)}")
+        raise InputError(f"{path / extra[0]} is not listed in {MANIFEST} ({len(extra)} such); {remedy(path)}")
     return manifest
 
 
@@ -119,13 +119,13 @@ def checked(path: Path, manifest: Manifest, name: str) -> Path:
     """Path of one listed file after comparing its digest. Raises InputError if it differs."""
     entry = manifest.files.get(name)
     if entry is None:
-        raise InputError(f"{path / name} is not part of this {manifest.schema} artifact; {_remedy(path)}")
+        raise InputError(f"{path / name} is not part of this {manifest.schema} artifact; {remedy(path)}")
     if sha256_file(path / name) != entry["sha256"]:
-        raise InputError(f"{path / name} does not match its sha256; {_remedy(path)}")
+        raise InputError(f"{path / name} does not match its sha256; {remedy(path)}")
     return path / name
 
 
-def _remedy(path: Path) -> str:
+def remedy(path: Path) -> str:
     return f"delete {path} and run its stage again"
 
 

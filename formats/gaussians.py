@@ -1,0 +1,79 @@
+"""`gaussians/1`: the checkpoint of a trained scene, all raw parameters, and the trace of its training."""
+
+from __future__ import annotations
+
+import csv
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import numpy as np
+
+from chebsplat.errors import InputError
+from chebsplat.formats import artifact
+from chebsplat.formats.artifact import Manifest
+from chebsplat.formats.tensors import Shape, read_tensors, write_tensors
+
+SCHEMA = "chebsplat.gaussians/1"
+SHAPES: dict[str, Shape] = {
+    "means": ("n", 3),
+    "log_scales": ("n", 3),
+    "quats": ("n", 4),
+    "logit_opacities": ("n",),
+    "sh0": ("n", 1, 3),
+    "shN": ("n", "k", 3),
+    "degrees": ("n",),
+}
+
+
+@dataclass
+class Gaussians:
+    """Raw parameters in float32; the name of each carries its transform.
+
+    parameters: `means` [N,3] scene units, `log_scales` [N,3], `quats` [N,4] wxyz, `logit_opacities` [N],
+                `sh0` [N,1,3], `shN` [N,K-1,3], `degrees` u8 [N] highest SH band kept, and, where the scene has a
+                semantic branch, `features` [N,C] and `fused` [N,C].
+    modules:    weights of the encoder, gate and masks by dotted name; empty where they were left out.
+    optimizer:  moments and step counts, so that a training can be resumed.
+    trace:      one row a report interval: error against run time.
+    """
+
+    parameters: dict[str, np.ndarray]
+    modules: dict[str, np.ndarray] = field(default_factory=dict)
+    optimizer: dict[str, np.ndarray] = field(default_factory=dict)
+    trace: list[dict[str, float]] = field(default_factory=list)
+
+
+def write_gaussians(out: Path, gaussians: Gaussians) -> None:
+    """Fill the directory that `artifact.publish` yields. Raises ValueError on a non-finite parameter."""
+    write_tensors(out / "parameters.safetensors", gaussians.parameters)
+    for name, arrays in (("modules", gaussians.modules), ("optimizer", gaussians.optimizer)):
+        if arrays:
+            write_tensors(out / f"{name}.safetensors", arrays)
+    with (out / "trace.csv").open("w", newline="") as handle:
+        columns = list(gaussians.trace[0]) if gaussians.trace else ["step", "seconds"]
+        writer = csv.DictWriter(handle, columns)
+        writer.writeheader()
+        writer.writerows(gaussians.trace)
+
+
+def read_gaussians(path: Path) -> Gaussians:
+    """Raises: InputError naming the damaged file and the remedy."""
+    manifest = artifact.read_manifest(path, SCHEMA)
+    parameters = read_tensors(path, manifest, "parameters.safetensors", SHAPES)
+    n = len(parameters["means"])
+    for name in {"features", "fused"} & set(parameters):
+        if parameters[name].ndim != 2 or len(parameters[name]) != n:
+            raise InputError(
+                f"{path / 'parameters.safetensors'}: {name} has shape {parameters[name].shape}, expected ({n}, C); "
+                + artifact.remedy(path)
+            )
+    optional = {
+        name: read_tensors(path, manifest, f"{name}.safetensors") if f"{name}.safetensors" in manifest.files else {}
+        for name in ("modules", "optimizer")
+    }
+    return Gaussians(parameters, optional["modules"], optional["optimizer"], _read_trace(path, manifest))
+
+
+def _read_trace(path: Path, manifest: Manifest) -> list[dict[str, float]]:
+    with artifact.checked(path, manifest, "trace.csv").open(newline="") as handle:
+        return [{name: float(value) for name, value in row.items()} for row in csv.DictReader(handle)]

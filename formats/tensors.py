@@ -1,0 +1,55 @@
+"""Named arrays in one safetensors file: no pickle, every array checked for shape and finiteness on reading."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from pathlib import Path
+
+import numpy as np
+from safetensors import SafetensorError
+from safetensors.numpy import load_file, save_file
+
+from chebsplat.errors import InputError
+from chebsplat.formats import artifact
+from chebsplat.formats.artifact import Manifest
+
+Shape = tuple[int | str, ...]
+
+
+def write_tensors(path: Path, arrays: Mapping[str, np.ndarray]) -> None:
+    """Write named arrays. Raises ValueError on a name with a non-finite value: nothing bad is ever published."""
+    for name, array in arrays.items():
+        if np.issubdtype(array.dtype, np.floating) and not np.isfinite(array).all():
+            raise ValueError(f"{path.name}: {name} holds {np.sum(~np.isfinite(array))} non-finite values")
+    save_file({name: np.ascontiguousarray(array) for name, array in arrays.items()}, path)
+
+
+def read_tensors(
+    root: Path, manifest: Manifest, name: str, shapes: Mapping[str, Shape] | None = None
+) -> dict[str, np.ndarray]:
+    """Read a listed file after comparing its digest.
+
+    Args:
+      shapes: what must be there; a string is a size that has to agree wherever it occurs, e.g. ("n", 3).
+    Raises: InputError naming the file, the array and the remedy.
+    """
+    path = artifact.checked(root, manifest, name)
+    try:
+        arrays = load_file(path)
+    except (SafetensorError, ValueError) as error:
+        raise InputError(f"{path} is not a safetensors file ({error}); {artifact.remedy(root)}") from None
+    sizes: dict[str, int] = {}
+    for key, shape in (shapes or {}).items():
+        if key not in arrays:
+            raise InputError(f"{path} has no array {key}; {artifact.remedy(root)}")
+        found = arrays[key].shape
+        fits = len(found) == len(shape) and all(
+            n == (sizes.setdefault(want, n) if isinstance(want, str) else want)
+            for n, want in zip(found, shape, strict=True)
+        )
+        if not fits:
+            raise InputError(f"{path}: {key} has shape {found}, expected {shape}; {artifact.remedy(root)}")
+    for key, array in arrays.items():
+        if np.issubdtype(array.dtype, np.floating) and not np.isfinite(array).all():
+            raise InputError(f"{path}: {key} holds non-finite values; {artifact.remedy(root)}")
+    return arrays

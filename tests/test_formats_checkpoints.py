@@ -1,0 +1,85 @@
+"""Checkpoints and bases come back bit for bit, and a damaged or non-finite one is refused by name."""
+
+import numpy as np
+import pytest
+
+from chebsplat.errors import InputError
+from chebsplat.formats import artifact
+from chebsplat.formats.artifact import Manifest
+from chebsplat.formats.basis import Basis, read_basis, write_basis
+from chebsplat.formats.gaussians import Gaussians, read_gaussians, write_gaussians
+
+
+def example(n=5, seed=0):
+    rng = np.random.default_rng(seed)
+    shapes = {"means": (n, 3), "log_scales": (n, 3), "quats": (n, 4), "logit_opacities": (n,)}
+    shapes |= {"sh0": (n, 1, 3), "shN": (n, 15, 3), "features": (n, 13)}
+    parameters = {k: rng.normal(size=s).astype(np.float32) for k, s in shapes.items()}
+    return parameters | {"degrees": rng.integers(0, 4, n).astype(np.uint8)}
+
+
+def publish_gaussians(path, gaussians):
+    with artifact.publish(path, Manifest("chebsplat.gaussians/1", "k", "train")) as tmp:
+        write_gaussians(tmp, gaussians)
+    return path
+
+
+def publish_basis(path, basis):
+    with artifact.publish(path, Manifest("chebsplat.basis/1", "k", "cks")) as tmp:
+        write_basis(tmp, basis)
+    return path
+
+
+@pytest.mark.parametrize("n", [0, 1, 5])
+def test_checkpoint_round_trip_is_exact(tmp_path, n):
+    given = Gaussians(example(n), {"encoder.w": np.ones((2, 3), np.float32)}, {}, [{"step": 1.0, "psnr": 20.25}])
+    found = read_gaussians(publish_gaussians(tmp_path / "g", given))
+    assert found.parameters.keys() == given.parameters.keys()
+    for name, array in given.parameters.items():
+        np.testing.assert_array_equal(found.parameters[name], array)
+    assert found.trace == given.trace
+    assert found.optimizer == {}
+
+
+@pytest.mark.parametrize(("name", "shape"), [("quats", (5, 3)), ("means", (4, 3)), ("features", (4, 13))])
+def test_disagreeing_shape_is_named(tmp_path, name, shape):
+    path = publish_gaussians(tmp_path / "g", Gaussians(example() | {name: np.zeros(shape, np.float32)}))
+    with pytest.raises(InputError, match=r"shape .* expected"):
+        read_gaussians(path)
+
+
+def test_missing_array_is_named(tmp_path):
+    parameters = example()
+    del parameters["quats"]
+    with pytest.raises(InputError, match="no array quats"):
+        read_gaussians(publish_gaussians(tmp_path / "g", Gaussians(parameters)))
+
+
+def test_non_finite_parameter_is_never_published(tmp_path):
+    parameters = example()
+    parameters["means"][2, 1] = np.nan
+    with pytest.raises(ValueError, match="means holds 1 non-finite"):
+        publish_gaussians(tmp_path / "g", Gaussians(parameters))
+    assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.parametrize("file", ["parameters.safetensors", "trace.csv"])
+def test_bit_flip_is_named_with_the_remedy(tmp_path, file):
+    path = publish_gaussians(tmp_path / "g", Gaussians(example(), trace=[{"step": 1.0}]))
+    data = bytearray((path / file).read_bytes())
+    data[-1] ^= 1
+    (path / file).write_bytes(data)
+    with pytest.raises(InputError, match=f"{file}.*again"):
+        read_gaussians(path)
+
+
+def test_basis_round_trip_and_refusal_of_a_skew_basis(tmp_path):
+    q, _ = np.linalg.qr(np.random.default_rng(0).normal(size=(8, 3)))
+    weights = {"layer0.query": np.ones((8, 8), np.float32)}
+    given = Basis({"layer0.query": q.astype(np.float32)}, weights, [{"scene": "toy", "rank": 3}])
+    found = read_basis(publish_basis(tmp_path / "b", given))
+    np.testing.assert_array_equal(found.bases["layer0.query"], given.bases["layer0.query"])
+    assert (found.revision, found.lineage) == (1, given.lineage)
+    given.bases["layer0.query"] *= 1.01
+    with pytest.raises(InputError, match="not orthonormal"):
+        read_basis(publish_basis(tmp_path / "skew", given))
