@@ -1,0 +1,94 @@
+"""A stage command publishes one artifact, prints its path and nothing else, and ends with the documented exit code."""
+
+import json
+import logging
+
+import pytest
+from click.testing import CliRunner
+
+from chebsplat.errors import DataFailure
+from chebsplat.formats import artifact
+from chebsplat.formats.artifact import Manifest
+from chebsplat.stages.command import command
+from chebsplat.stages.registry import STAGES
+
+
+@pytest.fixture(autouse=True)
+def _release_logging():
+    yield
+    logging.getLogger().handlers.clear()
+
+
+def invoke(run, *arguments, stage="ingest"):
+    return CliRunner().invoke(command(stage, run), [str(a) for a in arguments])
+
+
+def good(job):
+    (job.out / "a.txt").write_text("a")
+    job.left_out("depth", "none given")
+
+
+def test_artifact_is_published_and_its_path_printed(tmp_path):
+    result = invoke(good, "--out", tmp_path / "x", "--key", "abc")
+    assert (result.exit_code, result.stdout) == (0, f"{tmp_path / 'x'}\n")
+    manifest = artifact.verify(tmp_path / "x", "chebsplat.capture/1")
+    assert (manifest.key, manifest.facts) == ("abc", {"left_out": {"depth": "none given"}})
+    assert set(manifest.config) == {"scene", "source", "ingest"}
+
+
+def test_finished_artifact_is_not_made_again_unless_forced(tmp_path):
+    runs = []
+
+    def counted(job):
+        runs.append(1)
+        good(job)
+
+    for extra in ([], [], ["--force"]):
+        assert invoke(counted, "--out", tmp_path / "x", *extra).exit_code == 0
+    assert len(runs) == 2
+
+
+def fail_data(job):
+    raise DataFailure("3 of 9 views registered")
+
+
+def crash(job):
+    raise RuntimeError("bug")
+
+
+@pytest.mark.parametrize(("run", "code"), [(fail_data, 4), (crash, 1)])
+def test_failed_run_publishes_nothing(tmp_path, run, code):
+    result = invoke(run, "--out", tmp_path / "x")
+    assert (result.exit_code, result.stdout) == (code, "")
+    assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.parametrize("stage", STAGES)
+def test_bad_config_of_every_stage_exits_2(tmp_path, stage):
+    (tmp_path / "c.toml").write_text("[train]\nstpes = 3\n")
+    inputs = [a for role, _ in STAGES[stage].inputs for a in (f"--in-{role}", tmp_path / role)]
+    result = invoke(good, *inputs, "--config", tmp_path / "c.toml", "--out", tmp_path / "x", stage=stage)
+    assert result.exit_code == 2
+    assert invoke(good, "--no-such-option", stage=stage).exit_code == 2
+
+
+@pytest.mark.parametrize("stage", [name for name, stage in STAGES.items() if stage.inputs])
+def test_missing_or_wrong_input_of_every_stage_exits_3(tmp_path, stage):
+    inputs = [a for role, _ in STAGES[stage].inputs for a in (f"--in-{role}", tmp_path / role)]
+    assert invoke(good, *inputs, "--out", tmp_path / "x", stage=stage).exit_code == 3
+    for role, _ in STAGES[stage].inputs:
+        with artifact.publish(tmp_path / role, Manifest("chebsplat.other/1", "k", "other")):
+            pass
+    assert invoke(good, *inputs, "--out", tmp_path / "x", stage=stage).exit_code == 3
+    assert not (tmp_path / "x").exists()
+
+
+def test_log_is_part_of_the_artifact(tmp_path):
+    def logs(job):
+        for step, status in job.progress.track(range(3), 3, "steps"):
+            status["loss"] = 0.5
+            job.progress.record(step=step)
+
+    assert invoke(logs, "--out", tmp_path / "x", "--no-progress").exit_code == 0
+    lines = (tmp_path / "x/log.jsonl").read_text().splitlines()
+    assert [json.loads(line)["step"] for line in lines] == [0, 1, 2]
