@@ -1,0 +1,96 @@
+"""Perspective projection of 3D Gaussians to screen-space ellipses (EWA)."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+
+class Projected(NamedTuple):
+    """Gaussians of one view. Rows with `visible` false hold zeros."""
+
+    means2d: Tensor  # [N, 2] pixels; pixel centres are at half integers
+    conics: Tensor  # [N, 3] upper triangle of the inverse 2D covariance, pixels⁻²
+    depths: Tensor  # [N] camera z
+    radii: Tensor  # [N] int, extent of the opacity-independent 3σ ellipse in pixels
+    visible: Tensor  # [N] bool
+
+
+def rotation_matrices(quats: Tensor) -> Tensor:
+    """Rotation matrices [N, 3, 3] of quaternions [N, 4], wxyz, not necessarily of unit length.
+
+    Choices: pre-scaled by the largest entry, so that neither 1e20 nor 1e-20 overflows or vanishes.
+    """
+    scaled = quats / quats.detach().abs().amax(-1, keepdim=True).clamp_min(1e-30)
+    w, x, y, z = torch.nn.functional.normalize(scaled, dim=-1).unbind(-1)
+    rows = [
+        torch.stack([1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)], -1),
+        torch.stack([2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)], -1),
+        torch.stack([2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)], -1),
+    ]
+    return torch.stack(rows, -2)
+
+
+def project(
+    means: Tensor,
+    quats: Tensor,
+    scales: Tensor,
+    viewmat: Tensor,
+    K: Tensor,
+    width: int,
+    height: int,
+    near_plane: float,
+    far_plane: float,
+    eps2d: float,
+) -> Projected:
+    """Project Gaussians into one camera.
+
+    Args: see `rasterize`; `viewmat` [4, 4], `K` [3, 3].
+    Choices: culled by `not (near < z < far)`, which rejects NaN too; the view ray's slope is clamped to 1.3 times the
+    field of view in the Jacobian, as gsplat does; a zero quaternion or a non-finite result is culled, never repaired.
+    """
+    camera = means @ viewmat[:3, :3].T + viewmat[:3, 3]
+    usable = (camera[:, 2] > near_plane) & (camera[:, 2] < far_plane)
+    usable &= torch.isfinite(camera).all(-1) & torch.isfinite(scales).all(-1) & torch.isfinite(quats).all(-1)
+    usable &= quats.abs().amax(-1) > 1e-12
+
+    # Compute on harmless stand-ins where unusable: a masked-out NaN would still poison the gradient.
+    one = torch.tensor([0.0, 0.0, 1.0], dtype=means.dtype, device=means.device)
+    camera = torch.where(usable[:, None], camera, one)
+    quats = torch.where(usable[:, None], quats, torch.ones_like(quats))
+    scales = torch.where(usable[:, None], scales, torch.ones_like(scales))
+
+    x, y, z = camera.unbind(-1)
+    fx, fy, cx, cy = K[0, 0], K[1, 1], K[0, 2], K[1, 2]
+    slack_x, slack_y = 0.3 * 0.5 * width / fx, 0.3 * 0.5 * height / fy
+    tx = z * torch.minimum(torch.maximum(x / z, -(cx / fx + slack_x)), (width - cx) / fx + slack_x)
+    ty = z * torch.minimum(torch.maximum(y / z, -(cy / fy + slack_y)), (height - cy) / fy + slack_y)
+    zero = torch.zeros_like(z)
+    jacobian = torch.stack(
+        [torch.stack([fx / z, zero, -fx * tx / z**2], -1), torch.stack([zero, fy / z, -fy * ty / z**2], -1)], -2
+    )
+    factor = jacobian @ viewmat[:3, :3] @ rotation_matrices(quats) * scales[:, None, :]  # [N, 2, 3]
+    p1, p2 = factor.unbind(-2)
+    a, b, c = (p1 * p1).sum(-1), (p1 * p2).sum(-1), (p2 * p2).sum(-1)
+    # Cauchy-Binet: a sum of non-negative terms, where (a+ε)(c+ε) − b² cancels for needles.
+    cross = torch.linalg.cross(p1, p2)
+    determinant = eps2d**2 + eps2d * (a + c) + (cross * cross).sum(-1)
+    visible = usable & torch.isfinite(determinant)
+    determinant = torch.where(visible, determinant, torch.ones_like(determinant))
+    conics = torch.stack([c + eps2d, -b, a + eps2d], -1) / determinant[:, None]
+    means2d = torch.stack([fx * x / z + cx, fy * y / z + cy], -1)
+
+    largest = 0.5 * (a + c) + eps2d + (0.25 * (a - c) ** 2 + b * b).sqrt()
+    reach = (3 * largest.detach().sqrt()).ceil().clamp_max(2**30)
+    u, v = means2d.detach().unbind(-1)
+    visible = visible & (u + reach > 0) & (u - reach < width) & (v + reach > 0) & (v - reach < height)
+    keep = visible[:, None]
+    return Projected(
+        torch.where(keep, means2d, torch.zeros_like(means2d)),
+        torch.where(keep, conics, torch.zeros_like(conics)),
+        torch.where(visible, z, zero),
+        torch.where(visible, reach, zero).int(),
+        visible,
+    )

@@ -1,0 +1,66 @@
+"""Colour by real spherical harmonics, in 3DGS's basis and sign convention."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+MAX_DEGREE = 3
+
+
+def n_coefficients(degree: int) -> int:
+    """Coefficients of all bands up to `degree`: (degree + 1)²."""
+    return (degree + 1) ** 2
+
+
+def basis(directions: Tensor, degree: int) -> Tensor:
+    """Real spherical harmonics with the Condon-Shortley phase.
+
+    Args:
+      directions: [N, 3] unit vectors, from the camera to the Gaussian.
+      degree:     0 to 3.
+    Returns: [N, (degree + 1)²], band by band, m from -l to l.
+    Raises:  ValueError on a degree outside 0...3.
+    """
+    if not 0 <= degree <= MAX_DEGREE:
+        raise ValueError(f"degree {degree} is not within 0...{MAX_DEGREE}")
+    x, y, z = directions.unbind(-1)
+    columns = [torch.full_like(x, 0.28209479177387814)]
+    if degree >= 1:
+        c = 0.4886025119029199
+        columns += [-c * y, c * z, -c * x]
+    if degree >= 2:
+        c = 1.0925484305920792
+        columns += [
+            c * x * y,
+            -c * y * z,
+            0.31539156525252005 * (3 * z * z - 1),
+            -c * x * z,
+            0.5462742152960396 * (x * x - y * y),
+        ]
+    if degree >= 3:
+        columns += [
+            -0.5900435899266435 * y * (3 * x * x - y * y),
+            2.890611442640554 * x * y * z,
+            -0.4570457994644658 * y * (5 * z * z - 1),
+            0.3731763325901154 * z * (5 * z * z - 3),
+            -0.4570457994644658 * x * (5 * z * z - 1),
+            1.445305721320277 * z * (x * x - y * y),
+            -0.5900435899266435 * x * (x * x - 3 * y * y),
+        ]
+    return torch.stack(columns, -1)
+
+
+def eval_sh(sh0: Tensor, shN: Tensor, directions: Tensor, degree: int) -> Tensor:
+    """Colour seen along a direction; the half-grey offset is added and negative light cut off.
+
+    Args:
+      sh0:        [N, 1, 3] coefficients of band 0.
+      shN:        [N, K - 1, 3] the rest, K - 1 at least `n_coefficients(degree) - 1`.
+      directions: [N, 3], from the camera to the Gaussian; normalised here.
+      degree:     highest band to use.
+    Returns: [N, 3], at least 0.
+    """
+    values = basis(torch.nn.functional.normalize(directions, dim=-1), degree)
+    coefficients = torch.cat([sh0, shN[:, : n_coefficients(degree) - 1]], 1)
+    return (torch.einsum("nk,nkc->nc", values, coefficients) + 0.5).clamp_min(0)

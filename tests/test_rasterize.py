@@ -1,0 +1,130 @@
+"""The rasterizer reproduces gsplat's image, and no input, however broken, spreads beyond itself."""
+
+import math
+import os
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from safetensors.torch import load_file
+
+from chebsplat import sh
+from chebsplat.rasterize import rasterize
+from chebsplat.rasterize.projection import rotation_matrices
+
+DATA = Path(os.environ.get("CHEBSPLAT_TEST_DATA", Path(__file__).parents[2] / "shared/data"))
+
+
+def camera(width=16, height=12, dtype=torch.float64):
+    K = torch.tensor([[20.0, 0, width / 2], [0, 20, height / 2], [0, 0, 1]], dtype=dtype)
+    return {"viewmats": torch.eye(4, dtype=dtype)[None], "Ks": K[None], "width": width, "height": height}
+
+
+def scene(n=6, channels=5, seed=0, dtype=torch.float64):
+    g = torch.Generator().manual_seed(seed)
+    means = torch.randn(n, 3, generator=g, dtype=dtype) * 0.4
+    means[:, 2] += 3
+    return {
+        "means": means,
+        "quats": torch.randn(n, 4, generator=g, dtype=dtype),
+        "scales": torch.rand(n, 3, generator=g, dtype=dtype) * 0.2 + 0.05,
+        "opacities": torch.rand(n, generator=g, dtype=dtype) * 0.7 + 0.2,
+        "colors": torch.rand(n, channels, generator=g, dtype=dtype),
+    }
+
+
+@pytest.mark.data
+def test_reference_image_of_four_gaussians_is_matched():
+    file = DATA / "raster_reference/tiny_case.safetensors"
+    if not file.exists():
+        pytest.skip("raster_reference is missing")
+    case = load_file(file)
+    height, width = case["out_img"].shape[:2]
+    viewmat = torch.eye(4)
+    viewmat[:3, 3] = -torch.tensor([0.123, 0.456, -8.0])
+    focal = width / 2 / math.tan(math.radians(90) / 2)
+    K = torch.tensor([[focal, 0, width / 2], [0, focal, height / 2], [0, 0, 1]])
+    coefficients = case["coeffs"]
+    directions = case["means"] - torch.tensor([0.123, 0.456, -8.0])
+    colors = sh.eval_sh(coefficients[:, :1], coefficients[:, 1:], directions, 3)
+    image, alpha, _ = rasterize(
+        case["means"], case["quats"], case["scales"].exp(), case["opacities"].sigmoid(), colors,
+        viewmat[None], K[None], width, height, max_alpha=0.999,
+    )  # fmt: skip
+    error = (torch.cat([image, alpha], -1)[0] - case["out_img"]).abs().max()
+    assert error < 1e-4
+
+
+def test_gradients_match_finite_differences():
+    given = {k: v.requires_grad_() for k, v in scene(3, 2).items()}
+    torch.autograd.gradcheck(
+        lambda *values: rasterize(*values, **camera(6, 5), backgrounds=torch.ones(1, 2, dtype=torch.float64))[:2],
+        tuple(given.values()),
+        atol=1e-6,
+    )
+
+
+def test_means2d_keep_their_gradient_for_densification():
+    given = scene()
+    given["means"].requires_grad_()
+    image, _, meta = rasterize(**given, **camera())
+    image.sum().backward()
+    assert meta["means2d"].grad.shape == (1, 6, 2)
+    assert meta["means2d"].grad.abs().sum() > 0
+
+
+@pytest.mark.parametrize("n", [0, 3])
+def test_nothing_in_view_gives_the_background(n):
+    given = scene(n)
+    given["means"][:, 2] = -1
+    image, alpha, _ = rasterize(**given, **camera(), backgrounds=torch.full((1, 5), 0.25, dtype=torch.float64))
+    assert (image == 0.25).all()
+    assert (alpha == 0).all()
+
+
+@pytest.mark.parametrize("field", ["means", "quats", "scales", "opacities", "colors"])
+@pytest.mark.parametrize("bad", [math.nan, math.inf])
+def test_broken_gaussian_touches_no_pixel_and_no_gradient(field, bad):
+    clean = scene()
+    broken = {k: torch.cat([v, v[:1].clone()]) for k, v in clean.items()}
+    broken[field][-1] = bad
+    broken = {k: v.requires_grad_() for k, v in broken.items()}
+    image, _, _ = rasterize(**broken, **camera())
+    torch.testing.assert_close(image, rasterize(**clean, **camera())[0], rtol=0, atol=0)
+    image.sum().backward()
+    for name, value in broken.items():
+        assert torch.isfinite(value.grad).all(), name
+
+
+def test_extreme_shapes_stay_finite():
+    given = scene(4)
+    given["scales"] = torch.tensor([[1e3, 1e-9, 1e-9], [1e6, 1e6, 1e6], [1e-12] * 3, [1, 0, 0]], dtype=torch.float64)
+    given = {k: v.requires_grad_() for k, v in given.items()}
+    image, _, _ = rasterize(**given, **camera())
+    image.sum().backward()
+    assert torch.isfinite(image).all()
+    assert all(torch.isfinite(v.grad).all() for v in given.values())
+
+
+def test_order_of_gaussians_does_not_matter():
+    given = scene(8)
+    shuffled = {k: v[torch.randperm(8, generator=torch.Generator().manual_seed(1))] for k, v in given.items()}
+    torch.testing.assert_close(rasterize(**given, **camera())[0], rasterize(**shuffled, **camera())[0])
+
+
+@pytest.mark.parametrize("length", [1e-10, 1.0, 1e20])
+def test_length_of_a_quaternion_does_not_matter(length):
+    quats = scene()["quats"]
+    torch.testing.assert_close(rotation_matrices(quats * length), rotation_matrices(quats))
+
+
+def test_harmonics_are_orthonormal():
+    n = 64
+    z, weights = np.polynomial.legendre.leggauss(n)
+    phi = (np.arange(2 * n) + 0.5) * np.pi / n
+    r = np.sqrt(1 - z**2)[:, None]
+    grid = np.stack([r * np.cos(phi), r * np.sin(phi), np.broadcast_to(z[:, None], (n, 2 * n))], -1).reshape(-1, 3)
+    values = sh.basis(torch.from_numpy(grid), 3).numpy()
+    area = np.repeat(weights, 2 * n) * np.pi / n
+    np.testing.assert_allclose(values.T @ (values * area[:, None]), np.eye(16), atol=1e-12)
