@@ -13,13 +13,13 @@ from pathlib import Path
 from typing import Any
 
 import click
+
+from chebsplat.errors import ChebsplatError
 from chebsplat.formats import artifact
 from chebsplat.formats.artifact import Manifest
 from chebsplat.stages import config as configs
 from chebsplat.stages.progress import Progress
 from chebsplat.stages.registry import STAGES
-
-from chebsplat.errors import ChebsplatError
 
 log = logging.getLogger("chebsplat")
 

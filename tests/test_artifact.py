@@ -3,10 +3,10 @@
 import os
 
 import pytest
-from chebsplat.formats import artifact
-from chebsplat.formats.artifact import Manifest
 
 from chebsplat.errors import InputError
+from chebsplat.formats import artifact
+from chebsplat.formats.artifact import Manifest
 
 
 def make(path, text="hello"):

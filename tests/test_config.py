@@ -3,10 +3,10 @@
 import json
 
 import pytest
-from chebsplat.stages import config
-from chebsplat.stages.registry import STAGES
 
 from chebsplat.errors import ConfigError
+from chebsplat.stages import config
+from chebsplat.stages.registry import STAGES
 
 
 @pytest.mark.parametrize(
