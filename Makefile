@@ -5,7 +5,7 @@ READY := .venv/.ready
 unexport PYTHONDONTWRITEBYTECODE
 
 .DEFAULT_GOAL := help
-.PHONY: help setup test test-all lint lock plan
+.PHONY: help setup test test-all lint lock
 
 help:  ## list the targets
 	@grep -hE '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed -E 's/:.*## /\t/' | expand -t 14
@@ -24,9 +24,6 @@ test-all: $(READY)  ## all tests, the slow ones too
 
 lint: $(READY)  ## ruff (lint, format)
 	@$(PY) -m ruff check . && $(PY) -m ruff format --check .
-
-plan: $(READY)  ## what would run for scene=NAME, what is fresh, what is left out and why
-	@.venv/bin/chebsplat plan $(scene) $(if $(set),--set $(set)) $(if $(ablation),--ablation $(ablation))
 
 lock: $(READY)  ## resolve requirements.lock anew
 	@links="$$($(PY) -m pip config get global.find-links 2>/dev/null || true)"; \
