@@ -1,0 +1,110 @@
+"""Chunked arrays in zarr v3, one view a chunk; every chunk present and checksummed, so that no fill value is read.
+
+Measured traps this closes: a missing chunk and a zero-byte one read silently as fill values, a flipped bit reads
+silently as data. Presence and size come from the manifest, the bits from each chunk's crc32c.
+"""
+
+from __future__ import annotations
+
+import itertools
+import math
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from chebsplat.errors import InputError
+from chebsplat.formats import artifact
+from chebsplat.formats.artifact import Manifest
+
+
+def write_array(
+    path: Path, data: np.ndarray, dimensions: Sequence[str], units: str = "", chunks: tuple[int, ...] | None = None
+) -> None:
+    """Write one array; `chunks` defaults to one entry of the first dimension. Float arrays have nan as fill value."""
+    import zarr
+    from zarr.codecs import Crc32cCodec, ZstdCodec
+
+    array = zarr.create_array(
+        str(path),
+        shape=data.shape,
+        dtype=data.dtype,
+        chunks=chunks or (1, *(max(n, 1) for n in data.shape[1:])),
+        compressors=[ZstdCodec(level=3), Crc32cCodec()],
+        fill_value=float("nan") if data.dtype.kind == "f" else 0,
+        dimension_names=list(dimensions),
+        attributes={"units": units},
+        config={"write_empty_chunks": True},
+    )
+    array[:] = data
+    absent = [name for name in _chunk_names(array) if not (path / name).is_file()]
+    if absent:
+        raise OSError(f"{path / absent[0]} was not written ({len(absent)} chunks absent)")
+
+
+def _chunk_names(array: Any) -> list[str]:
+    grid = [range(math.ceil(n / c)) for n, c in zip(array.shape, array.chunks, strict=True)]
+    return ["/".join(["c", *map(str, index)]) for index in itertools.product(*grid)]
+
+
+class StoredArray:
+    """A published array, read chunk by chunk: `array[i]`, `array[a:b]`, `array[:]` give numpy arrays."""
+
+    def __init__(self, root: Path, manifest: Manifest, name: str):
+        """Raises: InputError if metadata is damaged or a chunk is not listed in the manifest."""
+        import zarr
+
+        self.root, self.path = root, root / name
+        artifact.checked(root, manifest, f"{name}/zarr.json")
+        try:
+            self._array: Any = zarr.open_array(str(self.path), mode="r")
+        except (ValueError, KeyError, OSError) as error:
+            raise InputError(
+                f"{self.path / 'zarr.json'} is not zarr metadata ({error}); {artifact.remedy(root)}"
+            ) from None
+        for chunk in _chunk_names(self._array):
+            if f"{name}/{chunk}" not in manifest.files:
+                raise InputError(f"{self.path / chunk} is missing; {artifact.remedy(root)}")
+        self.shape: tuple[int, ...] = self._array.shape
+        self.dtype: np.dtype = self._array.dtype
+
+    def __len__(self) -> int:
+        return self.shape[0]
+
+    def __getitem__(self, index: Any) -> np.ndarray:
+        try:
+            return np.asarray(self._array[index])
+        except IndexError:
+            raise
+        except (ValueError, RuntimeError, OSError) as error:
+            raise InputError(f"{self.path}: {self._culprit()}: {error}; {artifact.remedy(self.root)}") from None
+
+    def __array__(self, dtype: Any = None, copy: bool | None = None) -> np.ndarray:
+        return np.asarray(self[:], dtype)
+
+    def _culprit(self) -> str:
+        """The first chunk that does not decode, for the message."""
+        sizes = self._array.chunks
+        for name in _chunk_names(self._array):
+            where = tuple(slice(int(k) * n, (int(k) + 1) * n) for k, n in zip(name.split("/")[1:], sizes, strict=True))
+            try:
+                self._array[where]
+            except (ValueError, RuntimeError, OSError):
+                return f"chunk {name} is damaged"
+        return "a chunk is damaged"
+
+
+def open_array(root: Path, manifest: Manifest, name: str, shape: Sequence[int | None], dtype: str) -> StoredArray:
+    """A listed array whose shape (None: any size) and dtype are as expected. Raises InputError otherwise."""
+    array = StoredArray(root, manifest, name)
+    fits = len(array.shape) == len(shape) and all(w in (None, n) for n, w in zip(array.shape, shape, strict=True))
+    if not fits or array.dtype != np.dtype(dtype):
+        raise InputError(
+            f"{array.path} is {array.dtype} {array.shape}, expected {dtype} {tuple(shape)}; {artifact.remedy(root)}"
+        )
+    return array
+
+
+def has_array(manifest: Manifest, name: str) -> bool:
+    return f"{name}/zarr.json" in manifest.files

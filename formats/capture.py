@@ -1,0 +1,126 @@
+"""`capture/1`: what was photographed. Images and cameras; depth, labels and loss masks where the source has them."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from chebsplat.errors import InputError
+from chebsplat.formats import artifact
+from chebsplat.formats.arrays import StoredArray, has_array, open_array, write_array
+from chebsplat.formats.documents import read_document, write_document
+from chebsplat.formats.tensors import read_tensors, write_tensors
+
+SCHEMA = "chebsplat.capture/1"
+OPTIONAL = {
+    "depth": ("float32", ("view", "row", "column"), "scene units, z-depth, nan where unknown"),
+    "labels": ("int16", ("view", "row", "column"), "class index, -1 ignored"),
+    "loss_mask": ("bool", ("view", "row", "column"), "true where a pixel counts"),
+}
+Stack = np.ndarray | StoredArray
+
+
+@dataclass
+class Capture:
+    """V views of one size H x W.
+
+    names:          unique per view; every join between artifacts is on these, never on position.
+    images:         u8 [V, H, W, 3].
+    Ks:             f64 [V, 3, 3] pixels, pixel centres at half integers (COLMAP).
+    cam_from_world: f64 [V, 4, 4] OpenCV axes, or None where poses are unknown.
+    is_test:        bool [V]; test views are never trained on.
+    depth, labels, loss_mask: as in OPTIONAL, or None. class_names[labels] names a pixel.
+    source:         which source, and notes about what was dropped or changed; protocol: name and parameters.
+    """
+
+    names: list[str]
+    images: Stack
+    Ks: np.ndarray
+    cam_from_world: np.ndarray | None
+    is_test: np.ndarray
+    depth: Stack | None = None
+    labels: Stack | None = None
+    loss_mask: Stack | None = None
+    class_names: list[str] | None = None
+    source: dict[str, Any] = field(default_factory=dict)
+    protocol: dict[str, Any] = field(default_factory=dict)
+
+    @property
+    def size(self) -> tuple[int, int]:
+        """(width, height)."""
+        return self.images.shape[2], self.images.shape[1]
+
+
+def write_capture(out: Path, capture: Capture) -> None:
+    """Fill the directory that `artifact.publish` yields. Raises InputError if the views do not fit together."""
+    _check(capture, "capture")
+    write_array(out / "images", np.asarray(capture.images), ("view", "row", "column", "channel"), "sRGB")
+    for name, (dtype, dimensions, units) in OPTIONAL.items():
+        data = getattr(capture, name)
+        if data is not None:
+            write_array(out / name, np.asarray(data).astype(dtype, copy=False), dimensions, units)
+    cameras = {"Ks": capture.Ks, "is_test": capture.is_test.astype(np.uint8)}
+    if capture.cam_from_world is not None:
+        cameras["cam_from_world"] = capture.cam_from_world
+    write_tensors(out / "cameras.safetensors", cameras)
+    write_document(
+        out / "capture.json",
+        {
+            "names": capture.names,
+            "class_names": capture.class_names,
+            "source": capture.source,
+            "protocol": capture.protocol,
+        },
+    )
+
+
+def read_capture(path: Path) -> Capture:
+    """Images, depth, labels and masks stay on disk until indexed. Raises InputError naming file and remedy."""
+    path = Path(path)
+    manifest = artifact.read_manifest(path, SCHEMA)
+    document = read_document(path, manifest, "capture.json", ("names", "class_names", "source", "protocol"))
+    cameras = read_tensors(path, manifest, "cameras.safetensors", {"Ks": ("v", 3, 3), "is_test": ("v",)})
+    images = open_array(path, manifest, "images", (len(document["names"]), None, None, 3), "uint8")
+    optional = {
+        name: open_array(path, manifest, name, images.shape[:3], dtype) if has_array(manifest, name) else None
+        for name, (dtype, _, _) in OPTIONAL.items()
+    }
+    capture = Capture(
+        document["names"],
+        images,
+        cameras["Ks"],
+        cameras.get("cam_from_world"),
+        cameras["is_test"].astype(bool),
+        **optional,
+        class_names=document["class_names"],
+        source=document["source"],
+        protocol=document["protocol"],
+    )
+    _check(capture, str(path))
+    return capture
+
+
+def _check(capture: Capture, where: str) -> None:
+    n = len(capture.names)
+    if len(set(capture.names)) != n:
+        twice = next(name for name in capture.names if capture.names.count(name) > 1)
+        raise InputError(f"{where}: view name {twice} occurs twice; rename the image")
+    for name in ("images", "Ks", "is_test", "cam_from_world", *OPTIONAL):
+        data = getattr(capture, name)
+        if data is not None and len(data) != n:
+            raise InputError(f"{where}: {len(data)} {name} for {n} views")
+    for name in OPTIONAL:
+        data = getattr(capture, name)
+        if data is not None and tuple(data.shape) != tuple(capture.images.shape[:3]):
+            raise InputError(f"{where}: {name} is {data.shape}, images are {capture.images.shape}")
+    if capture.labels is not None and not capture.class_names:
+        raise InputError(f"{where}: labels without class names; give source.class_names")
+    if capture.cam_from_world is not None:
+        rotations = capture.cam_from_world[:, :3, :3]
+        error = np.abs(rotations @ rotations.transpose(0, 2, 1) - np.eye(3)).max(axis=(1, 2))
+        if not np.all(error < 1e-3):
+            worst = int(np.argmax(np.nan_to_num(error, nan=np.inf)))
+            raise InputError(f"{where}: the pose of {capture.names[worst]} is not a rotation; correct the source")

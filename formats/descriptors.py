@@ -1,0 +1,43 @@
+"""`descriptors/1`: regions of the initial Gaussians and their anisotropic Chebyshev descriptors."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from chebsplat.formats import artifact
+from chebsplat.formats.documents import read_document, write_document
+from chebsplat.formats.tensors import read_tensors, write_tensors
+
+SCHEMA = "chebsplat.descriptors/1"
+
+
+@dataclass
+class Descriptors:
+    """centers: i64 [M] indices of the points that regions are centred on. members: i64 [M, n], -1 where padded.
+    values: f32 [M, n, J, D-1], zero where padded. settings: the parameters they were computed with.
+    """
+
+    centers: np.ndarray
+    members: np.ndarray
+    values: np.ndarray
+    settings: dict[str, Any] = field(default_factory=dict)
+
+
+def write_descriptors(out: Path, descriptors: Descriptors) -> None:
+    """Fill the directory that `artifact.publish` yields. Raises ValueError on a non-finite value."""
+    arrays = {name: getattr(descriptors, name) for name in ("centers", "members", "values")}
+    write_tensors(out / "descriptors.safetensors", arrays)
+    write_document(out / "settings.json", descriptors.settings)
+
+
+def read_descriptors(path: Path) -> Descriptors:
+    """Raises: InputError naming the damaged file and the remedy."""
+    path = Path(path)
+    manifest = artifact.read_manifest(path, SCHEMA)
+    shapes = {"centers": ("m",), "members": ("m", "n"), "values": ("m", "n", "j", "d")}
+    arrays = read_tensors(path, manifest, "descriptors.safetensors", shapes)
+    return Descriptors(**{k: arrays[k] for k in shapes}, settings=read_document(path, manifest, "settings.json"))

@@ -1,0 +1,67 @@
+"""ingest: read a source into a capture."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+from typing import Any
+
+from chebsplat.errors import ConfigError, InputError
+from chebsplat.stages.command import Job, command
+from chebsplat.stages.config import IngestSection, SourceSection
+
+
+def resolve(name: str, source: SourceSection) -> SourceSection:
+    """The source really meant: `named` is Replica's scene where REPLICA_ROOT holds it, else the generated one.
+
+    The result, not `named`, enters an artifact's key, so the two can never be mistaken for each other.
+    """
+    if source.kind == "scannet":
+        raise ConfigError("source.kind = scannet: not yet; export the scene to COLMAP and use source.kind = colmap")
+    if source.kind == "named":
+        root = os.environ.get("REPLICA_ROOT")
+        spellings = (name, name.rstrip("0123456789") + "_" + name[len(name.rstrip("0123456789")) :])
+        found = [Path(root) / s for s in spellings if root and (Path(root) / s).is_dir()]
+        change = {"kind": "replica", "path": str(found[0])} if found else {"kind": "generated", "path": None}
+        source = source.model_copy(update=change)
+    if source.kind != "generated" and source.path is None:
+        raise ConfigError(f"source.kind = {source.kind} needs source.path")
+    return source
+
+
+def read(name: str, source: SourceSection, settings: IngestSection) -> dict[str, Any]:
+    """The fields of a capture, as its source gives them. Raises InputError if the source's folder is absent."""
+    if source.kind == "generated":
+        from chebsplat.stages.sources import generated
+
+        return generated.capture(name, source.seed, source.preset)
+    from chebsplat.stages.sources import colmap, photos, replica, transforms
+
+    folder = Path(str(source.path)).expanduser()
+    if not folder.is_dir():
+        raise InputError(f"{folder} is not a folder; correct source.path")
+    module = {"colmap": colmap, "transforms": transforms, "photos": photos, "replica": replica}[source.kind]
+    return module.read(folder, settings)
+
+
+def run(job: Job) -> None:
+    import numpy as np
+
+    from chebsplat.formats.capture import Capture, write_capture
+
+    name, settings = job.config.scene.name, job.config.ingest
+    source = resolve(name, job.config.source)
+    fields = read(name, source, settings)
+    n_views = len(fields["names"])
+    fields.setdefault("is_test", np.arange(n_views) % settings.test_every == settings.test_offset)
+    protocol = {"name": settings.protocol, "test_every": settings.test_every, "test_offset": settings.test_offset}
+    optional: dict[str, Any] = {"depth": None, "labels": None, "loss_mask": None, "class_names": None}
+    capture = Capture(**(optional | fields), protocol=protocol)
+    for what in ("depth", "labels"):
+        if fields.get(what) is None:
+            job.left_out(what, f"the {source.kind} source has none")
+    job.facts |= {"source": capture.source, "n_views": n_views, "n_test": int(np.sum(capture.is_test))}
+    write_capture(job.out, capture)
+
+
+main = command("ingest", run)

@@ -1,0 +1,263 @@
+"""Every artifact reads back what was written; every kind of damage to every file is named with its remedy."""
+
+import os
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from chebsplat.errors import InputError
+from chebsplat.formats import artifact, capture, descriptors, evaluation, features, ply, points, scene
+from chebsplat.formats.artifact import Manifest
+
+DATA = Path(os.environ.get("CHEBSPLAT_TEST_DATA", Path(__file__).parents[1] / "../shared/data"))
+
+
+def gaussian_parameters(n=6, seed=0):
+    rng = np.random.default_rng(seed)
+    degrees = np.sort(rng.integers(0, 4, n)).astype(np.uint8)
+    shN = rng.normal(size=(n, 15, 3)).astype(np.float32)
+    for row, degree in enumerate(degrees):
+        shN[row, ply.REST[int(degree)] :] = 0
+    shapes = {"means": (n, 3), "log_scales": (n, 3), "quats": (n, 4), "logit_opacities": (n,), "sh0": (n, 1, 3)}
+    return {k: rng.normal(size=s).astype(np.float32) for k, s in shapes.items()} | {"shN": shN, "degrees": degrees}
+
+
+def make_capture():
+    rng = np.random.default_rng(1)
+    depth = rng.random((3, 4, 5), dtype=np.float32)
+    depth[0, 0, 0] = np.nan
+    return capture.Capture(
+        ["a", "b", "c"],
+        rng.integers(0, 255, (3, 4, 5, 3), dtype=np.uint8),
+        np.tile(np.eye(3), (3, 1, 1)),
+        np.tile(np.eye(4), (3, 1, 1)),
+        np.array([True, False, False]),
+        depth,
+        rng.integers(-1, 2, (3, 4, 5)).astype(np.int16),
+        rng.random((3, 4, 5)) > 0.5,
+        ["wall", "floor"],
+        {"kind": "test"},
+        {"name": "labels"},
+    )
+
+
+def make_points():
+    rng = np.random.default_rng(2)
+    return points.Points(
+        ["a"],
+        np.eye(3)[None],
+        np.eye(4)[None],
+        rng.normal(size=(5, 3)),
+        rng.integers(0, 255, (5, 3), dtype=np.uint8),
+        rng.normal(size=(5, 3)).astype(np.float32),
+        np.tile(np.eye(3, dtype=np.float32), (5, 1, 1)),
+        np.zeros((0, 2), np.int32),
+        {"how": "depth"},
+    )
+
+
+def make_features():
+    rng = np.random.default_rng(3)
+    return features.Features(
+        ["a", "b"],
+        rng.normal(size=(2, 3, 4, 5)).astype(np.float16),
+        ["wall", "floor"],
+        np.eye(2, 5, dtype=np.float32),
+        rng.integers(0, 2, (2, 3, 4)).astype(np.int16),
+        rng.random((2, 3, 4)).astype(np.float16),
+        {"normalized": True},
+    )
+
+
+def make_descriptors():
+    rng = np.random.default_rng(4)
+    return descriptors.Descriptors(
+        np.array([0, 3]),
+        np.array([[0, 1, -1], [3, 4, 5]]),
+        rng.normal(size=(2, 3, 4, 7)).astype(np.float32),
+        {"n_angles": 4},
+    )
+
+
+def make_scene():
+    p = gaussian_parameters()
+    p["features"] = np.random.default_rng(5).normal(size=(6, 4)).astype(np.float16).astype(np.float32)
+    labels = np.array([0, 1, -1, 0, 1, 1], np.int32)
+    return scene.Scene(p, labels, ["wall", "floor"], np.eye(2, 4, dtype=np.float32), {"left_out": {"cks": "none"}})
+
+
+def make_evaluation():
+    rng = np.random.default_rng(6)
+    pictures = {
+        "renders": rng.integers(0, 255, (2, 3, 4, 3), dtype=np.uint8),
+        "labels": np.zeros((2, 3, 4), np.int16),
+    }
+    return evaluation.Evaluation({"psnr": 30.0, "lpips": None}, pictures)
+
+
+CASES = {
+    "capture": (make_capture, capture.write_capture, capture.read_capture, capture.SCHEMA),
+    "points": (make_points, points.write_points, points.read_points, points.SCHEMA),
+    "features": (make_features, features.write_features, features.read_features, features.SCHEMA),
+    "descriptors": (make_descriptors, descriptors.write_descriptors, descriptors.read_descriptors, descriptors.SCHEMA),
+    "scene": (make_scene, scene.write_scene, scene.read_scene, scene.SCHEMA),
+    "evaluation": (make_evaluation, evaluation.write_evaluation, evaluation.read_evaluation, evaluation.SCHEMA),
+}
+
+
+@pytest.fixture(params=CASES)
+def case(request, tmp_path):
+    make, write, read, schema = CASES[request.param]
+    record, path = make(), tmp_path / request.param
+    with artifact.publish(path, Manifest(schema, "k", "s")) as tmp:
+        write(tmp, record)
+    return record, read, path
+
+
+def same(a, b):
+    if isinstance(a, dict):
+        return set(a) <= set(b) and all(same(a[k], b[k]) for k in a)
+    if isinstance(a, np.ndarray):
+        return np.array_equal(np.asarray(b), a, equal_nan=a.dtype.kind == "f")
+    return a == b
+
+
+def touch_all(record):
+    """Read what is lazy."""
+    for value in [*vars(record).values(), *getattr(record, "pictures", {}).values()]:
+        if hasattr(value, "path"):
+            value[:]
+
+
+def test_an_artifact_reads_back(case):
+    record, read, path = case
+    found = read(path)
+    for name, value in vars(record).items():
+        assert same(value, getattr(found, name)), name
+    artifact.verify(path)
+
+
+@pytest.mark.parametrize("damage", ["truncate", "empty", "flip", "remove"])
+def test_damage_to_any_file_is_named_with_its_remedy(case, damage):
+    _, read, path = case
+    for file in sorted(p for p in path.rglob("*") if p.is_file() and p.suffix != ".ply" and p.name != "artifact.json"):
+        good = file.read_bytes()
+        if damage == "remove":
+            file.unlink()
+        else:
+            middle = len(good) // 2
+            flipped = good[:middle] + bytes([good[middle] ^ 1]) + good[middle + 1 :]
+            file.write_bytes({"truncate": good[:-1], "empty": b"", "flip": flipped}[damage])
+        with pytest.raises(InputError, match="run its stage again") as error:
+            touch_all(read(path))
+        assert file.name in str(error.value) or file.parent.name in str(error.value), file
+        with pytest.raises(InputError):
+            artifact.verify(path)
+        file.write_bytes(good)
+    touch_all(read(path))
+
+
+def test_a_chunk_dropped_from_the_manifest_is_not_read_as_fill_value(case):
+    import json
+
+    _, read, path = case
+    chunks = [p for p in path.rglob("c/*") if p.is_file()]
+    if not chunks:
+        return
+    chunks[0].unlink()
+    manifest = json.loads((path / "artifact.json").read_text())
+    del manifest["files"][chunks[0].relative_to(path).as_posix()]
+    (path / "artifact.json").write_text(json.dumps(manifest))
+    with pytest.raises(InputError, match="missing"):
+        touch_all(read(path))
+
+
+def test_non_finite_values_are_never_published(tmp_path):
+    record = make_points()
+    record.means[2, 1] = np.nan
+    with pytest.raises(ValueError, match="non-finite"), artifact.publish(tmp_path / "p", Manifest("s", "k", "s")) as t:
+        points.write_points(t, record)
+    assert not (tmp_path / "p").exists()
+
+
+def test_a_capture_with_a_repeated_name_is_refused(tmp_path):
+    record = make_capture()
+    record.names = ["a", "b", "a"]
+    with pytest.raises(InputError, match="a occurs twice"):
+        capture.write_capture(tmp_path, record)
+
+
+@pytest.mark.parametrize("degree", range(4))
+def test_ply_reads_back(tmp_path, degree):
+    p = gaussian_parameters()
+    p["shN"][:, ply.REST[degree] :] = 0
+    labels = np.array([0, 5, -1, 2, 2, 1])
+    ply.write_ply(tmp_path / "a.ply", p, degree, labels)
+    found, file_degree, found_labels = ply.read_ply(tmp_path / "a.ply")
+    assert file_degree == degree
+    assert np.array_equal(found_labels, labels)
+    assert all(np.array_equal(found[name], p[name]) for name in found)
+
+
+def test_full_ply_has_the_62_float_header(tmp_path):
+    from plyfile import PlyData
+
+    ply.write_ply(tmp_path / "a.ply", gaussian_parameters(), 3)
+    vertex = PlyData.read(str(tmp_path / "a.ply"))["vertex"]
+    rest = [f"f_rest_{i}" for i in range(45)]
+    names = ["x", "y", "z", "nx", "ny", "nz", "f_dc_0", "f_dc_1", "f_dc_2", *rest, "opacity"]
+    names += ["scale_0", "scale_1", "scale_2", "rot_0", "rot_1", "rot_2", "rot_3"]
+    assert [p.name for p in vertex.properties] == names
+    assert vertex.data.dtype.itemsize == 62 * 4
+
+
+def test_split_ply_files_hold_the_same_gaussians(tmp_path):
+    record = make_scene()
+    scene.write_scene(tmp_path, record)
+    parts = [ply.read_ply(file)[0]["means"] for file in sorted(tmp_path.glob("scene_d*.ply"))]
+    assert len(parts) > 1
+    assert np.array_equal(np.concatenate(parts), record.parameters["means"])
+
+
+@pytest.mark.parametrize("damage", ["truncate", "text", "missing"])
+def test_a_damaged_ply_is_named(tmp_path, damage):
+    file = tmp_path / "a.ply"
+    ply.write_ply(file, gaussian_parameters(), 3)
+    if damage == "truncate":
+        file.write_bytes(file.read_bytes()[:-10])
+    elif damage == "text":
+        file.write_text("hello")
+    else:
+        file.unlink()
+    with pytest.raises(InputError, match=r"a\.ply"):
+        ply.read_ply(file)
+
+
+def third_party(name):
+    if not (DATA / "gs_ply").is_dir():
+        pytest.skip("gs_ply: no such folder (CHEBSPLAT_TEST_DATA)")
+    return DATA / "gs_ply" / name
+
+
+@pytest.mark.data
+def test_graphdeco_ply_survives_a_round_trip(tmp_path):
+    p, degree, _ = ply.read_ply(third_party("graphdeco_sh3_100.ply"))
+    assert degree == 3
+    assert len(p["means"]) == 100
+    ply.write_ply(tmp_path / "a.ply", p, 3)
+    again, _, _ = ply.read_ply(tmp_path / "a.ply")
+    assert all(np.array_equal(again[name], p[name]) for name in p)
+
+
+@pytest.mark.data
+def test_a_17_float_ply_reads(tmp_path):
+    p, degree, _ = ply.read_ply(third_party("guitar_decoded_sh0.ply"))
+    assert degree == 0
+    assert len(p["means"]) == 90_854
+
+
+@pytest.mark.data
+def test_a_compressed_ply_is_refused_with_advice():
+    with pytest.raises(InputError, match="convert it first"):
+        ply.read_ply(third_party("guitar.compressed.ply"))
