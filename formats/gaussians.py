@@ -5,12 +5,15 @@ from __future__ import annotations
 import csv
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
 from chebsplat.errors import InputError
 from chebsplat.formats import artifact
 from chebsplat.formats.artifact import Manifest
+from chebsplat.formats.cameras import Cameras, read_cameras, write_cameras
+from chebsplat.formats.documents import read_document, write_document
 from chebsplat.formats.tensors import Shape, read_tensors, write_tensors
 
 SCHEMA = "chebsplat.gaussians/1"
@@ -32,20 +35,26 @@ class Gaussians:
     parameters: `means` [N,3] scene units, `log_scales` [N,3], `quats` [N,4] wxyz, `logit_opacities` [N],
                 `sh0` [N,1,3], `shN` [N,K-1,3], `degrees` u8 [N] highest SH band kept, and, where the scene has a
                 semantic branch, `features` [N,C] and `fused` [N,C].
+    cameras:    of the views it was trained and may be evaluated on.
     modules:    weights of the encoder, gate and masks by dotted name; empty where they were left out.
     optimizer:  moments and step counts, so that a training can be resumed.
     trace:      one row a report interval: error against run time.
+    notes:      encoder sizes, label names, and what the scene left out and why.
     """
 
     parameters: dict[str, np.ndarray]
+    cameras: Cameras
     modules: dict[str, np.ndarray] = field(default_factory=dict)
     optimizer: dict[str, np.ndarray] = field(default_factory=dict)
     trace: list[dict[str, float]] = field(default_factory=list)
+    notes: dict[str, Any] = field(default_factory=dict)
 
 
 def write_gaussians(out: Path, gaussians: Gaussians) -> None:
     """Fill the directory that `artifact.publish` yields. Raises ValueError on a non-finite parameter."""
     write_tensors(out / "parameters.safetensors", gaussians.parameters)
+    write_cameras(out, gaussians.cameras)
+    write_document(out / "notes.json", gaussians.notes)
     for name, arrays in (("modules", gaussians.modules), ("optimizer", gaussians.optimizer)):
         if arrays:
             write_tensors(out / f"{name}.safetensors", arrays)
@@ -71,7 +80,14 @@ def read_gaussians(path: Path) -> Gaussians:
         name: read_tensors(path, manifest, f"{name}.safetensors") if f"{name}.safetensors" in manifest.files else {}
         for name in ("modules", "optimizer")
     }
-    return Gaussians(parameters, optional["modules"], optional["optimizer"], _read_trace(path, manifest))
+    return Gaussians(
+        parameters,
+        read_cameras(path, manifest),
+        optional["modules"],
+        optional["optimizer"],
+        _read_trace(path, manifest),
+        read_document(path, manifest, "notes.json"),
+    )
 
 
 def _read_trace(path: Path, manifest: Manifest) -> list[dict[str, float]]:

@@ -11,6 +11,7 @@ import numpy as np
 from chebsplat.errors import InputError
 from chebsplat.formats import artifact
 from chebsplat.formats.arrays import StoredArray, has_array, open_array, write_array
+from chebsplat.formats.cameras import Cameras, read_cameras, write_cameras
 from chebsplat.formats.documents import read_document, write_document
 from chebsplat.formats.ply import REST, write_ply
 from chebsplat.formats.tensors import read_tensors, write_tensors
@@ -25,11 +26,13 @@ class Scene:
 
     parameters: `means`, `log_scales`, `quats`, `logit_opacities`, `sh0` [N,1,3], `shN` [N,15,3] (zero above a
                 Gaussian's degree), `degrees` u8 [N] ascending, and `features` [N,C] where there are semantics.
+    cameras:    of the views it can be evaluated on.
     labels:     i32 [N] class index, -1 none; None without semantics. label_names, label_embeddings f32 [L, C].
     summary:    counts, bytes, and what was left out and why.
     """
 
     parameters: dict[str, np.ndarray]
+    cameras: Cameras
     labels: np.ndarray | None = None
     label_names: list[str] | None = None
     label_embeddings: np.ndarray | None = None
@@ -62,7 +65,7 @@ def write_scene(out: Path, scene: Scene, split_by_degree: bool = True) -> dict[s
     if "features" in p:
         _write_flat(out / "ragged/features", p["features"].astype(np.float16))
     write_tensors(out / "degrees.safetensors", {"degrees": degrees.astype(np.uint8)})
-    labelled = {}
+    write_cameras(out, scene.cameras)
     if scene.labels is not None and scene.label_embeddings is not None:
         labelled = {"labels": scene.labels.astype(np.int32), "embeddings": scene.label_embeddings.astype(np.float32)}
         write_tensors(out / "labels.safetensors", labelled)
@@ -101,14 +104,15 @@ def read_scene(path: Path) -> Scene:
         rows = flat(f"sh{band}", int(kept.sum()), 3 * width).reshape(-1, width, 3)
         parameters["shN"][kept, REST[band - 1] : REST[band]] = rows
     parameters["degrees"] = degrees
+    cameras = read_cameras(path, manifest)
     summary = read_document(path, manifest, "summary.json", ("bytes", "max_degree", "n"))
     if not has_array(manifest, "ragged/features"):
-        return Scene(parameters, summary=summary)
+        return Scene(parameters, cameras, summary=summary)
     parameters["features"] = flat("features", n, None)
     names = list(read_document(path, manifest, "labels.json").values())
     shapes = {"labels": (n,), "embeddings": (len(names), parameters["features"].shape[1])}
     found = read_tensors(path, manifest, "labels.safetensors", shapes)
-    return Scene(parameters, found["labels"], names, found["embeddings"], summary)
+    return Scene(parameters, cameras, found["labels"], names, found["embeddings"], summary)
 
 
 def _write_flat(path: Path, rows: np.ndarray) -> None:

@@ -9,6 +9,7 @@ import pytest
 from chebsplat.errors import InputError
 from chebsplat.formats import artifact, capture, descriptors, evaluation, features, ply, points, scene
 from chebsplat.formats.artifact import Manifest
+from chebsplat.formats.cameras import Cameras
 
 DATA = Path(os.environ.get("CHEBSPLAT_TEST_DATA", Path(__file__).parents[1] / "../shared/data"))
 
@@ -80,11 +81,17 @@ def make_descriptors():
     )
 
 
+def make_cameras():
+    return Cameras(["a"], np.eye(3)[None], np.eye(4)[None], 5, 4)
+
+
 def make_scene():
     p = gaussian_parameters()
     p["features"] = np.random.default_rng(5).normal(size=(6, 4)).astype(np.float16).astype(np.float32)
     labels = np.array([0, 1, -1, 0, 1, 1], np.int32)
-    return scene.Scene(p, labels, ["wall", "floor"], np.eye(2, 4, dtype=np.float32), {"left_out": {"cks": "none"}})
+    return scene.Scene(
+        p, make_cameras(), labels, ["wall", "floor"], np.eye(2, 4, dtype=np.float32), {"left_out": {"cks": "none"}}
+    )
 
 
 def make_evaluation():
@@ -116,6 +123,8 @@ def case(request, tmp_path):
 
 
 def same(a, b):
+    if isinstance(a, Cameras):
+        return same(vars(a), vars(b))
     if isinstance(a, dict):
         return set(a) <= set(b) and all(same(a[k], b[k]) for k in a)
     if isinstance(a, np.ndarray):

@@ -7,7 +7,10 @@ from chebsplat.errors import InputError
 from chebsplat.formats import artifact
 from chebsplat.formats.artifact import Manifest
 from chebsplat.formats.basis import Basis, read_basis, write_basis
+from chebsplat.formats.cameras import Cameras
 from chebsplat.formats.gaussians import Gaussians, read_gaussians, write_gaussians
+
+CAMERAS = Cameras(["a"], np.eye(3)[None], np.eye(4)[None], 5, 4)
 
 
 def example(n=5, seed=0):
@@ -32,7 +35,9 @@ def publish_basis(path, basis):
 
 @pytest.mark.parametrize("n", [0, 1, 5])
 def test_checkpoint_round_trip_is_exact(tmp_path, n):
-    given = Gaussians(example(n), {"encoder.w": np.ones((2, 3), np.float32)}, {}, [{"step": 1.0, "psnr": 20.25}])
+    given = Gaussians(
+        example(n), CAMERAS, {"encoder.w": np.ones((2, 3), np.float32)}, {}, [{"step": 1.0, "psnr": 20.25}]
+    )
     found = read_gaussians(publish_gaussians(tmp_path / "g", given))
     assert found.parameters.keys() == given.parameters.keys()
     for name, array in given.parameters.items():
@@ -43,7 +48,7 @@ def test_checkpoint_round_trip_is_exact(tmp_path, n):
 
 @pytest.mark.parametrize(("name", "shape"), [("quats", (5, 3)), ("means", (4, 3)), ("features", (4, 13))])
 def test_disagreeing_shape_is_named(tmp_path, name, shape):
-    path = publish_gaussians(tmp_path / "g", Gaussians(example() | {name: np.zeros(shape, np.float32)}))
+    path = publish_gaussians(tmp_path / "g", Gaussians(example() | {name: np.zeros(shape, np.float32)}, CAMERAS))
     with pytest.raises(InputError, match=r"shape .* expected"):
         read_gaussians(path)
 
@@ -52,20 +57,20 @@ def test_missing_array_is_named(tmp_path):
     parameters = example()
     del parameters["quats"]
     with pytest.raises(InputError, match="no array quats"):
-        read_gaussians(publish_gaussians(tmp_path / "g", Gaussians(parameters)))
+        read_gaussians(publish_gaussians(tmp_path / "g", Gaussians(parameters, CAMERAS)))
 
 
 def test_non_finite_parameter_is_never_published(tmp_path):
     parameters = example()
     parameters["means"][2, 1] = np.nan
     with pytest.raises(ValueError, match="means holds 1 non-finite"):
-        publish_gaussians(tmp_path / "g", Gaussians(parameters))
+        publish_gaussians(tmp_path / "g", Gaussians(parameters, CAMERAS))
     assert not list(tmp_path.iterdir())
 
 
 @pytest.mark.parametrize("file", ["parameters.safetensors", "trace.csv"])
 def test_bit_flip_is_named_with_the_remedy(tmp_path, file):
-    path = publish_gaussians(tmp_path / "g", Gaussians(example(), trace=[{"step": 1.0}]))
+    path = publish_gaussians(tmp_path / "g", Gaussians(example(), CAMERAS, trace=[{"step": 1.0}]))
     data = bytearray((path / file).read_bytes())
     data[-1] ^= 1
     (path / file).write_bytes(data)

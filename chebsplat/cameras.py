@@ -1,0 +1,37 @@
+"""Pinhole cameras: centres, scene extent, back-projection, and the change of resolution."""
+
+from __future__ import annotations
+
+import numpy as np
+
+
+def centers(cam_from_world: np.ndarray) -> np.ndarray:
+    """Camera centres [V, 3] in the world, of poses [V, 4, 4]."""
+    rotations, translations = cam_from_world[:, :3, :3], cam_from_world[:, :3, 3]
+    return -np.einsum("vji,vj->vi", rotations, translations)
+
+
+def extent(cam_from_world: np.ndarray) -> float:
+    """1.1 times the largest distance of a camera from their mean, scene units: 3DGS's scale of the learning rate."""
+    where = centers(cam_from_world)
+    return float(1.1 * np.linalg.norm(where - where.mean(0), axis=1).max(initial=0.0)) or 1.0
+
+
+def resized(K: np.ndarray, factor_x: float, factor_y: float) -> np.ndarray:
+    """Intrinsics [..., 3, 3] after the image is resized; with half-integer pixel centres every entry just scales."""
+    return K * np.array([[factor_x], [factor_y], [1.0]])
+
+
+def unproject(depth: np.ndarray, K: np.ndarray, cam_from_world: np.ndarray, pixels: np.ndarray) -> np.ndarray:
+    """World points of pixels with depth.
+
+    Args:
+      depth:  [H, W] z-depth, scene units; K [3, 3] pixels; cam_from_world [4, 4].
+      pixels: [P, 2] int (row, column).
+    Returns: [P, 3] float64.
+    """
+    z = depth[pixels[:, 0], pixels[:, 1]].astype(np.float64)
+    image = np.stack([pixels[:, 1] + 0.5, pixels[:, 0] + 0.5, np.ones(len(pixels))], 1)
+    rays = image @ np.linalg.inv(K).T
+    camera = rays * z[:, None]
+    return (camera - cam_from_world[:3, 3]) @ cam_from_world[:3, :3]

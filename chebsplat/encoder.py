@@ -1,0 +1,107 @@
+"""The local encoder: a region of Gaussians in, one semantic vector out (Eq 7)."""
+
+from __future__ import annotations
+
+import math
+
+import torch
+from torch import Tensor, nn
+
+N_FREQUENCIES = 4
+
+
+def positional_encoding(positions: Tensor) -> Tensor:
+    """Positions and their sines and cosines at octaves, [..., 3] -> [..., 3 + 6 * N_FREQUENCIES]."""
+    angles = torch.cat([positions * (math.pi * 2.0**k) for k in range(N_FREQUENCIES)], -1)
+    return torch.cat([positions, angles.sin(), angles.cos()], -1)
+
+
+class Attention(nn.Module):
+    """Multi-head self-attention whose padded keys get no weight."""
+
+    def __init__(self, width: int, n_heads: int):
+        super().__init__()
+        if width % n_heads:
+            raise ValueError(f"width {width} is not a multiple of n_heads {n_heads}")
+        self.n_heads = n_heads
+        self.query, self.key, self.value, self.output = (nn.Linear(width, width) for _ in range(4))
+
+    def forward(self, tokens: Tensor, mask: Tensor) -> Tensor:
+        """tokens [M, n, width], mask [M, n] true where a token exists -> [M, n, width]."""
+        heads = (tokens.shape[0], tokens.shape[1], self.n_heads, tokens.shape[2] // self.n_heads)
+        q, k, v = (part(tokens).reshape(heads).transpose(1, 2) for part in (self.query, self.key, self.value))
+        scores = q @ k.transpose(-1, -2) / math.sqrt(heads[-1])
+        weights = scores.masked_fill(~mask[:, None, None, :], -1e9).softmax(-1)
+        return self.output((weights @ v).transpose(1, 2).reshape(tokens.shape))
+
+
+class Block(nn.Module):
+    """Pre-norm attention and feed-forward, each with its residual."""
+
+    def __init__(self, width: int, n_heads: int):
+        super().__init__()
+        self.norm_attention, self.norm_forward = nn.LayerNorm(width), nn.LayerNorm(width)
+        self.attention = Attention(width, n_heads)
+        self.forward_1, self.forward_2 = nn.Linear(width, 2 * width), nn.Linear(2 * width, width)
+
+    def forward(self, tokens: Tensor, mask: Tensor) -> Tensor:
+        tokens = tokens + self.attention(self.norm_attention(tokens), mask)
+        return tokens + self.forward_2(nn.functional.gelu(self.forward_1(self.norm_forward(tokens))))
+
+
+class RegionEncoder(nn.Module):
+    """Tokens of a region's Gaussians, a learned region token, a transformer, and an MLP on the region token.
+
+    Args:
+      n_inputs:   width of a token's input: flattened descriptor, context, or both; 0 for positions alone.
+      n_channels: width of the semantic features.
+      n_layers:   0 replaces attention by a maximum over tokens (the paper's ablation without the transformer).
+    Choices: pre-norm, with output projection and feed-forward; inputs are normalised by a LayerNorm, so that
+      descriptors of any magnitude start alike; a region without members gives a finite vector that nothing reads.
+    """
+
+    def __init__(self, n_inputs: int, n_channels: int, width: int = 32, n_layers: int = 2, n_heads: int = 4):
+        super().__init__()
+        self.n_inputs, self.n_channels = n_inputs, n_channels
+        self.settings = {"width": width, "n_layers": n_layers, "n_heads": n_heads}
+        self.embed_position = nn.Linear(3 + 6 * N_FREQUENCIES, width)
+        if n_inputs:
+            self.norm_input = nn.LayerNorm(n_inputs)
+            self.embed_input = nn.Linear(n_inputs, width)
+        self.hidden = nn.Linear(width, width)
+        self.region_token = nn.Parameter(torch.zeros(width))
+        self.blocks = nn.ModuleList(Block(width, n_heads) for _ in range(n_layers))
+        self.norm = nn.LayerNorm(width)
+        self.decode = nn.Sequential(nn.Linear(width, 2 * width), nn.GELU(), nn.Linear(2 * width, n_channels))
+
+    def forward(self, inputs: Tensor, positions: Tensor, mask: Tensor) -> Tensor:
+        """Encode regions.
+
+        Args:
+          inputs:    [M, n, n_inputs]; ignored where n_inputs is 0.
+          positions: [M, n, 3] relative to the region's centre, in units of its radius.
+          mask:      [M, n] bool, true where a member exists.
+        Returns: [M, n_channels].
+        """
+        tokens = self.embed_position(positional_encoding(positions))
+        if self.n_inputs:
+            tokens = tokens + self.embed_input(self.norm_input(inputs))
+        tokens = self.hidden(nn.functional.gelu(tokens))
+        if not self.blocks:
+            pooled = tokens.masked_fill(~mask[..., None], -1e9).amax(1)
+            present = mask.any(1, keepdim=True)
+            return self.decode(self.norm(torch.where(present, pooled, torch.zeros_like(pooled))))
+        region = self.region_token.expand(tokens.shape[0], 1, -1)
+        tokens = torch.cat([region, tokens], 1)
+        mask = torch.cat([torch.ones_like(mask[:, :1]), mask], 1)
+        for block in self.blocks:
+            tokens = block(tokens, mask)
+        return self.decode(self.norm(tokens[:, 0]))
+
+    def projections(self) -> dict[str, Tensor]:
+        """The projection matrices that the knowledge space follows, by name."""
+        return {
+            f"blocks.{index}.{part}": getattr(block.attention, part).weight
+            for index, block in enumerate(self.blocks)
+            for part in ("query", "key", "value", "output")
+        }

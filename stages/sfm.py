@@ -1,0 +1,123 @@
+"""sfm: cameras, and points with normals and local anisotropic covariances."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any
+
+from chebsplat.errors import DataFailure
+from chebsplat.stages.command import Job, command
+
+if TYPE_CHECKING:
+    import numpy as np
+
+    from chebsplat.formats.capture import Capture
+    from chebsplat.stages.config import SfmSection
+
+
+def run(job: Job) -> None:
+    import numpy as np
+
+    from chebsplat.cameras import centers
+    from chebsplat.formats.capture import read_capture
+    from chebsplat.formats.points import Points, write_points
+    from chebsplat.gaussians import local_shape
+
+    settings, capture = job.config.sfm, read_capture(job.inputs["capture"])
+    if capture.cam_from_world is not None and capture.depth is not None:
+        job.left_out("feature matching", "poses and depth are given: points come from depth")
+        found = from_depth(job, capture, settings)
+    else:
+        from chebsplat.stages import reconstruction
+
+        if capture.cam_from_world is not None:
+            job.left_out("pose estimation", "poses are given: points are triangulated")
+        found = reconstruction.reconstruct(job, capture, settings)
+    means = found["means"]
+    if len(means) < 16:
+        raise DataFailure(f"only {len(means)} points were found, at least 16 are needed; add views with more overlap")
+    covariances, normals = local_shape(means, settings.n_neighbors)
+    eye = centers(found["cam_from_world"])[found["seen_from"]]
+    away = np.einsum("ni,ni->n", normals, eye - means) < 0
+    normals[away] *= -1
+    job.facts |= {"n_points": len(means), "n_views": len(found["names"])} | found["notes"]
+    write_points(
+        job.out,
+        Points(
+            found["names"],
+            found["Ks"],
+            found["cam_from_world"],
+            means,
+            found["colors"],
+            normals,
+            covariances,
+            found["tracks"],
+            found["notes"],
+        ),
+    )
+
+
+def from_depth(job: Job, capture: Capture, settings: SfmSection) -> dict[str, Any]:
+    """Points back-projected from the depth of training views, thinned to one a voxel.
+
+    Choices: test views give no points; pixels are drawn evenly over views, and the voxel is chosen by bisection so
+    that about `max_points` remain; each voxel keeps its first point.
+    """
+    import numpy as np
+
+    from chebsplat.cameras import unproject
+
+    assert capture.cam_from_world is not None and capture.depth is not None
+    rng = np.random.default_rng(settings.seed)
+    used = np.flatnonzero(~capture.is_test)
+    per_view = max(4 * settings.max_points // max(len(used), 1), 16)
+    means, colors, seen = [], [], []
+    for view, status in job.progress.track(used, len(used), "depth"):
+        depth, image = capture.depth[view], capture.images[view]
+        valid = np.isfinite(depth) & (depth > 0)
+        if capture.loss_mask is not None:
+            valid &= capture.loss_mask[view]
+        pixels = np.argwhere(valid)
+        pixels = pixels[rng.choice(len(pixels), min(per_view, len(pixels)), replace=False)]
+        means.append(unproject(depth, capture.Ks[view], capture.cam_from_world[view], pixels))
+        colors.append(image[pixels[:, 0], pixels[:, 1]])
+        seen.append(np.full(len(pixels), view))
+        status["points"] = sum(map(len, means))
+    points = np.concatenate(means)
+    if len(points) == 0:
+        raise DataFailure("no training view has a pixel with depth; ingest the source without depth instead")
+    kept = thin(points, settings.max_points)
+    return {
+        "names": list(capture.names),
+        "Ks": capture.Ks,
+        "cam_from_world": capture.cam_from_world,
+        "means": points[kept],
+        "colors": np.concatenate(colors)[kept],
+        "seen_from": np.concatenate(seen)[kept],
+        "tracks": np.zeros((0, 2), np.int32),
+        "notes": {"how": "depth", "n_candidates": len(points)},
+    }
+
+
+def thin(points: np.ndarray, count: int) -> np.ndarray:
+    """Indices of at most `count` points, one a voxel of the smallest cube that allows it."""
+    import numpy as np
+
+    if len(points) <= count:
+        return np.arange(len(points))
+    origin = points.min(0)
+    size = float(np.ptp(points, axis=0).max()) or 1.0
+
+    def occupied(edge: float) -> np.ndarray:
+        cells = np.floor((points - origin) / edge).astype(np.int64)
+        sides = cells.max(0) + 1
+        flat = (cells[:, 0] * sides[1] + cells[:, 1]) * sides[2] + cells[:, 2]
+        return np.sort(np.unique(flat, return_index=True)[1])
+
+    low, high = size / 4096, size
+    for _ in range(24):
+        middle = (low * high) ** 0.5
+        low, high = (middle, high) if len(occupied(middle)) > count else (low, middle)
+    return occupied(high)
+
+
+main = command("sfm", run)
