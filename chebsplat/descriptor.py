@@ -6,6 +6,7 @@ import torch
 from torch import Tensor
 
 from chebsplat.albo import canonicalize, metric_factors, rotations_about, similarity, tangent_axis
+from chebsplat.rasterize.projection import rotation_matrices
 
 
 def chebyshev_diagonals(S: Tensor, max_degree: int) -> Tensor:
@@ -73,3 +74,37 @@ def describe_regions(
         else:
             paired.append(certainty * 0.5 * (low - high).abs())
     return torch.where(region.mask[..., None, None], torch.stack(paired, 2), 0.0)
+
+
+def describe_members(
+    means: Tensor,
+    quats: Tensor,
+    scales: Tensor,
+    members: Tensor,
+    *,
+    n_angles: int,
+    max_degree: int,
+    anisotropy: float,
+    bandwidth: float,
+    chunk: int = 512,
+) -> Tensor:
+    """`describe_regions` of Gaussians [N] gathered by `members` i64 [M, n], -1 where padded; `chunk` bounds memory.
+
+    Returns: [M, n, J, D - 1] float32.
+    """
+    parts = [torch.zeros(0, members.shape[1], n_angles, max_degree - 1)]
+    for part in members.split(chunk):
+        index = part.clamp_min(0)
+        parts.append(
+            describe_regions(
+                means[index],
+                scales[index],
+                rotation_matrices(quats[index].reshape(-1, 4)).reshape(*index.shape, 3, 3),
+                part >= 0,
+                n_angles=n_angles,
+                max_degree=max_degree,
+                anisotropy=anisotropy,
+                bandwidth=bandwidth,
+            )
+        )
+    return torch.cat(parts)

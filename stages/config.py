@@ -68,10 +68,8 @@ class TeacherSection(_Section):
 class DescribeSection(_Section):
     """METHOD.md section 2; shared by the describe stage and the refresh inside training."""
 
-    spectrum: Literal["full", "taper", "hard"] = "full"
     n_angles: int = Field(4, ge=1)  # J
     max_degree: int = Field(8, ge=2)  # D
-    n_eigs: int = Field(16, ge=1)  # K, for taper and hard
     anisotropy: float = Field(30.0, ge=0)
     bandwidth: float = Field(0.7, gt=0)
     region_size: int = Field(32, ge=4, le=64)  # Gaussians in a region, at most
@@ -98,16 +96,19 @@ class TrainSection(_Section):
     width: int = Field(32, ge=4)
     n_layers: int = Field(2, ge=1)
     n_heads: int = Field(4, ge=1)
-    regions_per_step: int = Field(64, ge=1)
+    regions_per_step: int = Field(64, ge=1)  # encoded anew in a step; the others come from the cache
+    n_covers: int = Field(4, ge=1)  # regions that reach a Gaussian, at most
+    context: Literal["features", "none"] = "features"  # what tokens hold beside the descriptor
     # schedule, as fractions of `steps`
     coarse_until: float = Field(0.1, ge=0, le=1)  # half resolution until here
-    encode_from: float = Field(0.3, ge=0, le=1)
-    densify_from: float = Field(0.05, ge=0, le=1)
+    encode_from: float = Field(0.1, ge=0, le=1)
+    densify_from: float = Field(0.1, ge=0, le=1)
     densify_until: float = Field(0.6, ge=0, le=1)
     n_densify: int = Field(12, ge=0)
     prune_from: float = Field(0.4, ge=0, le=1)
     sh_freeze: float = Field(0.8, ge=0, le=1)
-    refresh_every: int = Field(200, ge=1)  # steps between descriptor refreshes
+    refresh_every: int = Field(200, ge=1)  # steps between refreshes of regions and descriptors
+    report_every: int = Field(100, ge=1)  # steps between rows of the trace
     # rates
     lr_means: float = 1.6e-4
     lr_scales: float = 5e-3

@@ -1,5 +1,31 @@
 """Differentiable Gaussian rasterization behind one signature, in the words of gsplat."""
 
-from chebsplat.rasterize.reference import rasterize
+from __future__ import annotations
+
+from typing import Any
+
+import torch
+from torch import Tensor
+
+
+def rasterize(
+    means: Tensor, *args: Any, backend: str = "auto", **options: Any
+) -> tuple[Tensor, Tensor, dict[str, Any]]:
+    """Render Gaussians; arguments and results as `reference.rasterize`.
+
+    Args: backend: `cpu` (float32, numba), `reference` (plain torch, any float type), or `auto`: cpu for float32 on
+      the CPU, otherwise the reference.
+    Raises: ValueError on an unknown backend, or tensors that the chosen one does not take.
+    """
+    if backend == "auto":
+        backend = "cpu" if means.dtype == torch.float32 and means.device.type == "cpu" else "reference"
+    if backend == "cpu":
+        from chebsplat.rasterize.cpu import rasterize as chosen
+    elif backend == "reference":
+        from chebsplat.rasterize.reference import rasterize as chosen
+    else:
+        raise ValueError(f"backend {backend!r} is none of auto, cpu, reference")
+    return chosen(means, *args, **options)
+
 
 __all__ = ["rasterize"]

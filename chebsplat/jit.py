@@ -1,0 +1,33 @@
+"""The door to numba: its on-disk cache is keyed by our kernels' source, so an edited helper is never served stale."""
+
+from __future__ import annotations
+
+import hashlib
+import logging
+import os
+from pathlib import Path
+
+log = logging.getLogger("chebsplat")
+
+_SOURCES = ("rasterize/kernels.py", "blur.py")
+
+
+def _cache_folder() -> Path:
+    root = Path(__file__).parent
+    text = b"".join((root / name).read_bytes() for name in _SOURCES)
+    base = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache")
+    return base / "chebsplat" / f"numba-{hashlib.sha256(text).hexdigest()[:16]}"
+
+
+# Must precede numba's import; a folder that the user has chosen is left alone.
+FOLDER = Path(os.environ.setdefault("NUMBA_CACHE_DIR", str(_cache_folder())))
+if not FOLDER.exists():
+    log.info("compiling kernels, about 20 s, once")
+
+import numba  # noqa: E402
+
+# No fast-math beyond reassociation and contraction: NaN and infinity keep their meaning.
+kernel = numba.njit(cache=True, parallel=True, error_model="numpy", fastmath={"reassoc", "contract", "nsz"})
+inline = numba.njit(cache=True, error_model="numpy", fastmath={"reassoc", "contract", "nsz"}, inline="always")
+serial = numba.njit(cache=True, error_model="numpy")
+prange = numba.prange

@@ -1,0 +1,223 @@
+"""The trainable scene: Gaussians with colour and meaning, and the shape encoder that guides them."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor, nn
+
+from chebsplat import adapt, sh_prune
+from chebsplat.descriptor import describe_members
+from chebsplat.encoder import RegionEncoder
+from chebsplat.fusion import Gate, propagate, propagation_weights
+from chebsplat.rasterize import rasterize
+from chebsplat.rasterize.projection import rotation_matrices
+from chebsplat.regions import Regions, build_regions, covering
+from chebsplat.sh import eval_sh, n_coefficients
+
+
+@dataclass
+class View:
+    """One camera at one resolution. K [3, 3] pixels, viewmat [4, 4], float32."""
+
+    K: Tensor
+    viewmat: Tensor
+    width: int
+    height: int
+
+
+@dataclass
+class Rendered:
+    """rgb [H, W, 3], alpha [H, W, 1], features [H, W, C] or None; `index` [V] the Gaussians in the frustum."""
+
+    rgb: Tensor
+    alpha: Tensor
+    features: Tensor | None
+    meta: dict[str, Any]
+    index: Tensor
+
+
+def in_frustum(means: Tensor, view: View, reach: Tensor, margin: float = 0.15) -> Tensor:
+    """Indices of points whose sphere of radius `reach` [N] may touch the image; NaN never does."""
+    camera = means @ view.viewmat[:3, :3].T + view.viewmat[:3, 3]
+    x, y, z = camera.unbind(-1)
+    half_x, half_y = 0.5 * view.width * (1 + margin), 0.5 * view.height * (1 + margin)
+    fx, fy = view.K[0, 0], view.K[1, 1]
+    u = fx * x + (view.K[0, 2] - 0.5 * view.width) * z
+    v = fy * y + (view.K[1, 2] - 0.5 * view.height) * z
+    near = z + reach > 0.01
+    inside = (u.abs() <= half_x * z.clamp_min(0) + (fx + half_x) * reach) & (
+        v.abs() <= half_y * z.clamp_min(0) + (fy + half_y) * reach
+    )
+    return (near & inside).nonzero()[:, 0]
+
+
+class Shape(nn.Module):
+    """Regions of the current Gaussians, their descriptors, and the encoder and gate that use them (Eqs 4-10)."""
+
+    def __init__(self, n_channels: int, describe: dict[str, Any], train: dict[str, Any]):
+        super().__init__()
+        self.describe, self.train_settings = describe, train
+        self.n_described = describe["n_angles"] * (describe["max_degree"] - 1) if train["albo"] else 0
+        n_context = n_channels if train["context"] == "features" else 0
+        n_layers = train["n_layers"] if train["encoder"] == "transformer" else 0
+        self.encoder = RegionEncoder(
+            self.n_described + n_context, n_channels, train["width"], n_layers, train["n_heads"]
+        )
+        self.gate = Gate(n_channels)
+        self.regions: Regions | None = None
+
+    @torch.no_grad()
+    def refresh(
+        self, raw: dict[str, Tensor], regions: Regions | None = None, descriptors: Tensor | None = None
+    ) -> None:
+        """Regions of the Gaussians as they are now; `regions` and `descriptors` spare their computation."""
+        means, settings = raw["means"].detach(), self.describe
+        if regions is None:
+            sizes = (settings["n_regions"], settings["region_size"], settings["seed"])
+            regions = build_regions(means.double().numpy(), *sizes)
+        self.regions = regions
+        self.members = torch.as_tensor(regions.members)
+        self.centers = torch.as_tensor(regions.centers)
+        scales = raw["log_scales"].detach().exp()
+        if not self.n_described:
+            self.descriptors = torch.zeros(*self.members.shape, 0)
+        elif descriptors is not None:
+            self.descriptors = descriptors.flatten(2)
+        else:
+            chosen = {k: settings[k] for k in ("n_angles", "max_degree", "anisotropy", "bandwidth")}
+            described = describe_members(means, raw["quats"].detach(), scales, self.members, **chosen)
+            self.descriptors = described.flatten(2)
+        where = means[self.centers]
+        offsets = means[self.members.clamp_min(0)] - where[:, None]
+        self.positions = offsets / max(regions.radius, 1e-12)
+        cover = covering(means.numpy(), where.numpy(), regions.radius, self.train_settings["n_covers"])
+        self.cover = torch.as_tensor(cover)
+        frames = rotation_matrices(raw["quats"].detach()[self.centers])
+        self.weights = propagation_weights(means, self.cover, where, frames, scales[self.centers], regions.radius)
+        self.cache = torch.cat([self.encode(raw["features"], part) for part in self._chunks()])
+
+    def _chunks(self) -> tuple[Tensor, ...]:
+        return torch.arange(len(self.members)).split(256)
+
+    def encode(self, features: Tensor, chosen: Tensor) -> Tensor:
+        """Encodings [R, C] of the regions `chosen` [R]; tokens see the features without a gradient."""
+        members = self.members[chosen]
+        inputs = self.descriptors[chosen]
+        if self.encoder.n_inputs > self.n_described:
+            inputs = torch.cat([inputs, features.detach()[members.clamp_min(0)]], -1)
+        return self.encoder(inputs, self.positions[chosen], members >= 0)
+
+    def fuse(self, features: Tensor, index: Tensor, generator: torch.Generator | None = None) -> tuple[Tensor, Tensor]:
+        """Fused features [V, C] and gate [V, C] of the Gaussians `index` [V].
+
+        With a generator, `regions_per_step` of the regions that reach them are encoded anew, with gradient, and
+        the rest come from the cache; without one the cache alone is used.
+        """
+        encodings = self.cache
+        if generator is not None:
+            reached = torch.unique(self.cover[index])
+            reached = reached[reached >= 0]
+            order = torch.randperm(len(reached), generator=generator)[: self.train_settings["regions_per_step"]]
+            chosen = reached[order]
+            fresh = self.encode(features, chosen)
+            encodings = self.cache.index_copy(0, chosen, fresh)
+            self.cache = self.cache.index_copy(0, chosen, fresh.detach())
+        cover = self.cover[index]
+        shape = propagate(encodings, cover, self.weights[index])
+        return self.gate(features[index], shape, cover[:, 0] >= 0)
+
+
+class SceneModel:
+    """Raw parameters by name, each [N, ...] and a leaf tensor, and the modules beside them.
+
+    `features` [N, C], `prune_logits` [N] and `sh_logits` [N, 3] are there only if the scene needs them.
+    """
+
+    def __init__(self, raw: dict[str, Tensor], describe: dict[str, Any], train: dict[str, Any], n_channels: int | None):
+        n = len(raw["means"])
+        self.raw = dict(raw)
+        if n_channels is not None:
+            self.raw["features"] = torch.zeros(n, n_channels)
+        if train["prune"]:
+            self.raw["prune_logits"] = torch.full((n,), 3.0)
+        if train["sh_prune"]:
+            self.raw["sh_logits"] = torch.full((n, 3), 3.0)
+        for value in self.raw.values():
+            value.requires_grad_(True)
+        self.shape = Shape(n_channels, describe, train) if n_channels and train["encoder"] != "off" else None
+        self.semantic_gate = (
+            adapt.SemanticGate(n_channels) if n_channels and train["prune"] and train["prune_semantic"] else None
+        )
+
+    def __len__(self) -> int:
+        return len(self.raw["means"])
+
+    @property
+    def modules(self) -> dict[str, nn.Module]:
+        parts = {"shape": self.shape, "semantic_gate": self.semantic_gate}
+        return {name: module for name, module in parts.items() if module is not None}
+
+    def soft_mask(self, index: Tensor, features: Tensor | None) -> Tensor | None:
+        """m̂ [V] in (0, 1) of the pruning gates, None where pruning is off."""
+        if "prune_logits" not in self.raw:
+            return None
+        semantic = None
+        if self.semantic_gate is not None and features is not None:
+            semantic = self.semantic_gate(features.detach())
+        return adapt.soft_mask(self.raw["prune_logits"][index], semantic)
+
+    def sh_mask(self, index: Tensor) -> Tensor | None:
+        """Nested band masks [V, 3] with a straight-through gradient, None where SH pruning is off."""
+        return sh_prune.band_mask(self.raw["sh_logits"][index]) if "sh_logits" in self.raw else None
+
+    def render(
+        self,
+        view: View,
+        degree: int,
+        *,
+        masked: bool = True,
+        fused: bool = False,
+        generator: torch.Generator | None = None,
+    ) -> tuple[Rendered, dict[str, Tensor]]:
+        """Colour and features in one pass; the second result holds masks and gate for the losses.
+
+        degree: SH bands in use; masked: apply the pruning masks; fused: render fused features, not the raw ones.
+        """
+        raw = self.raw
+        with torch.no_grad():
+            reach = 3 * raw["log_scales"].amax(1).exp()
+            index = in_frustum(raw["means"], view, reach)
+        means, quats = raw["means"][index], raw["quats"][index]
+        scales, opacities = raw["log_scales"][index].exp(), raw["logit_opacities"][index].sigmoid()
+        aside: dict[str, Tensor] = {}
+        features = raw["features"][index] if "features" in raw else None
+        if fused and self.shape is not None and self.shape.regions is not None:
+            features, aside["gate"] = self.shape.fuse(raw["features"], index, generator)
+        if masked and (soft := self.soft_mask(index, features)) is not None:
+            aside["mask"] = soft
+            scales, opacities = adapt.apply_mask(adapt.hard_mask(soft), scales, opacities)
+        shN = raw["shN"][index, : n_coefficients(degree) - 1]
+        if masked and degree > 0 and (bands := self.sh_mask(index)) is not None:
+            aside["bands"] = bands
+            shN = sh_prune.masked_sh(shN, bands)
+        eye = -view.viewmat[:3, :3].T @ view.viewmat[:3, 3]
+        colors = eval_sh(raw["sh0"][index], shN, means.detach() - eye, degree)
+        channels = colors if features is None else torch.cat([colors, features], -1)
+        render, alpha, meta = rasterize(
+            means, quats, scales, opacities, channels, view.viewmat[None], view.K[None], view.width, view.height
+        )
+        rendered = Rendered(render[0, ..., :3], alpha[0], render[0, ..., 3:] if features is not None else None,
+                            meta, index)  # fmt: skip
+        return rendered, aside
+
+    @torch.no_grad()
+    def fused_features(self) -> np.ndarray | None:
+        """Fused features [N, C] of all Gaussians, every region encoded; None without an encoder."""
+        if self.shape is None:
+            return None
+        self.shape.refresh(self.raw)
+        return self.shape.fuse(self.raw["features"], torch.arange(len(self)))[0].numpy()

@@ -1,0 +1,292 @@
+"""One training: schedules, losses, growth and pruning of a scene model. Arrays in, arrays out; no files."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from chebsplat import adapt, cks, sh_prune
+from chebsplat.errors import DataFailure
+from chebsplat.losses import feature_l1, photometric
+from chebsplat.metrics import psnr
+from chebsplat.model import Rendered, SceneModel, View
+from chebsplat.sh import MAX_DEGREE
+
+RATES = {
+    "means": "lr_means",
+    "log_scales": "lr_scales",
+    "quats": "lr_quats",
+    "logit_opacities": "lr_opacities",
+    "sh0": "lr_sh0",
+    "features": "lr_features",
+    "prune_logits": "lr_masks",
+    "sh_logits": "lr_masks",
+}
+FASTER = {"means": 0.01, "features": 0.01}  # what a rate has fallen to at the end; 0.1 elsewhere
+
+
+@dataclass
+class Views:
+    """Training views. images [V, H, W, 3] u8; masks [V, H, W] bool or None; features: view index -> [h, w, C]."""
+
+    names: list[str]
+    images: Tensor
+    Ks: Tensor
+    viewmats: Tensor
+    masks: Tensor | None = None
+    features: Callable[[int], Tensor] | None = None
+
+    def camera(self, index: int, factor: int) -> View:
+        height, width = self.images.shape[1] // factor, self.images.shape[2] // factor
+        scale = torch.tensor([[width / self.images.shape[2]], [height / self.images.shape[1]], [1.0]])
+        return View(self.Ks[index] * scale, self.viewmats[index], width, height)
+
+    def target(self, index: int, factor: int) -> tuple[Tensor, Tensor | None]:
+        """Colours [H, W, 3] in [0, 1] and mask [H, W] at 1/factor; a reduced pixel counts if all of it does."""
+        image = self.images[index].float() / 255
+        mask = None if self.masks is None else self.masks[index]
+        if factor > 1:
+            image = torch.nn.functional.avg_pool2d(image.permute(2, 0, 1), factor).permute(1, 2, 0).contiguous()
+            if mask is not None:
+                mask = -torch.nn.functional.max_pool2d(-mask[None].float(), factor)[0] > 0.5
+        return image, mask
+
+
+class Trainer:
+    """Call `steps()` and read `trace`; then `finish()`.
+
+    Args:
+      settings: the config's train section; extent: scene units, scales the means' learning rate.
+      basis:    matrices [q, r] by name of an earlier scene's knowledge, empty for none.
+    """
+
+    def __init__(
+        self, model: SceneModel, views: Views, settings: dict[str, Any], extent: float, basis: dict[str, Tensor]
+    ):
+        self.model, self.views, self.settings, self.extent = model, views, settings, extent
+        self.basis = basis if model.shape is not None else {}
+        self.modulation = cks.Modulation(len(self.basis)) if self.basis else None
+        self.optimizer = self._optimizer()
+        self.rates = [group["lr"] for group in self.optimizer.param_groups]
+        self.order_generator = np.random.default_rng(settings["seed"])
+        self.generator = torch.Generator().manual_seed(settings["seed"])
+        self.n_added = self.n_removed = 0
+        self._clear_gradients()
+        total = settings["steps"]
+        first, last = round(settings["densify_from"] * total), round(settings["densify_until"] * total)
+        self.growth = set(np.linspace(first, last, settings["n_densify"] + 2)[1:-1].round().astype(int).tolist())
+        if settings["densify"] == "off":
+            self.growth = set()
+        self.freeze_step = round(settings["sh_freeze"] * total)
+
+    def _optimizer(self) -> torch.optim.Adam:
+        groups = []
+        for name, value in self.model.raw.items():
+            rate = self.settings["lr_sh0"] / 20 if name == "shN" else self.settings[RATES[name]]
+            groups.append({"params": [value], "lr": rate * (self.extent if name == "means" else 1), "name": name})
+        weights = [p for module in self.model.modules.values() for p in module.parameters()]
+        if self.modulation is not None:
+            weights += list(self.modulation.parameters())
+        if weights:
+            groups.append({"params": weights, "lr": self.settings["lr_encoder"], "name": "modules"})
+        return torch.optim.Adam(groups, eps=1e-15, fused=True)
+
+    def _clear_gradients(self) -> None:
+        self.gradient_sum, self.gradient_count = (torch.zeros(len(self.model)) for _ in range(2))
+
+    def degree(self, step: int) -> int:
+        """SH bands in use: one more every tenth of the training."""
+        return min(step * 10 // self.settings["steps"], self.settings["sh_degree"], MAX_DEGREE)
+
+    def steps(self) -> Iterator[tuple[int, dict[str, float]]]:
+        """Train; yields (step, figures) after each step."""
+        total, n_views = self.settings["steps"], len(self.views.names)
+        order: list[int] = []
+        for step in range(1, total + 1):
+            order = order or self.order_generator.permutation(n_views).tolist()
+            for group, rate in zip(self.optimizer.param_groups, self.rates, strict=True):
+                group["lr"] = rate * FASTER.get(group["name"], 0.1) ** (step / total)
+            figures = self._step(step, order.pop())
+            if step in self.growth:
+                self._grow()
+            if step in self.growth or (step > self.settings["densify_until"] * total and step % 200 == 0):
+                self._remove(step)
+            if self._encodes(step) and self._is_stale(step):
+                self.refresh()
+            if step == self.freeze_step:
+                self._freeze_bands()
+            yield step, figures | {"n": len(self.model)}
+
+    def _encodes(self, step: int) -> bool:
+        return self.model.shape is not None and step >= self.settings["encode_from"] * self.settings["steps"]
+
+    def _is_stale(self, step: int) -> bool:
+        shape = self.model.shape
+        assert shape is not None
+        return shape.regions is None or step % self.settings["refresh_every"] == 0
+
+    def refresh(self) -> None:
+        if self.model.shape is not None:
+            self.model.shape.refresh(self.model.raw)
+
+    def _step(self, step: int, index: int) -> dict[str, float]:
+        settings = self.settings
+        factor = 2 if step <= settings["coarse_until"] * settings["steps"] else 1
+        target, mask = self.views.target(index, factor)
+        pruning = step >= settings["prune_from"] * settings["steps"]
+        rendered, aside = self.model.render(
+            self.views.camera(index, factor),
+            self.degree(step),
+            masked=pruning,
+            fused=self._encodes(step),
+            generator=self.generator,
+        )
+        losses = {"color": photometric(rendered.rgb, target, mask, settings["weight_ssim"])}
+        if rendered.features is not None and self.views.features is not None:
+            wanted = self.views.features(index)
+            losses["features"] = settings["weight_features"] * feature_l1(rendered.features, wanted, mask)
+        if "mask" in aside and pruning:
+            losses["mask"] = settings["weight_mask"] * aside["mask"].mean()
+        if "bands" in aside and step < self.freeze_step:
+            guidance = self._band_guidance(rendered.index)
+            losses["sh"] = settings["weight_sh"] * sh_prune.sh_loss(aside["bands"], guidance)
+        if self.modulation is not None and self.model.shape is not None:
+            projections = self.model.shape.encoder.projections()
+            losses["basis"] = settings["weight_basis"] * cks.basis_loss(projections, self.basis, self.modulation)
+        loss = torch.stack(list(losses.values())).sum()
+        if not torch.isfinite(loss):
+            bad = [name for name, value in losses.items() if not torch.isfinite(value)]
+            raise DataFailure(f"step {step}, view {self.views.names[index]}: loss {', '.join(bad)} is not finite")
+        self.optimizer.zero_grad(set_to_none=True)
+        loss.backward()
+        self._note_gradients(rendered)
+        self.optimizer.step()
+        return {"loss": float(loss.detach())} | {f"loss_{k}": float(v.detach()) for k, v in losses.items()}
+
+    def _band_guidance(self, index: Tensor) -> Tensor | None:
+        """Weight [V, 3] of each band's penalty by the region's colours (Eq 13); None without regions."""
+        shape = self.model.shape
+        if shape is None or shape.regions is None:
+            return None
+        if not hasattr(shape, "guidance") or len(shape.guidance) != len(self.model):
+            shape.guidance = sh_prune.region_guidance(self.model.raw["shN"].detach(), shape.members, len(self.model))
+        return shape.guidance[index]
+
+    def _note_gradients(self, rendered: Rendered) -> None:
+        """Length of the total loss' gradient to the 2D means, in half image widths as gsplat counts it."""
+        gradient = rendered.meta["means2d"].grad
+        if gradient is None:
+            return
+        height, width = rendered.rgb.shape[:2]
+        length = (gradient[0] * torch.tensor([0.5 * width, 0.5 * height])).norm(dim=-1)
+        seen = rendered.meta["radii"][0].reshape(len(length), -1).amax(1) > 0
+        index = rendered.index[seen]
+        self.gradient_sum[index] += length[seen]
+        self.gradient_count[index] += 1
+
+    def _grow(self) -> None:
+        """Densify: by regions (Eqs 11-12) or by classic clone and split."""
+        settings = self.settings
+        left = max(settings["max_gaussians"] - len(self.model), 0)
+        budget = min(left, settings["max_gaussians"] // max(settings["n_densify"], 1))
+        gradient = self.gradient_sum / self.gradient_count.clamp_min(1)
+        self._clear_gradients()
+        if budget == 0:
+            return
+        raw = {name: value.detach() for name, value in self.model.raw.items()}
+        if settings["densify"] == "classic":
+            additions = adapt.clone_or_split(
+                raw, gradient, settings["grow_threshold"], 0.01 * self.extent, budget, self.generator
+            )
+        else:
+            members = self._members()
+            mean = adapt.region_gradients(gradient, members)
+            additions = adapt.densify(raw, members, mean, settings["grow_threshold"], budget, self.generator)
+        self.n_added += len(additions.parents)
+        adapt.apply_additions(self.optimizer, self.model.raw, additions)
+        self._topology_changed()
+
+    def _members(self) -> Tensor:
+        from chebsplat.regions import build_regions
+
+        shape = self.model.shape
+        if shape is not None and shape.regions is not None:
+            return shape.members
+        means = self.model.raw["means"].detach().double().numpy()
+        return torch.as_tensor(build_regions(means, self.settings["n_regions"], 32, self.settings["seed"]).members)
+
+    def _remove(self, step: int) -> None:
+        """Hard-prune what is masked out or too faint, but never below `min_gaussians`."""
+        settings, raw = self.settings, self.model.raw
+        with torch.no_grad():
+            strength = raw["logit_opacities"].sigmoid()
+            if step >= settings["prune_from"] * settings["steps"]:
+                everyone = torch.arange(len(self.model))
+                features = raw.get("features")
+                if self._encodes(step) and self.model.shape is not None and self.model.shape.regions is not None:
+                    self.refresh() if self._is_grown() else None
+                    features = self.model.shape.fuse(raw["features"], everyone)[0]
+                soft = self.model.soft_mask(everyone, features)
+                if soft is not None:
+                    strength = strength * adapt.hard_mask(soft)
+            keep = (strength >= 0.005) & torch.isfinite(raw["means"]).all(1)
+            if keep.sum() < settings["min_gaussians"]:
+                keep[strength.topk(min(settings["min_gaussians"], len(strength))).indices] = True
+        if keep.all():
+            return
+        self.n_removed += int((~keep).sum())
+        adapt.prune_optimizer(self.optimizer, self.model.raw, keep)
+        self._topology_changed()
+
+    def _is_grown(self) -> bool:
+        shape = self.model.shape
+        return shape is not None and shape.regions is not None and len(shape.cover) != len(self.model)
+
+    def _topology_changed(self) -> None:
+        self._clear_gradients()
+        if self.model.shape is not None:
+            self.model.shape.regions = None
+
+    @torch.no_grad()
+    def _freeze_bands(self) -> None:
+        """Fix every Gaussian's SH degree: the logits go to their bounds and learn no more."""
+        if "sh_logits" not in self.model.raw:
+            return
+        logits = self.model.raw["sh_logits"]
+        logits.copy_(torch.where(sh_prune.band_mask(logits) > 0.5, 10.0, -10.0))
+        for index, group in enumerate(self.optimizer.param_groups):
+            if group["name"] == "sh_logits":
+                self.rates[index] = 0.0
+
+    @torch.no_grad()
+    def held_in_psnr(self, indices: list[int], step: int) -> float:
+        """Mean PSNR over training views at full resolution, dB."""
+        scores = []
+        for index in indices:
+            rendered, _ = self.model.render(self.views.camera(index, 1), self.degree(step))
+            image = (rendered.rgb.clamp(0, 1) * 255).round().byte().numpy()
+            mask = None if self.views.masks is None else self.views.masks[index].numpy()
+            truth = self.views.images[index].numpy()
+            scores.append(psnr(image, truth) if mask is None else psnr(image[mask], truth[mask]))
+        return float(np.mean(scores))
+
+    @torch.no_grad()
+    def finish(self) -> dict[str, np.ndarray]:
+        """Final raw parameters: degrees fixed, bands above them zero, fused features of every Gaussian."""
+        raw = self.model.raw
+        mask = self.model.sh_mask(torch.arange(len(self.model)))
+        top = self.degree(self.settings["steps"])
+        degrees = torch.full((len(self.model),), top, dtype=torch.uint8)
+        if mask is not None:
+            degrees = sh_prune.degrees(mask).clamp_max(top)
+        bands = (torch.arange(1, 4)[None] <= degrees[:, None]).float()
+        parameters = {name: value.detach().numpy() for name, value in raw.items() if not name.endswith("_logits")}
+        parameters["shN"] = sh_prune.masked_sh(raw["shN"].detach(), bands).numpy()
+        parameters["degrees"] = degrees.numpy()
+        fused = self.model.fused_features()
+        return parameters if fused is None else parameters | {"fused": fused}

@@ -1,0 +1,68 @@
+"""Losses equal their plain-torch definitions, in value and gradient, and masked pixels do not exist."""
+
+import numpy as np
+import torch
+
+from chebsplat.losses import feature_l1, photometric, ssim, ssim_map
+
+
+def images(height=40, width=52, seed=0):
+    g = torch.Generator().manual_seed(seed)
+    return torch.rand(height, width, 3, generator=g), torch.rand(height, width, 3, generator=g)
+
+
+def oracle(render, target, weight_ssim):
+    a, b = render.double().requires_grad_(True), target.double()
+    value = (1 - weight_ssim) * (a - b).abs().mean() + weight_ssim * (1 - ssim_map(a, b).mean())
+    value.backward()
+    return value, a.grad
+
+
+def test_photometric_equals_the_oracle():
+    render, target = images()
+    value, gradient = oracle(render, target, 0.2)
+    render.requires_grad_(True)
+    found = photometric(render, target, None, 0.2)
+    found.backward()
+    assert abs(found.item() - value.item()) < 1e-6
+    assert (render.grad - gradient).abs().max() < 1e-5 * gradient.abs().max()
+
+
+def test_gradient_is_finite_on_flat_and_equal_images():
+    for level in (0.0, 1.0):
+        render = torch.full((20, 20, 3), level, requires_grad=True)
+        photometric(render, torch.zeros(20, 20, 3), None, 0.2).backward()
+        assert torch.isfinite(render.grad).all()
+
+
+def test_masked_pixels_have_no_influence_and_no_gradient():
+    render, target = images()
+    mask = torch.zeros(40, 52, dtype=torch.bool)
+    mask[5:30, 10:40] = True
+    other = render.clone()
+    other[~mask] = 0.1
+    values = []
+    for image in (render, other):
+        image.requires_grad_(True)
+        value = photometric(image, target, mask, 0.2)
+        value.backward()
+        assert (image.grad[~mask] == 0).all()
+        values.append(value.item())
+    assert values[0] == values[1]
+    assert photometric(render, target, torch.zeros_like(mask), 0.2).item() == 0
+
+
+def test_ssim_of_equal_images_is_one():
+    image = np.random.default_rng(0).integers(0, 255, (30, 40, 3), dtype=np.uint8)
+    assert abs(ssim(image, image) - 1) < 1e-12
+    assert ssim(image, 255 - image) < 0.5
+
+
+def test_feature_distance_is_zero_for_the_pooled_render_and_ignores_masked_pixels():
+    render = torch.rand(8, 12, 4, generator=torch.Generator().manual_seed(0))
+    pooled = render.reshape(2, 4, 3, 4, 4).mean((1, 3))
+    assert feature_l1(render, pooled).item() < 1e-6
+    mask = torch.ones(8, 12, dtype=torch.bool)
+    mask[:4, :4] = False
+    pooled[0, 0] = 100
+    assert feature_l1(render, pooled, mask).item() < 1e-6
