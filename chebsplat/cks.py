@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import Any
 
 import torch
-from torch import Tensor, nn
+from torch import Tensor
 
 EPS = torch.finfo(torch.float64).eps
 
@@ -78,28 +78,15 @@ def _orthonormal(columns: Tensor) -> Tensor:
     return kept
 
 
-class Modulation(nn.Module):
-    """Weights α > 0 of the regulariser, one a projection; softplus, starting at 1.
+def basis_loss(projections: dict[str, Tensor], bases: dict[str, Tensor]) -> Tensor:
+    """Mean over projections of ‖W − B Bᵀ W‖² / ‖W‖² (Eq 14).
 
-    Choices: learned jointly, α has the trivial minimum 0, so the regulariser's gradient never reaches it.
-    """
-
-    def __init__(self, n: int):
-        super().__init__()
-        self.raw = nn.Parameter(torch.full((n,), 0.5413))
-
-    def forward(self) -> Tensor:
-        return nn.functional.softplus(self.raw).detach()
-
-
-def basis_loss(projections: dict[str, Tensor], bases: dict[str, Tensor], modulation: Modulation) -> Tensor:
-    """Σ α ‖W − B Bᵀ W‖² / ‖W‖² over the projections that have a basis (Eq 14); gradients to W alone.
-
-    Choices: relative, so that shrinking W does not lower it; ‖W‖² in the denominator carries no gradient.
+    Choices: relative, so that shrinking W does not lower it: the denominator carries no gradient. The printed
+      modulation α is 1 here and its size the loss' weight: learned jointly it has the trivial minimum 0, and with
+      that path cut nothing else teaches it.
     """
     terms = []
-    for alpha, name in zip(modulation(), sorted(bases), strict=True):
-        W, B = projections[name], bases[name]
-        size = (W.detach() ** 2).sum().clamp_min(1e-20)
-        terms.append(alpha * ((W - B @ (B.T @ W)) ** 2).sum() / size)
+    for name, B in bases.items():
+        W = projections[name]
+        terms.append(((W - B @ (B.T @ W)) ** 2).sum() / (W.detach() ** 2).sum().clamp_min(1e-20))
     return torch.stack(terms).mean()

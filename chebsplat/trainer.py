@@ -15,6 +15,7 @@ from chebsplat.errors import DataFailure
 from chebsplat.losses import feature_l1, photometric
 from chebsplat.metrics import psnr
 from chebsplat.model import Rendered, SceneModel, View
+from chebsplat.regions import Regions, build_regions
 from chebsplat.sh import MAX_DEGREE
 
 RATES = {
@@ -58,19 +59,25 @@ class Views:
 
 
 class Trainer:
-    """Call `steps()` and read `trace`; then `finish()`.
+    """Call `refresh()` once, iterate over `steps()`, then call `finish()`.
 
     Args:
-      settings: the config's train section; extent: scene units, scales the means' learning rate.
+      settings, describe: the config's sections; extent: scene units, scales the means' learning rate.
       basis:    matrices [q, r] by name of an earlier scene's knowledge, empty for none.
     """
 
     def __init__(
-        self, model: SceneModel, views: Views, settings: dict[str, Any], extent: float, basis: dict[str, Tensor]
+        self,
+        model: SceneModel,
+        views: Views,
+        settings: dict[str, Any],
+        describe: dict[str, Any],
+        extent: float,
+        basis: dict[str, Tensor],
     ):
-        self.model, self.views, self.settings, self.extent = model, views, settings, extent
+        self.model, self.views, self.settings, self.describe, self.extent = model, views, settings, describe, extent
         self.basis = basis if model.shape is not None else {}
-        self.modulation = cks.Modulation(len(self.basis)) if self.basis else None
+        self.guidance: Tensor | None = None
         self.optimizer = self._optimizer()
         self.rates = [group["lr"] for group in self.optimizer.param_groups]
         self.order_generator = np.random.default_rng(settings["seed"])
@@ -90,8 +97,6 @@ class Trainer:
             rate = self.settings["lr_sh0"] / 20 if name == "shN" else self.settings[RATES[name]]
             groups.append({"params": [value], "lr": rate * (self.extent if name == "means" else 1), "name": name})
         weights = [p for module in self.model.modules.values() for p in module.parameters()]
-        if self.modulation is not None:
-            weights += list(self.modulation.parameters())
         if weights:
             groups.append({"params": weights, "lr": self.settings["lr_encoder"], "name": "modules"})
         return torch.optim.Adam(groups, eps=1e-15, fused=True)
@@ -112,11 +117,14 @@ class Trainer:
             for group, rate in zip(self.optimizer.param_groups, self.rates, strict=True):
                 group["lr"] = rate * FASTER.get(group["name"], 0.1) ** (step / total)
             figures = self._step(step, order.pop())
-            if step in self.growth:
+            growing = step in self.growth
+            if growing:
                 self._grow()
-            if step in self.growth or (step > self.settings["densify_until"] * total and step % 200 == 0):
+            if growing or (step > self.settings["densify_until"] * total and step % 200 == 0):
                 self._remove(step)
-            if self._encodes(step) and self._is_stale(step):
+                self._clear_gradients()
+                self.refresh()
+            elif step % self.settings["refresh_every"] == 0:
                 self.refresh()
             if step == self.freeze_step:
                 self._freeze_bands()
@@ -125,14 +133,19 @@ class Trainer:
     def _encodes(self, step: int) -> bool:
         return self.model.shape is not None and step >= self.settings["encode_from"] * self.settings["steps"]
 
-    def _is_stale(self, step: int) -> bool:
-        shape = self.model.shape
-        assert shape is not None
-        return shape.regions is None or step % self.settings["refresh_every"] == 0
-
-    def refresh(self) -> None:
-        if self.model.shape is not None:
-            self.model.shape.refresh(self.model.raw)
+    def refresh(self, regions: Regions | None = None, descriptors: Tensor | None = None) -> None:
+        """Regions, descriptors and band guidance of the Gaussians as they are now."""
+        shape, settings = self.model.shape, self.settings
+        if shape is not None:
+            shape.refresh(self.model.raw, regions, descriptors)
+            regions = shape.regions
+        elif regions is None:
+            means = self.model.raw["means"].detach().double().numpy()
+            regions = build_regions(means, *(self.describe[k] for k in ("n_regions", "region_size", "seed")))
+        assert regions is not None
+        self.members = torch.as_tensor(regions.members)
+        if settings["sh_prune"] and settings["sh_guided"] and settings["sh_degree"] > 0:
+            self.guidance = sh_prune.region_guidance(self.model.raw["shN"].detach(), self.members, len(self.model))
 
     def _step(self, step: int, index: int) -> dict[str, float]:
         settings = self.settings
@@ -153,11 +166,11 @@ class Trainer:
         if "mask" in aside and pruning:
             losses["mask"] = settings["weight_mask"] * aside["mask"].mean()
         if "bands" in aside and step < self.freeze_step:
-            guidance = self._band_guidance(rendered.index)
+            guidance = None if self.guidance is None else self.guidance[rendered.index]
             losses["sh"] = settings["weight_sh"] * sh_prune.sh_loss(aside["bands"], guidance)
-        if self.modulation is not None and self.model.shape is not None:
+        if self.basis and self.model.shape is not None:
             projections = self.model.shape.encoder.projections()
-            losses["basis"] = settings["weight_basis"] * cks.basis_loss(projections, self.basis, self.modulation)
+            losses["basis"] = settings["weight_basis"] * cks.basis_loss(projections, self.basis)
         loss = torch.stack(list(losses.values())).sum()
         if not torch.isfinite(loss):
             bad = [name for name, value in losses.items() if not torch.isfinite(value)]
@@ -168,15 +181,6 @@ class Trainer:
         self.optimizer.step()
         return {"loss": float(loss.detach())} | {f"loss_{k}": float(v.detach()) for k, v in losses.items()}
 
-    def _band_guidance(self, index: Tensor) -> Tensor | None:
-        """Weight [V, 3] of each band's penalty by the region's colours (Eq 13); None without regions."""
-        shape = self.model.shape
-        if shape is None or shape.regions is None:
-            return None
-        if not hasattr(shape, "guidance") or len(shape.guidance) != len(self.model):
-            shape.guidance = sh_prune.region_guidance(self.model.raw["shN"].detach(), shape.members, len(self.model))
-        return shape.guidance[index]
-
     def _note_gradients(self, rendered: Rendered) -> None:
         """Length of the total loss' gradient to the 2D means, in half image widths as gsplat counts it."""
         gradient = rendered.meta["means2d"].grad
@@ -184,7 +188,7 @@ class Trainer:
             return
         height, width = rendered.rgb.shape[:2]
         length = (gradient[0] * torch.tensor([0.5 * width, 0.5 * height])).norm(dim=-1)
-        seen = rendered.meta["radii"][0].reshape(len(length), -1).amax(1) > 0
+        seen = rendered.meta["radii"][0] > 0
         index = rendered.index[seen]
         self.gradient_sum[index] += length[seen]
         self.gradient_count[index] += 1
@@ -195,7 +199,6 @@ class Trainer:
         left = max(settings["max_gaussians"] - len(self.model), 0)
         budget = min(left, settings["max_gaussians"] // max(settings["n_densify"], 1))
         gradient = self.gradient_sum / self.gradient_count.clamp_min(1)
-        self._clear_gradients()
         if budget == 0:
             return
         raw = {name: value.detach() for name, value in self.model.raw.items()}
@@ -204,53 +207,28 @@ class Trainer:
                 raw, gradient, settings["grow_threshold"], 0.01 * self.extent, budget, self.generator
             )
         else:
-            members = self._members()
-            mean = adapt.region_gradients(gradient, members)
-            additions = adapt.densify(raw, members, mean, settings["grow_threshold"], budget, self.generator)
+            mean = adapt.region_gradients(gradient, self.members)
+            additions = adapt.densify(raw, self.members, mean, settings["grow_threshold"], budget, self.generator)
         self.n_added += len(additions.parents)
         adapt.apply_additions(self.optimizer, self.model.raw, additions)
-        self._topology_changed()
 
-    def _members(self) -> Tensor:
-        from chebsplat.regions import build_regions
-
-        shape = self.model.shape
-        if shape is not None and shape.regions is not None:
-            return shape.members
-        means = self.model.raw["means"].detach().double().numpy()
-        return torch.as_tensor(build_regions(means, self.settings["n_regions"], 32, self.settings["seed"]).members)
-
+    @torch.no_grad()
     def _remove(self, step: int) -> None:
         """Hard-prune what is masked out or too faint, but never below `min_gaussians`."""
         settings, raw = self.settings, self.model.raw
-        with torch.no_grad():
-            strength = raw["logit_opacities"].sigmoid()
-            if step >= settings["prune_from"] * settings["steps"]:
-                everyone = torch.arange(len(self.model))
-                features = raw.get("features")
-                if self._encodes(step) and self.model.shape is not None and self.model.shape.regions is not None:
-                    self.refresh() if self._is_grown() else None
-                    features = self.model.shape.fuse(raw["features"], everyone)[0]
-                soft = self.model.soft_mask(everyone, features)
-                if soft is not None:
-                    strength = strength * adapt.hard_mask(soft)
-            keep = (strength >= 0.005) & torch.isfinite(raw["means"]).all(1)
-            if keep.sum() < settings["min_gaussians"]:
-                keep[strength.topk(min(settings["min_gaussians"], len(strength))).indices] = True
-        if keep.all():
-            return
+        strength = raw["logit_opacities"].sigmoid()
+        if step >= settings["prune_from"] * settings["steps"]:
+            features = raw.get("features")
+            if self.model.semantic_gate is not None and self._encodes(step) and self.model.shape is not None:
+                self.refresh()
+                features, _ = self.model.shape.fuse(raw["features"], torch.arange(len(self.model)))
+            soft = self.model.soft_mask(torch.arange(len(self.model)), features)
+            strength = strength if soft is None else strength * adapt.hard_mask(soft)
+        keep = (strength >= 0.005) & torch.isfinite(raw["means"]).all(1)
+        if keep.sum() < settings["min_gaussians"]:
+            keep[strength.topk(min(settings["min_gaussians"], len(strength))).indices] = True
         self.n_removed += int((~keep).sum())
-        adapt.prune_optimizer(self.optimizer, self.model.raw, keep)
-        self._topology_changed()
-
-    def _is_grown(self) -> bool:
-        shape = self.model.shape
-        return shape is not None and shape.regions is not None and len(shape.cover) != len(self.model)
-
-    def _topology_changed(self) -> None:
-        self._clear_gradients()
-        if self.model.shape is not None:
-            self.model.shape.regions = None
+        adapt.prune_optimizer(self.optimizer, raw, keep)
 
     @torch.no_grad()
     def _freeze_bands(self) -> None:

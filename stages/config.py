@@ -88,7 +88,9 @@ class TrainSection(_Section):
     prune: bool = True
     prune_semantic: bool = True  # false: "no semantic guidance"
     densify: Literal["region", "classic", "off"] = "region"
+    grow_threshold: float = Field(2e-4, gt=0)  # gradient to the 2D means, half image widths
     sh_prune: bool = True
+    sh_guided: bool = True  # false: the paper's "no semantic guidance" of SH pruning
     # sizes
     sh_degree: int = Field(3, ge=0, le=3)
     max_gaussians: int = Field(40_000, ge=16)

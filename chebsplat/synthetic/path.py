@@ -1,0 +1,45 @@
+"""A camera that walks an ellipse through the room at eye height and looks across it."""
+
+from __future__ import annotations
+
+import numpy as np
+
+
+def look_at(eye: np.ndarray, target: np.ndarray) -> np.ndarray:
+    """cam_from_world [4, 4] of a camera at `eye` that looks at `target`, OpenCV axes, world z up."""
+    forward = (target - eye) / np.linalg.norm(target - eye)
+    right = np.cross(forward, (0.0, 0.0, 1.0))
+    right /= np.linalg.norm(right)
+    rotation = np.stack([right, np.cross(forward, right), forward])
+    pose = np.eye(4)
+    pose[:3, :3], pose[:3, 3] = rotation, -rotation @ eye
+    return pose
+
+
+def walk(size: tuple[float, float, float], n_views: int, seed: int) -> np.ndarray:
+    """Poses [V, 4, 4] cam_from_world along the path.
+
+    Choices: two rounds, the second lower and turned the other way; the gaze crosses the room, swings by ±50° and
+      nods between 26° down and 4° up, so every surface is met from several sides.
+    """
+    rng = np.random.default_rng([seed, 1])
+    phase = rng.uniform(0, 2 * np.pi)
+    width, depth, _ = size
+    poses = []
+    for k in range(n_views):
+        t = 2 * k / n_views  # rounds
+        round_, angle = int(t), 2 * np.pi * t + phase
+        radius = (0.27, 0.25) if round_ == 0 else (0.20, 0.17)
+        height = (1.62 if round_ == 0 else 1.40) + 0.08 * np.sin(3 * angle)
+        eye = np.array([width * (0.5 + radius[0] * np.cos(angle)), depth * (0.5 + radius[1] * np.sin(angle)), height])
+        gaze = angle + np.pi + (0.85 if round_ == 0 else -0.85) * np.sin(2.5 * angle + phase)
+        pitch = np.deg2rad(-11 + 15 * np.sin(4.3 * angle))
+        direction = np.array([np.cos(gaze) * np.cos(pitch), np.sin(gaze) * np.cos(pitch), np.sin(pitch)])
+        poses.append(look_at(eye, eye + direction))
+    return np.stack(poses)
+
+
+def intrinsics(width: int, height: int, fov_x: float = 72.0) -> np.ndarray:
+    """K [3, 3] of a centred pinhole; fov_x in degrees."""
+    focal = 0.5 * width / np.tan(np.deg2rad(fov_x) / 2)
+    return np.array([[focal, 0, width / 2], [0, focal, height / 2], [0, 0, 1.0]])

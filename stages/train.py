@@ -1,0 +1,193 @@
+"""train: the semantic Gaussian scene (Eqs 7-13), with its trace of error against run time."""
+
+from __future__ import annotations
+
+import time
+from typing import TYPE_CHECKING, Any
+
+from chebsplat.errors import ConfigError, DataFailure, InputError
+from chebsplat.stages.command import Job, command
+
+if TYPE_CHECKING:
+    import numpy as np
+
+    from chebsplat.formats.capture import Capture
+    from chebsplat.formats.features import Features
+    from chebsplat.formats.points import Points
+    from chebsplat.trainer import Trainer, Views
+
+
+def run(job: Job) -> None:
+    import torch
+
+    from chebsplat.cameras import extent
+    from chebsplat.formats.cameras import Cameras
+    from chebsplat.formats.capture import read_capture
+    from chebsplat.formats.features import read_features
+    from chebsplat.formats.gaussians import Gaussians, write_gaussians
+    from chebsplat.formats.points import read_points
+    from chebsplat.gaussians import initial_gaussians
+    from chebsplat.model import SceneModel
+    from chebsplat.trainer import Trainer
+
+    if job.device == "cuda":
+        raise ConfigError("training runs on the CPU in this version; pass --device cpu")
+    train, describe = job.config.train.model_dump(), job.config.describe.model_dump()
+    capture, points = read_capture(job.inputs["capture"]), read_points(job.inputs["points"])
+    features = read_features(job.inputs["features"]) if "features" in job.inputs and train["semantics"] else None
+    note_left_out(job, train, features is not None)
+    torch.manual_seed(train["seed"])
+    raw = initial_gaussians(points.means, points.colors, points.covariances)
+    model = SceneModel(raw, describe, train, features.features.shape[-1] if features is not None else None)
+    views = training_views(capture, points, features)
+    bases = knowledge(job, model, train)
+    trainer = Trainer(model, views, train, describe, extent(points.cam_from_world), bases)
+    first_regions(job, trainer, len(points.means))
+    trace = follow(job, trainer, train)
+    parameters = trainer.finish()
+    left = parameters["degrees"].size
+    if left == 0:
+        raise DataFailure("no Gaussian is left; lower train.weight_mask or raise train.min_gaussians")
+    modules = {f"{n}.{k}": v.detach().numpy() for n, m in model.modules.items() for k, v in m.state_dict().items()}
+    cameras = Cameras(points.names, points.Ks, points.cam_from_world, *capture.size)
+    notes: dict[str, Any] = {"left_out": job.facts.get("left_out", {}), "n_added": trainer.n_added}
+    notes |= {"n_removed": trainer.n_removed, "n_initial": len(points.means)}
+    if features is not None:
+        notes |= {"label_names": features.label_names, "convention": features.convention}
+    if model.shape is not None:
+        encoder = model.shape.encoder
+        notes["encoder"] = {"n_inputs": encoder.n_inputs, "n_channels": encoder.n_channels} | encoder.settings
+    job.facts |= {"n_gaussians": left, "seconds_per_step": trace[-1]["seconds"] / train["steps"]}
+    write_gaussians(job.out, Gaussians(parameters, cameras, modules, optimizer_state(trainer), trace, notes))
+
+
+def note_left_out(job: Job, train: dict[str, Any], has_semantics: bool) -> None:
+    """Say what this training does without, and why."""
+    if not has_semantics:
+        why = "no teacher features: rendering only" if train["semantics"] else "train.semantics is false"
+        job.left_out("semantic branch", why)
+    unneeded = {
+        "shape encoder": [(not has_semantics, "no semantics to encode"), (train["encoder"] == "off", "encoder is off")],
+        "pruning": [(not train["prune"], "train.prune is false")],
+        "densification": [(train["densify"] == "off", "train.densify is off")],
+        "SH pruning": [(not train["sh_prune"], "train.sh_prune is false")],
+        "knowledge basis": [("basis" not in job.inputs, "no sequence is named: this scene starts from nothing")],
+    }
+    for what, reasons in unneeded.items():
+        why = [reason for applies, reason in reasons if applies]
+        if why:
+            job.left_out(what, why[0])
+
+
+def training_views(capture: Capture, points: Points, features: Features | None) -> Views:
+    """The registered training views, joined by name. Raises InputError if artifacts do not belong together."""
+    import numpy as np
+    import torch
+
+    from chebsplat.trainer import Views
+
+    row = {name: view for view, name in enumerate(capture.names)}
+    unknown = [name for name in points.names if name not in row]
+    if unknown:
+        raise InputError(f"the points know a view {unknown[0]} that the capture does not; pass artifacts of one scene")
+    used = [k for k, name in enumerate(points.names) if not capture.is_test[row[name]]]
+    if not used:
+        raise DataFailure("no training view is registered")
+    names = [points.names[k] for k in used]
+    images, masks = capture.images[:], capture.loss_mask
+    chosen = [row[name] for name in names]
+    of = None
+    if features is not None:
+        source = {name: view for view, name in enumerate(features.names)}
+        absent = [name for name in names if name not in source]
+        if absent:
+            raise InputError(f"the features have no view {absent[0]}; run the teacher stage on this capture")
+        held = features
+
+        def of(index: int) -> torch.Tensor:
+            return torch.from_numpy(held.features[source[names[index]]].astype(np.float32))
+
+    return Views(
+        names,
+        torch.from_numpy(images[chosen]),
+        torch.from_numpy(points.Ks[used]).float(),
+        torch.from_numpy(points.cam_from_world[used]).float(),
+        None if masks is None else torch.from_numpy(masks[:][chosen]),
+        of,
+    )
+
+
+def knowledge(job: Job, model: Any, train: dict[str, Any]) -> dict[str, Any]:
+    """Bases of earlier scenes; with `train.warm_start` the encoder also starts from their weights."""
+    if "basis" not in job.inputs or model.shape is None:
+        return {}
+    import torch
+
+    from chebsplat.formats.basis import read_basis
+
+    basis, projections = read_basis(job.inputs["basis"]), model.shape.encoder.projections()
+    wrong = [n for n, w in projections.items() if n not in basis.bases or len(basis.bases[n]) != len(w)]
+    if wrong:
+        raise InputError(f"{job.inputs['basis']} does not fit the encoder at {wrong[0]}; start another sequence")
+    if train["warm_start"]:
+        state = model.shape.encoder.state_dict()
+        fitting = {k: torch.from_numpy(v) for k, v in basis.weights.items() if k in state and state[k].shape == v.shape}
+        model.shape.encoder.load_state_dict(state | fitting)
+        job.facts["warm_started"] = len(fitting)
+    return {name: torch.from_numpy(basis.bases[name]) for name in projections} if train["weight_basis"] > 0 else {}
+
+
+def first_regions(job: Job, trainer: Trainer, n_points: int) -> None:
+    """Start from the describe stage's regions where there are any."""
+    import numpy as np
+    import torch
+
+    from chebsplat.formats.descriptors import read_descriptors
+    from chebsplat.regions import Regions
+
+    if "descriptors" not in job.inputs:
+        trainer.refresh()
+        return
+    found = read_descriptors(job.inputs["descriptors"])
+    if found.members.max(initial=-1) >= n_points:
+        raise InputError(f"{job.inputs['descriptors']} describes other points; run the describe stage on these points")
+    means = trainer.model.raw["means"].detach().numpy()
+    offsets = means[np.maximum(found.members, 0)] - means[found.centers][:, None]
+    from scipy.spatial import cKDTree
+
+    reach, _ = cKDTree(means[found.centers]).query(means)
+    spread = np.linalg.norm(offsets, axis=-1)[found.members >= 0].max(initial=0.0)
+    radius = float(max(1.5 * reach.max(), spread))
+    trainer.refresh(Regions(found.centers, found.members, radius), torch.from_numpy(found.values))
+
+
+def follow(job: Job, trainer: Trainer, train: dict[str, Any]) -> list[dict[str, float]]:
+    """Run the steps; returns the trace, whose seconds count training alone, not the held-in measurements."""
+    n_views = len(trainer.views.names)
+    watched = list(range(0, n_views, max(n_views // 4, 1)))[:4]
+    trace: list[dict[str, float]] = []
+    began, spent_measuring = time.perf_counter(), 0.0
+    for (step, figures), status in job.progress.track(trainer.steps(), train["steps"], "train"):
+        status |= {"loss": f"{figures['loss']:.4f}", "n": figures["n"]}
+        if step % train["report_every"] == 0 or step == train["steps"]:
+            paused = time.perf_counter()
+            row = {"step": step, "seconds": paused - began - spent_measuring, **figures}
+            row["psnr"] = trainer.held_in_psnr(watched, step)
+            spent_measuring += time.perf_counter() - paused
+            trace.append({k: float(v) for k, v in row.items()})
+            job.progress.record(**trace[-1])
+    columns = sorted({k for row in trace for k in row}, key=lambda k: (k != "step", k != "seconds", k))
+    return [{k: row.get(k, 0.0) for k in columns} for row in trace]
+
+
+def optimizer_state(trainer: Trainer) -> dict[str, np.ndarray]:
+    """Adam's moments of the per-Gaussian parameters, and the step count."""
+    arrays = {}
+    for group in trainer.optimizer.param_groups:
+        state = trainer.optimizer.state.get(group["params"][0], {})
+        if group["name"] != "modules" and "exp_avg" in state:
+            arrays |= {f"{group['name']}.{k}": state[k].numpy() for k in ("exp_avg", "exp_avg_sq")}
+    return arrays
+
+
+main = command("train", run)
