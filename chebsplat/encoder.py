@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 
+import numpy as np
 import torch
 from torch import Tensor, nn
 
@@ -97,6 +98,13 @@ class RegionEncoder(nn.Module):
         for block in self.blocks:
             tokens = block(tokens, mask)
         return self.decode(self.norm(tokens[:, 0]))
+
+    @classmethod
+    def restored(cls, settings: dict[str, int], weights: dict[str, np.ndarray]) -> RegionEncoder:
+        """The encoder of a checkpoint: constructor settings, and weights by name. Raises RuntimeError on a misfit."""
+        encoder = cls(**settings)
+        encoder.load_state_dict({name: torch.from_numpy(value) for name, value in weights.items()})
+        return encoder.eval()
 
     def projections(self) -> dict[str, Tensor]:
         """The projection matrices that the knowledge space follows, by name."""

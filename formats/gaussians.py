@@ -49,6 +49,14 @@ class Gaussians:
     trace: list[dict[str, float]] = field(default_factory=list)
     notes: dict[str, Any] = field(default_factory=dict)
 
+    def encoder(self) -> tuple[dict[str, int], dict[str, np.ndarray]]:
+        """Settings and weights of the local encoder. Raises InputError if the scene was trained without one."""
+        if "encoder" not in self.notes:
+            raise InputError("the scene was trained without an encoder; train it with train.encoder = transformer")
+        prefix = "shape.encoder."
+        weights = {k.removeprefix(prefix): v for k, v in self.modules.items() if k.startswith(prefix)}
+        return self.notes["encoder"], weights
+
 
 def write_gaussians(out: Path, gaussians: Gaussians) -> None:
     """Fill the directory that `artifact.publish` yields. Raises ValueError on a non-finite parameter."""

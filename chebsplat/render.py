@@ -1,0 +1,54 @@
+"""Rendering of a finished scene: colour by SH degree, so that a Gaussian costs only the bands it keeps."""
+
+from __future__ import annotations
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from chebsplat.gaussians import activated
+from chebsplat.model import View, in_frustum
+from chebsplat.rasterize import rasterize
+from chebsplat.sh import eval_sh
+
+
+def colors_by_degree(sh0: Tensor, shN: Tensor, directions: Tensor, degrees: Tensor) -> Tensor:
+    """Colours [N, 3] of Gaussians sorted by ascending degree; each bucket evaluates its own bands only.
+
+    Raises: ValueError if `degrees` [N] does not ascend.
+    """
+    if len(degrees) > 1 and (degrees.diff() < 0).any():
+        raise ValueError("Gaussians are not sorted by degree")
+    values, counts = torch.unique_consecutive(degrees.int(), return_counts=True)
+    parts, start = [sh0.new_zeros(0, 3)], 0
+    for degree, count in zip(values.tolist(), counts.tolist(), strict=True):
+        rows = slice(start, start + count)
+        parts.append(eval_sh(sh0[rows], shN[rows], directions[rows], degree))
+        start += count
+    return torch.cat(parts)
+
+
+class SceneRenderer:
+    """Renders an exported scene (`formats.scene.Scene.parameters`)."""
+
+    def __init__(self, parameters: dict[str, np.ndarray]):
+        raw = {name: torch.from_numpy(np.ascontiguousarray(values)) for name, values in parameters.items()}
+        self.means, self.quats, self.scales, self.opacities = activated(raw)
+        self.raw, self.reach = raw, 3 * self.scales.amax(1)
+
+    @torch.no_grad()
+    def render(self, view: View, with_features: bool = False) -> tuple[np.ndarray, np.ndarray | None]:
+        """Image u8 [H, W, 3], and features f32 [H, W, C] where asked for and present."""
+        index = in_frustum(self.means, view, self.reach)
+        eye = -view.viewmat[:3, :3].T @ view.viewmat[:3, 3]
+        raw = self.raw
+        channels = colors_by_degree(
+            raw["sh0"][index], raw["shN"][index], self.means[index] - eye, raw["degrees"][index]
+        )
+        if with_features and "features" in raw:
+            channels = torch.cat([channels, raw["features"][index]], 1)
+        gaussians = (self.means[index], self.quats[index], self.scales[index], self.opacities[index])
+        camera = (view.viewmat[None], view.K[None], view.width, view.height)
+        render, _, _ = rasterize(*gaussians, channels, *camera)
+        image = (render[0, ..., :3].clamp(0, 1) * 255).round().byte().numpy()
+        return image, render[0, ..., 3:].numpy() if channels.shape[1] > 3 else None

@@ -1,0 +1,48 @@
+"""cks: the next revision of the core knowledge space (Eqs 14-15). The old one is never changed."""
+
+from __future__ import annotations
+
+from chebsplat.errors import DataFailure
+from chebsplat.stages.command import Job, command
+
+
+def run(job: Job) -> None:
+    import torch
+
+    from chebsplat.cks import update
+    from chebsplat.encoder import RegionEncoder
+    from chebsplat.formats.artifact import read_manifest
+    from chebsplat.formats.basis import Basis, read_basis, write_basis
+    from chebsplat.formats.gaussians import read_gaussians
+
+    settings = job.config.cks
+    encoder = RegionEncoder.restored(*read_gaussians(job.inputs["gaussians"]).encoder())
+    old = read_basis(job.inputs["basis"]) if "basis" in job.inputs else Basis({}, {})
+    projections = encoder.projections()
+    if not projections:
+        raise DataFailure("the encoder has no projections (train.encoder = mlp); there is no knowledge to carry")
+    if old.bases and set(old.bases) != set(projections):
+        raise DataFailure("the basis belongs to an encoder of another depth; start another sequence")
+    bases, entry = {}, {"gaussians": read_manifest(job.inputs["gaussians"]).key}
+    for name, weight in projections.items():
+        start = torch.from_numpy(old.bases[name]) if name in old.bases else None
+        if start is not None and len(start) != len(weight):
+            raise DataFailure(f"the basis has {len(start)} rows at {name}, the encoder {len(weight)}")
+        grown, report = update(
+            start,
+            weight.detach(),
+            energy=settings.energy,
+            tolerance=settings.tolerance,
+            max_rank=settings.max_rank,
+            rule=settings.energy_rule,
+        )
+        bases[name] = grown.numpy()
+        entry[name] = report
+    weights = {name: value.numpy() for name, value in encoder.state_dict().items()}
+    if not old.bases:
+        job.left_out("earlier basis", "this is the first scene of its sequence")
+    job.facts |= {"revision": old.revision + 1, "ranks": {name: b.shape[1] for name, b in bases.items()}}
+    write_basis(job.out, Basis(bases, weights, [*old.lineage, entry]))
+
+
+main = command("cks", run)

@@ -1,0 +1,50 @@
+"""export: the trained scene as PLY files, ragged arrays, a label dictionary and a summary."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from chebsplat.stages.command import Job, command
+
+
+def run(job: Job) -> None:
+    import numpy as np
+
+    from chebsplat.formats.features import read_features
+    from chebsplat.formats.gaussians import read_gaussians
+    from chebsplat.formats.scene import Scene, write_scene
+    from chebsplat.noisy_teacher import decode
+
+    gaussians = read_gaussians(job.inputs["gaussians"])
+    order = np.argsort(gaussians.parameters["degrees"], kind="stable")
+    wanted = ("means", "log_scales", "quats", "logit_opacities", "sh0", "shN", "degrees")
+    parameters = {name: gaussians.parameters[name][order] for name in wanted}
+    semantic = gaussians.parameters.get("fused", gaussians.parameters.get("features"))
+    labelled: dict[str, Any] = {}
+    if semantic is None:
+        job.left_out("labels", "the scene was trained without semantics")
+    elif "features" not in job.inputs:
+        job.left_out("labels", "no --in-features: the label embeddings are unknown")
+    else:
+        teacher = read_features(job.inputs["features"])
+        parameters["features"] = semantic[order].astype(np.float16).astype(np.float32)
+        labels, _ = decode(parameters["features"], teacher.label_embeddings)
+        labelled = {
+            "labels": labels.astype(np.int32),
+            "label_names": teacher.label_names,
+            "label_embeddings": teacher.label_embeddings,
+        }
+    counts = np.bincount(parameters["degrees"], minlength=4).tolist()
+    for degree in range(int(parameters["degrees"].max(initial=0)) + 1, 4):
+        job.left_out(f"SH band {degree}", "no Gaussian keeps it")
+    if not job.config.export.split_by_degree:
+        job.left_out("split PLY files", "export.split_by_degree is false")
+    left_out = gaussians.notes.get("left_out", {}) | job.facts.get("left_out", {})
+    summary = {"left_out": left_out, "by_degree": counts, "n_initial": gaussians.notes.get("n_initial")}
+    scene = Scene(parameters, gaussians.cameras, **labelled, summary=summary)
+    sizes = write_scene(job.out, scene, job.config.export.split_by_degree)
+    dense = len(order) * 62 * 4
+    job.facts |= {"n_gaussians": len(order), "by_degree": counts, "bytes": sizes, "bytes_untrimmed_ply": dense}
+
+
+main = command("export", run)
