@@ -4,8 +4,25 @@ PY := .venv/bin/python
 READY := .venv/.ready
 unexport PYTHONDONTWRITEBYTECODE
 
-.DEFAULT_GOAL := help
-.PHONY: help setup test test-all lint lock
+CHEBSPLAT := .venv/bin/chebsplat
+CHOICE := $(if $(scene),--scene '$(scene)') $(if $(sequence),--sequence '$(sequence)') $(if $(set),--set '$(set)') \
+  $(if $(ablation),--ablation '$(ablation)')
+
+# `make scene=office0` needs no target: naming a scene or a sequence means running it.
+.DEFAULT_GOAL := $(if $(scene)$(sequence),run,help)
+.PHONY: help run plan verify clean-stale setup test test-all lint lock
+
+run: $(READY)  ## make scene=NAME|FOLDER [stage=] [set=a.b=c,...] [ablation=] [cores=]; or sequence=NAME
+	@$(CHEBSPLAT) run $(CHOICE) $(if $(stage),--stage '$(stage)') $(if $(cores),--cores '$(cores)')
+
+plan: $(READY)  ## make plan scene=NAME: what would run, what is fresh, what the scene leaves out, and why
+	@$(CHEBSPLAT) plan $(CHOICE)
+
+verify: $(READY)  ## make verify dir=FOLDER: recompute every digest of an artifact
+	@$(CHEBSPLAT) verify $(dir)
+
+clean-stale: $(READY)  ## list artifacts that nothing names; yes=1 removes them
+	@$(CHEBSPLAT) clean-stale $(if $(yes),--yes)
 
 help:  ## list the targets
 	@grep -hE '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed -E 's/:.*## /\t/' | expand -t 14

@@ -73,8 +73,9 @@ def command(name: str, run: Callable[[Job], None]) -> click.Command:
 
 def execute(name: str, run: Callable[[Job], None], options: dict[str, Any]) -> int:
     """Run one stage; returns the exit code. stdout gets the artifact's path and nothing else."""
-    logging.basicConfig(stream=sys.stderr, format=f"%(asctime)s {name}: %(message)s", datefmt="%H:%M:%S",
-                        level=options["log_level"].upper(), force=True)  # fmt: skip
+    line = f"%(asctime)s {name}: %(message)s"
+    logging.basicConfig(stream=sys.stderr, format=line, datefmt="%H:%M:%S", level="WARNING", force=True)
+    log.setLevel(options["log_level"].upper())
     out = Path(options["out"]).absolute()
     try:
         if artifact.is_published(out) and not options["force"]:
@@ -134,18 +135,7 @@ def _versions() -> dict[str, str]:
     """Versions of the packages that the stage really loaded."""
     from importlib import metadata
 
-    names = {
-        "torch",
-        "numpy",
-        "scipy",
-        "numba",
-        "pycolmap",
-        "open3d",
-        "zarr",
-        "onnxruntime",
-        "fpsample",
-        "PIL",
-    }
+    names = {"torch", "numpy", "scipy", "numba", "pycolmap", "open3d", "zarr", "onnxruntime", "fpsample", "PIL"}
     distributions = {"open3d": "open3d-cpu", "PIL": "pillow"}
     loaded = sorted(names & set(sys.modules))
     return {n: metadata.version(distributions.get(n, n)) for n in loaded} | {"python": sys.version.split()[0]}

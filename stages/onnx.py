@@ -42,11 +42,13 @@ def example(encoder: Any, n_regions: int, n_members: int, seed: int = 0) -> tupl
 def export(encoder: Any, path: Path, opset: int) -> None:
     """One self-contained file with dynamic region count and size."""
     import io
+    import logging
     import warnings
     from contextlib import redirect_stdout
 
     import torch
 
+    logging.getLogger("torch.onnx._internal.exporter._registration").setLevel("ERROR")  # "torchvision is absent"
     regions, members = torch.export.Dim("regions", min=1), torch.export.Dim("members", min=1)
     shape = {0: regions, 1: members}
     with warnings.catch_warnings(), redirect_stdout(io.StringIO()):

@@ -1,0 +1,194 @@
+"""The `chebsplat` command: run, plan, verify, clean-stale, scenes, and every stage as a plain command."""
+
+from __future__ import annotations
+
+import os
+import sys
+from pathlib import Path
+from typing import Any
+
+import click
+
+from chebsplat.errors import ChebsplatError, ConfigError
+from chebsplat.stages.registry import STAGES
+
+
+class Commands(click.Group):
+    """Stages are listed from their table and imported only when called, so that --help stays instant."""
+
+    def list_commands(self, context: click.Context) -> list[str]:
+        return [*super().list_commands(context), *STAGES]
+
+    def get_command(self, context: click.Context, name: str) -> click.Command | None:
+        if name in STAGES and not self._listing(context):
+            from importlib import import_module
+
+            return import_module(f"chebsplat.stages.{name}").main
+        if name in STAGES:
+            return click.Command(name, help=STAGES[name].help)
+        return super().get_command(context, name)
+
+    @staticmethod
+    def _listing(context: click.Context) -> bool:
+        return not context.args and not getattr(context, "_protected_args", None)
+
+
+@click.group(cls=Commands)
+def main() -> None:
+    """Semantic 3D Gaussian Splatting that understands shape."""
+
+
+def guarded(action: Any) -> None:
+    """Run `action() -> int` and leave with its exit code; typed errors become a line and their code."""
+    try:
+        code = action()
+    except ChebsplatError as error:
+        print(f"chebsplat: {error}", file=sys.stderr)
+        code = error.exit_code
+    sys.exit(code)
+
+
+def plans(scene: str | None, sequence: str | None, settings: str, ablation: str) -> list[Any]:
+    """The plan of a scene, or those of a sequence, each training on the basis of the one before."""
+    from chebsplat.pipelines import plan as planning
+
+    if (scene is None) == (sequence is None):
+        raise ConfigError("name one of scene= and sequence=")
+    planner = planning.Planner()
+    try:
+        if scene is not None:
+            return [planner.plan(scene, settings, ablation)]
+        found: list[Any] = []
+        basis: Path | None = None
+        for name in planning.read_toml("sequences", str(sequence))["scenes"]:
+            plan = planner.plan(name, settings, ablation, basis, keep_knowledge=True)
+            plan.title = f"{sequence}/{plan.title}".replace("/", "--")
+            basis = plan.targets.get("cks", basis)
+            found.append(plan)
+        return found
+    finally:
+        planner.save()
+
+
+def checked_stage(stage: str | None, found: list[Any]) -> str | None:
+    """Raises ConfigError for a stage that does not exist or that this scene leaves out."""
+    if stage is None:
+        return None
+    if stage not in STAGES:
+        import difflib
+
+        near = difflib.get_close_matches(stage, list(STAGES), 1)
+        raise ConfigError(f"no stage is called {stage}" + (f"; did you mean {near[0]}?" if near else ""))
+    for plan in found:
+        if stage not in plan.targets:
+            raise ConfigError(f"{plan.title} leaves out {stage}: {plan.left_out.get(stage, 'not needed')}")
+    return stage
+
+
+OPTIONS = [
+    click.option("--scene", help="a name from `chebsplat scenes`, or a folder"),
+    click.option("--sequence", help="scenes in order, each starting from the knowledge of those before"),
+    click.option("--set", "settings", default="", help="section.key=value,..."),
+    click.option("--ablation", default="", help="a named set of settings"),
+]
+
+
+def with_scene(command: Any) -> Any:
+    for option in reversed(OPTIONS):
+        command = option(command)
+    return command
+
+
+@main.command()
+@with_scene
+@click.option("--stage", help="stop after this stage")
+@click.option("--cores", type=click.IntRange(1), default=os.cpu_count())
+def run(scene: str | None, sequence: str | None, settings: str, ablation: str, stage: str | None, cores: int) -> None:
+    """Bring a scene up to date; recompute only what is stale."""
+
+    def action() -> int:
+        from chebsplat.pipelines.run import execute
+
+        found = plans(scene, sequence, settings, ablation)
+        return execute(found, checked_stage(stage or None, found), cores)
+
+    guarded(action)
+
+
+@main.command()
+@with_scene
+def plan(scene: str | None, sequence: str | None, settings: str, ablation: str) -> None:
+    """Show what would run, what is fresh, and what the scene leaves out, and why."""
+
+    def action() -> int:
+        for found in plans(scene, sequence, settings, ablation):
+            print(f"{found.title}: {found.source}")
+            for step in found.steps:
+                print(f"  {'fresh   ' if step.fresh else 'would run'} {step.stage:9s} {step.key}")
+            for what, why in found.left_out.items():
+                print(f"  left out  {what}: {why}")
+        return 0
+
+    guarded(action)
+
+
+@main.command()
+@click.argument("folders", nargs=-1, required=True, type=click.Path(path_type=Path))
+def verify(folders: tuple[Path, ...]) -> None:
+    """Recompute every digest of artifacts."""
+
+    def action() -> int:
+        from chebsplat.formats.artifact import verify as check
+
+        for folder in folders:
+            manifest = check(folder)
+            print(f"{folder}: {manifest.schema}, {len(manifest.files)} files, whole")
+        return 0
+
+    guarded(action)
+
+
+@main.command("clean-stale")
+@click.option("--yes", is_flag=True, help="remove what is listed")
+def clean_stale(yes: bool) -> None:
+    """List the artifacts that no scene names any more, and leftovers of killed runs."""
+
+    def action() -> int:
+        from chebsplat.pipelines import store
+
+        found = store.unnamed()
+        for path, size in found:
+            print(f"{size / 2**20:9.1f} MB  {path}")
+        total = sum(size for _, size in found) / 2**20
+        print(
+            f"{total:9.1f} MB  in {len(found)} folders" + ("" if yes or not found else "; yes=1 (--yes) removes them")
+        )
+        if yes:
+            for path, _ in found:
+                store.remove(path)
+        return 0
+
+    guarded(action)
+
+
+@main.command()
+def scenes() -> None:
+    """List the scenes, ablations and sequences that have a name."""
+    from chebsplat.pipelines.plan import names
+
+    for kind in ("scenes", "ablations", "sequences"):
+        print(f"{kind}: {' '.join(names(kind))}")
+
+
+@main.command(hidden=True)
+@click.argument("plan", type=click.Path(path_type=Path))
+@click.argument("key")
+def job(plan: Path, key: str) -> None:
+    """One step of a plan, as Snakemake runs it."""
+    from chebsplat.pipelines.run import job as run_job
+
+    sys.exit(run_job(plan, key))
+
+
+if __name__ == "__main__":
+    main()

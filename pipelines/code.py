@@ -1,0 +1,118 @@
+"""Identity of the code behind a stage: what it computes with, not how it is written down.
+
+The hash covers the syntax trees, without comments and docstrings, of the stage's module and of every module of ours
+it imports, however deep, and the versions of the packages these import. Plumbing that cannot change a result is left
+out, so that a better progress bar makes nothing stale.
+"""
+
+from __future__ import annotations
+
+import ast
+import hashlib
+import sys
+from importlib import metadata
+from pathlib import Path
+
+
+def installed() -> dict[str, Path]:
+    """Where the layers lie, in a checkout or in site-packages."""
+    import chebsplat
+    from chebsplat import formats, pipelines, stages
+
+    layers = {"chebsplat": chebsplat, "formats": formats, "stages": stages, "pipelines": pipelines}
+    return {name: Path(module.__path__[0]) for name, module in layers.items()}
+
+
+PLUMBING = {"stages.config", "stages.registry", "stages.command", "stages.progress"}
+LAYERS = ("formats", "stages", "pipelines")
+
+
+class Code:
+    """Reads modules below `folders` (layer name -> folder). `memo` maps a path to what was found in it at a (mtime,
+    size); the caller keeps it, so that an unchanged file is not parsed again.
+    """
+
+    def __init__(self, folders: dict[str, Path], memo: dict[str, list]):
+        self.folders, self.memo = folders, memo
+        self.read_now = 0  # files parsed in this process
+        self._versions: dict[str, str | None] = {}
+
+    def stage(self, name: str) -> dict[str, object]:
+        """{"hash": ..., "packages": {name: version}} of stage `name`."""
+        seen: dict[str, str] = {}
+        packages: set[str] = set()
+        waiting = [f"stages.{name}"]
+        while waiting:
+            module = waiting.pop()
+            path = self._path(module)
+            if module in seen or module in PLUMBING or path is None:
+                continue
+            digest, imports = self._read(path)
+            seen[module] = digest
+            for imported in imports:
+                first, _, rest = imported.partition(".")
+                if first == "chebsplat":
+                    waiting += self._modules(rest)
+                elif first not in sys.stdlib_module_names:
+                    packages.add(first)
+        text = "\n".join(f"{module} {digest}" for module, digest in sorted(seen.items()))
+        versions = {name: version for name in sorted(packages) if (version := self._version(name))}
+        return {"hash": hashlib.sha256(text.encode()).hexdigest()[:16], "packages": versions}
+
+    def _modules(self, dotted: str) -> list[str]:
+        """Modules that `import chebsplat.<dotted>` runs: the packages on the way, and the module itself."""
+        first = dotted.split(".")[0]
+        base = [] if first in LAYERS else ["chebsplat"]
+        parts = [p for p in dotted.split(".") if p]
+        found = []
+        for n in range(len(parts) + 1):
+            module = ".".join(base + parts[:n])
+            if module and self._path(module) is not None:
+                found.append(module)
+        return found
+
+    def _path(self, module: str) -> Path | None:
+        first, *rest = module.split(".")
+        path = self.folders[first].joinpath(*rest)
+        for candidate in (path.with_name(path.name + ".py"), path / "__init__.py"):
+            if candidate.is_file():
+                return candidate
+        return None
+
+    def _read(self, path: Path) -> tuple[str, list[str]]:
+        state, key = path.stat(), str(path)
+        stamp = [state.st_mtime_ns, state.st_size]
+        held = self.memo.get(key)
+        if held is None or held[0] != stamp:
+            self.read_now += 1
+            held = self.memo[key] = [stamp, *parsed(path.read_text(), key)]
+        return held[1], held[2]
+
+    def _version(self, package: str) -> str | None:
+        if package not in self._versions:
+            try:
+                name = {"PIL": "pillow", "open3d": "open3d-cpu"}.get(package, package)
+                self._versions[package] = metadata.version(name)
+            except metadata.PackageNotFoundError:
+                self._versions[package] = None
+        return self._versions[package]
+
+
+def parsed(text: str, name: str) -> tuple[str, list[str]]:
+    """Digest of a module's syntax tree without docstrings, and the dotted names it imports."""
+    tree = ast.parse(text, name)
+    imports: set[str] = set()
+    for node in ast.walk(tree):
+        if isinstance(node, ast.Import):
+            imports |= {alias.name for alias in node.names}
+        elif isinstance(node, ast.ImportFrom) and node.module:
+            imports |= {f"{node.module}.{alias.name}" for alias in node.names}
+        if isinstance(node, ast.Module | ast.ClassDef | ast.FunctionDef | ast.AsyncFunctionDef):
+            first = node.body[0] if node.body else None
+            if (
+                isinstance(first, ast.Expr)
+                and isinstance(first.value, ast.Constant)
+                and isinstance(first.value.value, str)
+            ):
+                node.body = node.body[1:] or [ast.Pass()]
+    return hashlib.sha256(ast.dump(tree).encode()).hexdigest()[:16], sorted(imports)

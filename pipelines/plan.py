@@ -1,0 +1,256 @@
+"""Config to keys to steps: what a scene runs, what is fresh, and what it leaves out and why."""
+
+from __future__ import annotations
+
+import difflib
+import hashlib
+import json
+import os
+import re
+import subprocess
+import tomllib
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+from chebsplat.errors import ConfigError, InputError
+from chebsplat.pipelines import store
+from chebsplat.pipelines.code import Code, installed
+from chebsplat.stages.registry import STAGES
+
+CONFIGS = Path(__file__).parent / "configs"
+
+
+@dataclass
+class Step:
+    """One stage to run: its command's arguments are all here."""
+
+    stage: str
+    key: str
+    path: Path
+    inputs: dict[str, Path]
+    sections: dict[str, Any]  # what the stage reads of the config
+    code: dict[str, Any]
+
+    @property
+    def fresh(self) -> bool:
+        return store.is_fresh(self.path)
+
+
+@dataclass
+class Plan:
+    """Steps in order, with what is left out and why. `title` names the links: scene[@ablation]."""
+
+    title: str
+    source: str
+    steps: list[Step]
+    left_out: dict[str, str] = field(default_factory=dict)
+
+    @property
+    def targets(self) -> dict[str, Path]:
+        return {step.stage: step.path for step in self.steps}
+
+
+def names(kind: str) -> list[str]:
+    return sorted(path.stem for path in (CONFIGS / kind).glob("*.toml"))
+
+
+def read_toml(kind: str, name: str) -> dict[str, Any]:
+    """A config of ours. Raises ConfigError with the nearest names."""
+    path = CONFIGS / kind / f"{name}.toml"
+    if not path.is_file():
+        near = difflib.get_close_matches(name, names(kind), 3) or names(kind)
+        raise ConfigError(f"no {kind[:-1]} is called {name}; did you mean {', '.join(near)}?")
+    return tomllib.loads(path.read_text())
+
+
+def scene_values(scene: str) -> tuple[str, dict[str, Any]]:
+    """(name, config values) of a named scene, or of a folder of photos, a COLMAP model or a transforms.json."""
+    folder = Path(scene).expanduser()
+    if "/" in scene or scene in (".", ".."):
+        if not folder.is_dir():
+            raise InputError(f"{folder} is not a folder; correct scene=")
+        from chebsplat.stages.sources.common import detect
+
+        name = re.sub(r"[^\w.-]+", "-", folder.resolve().name)
+        return name, {"scene": {"name": name}, "source": {"kind": detect(folder), "path": str(folder.resolve())}}
+    values = read_toml("scenes", scene)
+    values.setdefault("scene", {})["name"] = scene
+    if path := values.get("source", {}).get("path"):
+        values["source"]["path"] = str(Path(expanded(path)).resolve())
+    return scene, values
+
+
+def expanded(text: str) -> str:
+    """`${NAME:-default}` by the environment."""
+    return re.sub(r"\$\{(\w+):-([^}]*)\}", lambda m: os.environ.get(m[1]) or m[2], text)
+
+
+def merged(base: dict[str, Any], over: dict[str, Any]) -> dict[str, Any]:
+    return base | {s: base.get(s, {}) | v if isinstance(v, dict) else v for s, v in over.items()}
+
+
+def overrides(text: str) -> dict[str, Any]:
+    """`a.b=c,d.e=f` as nested values. Raises ConfigError on anything else."""
+    values: dict[str, Any] = {}
+    for item in filter(None, re.split(r",(?=[\w.]+=)", text)):
+        key, _, value = item.partition("=")
+        parts = key.strip().split(".")
+        if len(parts) != 2 or not value:
+            raise ConfigError(f"set={item}: section.key=value is needed, such as train.steps=500")
+        try:
+            parsed = tomllib.loads(f"v = {value}")["v"]
+        except tomllib.TOMLDecodeError:
+            parsed = {"on": True, "off": False}.get(value, value)
+        if parts[0] == "train" and parts[1] in ("encoder", "densify") and value == "off":
+            parsed = "off"
+        values.setdefault(parts[0], {})[parts[1]] = parsed
+    return values
+
+
+class Planner:
+    """Plans scenes; remembers hashes of code and raw files between runs."""
+
+    def __init__(self, folders: dict[str, Path] | None = None):
+        self.code_memo, self.file_memo = store.Memo("code"), store.Memo("files")
+        self.code = Code(folders or installed(), self.code_memo.values)
+
+    def save(self) -> None:
+        self.code_memo.save()
+        self.file_memo.save()
+
+    def plan(
+        self,
+        scene: str,
+        settings: str = "",
+        ablation: str = "",
+        basis: Path | None = None,
+        keep_knowledge: bool = False,
+    ) -> Plan:
+        """The steps of one scene.
+
+        Args: settings: `set=`; basis: an earlier scene's basis to train on; keep_knowledge: end with a cks step.
+        Raises: ConfigError, InputError.
+        """
+        from chebsplat.stages import config as configs
+        from chebsplat.stages import ingest
+
+        name, values = scene_values(scene)
+        title = name
+        if ablation:
+            values = merged(values, read_toml("ablations", ablation))
+            title += f"@{ablation}"
+        if settings:
+            values = merged(values, overrides(settings))
+            title += ("+" if ablation else "@") + re.sub(r"[^\w.=+-]+", "_", settings)[:80]
+        config = configs.build(values, f"scene {scene}")
+        source = ingest.resolve(name, config.source)
+        probe, files = self._probe(source)
+        kind, why = teacher_kind(config, probe)
+        teacher = config.teacher.model_copy(update={"kind": kind})
+        config = config.model_copy(update={"source": source, "teacher": teacher})
+        left_out = left_out_stages(config, kind, why, probe, basis is not None or keep_knowledge)
+        steps: dict[str, Step] = {}
+        extra = {
+            "ingest": {"raw": store.content_hash(files, self.file_memo.values)},
+            "teacher": {"raw": self._hash_named(teacher.model, teacher.labels)} if kind == "onnx" else {},
+        }
+        for stage in STAGES.values():
+            if stage.name in left_out or (stage.name == "cks" and not keep_knowledge):
+                continue
+            inputs = {role: steps[of].path for role, of in stage.roles.items() if of in steps}
+            if basis is not None and "basis" in stage.roles and stage.name in ("train", "cks"):
+                inputs["basis"] = basis
+            sections = config.sections(stage.sections)
+            code = self.code.stage(stage.name)
+            identity = {
+                "stage": stage.name,
+                "schema": stage.schema,
+                "config": sections,
+                "inputs": {role: path.name for role, path in inputs.items()},
+                "code": code,
+                **extra.get(stage.name, {}),
+            }
+            key = _digest(identity)
+            steps[stage.name] = Step(stage.name, key, store.artifact_path(stage.name, key), inputs, sections, code)
+        return Plan(title, source_sentence(name, config.source, source), list(steps.values()), left_out)
+
+    def _probe(self, source: Any) -> tuple[dict[str, bool], list[Path]]:
+        """What the source has, and the raw files its capture depends on."""
+        if source.kind == "generated":
+            return {"poses": True, "depth": True, "labels": True}, []
+        from importlib import import_module
+
+        folder = Path(source.path)
+        if not folder.is_dir():
+            raise InputError(f"{folder} is not a folder; correct source.path")
+        module = import_module(f"chebsplat.stages.sources.{source.kind}")
+        return module.probe(folder), module.files(folder)
+
+    def _hash_named(self, *paths: str | None) -> str:
+        files = [Path(path) for path in paths if path]
+        for file in files:
+            if not file.is_file():
+                raise InputError(f"{file} is missing; correct teacher.model or teacher.labels")
+        return store.content_hash(files, self.file_memo.values)
+
+
+def teacher_kind(config: Any, probe: dict[str, bool]) -> tuple[str, str]:
+    """The teacher really meant, and why there is none if there is none."""
+    wanted = config.teacher.kind
+    if not config.train.semantics:
+        return "none", "train.semantics is false"
+    if wanted == "none":
+        return "none", "teacher.kind is none"
+    if wanted == "labels" and not probe["labels"]:
+        raise ConfigError(
+            "teacher.kind is labels, but the source has none; give teacher.model or use teacher.kind=auto"
+        )
+    if wanted == "auto":
+        wanted = "onnx" if config.teacher.model else "labels" if probe["labels"] else "none"
+    return wanted, "the source has no labels and teacher.model names no encoder: rendering only"
+
+
+def left_out_stages(config: Any, kind: str, why: str, probe: dict[str, bool], knowledge: bool) -> dict[str, str]:
+    """Stages that this scene does not need, and why."""
+    left_out = {}
+    if kind == "none":
+        left_out |= {"teacher": why, "describe": f"no semantics to describe shape for ({why})"}
+        left_out |= {"onnx": f"no encoder is trained ({why})"}
+    elif config.train.encoder == "off":
+        left_out |= {"describe": "train.encoder is off", "onnx": "train.encoder is off"}
+    elif not config.train.albo:
+        left_out |= {"describe": "train.albo is false: tokens hold no descriptor"}
+    if not knowledge or "onnx" in left_out:
+        left_out["cks"] = "no sequence is named" if not knowledge else left_out["onnx"]
+    if probe["poses"] and probe["depth"]:
+        left_out["sfm: matching"] = "poses and depth are given"
+    elif probe["poses"]:
+        left_out["sfm: pose estimation"] = "poses are given"
+    return left_out
+
+
+def source_sentence(name: str, asked: Any, source: Any) -> str:
+    """Which of the possible sources it is, for the console."""
+    if source.kind != "generated":
+        return f"{source.kind} source at {source.path}"
+    note = ""
+    if asked.kind == "named":
+        note = " (REPLICA_ROOT has no such scene)" if os.environ.get("REPLICA_ROOT") else " (REPLICA_ROOT is not set)"
+    return f"generated scene {name}: preset {source.preset}, seed {source.seed}{note}"
+
+
+def git_state(root: Path) -> dict[str, Any]:
+    """{"commit", "dirty"} of the checkout; empty outside one."""
+    try:
+        run = {"cwd": root, "capture_output": True, "text": True, "check": True}
+        commit = subprocess.run(["git", "rev-parse", "HEAD"], **run).stdout.strip()  # type: ignore[call-overload]
+        status = subprocess.run(["git", "status", "--porcelain"], **run).stdout.strip()  # type: ignore[call-overload]
+    except (OSError, subprocess.CalledProcessError):
+        return {}
+    return {"commit": commit, "dirty": bool(status)}
+
+
+def _digest(identity: dict[str, Any]) -> str:
+    text = json.dumps(identity, sort_keys=True, separators=(",", ":"), allow_nan=False)
+    return hashlib.sha256(text.encode()).hexdigest()[:16]
