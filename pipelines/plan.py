@@ -166,7 +166,7 @@ class Planner:
             identity = {
                 "stage": stage.name,
                 "schema": stage.schema,
-                "config": sections,
+                "config": placeless(sections),
                 "inputs": {role: path.name for role, path in inputs.items()},
                 "code": code,
                 **extra.get(stage.name, {}),
@@ -238,6 +238,16 @@ def source_sentence(name: str, asked: Any, source: Any) -> str:
     if asked.kind == "named":
         note = " (REPLICA_ROOT has no such scene)" if os.environ.get("REPLICA_ROOT") else " (REPLICA_ROOT is not set)"
     return f"generated scene {name}: preset {source.preset}, seed {source.seed}{note}"
+
+
+def placeless(sections: dict[str, Any]) -> dict[str, Any]:
+    """Sections without the folders that hold the raw files: their content is hashed, where they lie is no matter."""
+    kept = {name: dict(section) for name, section in sections.items()}
+    for section, keys in (("source", ("path",)), ("teacher", ("model", "labels"))):
+        for key in keys:
+            if kept.get(section, {}).get(key):
+                kept[section][key] = Path(kept[section][key]).name
+    return kept
 
 
 def git_state(root: Path) -> dict[str, Any]:

@@ -28,7 +28,6 @@ class SourceSection(_Section):
     path: str | None = None
     seed: int = 0  # of a generated scene
     preset: Literal["office", "room", "toy"] = "office"
-    class_names: tuple[str, ...] | None = None  # overrides the source's own
 
 
 class IngestSection(_Section):

@@ -40,8 +40,8 @@ def read(name: str, source: SourceSection, settings: IngestSection) -> dict[str,
     folder = Path(str(source.path)).expanduser()
     if not folder.is_dir():
         raise InputError(f"{folder} is not a folder; correct source.path")
-    module = {"colmap": colmap, "transforms": transforms, "photos": photos, "replica": replica}[source.kind]
-    return module.read(folder, settings)
+    modules = {"colmap": colmap, "transforms": transforms, "photos": photos, "replica": replica}
+    return modules[source.kind].read(folder, settings)
 
 
 def run(job: Job) -> None:
@@ -52,8 +52,10 @@ def run(job: Job) -> None:
     name, settings = job.config.scene.name, job.config.ingest
     source = resolve(name, job.config.source)
     fields = read(name, source, settings)
+    fields["source"] = {"name": name} | fields["source"]
     n_views = len(fields["names"])
-    fields.setdefault("is_test", np.arange(n_views) % settings.test_every == settings.test_offset)
+    offset = settings.test_offset % settings.test_every
+    fields.setdefault("is_test", np.arange(n_views) % settings.test_every == offset)
     protocol = {"name": settings.protocol, "test_every": settings.test_every, "test_offset": settings.test_offset}
     optional: dict[str, Any] = {"depth": None, "labels": None, "loss_mask": None, "class_names": None}
     capture = Capture(**(optional | fields), protocol=protocol)
