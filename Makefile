@@ -34,10 +34,10 @@ $(READY): requirements.lock pyproject.toml pipelines/setup.sh
 	@touch $@
 
 test: $(READY)  ## the tests, in parallel, without the slow ones
-	@$(PY) -m pytest -q -n auto -m "not slow and not gpu" $(args)
+	@$(PY) -m pytest -q -n auto --dist loadgroup -m "not slow and not gpu" $(args)
 
 test-all: $(READY)  ## all tests, the slow ones too
-	@$(PY) -m pytest -q -n auto -m "not gpu" $(args)
+	@$(PY) -m pytest -q -n auto --dist loadgroup -m "not gpu" $(args)
 
 lint: $(READY)  ## ruff (lint, format)
 	@$(PY) -m ruff check . && $(PY) -m ruff format --check .

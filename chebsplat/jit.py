@@ -21,6 +21,8 @@ def _cache_folder() -> Path:
 
 # Must precede numba's import; a folder that the user has chosen is left alone.
 FOLDER = Path(os.environ.setdefault("NUMBA_CACHE_DIR", str(_cache_folder())))
+# open3d brings a TBB that numba refuses with a warning: OpenMP comes first.
+os.environ.setdefault("NUMBA_THREADING_LAYER_PRIORITY", "omp workqueue tbb")
 if not FOLDER.exists():
     log.info("compiling kernels, about 20 s, once")
 

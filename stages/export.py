@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from typing import Any
 
+from chebsplat.errors import DataFailure
 from chebsplat.stages.command import Job, command
 
 
@@ -16,6 +17,8 @@ def run(job: Job) -> None:
     from chebsplat.noisy_teacher import decode
 
     gaussians = read_gaussians(job.inputs["gaussians"])
+    if len(gaussians.parameters["means"]) == 0:
+        raise DataFailure("the checkpoint holds no Gaussians; train the scene again with milder pruning")
     order = np.argsort(gaussians.parameters["degrees"], kind="stable")
     wanted = ("means", "log_scales", "quats", "logit_opacities", "sh0", "shN", "degrees")
     parameters = {name: gaussians.parameters[name][order] for name in wanted}

@@ -5,6 +5,7 @@ from __future__ import annotations
 import csv
 from typing import TYPE_CHECKING, Any
 
+from chebsplat.errors import DataFailure
 from chebsplat.stages.command import Job, command
 
 if TYPE_CHECKING:
@@ -36,6 +37,8 @@ def run(job: Job) -> None:
 
     evaluation = read_evaluation(job.inputs["evaluation"])
     gaussians = read_gaussians(job.inputs["gaussians"])
+    if not gaussians.trace:
+        raise DataFailure("the training left no trace of error against run time; train the scene again")
     manifests = {role: read_manifest(job.inputs[role]) for role in STAGE_OF if role in job.inputs}
     figures = evaluation.figures
     left_out = dict(figures["left_out"])

@@ -1,0 +1,52 @@
+"""What tests share: the toy scene's settings, how stages feed one another, third-party data."""
+
+import json
+import os
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).parents[1]
+DATA = Path(os.environ.get("CHEBSPLAT_TEST_DATA", ROOT / "../shared/data"))
+
+TOY = {
+    "scene": {"name": "toy"},
+    "source": {"kind": "generated", "preset": "toy", "seed": 1},
+    "sfm": {"max_points": 300},
+    "describe": {"n_regions": 24, "region_size": 8},
+    "train": {"steps": 24, "max_gaussians": 500, "n_densify": 2, "report_every": 8, "refresh_every": 8},
+}
+INPUTS = {
+    "ingest": {},
+    "sfm": {"capture": "ingest"},
+    "teacher": {"capture": "ingest"},
+    "describe": {"points": "sfm"},
+    "train": {"capture": "ingest", "points": "sfm", "features": "teacher", "descriptors": "describe"},
+    "export": {"gaussians": "train", "features": "teacher"},
+    "onnx": {"gaussians": "train"},
+    "cks": {"gaussians": "train"},
+    "evaluate": {"capture": "ingest", "scene": "export", "features": "teacher"},
+    "report": {"evaluation": "evaluate", "gaussians": "train", "scene": "export", "encoder": "onnx"},
+}
+
+
+def data(name):
+    """A folder of third-party data, or a skip that names it."""
+    if not (DATA / name).is_dir():
+        pytest.skip(f"{name}: no such folder (CHEBSPLAT_TEST_DATA)")
+    return DATA / name
+
+
+def run_stage(stage, out, inputs=None, config=None):
+    """Run a stage's own command; returns its exit code."""
+    from importlib import import_module
+
+    out.parent.mkdir(parents=True, exist_ok=True)
+    file = out.parent / f"{out.name}.json"
+    file.write_text(json.dumps(TOY if config is None else config))
+    arguments = ["--config", str(file), "--out", str(out), "--device", "cpu"]
+    for role, path in (inputs or {}).items():
+        arguments += [f"--in-{role}", str(path)]
+    with pytest.raises(SystemExit) as stop:
+        import_module(f"chebsplat.stages.{stage}").main(arguments, prog_name=stage)
+    return stop.value.code

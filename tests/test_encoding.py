@@ -1,0 +1,156 @@
+"""Regions cover their points, the encoder ignores padding and order, and fusion keeps what nothing covers."""
+
+import numpy as np
+import pytest
+import torch
+
+from chebsplat.codes import VOCABULARY, class_codes
+from chebsplat.encoder import RegionEncoder
+from chebsplat.fusion import Gate, propagate, propagation_weights
+from chebsplat.gaussians import activated, covariances, initial_gaussians, local_shape
+from chebsplat.noisy_teacher import confusable, confuse_segments, decode, noisy_features, reduced
+from chebsplat.regions import build_regions, covering
+
+
+def cloud(n=600, seed=0):
+    return np.random.default_rng(seed).normal(size=(n, 3))
+
+
+def test_regions_cover_every_point_and_hold_their_centre():
+    points = cloud()
+    regions = build_regions(points, 40, 16)
+    assert (covering(points, points[regions.centers], regions.radius, 3)[:, 0] >= 0).all()
+    assert np.array_equal(regions.members[:, 0], regions.centers)
+    for row in regions.members:
+        kept = row[row >= 0]
+        assert len(set(kept)) == len(kept)
+        assert (np.linalg.norm(points[kept] - points[row[0]], axis=1) <= regions.radius * 1.001).all()
+
+
+@pytest.mark.parametrize("n", [0, 1, 2, 5])
+def test_few_points_make_few_regions(n):
+    regions = build_regions(cloud(n), 40, 16)
+    assert len(regions.centers) == n
+    assert (regions.members < max(n, 1)).all()
+
+
+def test_coincident_points_make_a_region():
+    regions = build_regions(np.zeros((30, 3)), 4, 8)
+    assert regions.radius > 0
+    assert len(regions.centers) >= 1
+
+
+def test_non_finite_points_are_refused():
+    with pytest.raises(ValueError, match="finite"):
+        build_regions(np.full((3, 3), np.nan), 2, 2)
+
+
+@pytest.mark.parametrize("n_layers", [0, 2])
+def test_encoding_ignores_padding_and_order(n_layers):
+    torch.manual_seed(0)
+    encoder = RegionEncoder(7, 5, n_layers=n_layers).eval()
+    inputs, positions = torch.randn(3, 6, 7), torch.rand(3, 6, 3)
+    plain = encoder(inputs, positions, torch.ones(3, 6, dtype=torch.bool))
+    padded = torch.nn.functional.pad
+    mask = torch.arange(10).expand(3, 10) < 6
+    more = encoder(padded(inputs, (0, 0, 0, 4), value=3.0), padded(positions, (0, 0, 0, 4), value=9.0), mask)
+    assert torch.allclose(plain, more, atol=1e-5)
+    order = torch.randperm(6)
+    assert torch.allclose(plain, encoder(inputs[:, order], positions[:, order], mask[:, :6]), atol=1e-5)
+
+
+@pytest.mark.parametrize("n_layers", [0, 1])
+def test_an_empty_region_encodes_to_something_finite(n_layers):
+    encoder = RegionEncoder(0, 4, n_layers=n_layers)
+    found = encoder(torch.zeros(1, 3, 0), torch.zeros(1, 3, 3), torch.zeros(1, 3, dtype=torch.bool))
+    assert torch.isfinite(found).all()
+
+
+def test_heads_must_divide_the_width():
+    with pytest.raises(ValueError, match="multiple"):
+        RegionEncoder(3, 4, width=30, n_heads=4)
+
+
+def propagation(means, centers, scale=0.1, cover=None, radius=1.0):
+    n, m = len(means), len(centers)
+    cover = torch.arange(m).expand(n, m) if cover is None else cover
+    return propagation_weights(means, cover, centers, torch.eye(3).expand(m, 3, 3), torch.full((m, 3), scale), radius)
+
+
+def test_propagation_weights_sum_to_one_even_for_needles():
+    means, centers = torch.rand(20, 3), torch.rand(4, 3)
+    for scale in (0.0, 1e-12, 1.0, 1e12):
+        weights = propagation(means, centers, scale)
+        assert torch.allclose(weights.sum(1), torch.ones(20))
+
+
+def test_the_nearer_region_weighs_more_and_an_uncovered_point_gets_nothing():
+    centers = torch.tensor([[0.0, 0, 0], [1.0, 0, 0]])
+    weights = propagation(torch.tensor([[0.1, 0, 0]]), centers)
+    assert weights[0, 0] > weights[0, 1]
+    bare = propagation(torch.zeros(1, 3), centers, cover=torch.tensor([[-1, -1]]))
+    assert (bare == 0).all()
+    assert (propagate(torch.ones(2, 5), torch.tensor([[-1, -1]]), bare) == 0).all()
+
+
+def test_the_gate_mixes_within_bounds_and_keeps_uncovered_features():
+    gate = Gate(3)
+    features, shape = torch.zeros(2, 3), torch.ones(2, 3)
+    fused, weight = gate(features, shape, torch.tensor([True, False]))
+    assert ((fused[0] > 0) & (fused[0] < 1)).all()
+    assert torch.equal(fused[1], features[1])
+    assert (weight[1] == 1).all()
+
+
+def test_initial_gaussians_reproduce_the_covariances_of_their_points():
+    points = cloud() * (1.0, 1.0, 0.02)
+    shapes, normals = local_shape(points, 16)
+    raw = initial_gaussians(points, np.zeros((600, 3), np.uint8), shapes)
+    _, quats, scales, _ = activated(raw)
+    assert np.allclose(covariances(quats, scales).numpy(), shapes, atol=1e-5 * np.abs(shapes).max())
+    assert np.median(np.abs(normals[:, 2])) > 0.8
+    assert torch.isfinite(raw["log_scales"]).all()
+
+
+def test_coincident_points_have_a_size():
+    shapes, _ = local_shape(np.zeros((20, 3)), 8)
+    assert (np.linalg.eigvalsh(shapes) > 0).all()
+
+
+def test_code_vectors_are_a_function_of_the_name_and_lie_apart():
+    codes = class_codes(list(VOCABULARY), 13)
+    gram = codes @ codes.T - 2 * np.eye(len(codes))
+    assert gram.max() < 0.35
+    assert np.array_equal(class_codes(["sofa", "Tableware"], 13)[0], codes[VOCABULARY.index("sofa")])
+    assert np.array_equal(class_codes(["Tableware"], 13), class_codes(["x", "Tableware"], 13)[1:])
+
+
+def test_reduced_labels_are_the_commonest():
+    labels = np.array([[0, 0, 1], [0, 2, 1], [5, 5, 5]])
+    assert reduced(labels, 2).tolist() == [[0, 1], [5, 5]]
+
+
+def test_confusion_rate_is_p_by_segment_and_keeps_ignored_pixels():
+    labels = np.indices((60, 60)).sum(0) % 2  # every pixel is its own 4-connected segment
+    labels[0] = -1
+    p = confusable(np.array([[0.1, 0.1, 0.1], [0.2, 0.2, 0.2], [0.9, 0, 0]]))
+    found = confuse_segments(labels, p, 0.3, np.random.default_rng(0))
+    assert abs((found[1:] != labels[1:]).mean() - 0.3) < 0.03
+    assert (found[0] == -1).all()
+    assert (found == 2).sum() < (found != labels).sum() * 0.05
+    assert np.array_equal(confuse_segments(labels, p, 0.0, np.random.default_rng(0)), labels)
+
+
+def test_a_class_that_does_not_occur_is_never_taken():
+    colors = np.array([[0.1, 0.1, 0.1], [np.nan] * 3, [0.2, 0.2, 0.2]])
+    assert (confusable(colors)[:, 1] == 0).all()
+    assert confusable(colors[:1]).tolist() == [[0.0]]
+
+
+def test_noise_free_features_decode_to_their_labels():
+    codes = class_codes(["wall", "floor", "sofa"], 13)
+    labels = np.random.default_rng(0).integers(0, 3, (8, 9))
+    features = noisy_features(labels, codes, 0.0, 0.0, np.random.default_rng(0))
+    found, confidence = decode(features, codes)
+    assert np.array_equal(found, labels)
+    assert (confidence > 0.9).all()

@@ -1,0 +1,276 @@
+"""Every stage does its job on a toy scene and fails with the documented exit code."""
+
+import copy
+import json
+import shutil
+
+import numpy as np
+import pytest
+from shared import INPUTS, TOY, run_stage
+
+from chebsplat.formats import artifact
+from chebsplat.formats.artifact import Manifest
+from chebsplat.formats.capture import read_capture, write_capture
+from chebsplat.formats.evaluation import read_evaluation
+from chebsplat.formats.gaussians import read_gaussians, write_gaussians
+from chebsplat.formats.points import read_points, write_points
+from chebsplat.formats.scene import read_scene
+from chebsplat.stages.registry import STAGES
+
+pytestmark = pytest.mark.xdist_group("toy")
+
+
+def changed(**sections):
+    config = copy.deepcopy(TOY)
+    for section, values in sections.items():
+        config.setdefault(section, {}).update(values)
+    return config
+
+
+def inputs_of(toy, stage):
+    return {role: toy[of] for role, of in INPUTS[stage].items()}
+
+
+def published(path, schema, write, record, *arguments):
+    with artifact.publish(path, Manifest(schema, "k", "test")) as tmp:
+        write(tmp, record, *arguments)
+    return path
+
+
+@pytest.mark.parametrize("stage", STAGES)
+def test_a_finished_artifact_is_whole_and_a_second_call_does_nothing(toy, stage, capsys):
+    manifest = artifact.verify(toy[stage], STAGES[stage].schema)
+    assert manifest.seconds > 0
+    assert (toy[stage] / "log.jsonl").is_file()
+    before = (toy[stage] / "artifact.json").stat().st_mtime_ns
+    capsys.readouterr()
+    assert run_stage(stage, toy[stage], inputs_of(toy, stage)) == 0
+    assert (toy[stage] / "artifact.json").stat().st_mtime_ns == before
+    assert capsys.readouterr().out == f"{toy[stage]}\n"
+
+
+@pytest.mark.parametrize("stage", STAGES)
+def test_a_misspelt_setting_is_exit_2(toy, stage, tmp_path, capsys):
+    section = STAGES[stage].sections[-1]
+    code = run_stage(stage, tmp_path / "out", inputs_of(toy, stage), {section: {"tets_every": 3}})
+    assert code == 2
+    assert f"{section}.tets_every" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("stage", [stage for stage in STAGES if INPUTS[stage]])
+@pytest.mark.parametrize("damage", ["missing", "manifest", "schema", "truncated"])
+def test_a_missing_or_damaged_input_is_exit_3(toy, stage, damage, tmp_path, capsys):
+    inputs = inputs_of(toy, stage)
+    role = next(iter(inputs))
+    copied = tmp_path / "input"
+    shutil.copytree(inputs[role], copied)
+    inputs[role] = copied
+    if damage == "missing":
+        shutil.rmtree(copied)
+    elif damage == "manifest":
+        (copied / "artifact.json").write_text("{")
+    elif damage == "schema":
+        document = json.loads((copied / "artifact.json").read_text())
+        (copied / "artifact.json").write_text(json.dumps(document | {"schema": "chebsplat.other/9"}))
+    else:
+        largest = max((p for p in copied.rglob("*") if p.is_file()), key=lambda p: p.stat().st_size)
+        largest.write_bytes(largest.read_bytes()[:-1])
+    assert run_stage(stage, tmp_path / "out", inputs) == 3
+    assert str(copied) in capsys.readouterr().err
+    assert not (tmp_path / "out").exists()
+
+
+def test_ingest_of_a_folder_that_is_not_there_is_exit_3(tmp_path, capsys):
+    config = {"source": {"kind": "photos", "path": str(tmp_path / "nowhere")}}
+    assert run_stage("ingest", tmp_path / "out", config=config) == 3
+    assert "nowhere" in capsys.readouterr().err
+
+
+def test_scannet_is_not_there_yet_and_says_so(tmp_path, capsys):
+    assert run_stage("ingest", tmp_path / "out", config={"source": {"kind": "scannet", "path": "."}}) == 2
+    assert "not yet" in capsys.readouterr().err
+
+
+def one_photo(toy, tmp):
+    from PIL import Image
+
+    (tmp / "photos").mkdir()
+    Image.new("RGB", (32, 24)).save(tmp / "photos/a.jpg")
+    return {}, {"source": {"kind": "photos", "path": str(tmp / "photos")}}
+
+
+def without_depth(toy, tmp):
+    record = read_capture(toy["ingest"])
+    record.depth = np.full(record.depth.shape, np.nan, np.float32)
+    return {"capture": published(tmp / "c", "chebsplat.capture/1", write_capture, record)}, TOY
+
+
+def without_labels(toy, tmp):
+    record = read_capture(toy["ingest"])
+    record.labels = None
+    path = published(tmp / "c", "chebsplat.capture/1", write_capture, record)
+    return {"capture": path}, changed(teacher={"kind": "labels"})
+
+
+def without_points(toy, tmp):
+    record = read_points(toy["sfm"])
+    for name in ("means", "colors", "normals", "covariances"):
+        setattr(record, name, getattr(record, name)[:0])
+    return {"points": published(tmp / "p", "chebsplat.points/1", write_points, record)}, TOY
+
+
+def only_test_views(toy, tmp):
+    record = read_capture(toy["ingest"])
+    record.is_test[:] = True
+    path = published(tmp / "c", "chebsplat.capture/1", write_capture, record)
+    return inputs_of(toy, "train") | {"capture": path}, TOY
+
+
+def without_gaussians(toy, tmp):
+    record = read_gaussians(toy["train"])
+    record.parameters = {name: values[:0] for name, values in record.parameters.items()}
+    return {"gaussians": published(tmp / "g", "chebsplat.gaussians/1", write_gaussians, record)}, TOY
+
+
+def strict_tolerance(toy, tmp):
+    return inputs_of(toy, "onnx"), changed(onnx={"tolerance": 1e-30})
+
+
+def encoder_without_projections(toy, tmp):
+    inputs = {role: toy[of] for role, of in INPUTS["train"].items()}
+    config = changed(train={"encoder": "mlp", "steps": 8})
+    assert run_stage("train", tmp / "mlp", inputs, config) == 0
+    return {"gaussians": tmp / "mlp"}, TOY
+
+
+def no_test_view(toy, tmp):
+    record = read_capture(toy["ingest"])
+    record.is_test[:] = False
+    path = published(tmp / "c", "chebsplat.capture/1", write_capture, record)
+    return inputs_of(toy, "evaluate") | {"capture": path}, TOY
+
+
+def without_trace(toy, tmp):
+    record = read_gaussians(toy["train"])
+    record.trace = []
+    path = published(tmp / "g", "chebsplat.gaussians/1", write_gaussians, record)
+    return inputs_of(toy, "report") | {"gaussians": path}, TOY
+
+
+FAILURES = {
+    "ingest": one_photo,
+    "sfm": without_depth,
+    "teacher": without_labels,
+    "describe": without_points,
+    "train": only_test_views,
+    "export": without_gaussians,
+    "onnx": strict_tolerance,
+    "cks": encoder_without_projections,
+    "evaluate": no_test_view,
+    "report": without_trace,
+}
+
+
+@pytest.mark.parametrize("stage", STAGES)
+def test_data_that_cannot_be_worked_with_is_exit_4(toy, stage, tmp_path):
+    inputs, config = FAILURES[stage](toy, tmp_path)
+    assert run_stage(stage, tmp_path / "out", inputs, config) == 4
+    assert not (tmp_path / "out").exists()
+
+
+def test_onnx_equals_torch_for_several_counts_and_sizes(toy):
+    import onnxruntime
+    import torch
+
+    from chebsplat.encoder import RegionEncoder
+
+    encoder = RegionEncoder.restored(*read_gaussians(toy["train"]).encoder())
+    session = onnxruntime.InferenceSession(str(toy["onnx"] / "encoder.onnx"))
+    for n_regions, n_members in [(1, 1), (2, 3), (7, 16), (31, 33), (64, 64)]:
+        generator = torch.Generator().manual_seed(n_regions)
+        inputs = torch.randn(n_regions, n_members, encoder.n_inputs, generator=generator)
+        positions = torch.rand(n_regions, n_members, 3, generator=generator) * 2 - 1
+        mask = torch.rand(n_regions, n_members, generator=generator) < 0.7
+        feed = {"inputs": inputs.numpy(), "positions": positions.numpy(), "mask": mask.numpy()}
+        with torch.no_grad():
+            expected = encoder(inputs, positions, mask)
+        found = torch.from_numpy(session.run(None, feed)[0])
+        assert (found - expected).abs().max() < 1e-5
+
+
+def test_the_report_is_one_page_with_pictures_curve_and_what_was_left_out(toy):
+    text = (toy["report"] / "report.html").read_text()
+    assert "<svg" in text
+    assert text.count("data:image/png;base64") >= 4
+    assert "http://" not in text.replace("http://www.w3.org", "").replace("http://purl.org", "").replace("http://creativecommons.org", "")  # fmt: skip  # noqa: E501
+    assert "no sequence is named" in text
+    assert "LPIPS" in text
+    assert (toy["report"] / "figures.csv").read_text().startswith("figure,")
+
+
+def test_rendering_only_scenes_leave_the_semantic_branch_out(toy, tmp_path):
+    def made(stage, inputs):
+        assert run_stage(stage, tmp_path / stage, inputs) == 0
+        return tmp_path / stage
+
+    gaussians = made("train", {"capture": toy["ingest"], "points": toy["sfm"]})
+    exported = made("export", {"gaussians": gaussians})
+    evaluation = made("evaluate", {"capture": toy["ingest"], "scene": exported})
+    page = made("report", {"evaluation": evaluation, "gaussians": gaussians}) / "report.html"
+    assert "features" not in read_gaussians(gaussians).parameters
+    assert "segmentation" not in read_evaluation(evaluation).figures
+    assert "semantic branch" in page.read_text()
+
+
+def test_training_is_reproducible_for_a_seed(toy, tmp_path):
+    inputs = {role: toy[of] for role, of in INPUTS["train"].items()}
+    assert run_stage("train", tmp_path / "again", inputs) == 0
+    first, again = read_gaussians(toy["train"]).parameters, read_gaussians(tmp_path / "again").parameters
+    assert all(np.array_equal(first[name], again[name]) for name in first)
+
+
+def test_a_second_scene_starts_from_the_basis_of_the_first(toy, tmp_path):
+    from chebsplat.formats.basis import read_basis
+
+    inputs = {role: toy[of] for role, of in INPUTS["train"].items()} | {"basis": toy["cks"]}
+    assert run_stage("train", tmp_path / "second", inputs) == 0
+    assert artifact.read_manifest(tmp_path / "second").facts["warm_started"] > 0
+    assert run_stage("cks", tmp_path / "basis", {"gaussians": tmp_path / "second", "basis": toy["cks"]}) == 0
+    assert read_basis(tmp_path / "basis").revision == 2
+
+
+def test_an_onnx_teacher_gives_features_of_its_own_channels(toy, tmp_path):
+    import warnings
+
+    import torch
+
+    model, path = torch.nn.Conv2d(3, 6, 4, stride=4).eval(), tmp_path / "teacher.onnx"
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # the exporter warns about its own internals
+        torch.onnx.export(model, (torch.zeros(1, 3, 72, 96),), path, dynamo=True, external_data=False, verbose=False)
+    np.savez(tmp_path / "labels.npz", names=np.array(["wall", "floor"]), embeddings=np.eye(2, 6, dtype=np.float32))
+    config = changed(teacher={"kind": "onnx", "model": str(path), "labels": str(tmp_path / "labels.npz")})
+    assert run_stage("teacher", tmp_path / "out", {"capture": toy["ingest"]}, config) == 0
+    from chebsplat.formats.features import read_features
+
+    features = read_features(tmp_path / "out")
+    assert features.features.shape == (16, 18, 24, 6)
+    (tmp_path / "labels.npz").unlink()
+    assert run_stage("teacher", tmp_path / "other", {"capture": toy["ingest"]}, config) == 3
+
+
+def test_the_exported_scene_renders_like_the_checkpoint(toy):
+    from chebsplat.model import View
+    from chebsplat.render import SceneRenderer
+
+    scene = read_scene(toy["export"])
+    import torch
+
+    cameras = scene.cameras
+    view = View(torch.from_numpy(cameras.Ks[0]).float(), torch.from_numpy(cameras.cam_from_world[0]).float(), cameras.width, cameras.height)  # fmt: skip  # noqa: E501
+    parameters = read_gaussians(toy["train"]).parameters
+    order = np.argsort(parameters["degrees"], kind="stable")
+    direct = {name: values[order] for name, values in parameters.items() if name not in ("features", "fused")}
+    a, _ = SceneRenderer(scene.parameters).render(view)
+    b, _ = SceneRenderer(direct).render(view)
+    assert np.array_equal(a, b)
