@@ -144,7 +144,8 @@ class Planner:
             values = merged(values, overrides(settings))
             title += ("+" if ablation else "@") + re.sub(r"[^\w.=+-]+", "_", settings)[:80]
         config = configs.build(values, f"scene {scene}")
-        source = ingest.resolve(name, config.source)
+        asked = config.source
+        source = ingest.resolve(name, asked)
         probe, files = self._probe(source)
         kind, why = teacher_kind(config, probe)
         teacher = config.teacher.model_copy(update={"kind": kind})
@@ -173,7 +174,7 @@ class Planner:
             }
             key = _digest(identity)
             steps[stage.name] = Step(stage.name, key, store.artifact_path(stage.name, key), inputs, sections, code)
-        return Plan(title, source_sentence(name, config.source, source), list(steps.values()), left_out)
+        return Plan(title, source_sentence(name, asked, source), list(steps.values()), left_out)
 
     def _probe(self, source: Any) -> tuple[dict[str, bool], list[Path]]:
         """What the source has, and the raw files its capture depends on."""

@@ -208,5 +208,5 @@ def _advice(error: Any) -> str:
     else:
         elsewhere = [key for key in known_keys() if key.endswith("." + loc[-1])]
         own = [key.split(".")[1] for key in known_keys() if key.startswith(loc[0] + ".")]
-        near = elsewhere or difflib.get_close_matches(loc[-1], own, 1)
+        near = elsewhere or [f"{loc[0]}.{key}" for key in difflib.get_close_matches(loc[-1], own, 1)]
     return "no such key" + (f"; did you mean {near[0]}?" if near else "")

@@ -12,11 +12,11 @@ from chebsplat.stages.registry import STAGES
 @pytest.mark.parametrize(
     ("values", "hint"),
     [
-        ({"train": {"stpes": 5}}, "train.stpes: no such key; did you mean steps?"),
+        ({"train": {"stpes": 5}}, "train.stpes: no such key; did you mean train.steps?"),
         ({"trian": {}}, "trian: no such key; did you mean train?"),
         ({"train": {"n_angles": 5}}, "did you mean describe.n_angles?"),
         ({"train": {"steps": 0}}, "train.steps"),
-        ({"describe": {"spectrum": "ful"}}, "describe.spectrum"),
+        ({"train": {"encoder": "trnsformer"}}, "train.encoder"),
     ],
 )
 def test_bad_key_or_value_is_named(values, hint):

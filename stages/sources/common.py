@@ -234,8 +234,9 @@ def open_image(path: Path, upright: bool = False) -> Any:
     from PIL import Image, ImageOps
 
     try:
-        image = Image.open(path)
-        image.load()
+        with path.open("rb") as handle:
+            image = Image.open(handle)
+            image.load()
     except FileNotFoundError:
         raise InputError(f"{path} is missing; the source is incomplete") from None
     except (OSError, SyntaxError, ValueError) as error:

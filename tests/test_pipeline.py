@@ -1,0 +1,341 @@
+"""Exactly what a change makes stale runs again, and nothing else."""
+
+import json
+import os
+import shutil
+import subprocess
+import sys
+
+import pytest
+from shared import ROOT
+
+from chebsplat.errors import ConfigError, InputError
+from chebsplat.pipelines import store
+from chebsplat.pipelines.code import installed
+from chebsplat.pipelines.plan import Planner, overrides
+from chebsplat.stages.registry import STAGES
+
+ALL = [stage for stage in STAGES if stage != "cks"]
+AFTER_TRAIN = ["train", "export", "onnx", "evaluate", "report"]
+
+
+@pytest.fixture(autouse=True)
+def work(tmp_path, monkeypatch):
+    monkeypatch.setenv("CHEBSPLAT_WORK", str(tmp_path / "work"))
+    monkeypatch.delenv("REPLICA_ROOT", raising=False)
+    monkeypatch.chdir(ROOT)
+    return tmp_path / "work"
+
+
+@pytest.fixture
+def source_tree(tmp_path):
+    """A copy of the code that a test may edit."""
+    folders = {}
+    for name, folder in installed().items():
+        folders[name] = tmp_path / "code" / name
+        shutil.copytree(folder, folders[name], ignore=shutil.ignore_patterns("__pycache__"))
+    return folders
+
+
+def finish(plan):
+    """Pretend that every step has run."""
+    for step in plan.steps:
+        step.path.mkdir(parents=True, exist_ok=True)
+        inputs = {role: {"key": path.name} for role, path in step.inputs.items()}
+        (step.path / "artifact.json").write_text(json.dumps({"inputs": inputs, "seconds": 1.0}))
+
+
+def stale(folders=None, scene="toy", **options):
+    planner = Planner(folders)
+    plan = planner.plan(scene, **options)
+    planner.save()
+    return [step.stage for step in plan.steps if not step.fresh]
+
+
+def edit(path, old, new):
+    text = path.read_text()
+    assert old in text
+    path.write_text(text.replace(old, new, 1))
+
+
+def touch(tree):
+    os.utime(tree["chebsplat"] / "trainer.py", (1, 1))
+
+
+def comment(tree):
+    edit(tree["chebsplat"] / "trainer.py", "class Trainer", "# a remark\n\n\nclass Trainer")
+
+
+def docstring(tree):
+    edit(tree["stages"] / "ingest.py", '"""ingest: ', '"""ingest, that is ')
+
+
+def plumbing(tree):
+    edit(tree["stages"] / "progress.py", "every: float = 10.0", "every: float = 5.0")
+
+
+def trainer_code(tree):
+    edit(tree["chebsplat"] / "trainer.py", '"means": 0.01', '"means": 0.02')
+
+
+def deep_code(tree):
+    edit(tree["chebsplat"] / "synthetic/light.py", "0.95 * light", "0.96 * light")
+
+
+def report_code(tree):
+    edit(tree["stages"] / "page.py", "<h2>Pictures</h2>", "<h2>Views</h2>")
+
+
+def descriptor_code(tree):
+    edit(tree["chebsplat"] / "albo.py", "\nimport torch\n", "\nimport torch\n\nEXTRA = 1\n")
+
+
+def format_code(tree):
+    edit(tree["formats"] / "scene.py", "65_536", "32_768")
+
+
+CODE_CHANGES = [
+    (touch, []),
+    (comment, []),
+    (docstring, []),
+    (plumbing, []),
+    (report_code, ["report"]),
+    (format_code, ["export", "evaluate", "report"]),
+    (trainer_code, AFTER_TRAIN),
+    (descriptor_code, ["describe", *AFTER_TRAIN]),
+    (deep_code, ALL),
+]
+
+
+@pytest.mark.parametrize(("change", "expected"), CODE_CHANGES, ids=lambda v: getattr(v, "__name__", ""))
+def test_a_change_of_code_makes_exactly_these_stages_stale(source_tree, change, expected):
+    finish(Planner(source_tree).plan("toy"))
+    assert stale(source_tree) == []
+    before = {name: {p: p.read_bytes() for p in f.rglob("*.py")} for name, f in source_tree.items()}
+    change(source_tree)
+    assert stale(source_tree) == expected
+    for files in before.values():
+        for path, text in files.items():
+            path.write_bytes(text)
+    assert stale(source_tree) == []
+
+
+SETTING_CHANGES = [
+    ("train.steps=61", AFTER_TRAIN),
+    ("train.albo=off", AFTER_TRAIN),
+    ("teacher.confusion=0.2", ["teacher", *AFTER_TRAIN]),
+    ("describe.bandwidth=0.8", ["describe", *AFTER_TRAIN]),
+    ("sfm.max_points=700", ["sfm", "describe", *AFTER_TRAIN]),
+    ("export.split_by_degree=false", ["export", "evaluate", "report"]),
+    ("onnx.tolerance=1e-4", ["onnx", "report"]),
+    ("evaluate.boundary=3", ["evaluate", "report"]),
+    ("report.n_pictures=2", ["report"]),
+    ("source.seed=7", ALL),
+    ("train.steps=60", []),
+]
+
+
+@pytest.mark.parametrize(("settings", "expected"), SETTING_CHANGES, ids=lambda v: v if isinstance(v, str) else "")
+def test_a_change_of_setting_makes_exactly_these_stages_stale(settings, expected):
+    finish(Planner().plan("toy"))
+    assert stale(settings=settings) == expected
+    finish(Planner().plan("toy", settings))
+    assert stale() == []
+    assert stale(settings=settings) == []
+
+
+def photo_folder(folder):
+    from PIL import Image
+
+    folder.mkdir()
+    for k in range(4):
+        Image.new("RGB", (32, 24), (60 * k, 0, 0)).save(folder / f"{k}.jpg")
+    return f"{folder}/"
+
+
+def test_content_of_raw_files_counts_and_their_time_and_place_do_not(tmp_path):
+    scene = photo_folder(tmp_path / "photos")
+    finish(Planner().plan(scene))
+    assert stale(scene=scene) == []
+    os.utime(tmp_path / "photos/1.jpg", (5, 5))
+    assert stale(scene=scene) == []
+    moved = tmp_path / "elsewhere"
+    moved.mkdir()
+    shutil.move(tmp_path / "photos", moved / "photos")
+    assert stale(scene=f"{moved}/photos/") == []
+    shutil.copy(moved / "photos/1.jpg", moved / "photos/2.jpg")
+    assert stale(scene=f"{moved}/photos/") == ["ingest", "sfm", "train", "export", "evaluate", "report"]
+
+
+def test_generated_and_replica_scenes_never_share_a_key(tmp_path, monkeypatch):
+    generated = Planner().plan("office0")
+    assert "generated" in generated.source
+    assert "REPLICA_ROOT is not set" in generated.source
+    (tmp_path / "replica/office_0/results").mkdir(parents=True)
+    (tmp_path / "replica/office_0/cam_params.json").write_text(
+        '{"camera": {"w": 8, "h": 6, "fx": 5, "fy": 5, "cx": 3.5, "cy": 2.5, "scale": 6553.5}}'
+    )
+    from PIL import Image
+
+    for k in range(3):
+        Image.new("RGB", (8, 6)).save(tmp_path / f"replica/office_0/results/frame{k:06d}.jpg")
+    (tmp_path / "replica/office_0/traj.txt").write_text("1 0 0 0 0 1 0 0 0 0 1 0 0 0 0 1\n" * 3)
+    monkeypatch.setenv("REPLICA_ROOT", str(tmp_path / "replica"))
+    real = Planner().plan("office0")
+    assert "replica" in real.source
+    assert not {s.key for s in generated.steps} & {s.key for s in real.steps}
+
+
+@pytest.mark.parametrize(
+    ("settings", "left_out"),
+    [
+        ("", {"cks"}),
+        ("train.semantics=false", {"teacher", "describe", "onnx", "cks"}),
+        ("teacher.kind=none", {"teacher", "describe", "onnx", "cks"}),
+        ("train.encoder=off", {"describe", "onnx", "cks"}),
+        ("train.albo=false", {"describe", "cks"}),
+    ],
+)
+def test_a_scene_leaves_out_what_it_does_not_need_and_says_why(settings, left_out):
+    plan = Planner().plan("toy", settings)
+    assert {what for what in plan.left_out if what in STAGES} == left_out
+    assert all(plan.left_out.values())
+    assert set(STAGES) - left_out == set(plan.targets)
+
+
+def test_an_ablation_reuses_everything_before_training():
+    finish(Planner().plan("toy"))
+    assert stale(ablation="no-tle") == AFTER_TRAIN
+    assert Planner().plan("toy", "train.seed=3", "no-tle").title == "toy@no-tle+train.seed=3"
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (("ofice0",), "office0"),
+        (("toy", "train.stps=3"), "train.steps"),
+        (("toy", "tran.steps=3"), "train"),
+        (("toy", "train.steps"), "section.key=value"),
+        (("toy", "train.steps=many"), "train.steps"),
+        (("toy", "", "no-tel"), "no-tle"),
+    ],
+)
+def test_a_wrong_name_is_an_error_that_suggests_the_nearest(arguments, message):
+    with pytest.raises(ConfigError, match=message):
+        Planner().plan(*arguments)
+
+
+def test_labels_cannot_be_asked_of_a_source_without_them(tmp_path):
+    with pytest.raises(ConfigError, match=r"teacher\.model"):
+        Planner().plan(photo_folder(tmp_path / "photos"), "teacher.kind=labels")
+
+
+def test_a_folder_that_is_not_there_is_an_input_error(tmp_path):
+    with pytest.raises(InputError, match="not a folder"):
+        Planner().plan(f"{tmp_path}/nowhere/")
+
+
+def test_set_takes_scalars_words_switches_and_lists():
+    found = overrides("train.albo=off,train.encoder=off,train.steps=5,teacher.mean=[0.1,0.2,0.3],source.kind=photos")
+    assert found["train"] == {"albo": False, "encoder": "off", "steps": 5}
+    assert found["teacher"] == {"mean": [0.1, 0.2, 0.3]}
+    assert found["source"] == {"kind": "photos"}
+
+
+def test_a_sequence_carries_the_basis_from_scene_to_scene():
+    planner = Planner()
+    first = planner.plan("toy", keep_knowledge=True)
+    second = planner.plan("toy", basis=first.targets["cks"], keep_knowledge=True)
+    assert second.targets["ingest"] == first.targets["ingest"]
+    assert second.targets["train"] != first.targets["train"]
+    step = next(s for s in second.steps if s.stage == "cks")
+    assert step.inputs["basis"] == first.targets["cks"]
+
+
+def test_links_name_artifacts_and_clean_stale_finds_what_nothing_names(work):
+    plan, other = Planner().plan("toy"), Planner().plan("toy", "train.steps=9")
+    finish(plan)
+    finish(other)
+    store.link(plan.title, plan.targets)
+    assert (work / "toy/train").resolve() == plan.targets["train"]
+    leftover = plan.targets["train"].with_name(".tmp-abc-999999999")
+    leftover.mkdir()
+    found = {path for path, _ in store.unnamed()}
+    assert found == {leftover, *(other.targets[s] for s in AFTER_TRAIN)}
+    for path in found:
+        store.remove(path)
+    assert store.unnamed() == []
+    assert all(store.is_fresh(path) for path in plan.targets.values())
+
+
+def test_relinking_drops_stages_that_are_left_out(work):
+    store.link("toy", Planner().plan("toy").targets)
+    store.link("toy", Planner().plan("toy", "train.semantics=false").targets)
+    assert not (work / "toy/teacher").is_symlink()
+
+
+def chebsplat(*arguments, **environment):
+    command = [sys.executable, "-m", "chebsplat.pipelines.cli", *arguments]
+    return subprocess.run(command, capture_output=True, text=True, cwd=ROOT, env=os.environ | environment)
+
+
+FAST = "train.steps=12,train.n_densify=1,sfm.max_points=200,describe.n_regions=12"
+
+
+@pytest.mark.xdist_group("cli")
+def test_a_run_makes_the_report_and_a_second_run_does_nothing(work):
+    first = chebsplat("run", "--scene", "toy", "--set", FAST)
+    assert first.returncode == 0, first.stderr
+    page = first.stdout.strip()
+    assert page.endswith("report.html")
+    assert os.path.isfile(page)
+    assert "to run: ingest" in first.stderr
+    times = {p: p.stat().st_mtime_ns for p in work.glob("store/*/*/artifact.json")}
+    assert len(times) == len(ALL)
+    second = chebsplat("run", "--scene", "toy", "--set", FAST)
+    assert second.returncode == 0
+    assert second.stdout.strip() == page
+    assert "to run" not in second.stderr
+    assert times == {p: p.stat().st_mtime_ns for p in work.glob("store/*/*/artifact.json")}
+    only = chebsplat("run", "--scene", "toy", "--set", FAST + ",report.n_pictures=1")
+    assert "to run: report   fresh: 8" in only.stderr
+    checked = chebsplat("verify", *(str(p.parent) for p in times))
+    assert checked.returncode == 0, checked.stderr
+
+
+@pytest.mark.xdist_group("cli")
+def test_a_failing_stage_gives_its_exit_code_and_nothing_half_made(work):
+    failed = chebsplat("run", "--scene", "toy", "--set", "onnx.tolerance=1e-30," + FAST)
+    assert failed.returncode == 4
+    assert "onnx failed with exit code 4" in failed.stderr
+    assert not list(work.glob("store/onnx/*"))
+
+
+@pytest.mark.parametrize(
+    ("arguments", "code", "message"),
+    [
+        (("run", "--scene", "ofice0"), 2, "office0"),
+        (("run",), 2, "scene="),
+        (("run", "--scene", "toy", "--stage", "trian"), 2, "train"),
+        (("run", "--scene", "toy", "--stage", "cks"), 2, "no sequence"),
+        (("plan", "--scene", "./nowhere/"), 3, "not a folder"),
+        (("verify", "nowhere"), 3, "not a finished artifact"),
+    ],
+)
+def test_the_command_line_fails_with_documented_codes(arguments, code, message):
+    found = chebsplat(*arguments)
+    assert found.returncode == code
+    assert message in found.stderr
+
+
+def test_help_of_every_stage_needs_no_heavy_import():
+    script = (
+        "import sys\nfrom chebsplat.pipelines.cli import main\n"
+        f"for stage in {list(STAGES)!r}:\n"
+        "    try: main([stage, '--help'])\n"
+        "    except SystemExit as stop: assert not stop.code\n"
+        "heavy = {'torch', 'numba', 'open3d', 'pycolmap', 'zarr', 'scipy', 'matplotlib'} & set(sys.modules)\n"
+        "assert not heavy, heavy\n"
+    )
+    done = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr
