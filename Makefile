@@ -39,8 +39,11 @@ test: $(READY)  ## the tests, in parallel, without the slow ones
 test-all: $(READY)  ## all tests, the slow ones too
 	@$(PY) -m pytest -q -n auto --dist loadgroup -m "not gpu" $(args)
 
-lint: $(READY)  ## ruff (lint, format)
+lint: $(READY)  ## ruff (lint, format) and mypy
 	@$(PY) -m ruff check . && $(PY) -m ruff format --check .
+	@mkdir -p build/types/chebsplat && ln -sfn $(CURDIR)/chebsplat/* build/types/chebsplat/
+	@for layer in formats stages pipelines; do ln -sfn $(CURDIR)/$$layer build/types/chebsplat/$$layer; done
+	@cd build/types && ../../$(PY) -m mypy --config-file ../../pyproject.toml -p chebsplat
 
 lock: $(READY)  ## resolve requirements.lock anew
 	@links="$$($(PY) -m pip config get global.find-links 2>/dev/null || true)"; \

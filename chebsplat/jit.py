@@ -6,6 +6,7 @@ import hashlib
 import logging
 import os
 from pathlib import Path
+from typing import Any
 
 log = logging.getLogger("chebsplat")
 
@@ -29,7 +30,7 @@ if not FOLDER.exists():
 import numba  # noqa: E402
 
 # No fast-math beyond reassociation and contraction: NaN and infinity keep their meaning.
-kernel = numba.njit(cache=True, parallel=True, error_model="numpy", fastmath={"reassoc", "contract", "nsz"})
-inline = numba.njit(cache=True, error_model="numpy", fastmath={"reassoc", "contract", "nsz"}, inline="always")
-serial = numba.njit(cache=True, error_model="numpy")
+kernel: Any = numba.njit(cache=True, parallel=True, error_model="numpy", fastmath={"reassoc", "contract", "nsz"})
+inline: Any = numba.njit(cache=True, error_model="numpy", fastmath={"reassoc", "contract", "nsz"}, inline="always")
+serial: Any = numba.njit(cache=True, error_model="numpy")
 prange = numba.prange

@@ -93,7 +93,7 @@ def feature_l1(render: Tensor, target: Tensor, mask: Tensor | None = None) -> Te
     Args: render [H, W, C]; target [h, w, C], h ≤ H; mask [H, W] bool, true where a pixel counts.
     Choices: the render is averaged over each cell of the target; a cell counts by the share of its pixels that do.
     """
-    size = target.shape[:2]
+    size = (target.shape[0], target.shape[1])
     pooled = torch.nn.functional.adaptive_avg_pool2d(render.permute(2, 0, 1), size).permute(1, 2, 0)
     difference = (pooled - target.to(render.dtype)).abs().mean(-1)
     if mask is None:

@@ -21,9 +21,9 @@ class RayCaster:
     def __init__(self, vertices: np.ndarray, triangles: np.ndarray):
         import open3d as o3d
 
-        self._tensor: Any = o3d.core.Tensor
-        self._scene = o3d.t.geometry.RaycastingScene()
-        self._scene.add_triangles(self._tensor(vertices.astype(np.float32)), self._tensor(triangles.astype(np.uint32)))
+        self._open3d: Any = o3d
+        self._scene: Any = o3d.t.geometry.RaycastingScene()
+        self._scene.add_triangles(self._tensor(vertices, np.float32), self._tensor(triangles, np.uint32))
         self._none = self._scene.INVALID_ID
 
     def cast(self, origins: np.ndarray, directions: np.ndarray) -> Hits:
@@ -40,5 +40,7 @@ class RayCaster:
         return self._scene.test_occlusions(self._rays(origins, directions), 0.0, 1.0).numpy()
 
     def _rays(self, origins: np.ndarray, directions: np.ndarray) -> Any:
-        both = np.concatenate(np.broadcast_arrays(origins, directions), -1)
-        return self._tensor(np.ascontiguousarray(both, np.float32))
+        return self._tensor(np.concatenate(np.broadcast_arrays(origins, directions), -1), np.float32)
+
+    def _tensor(self, array: np.ndarray, dtype: Any) -> Any:
+        return self._open3d.core.Tensor(np.ascontiguousarray(array, dtype))

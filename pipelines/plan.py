@@ -214,7 +214,7 @@ def teacher_kind(config: Any, probe: dict[str, bool]) -> tuple[str, str]:
 
 def left_out_stages(config: Any, kind: str, why: str, probe: dict[str, bool], knowledge: bool) -> dict[str, str]:
     """Stages that this scene does not need, and why."""
-    left_out = {}
+    left_out: dict[str, str] = {}
     if kind == "none":
         left_out |= {"teacher": why, "describe": f"no semantics to describe shape for ({why})"}
         left_out |= {"onnx": f"no encoder is trained ({why})"}

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 from chebsplat.errors import DataFailure
 from chebsplat.stages.command import Job, command
 
@@ -23,7 +25,8 @@ def run(job: Job) -> None:
         raise DataFailure("the encoder has no projections (train.encoder = mlp); there is no knowledge to carry")
     if old.bases and set(old.bases) != set(projections):
         raise DataFailure("the basis belongs to an encoder of another depth; start another sequence")
-    bases, entry = {}, {"gaussians": read_manifest(job.inputs["gaussians"]).key}
+    bases: dict[str, Any] = {}
+    entry: dict[str, Any] = {"gaussians": read_manifest(job.inputs["gaussians"]).key}
     for name, weight in projections.items():
         start = torch.from_numpy(old.bases[name]) if name in old.bases else None
         if start is not None and len(start) != len(weight):

@@ -54,10 +54,15 @@ def command(name: str, run: Callable[[Job], None]) -> click.Command:
         sys.exit(execute(name, run, options))
 
     params: list[click.Parameter] = [
-        click.Option([f"--in-{role}"], type=click.Path(path_type=Path), required=(role, of) in stage.inputs,
-                     help=f"artifact of `{of}`" + ("" if (role, of) in stage.inputs else " (optional)"))
+        click.Option(
+            [f"--in-{role}"],
+            type=click.Path(path_type=Path),
+            required=(role, of) in stage.inputs,
+            help=f"artifact of `{of}`" + ("" if (role, of) in stage.inputs else " (optional)"),
+        )
         for role, of in (*stage.inputs, *stage.optional)
-    ] + [
+    ]
+    params += [
         click.Option(["--config"], type=click.Path(path_type=Path), help="TOML or JSON; defaults otherwise"),
         click.Option(["--out"], type=click.Path(path_type=Path), required=True, help="the artifact's directory"),
         click.Option(["--key"], help="identity given by the planner; the content's digest otherwise"),

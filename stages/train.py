@@ -74,9 +74,9 @@ def note_left_out(job: Job, train: dict[str, Any], has_semantics: bool) -> None:
         "knowledge basis": [("basis" not in job.inputs, "no sequence is named: this scene starts from nothing")],
     }
     for what, reasons in unneeded.items():
-        why = [reason for applies, reason in reasons if applies]
-        if why:
-            job.left_out(what, why[0])
+        applying = [reason for applies, reason in reasons if applies]
+        if applying:
+            job.left_out(what, applying[0])
 
 
 def training_views(capture: Capture, points: Points, features: Features | None) -> Views:
@@ -182,7 +182,7 @@ def follow(job: Job, trainer: Trainer, train: dict[str, Any]) -> list[dict[str, 
 
 def optimizer_state(trainer: Trainer) -> dict[str, np.ndarray]:
     """Adam's moments of the per-Gaussian parameters, and the step count."""
-    arrays = {}
+    arrays: dict[str, np.ndarray] = {}
     for group in trainer.optimizer.param_groups:
         state = trainer.optimizer.state.get(group["params"][0], {})
         if group["name"] != "modules" and "exp_avg" in state:

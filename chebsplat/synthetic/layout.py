@@ -48,8 +48,8 @@ class Palette:
 
     def add(self, pattern: str, first, second=(0.0, 0.0, 0.0), scale=0.2, gloss=0.0, shininess=30.0) -> int:  # type: ignore[no-untyped-def]
         seed = int(self.rng.integers(2**20))
-        tones = (tuple(float(v) for v in tone) for tone in (first, second))
-        self.table.append(Material(pattern, *tones, scale, gloss, shininess, seed))  # type: ignore[arg-type]
+        a, b = ((float(tone[0]), float(tone[1]), float(tone[2])) for tone in (first, second))
+        self.table.append(Material(pattern, a, b, scale, gloss, shininess, seed))
         return len(self.table) - 1
 
     def two_tones(self, level: float) -> tuple[np.ndarray, np.ndarray]:

@@ -26,7 +26,7 @@ def shade(
       lights:     [L, 2, 3] centres and half extents of ceiling panels, metres.
       is_blocked: shadow test of segments, (origins [N, 3], offsets [N, 3]) -> bool [N].
     """
-    ambient = (0.40 + 0.10 * normals[:, 2:]) * np.float32((1.0, 0.99, 0.97))
+    ambient = (0.40 + 0.10 * normals[:, 2:]) * np.array((1.0, 0.99, 0.97), np.float32)
     diffuse, highlight = np.zeros((len(points), 1), np.float32), np.zeros((len(points), 1), np.float32)
     start = points + 2e-3 * normals
     for centre, half in lights:

@@ -93,8 +93,8 @@ def shaded(room: Room, caster: RayCaster, pose: np.ndarray, rays: np.ndarray, hi
     part, material = room.soup.parts[triangle], room.soup.materials[triangle]
     local = np.einsum("nij,nj->ni", room.soup.rotations[part], points - room.soup.origins[part])
     albedo = colors(local, material, room.materials)
-    gloss = np.float32([m.gloss for m in room.materials])[material]
-    shininess = np.float32([m.shininess for m in room.materials])[material]
+    gloss = np.array([m.gloss for m in room.materials], np.float32)[material]
+    shininess = np.array([m.shininess for m in room.materials], np.float32)[material]
     light = np.zeros((len(seen), 3), np.float32)
     light[seen] = shade(points, normals, to_eye, albedo, gloss, shininess, room.lights, caster.is_blocked)
     return light
