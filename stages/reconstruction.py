@@ -64,6 +64,7 @@ def _match(job: Job, capture: Capture, settings: SfmSection) -> Path:
             mask = job.scratch / "masks" / f"{name}.png.png"
             mask.parent.mkdir(parents=True, exist_ok=True)
             Image.fromarray(np.where(capture.loss_mask[view], 255, 0).astype(np.uint8)).save(mask)
+    pycolmap.Database.open(database).close()  # creates it
     files = sorted(f"{name}.png" for name in capture.names)
     reader = pycolmap.ImageReaderOptions()
     reader.camera_model = "PINHOLE"
