@@ -8,6 +8,8 @@ import os
 from pathlib import Path
 from typing import Any
 
+import numba
+
 log = logging.getLogger("chebsplat")
 
 _SOURCES = ("rasterize/kernels.py", "blur.py")
@@ -20,14 +22,13 @@ def _cache_folder() -> Path:
     return base / "chebsplat" / f"numba-{hashlib.sha256(text).hexdigest()[:16]}"
 
 
-# Must precede numba's import; a folder that the user has chosen is left alone.
-FOLDER = Path(os.environ.setdefault("NUMBA_CACHE_DIR", str(_cache_folder())))
-# open3d brings a TBB that numba refuses with a warning: OpenMP comes first.
-os.environ.setdefault("NUMBA_THREADING_LAYER_PRIORITY", "omp workqueue tbb")
+# A folder that the user has chosen is left alone.
+FOLDER = Path(os.environ.get("NUMBA_CACHE_DIR") or _cache_folder())
 if not FOLDER.exists():
     log.info("compiling kernels, about 20 s, once")
-
-import numba  # noqa: E402
+numba.config.CACHE_DIR = str(FOLDER)
+# open3d brings a TBB that numba refuses with a warning: OpenMP comes first.
+numba.config.THREADING_LAYER_PRIORITY = ["omp", "workqueue", "tbb"]
 
 # No fast-math beyond reassociation and contraction: NaN and infinity keep their meaning.
 kernel: Any = numba.njit(cache=True, parallel=True, error_model="numpy", fastmath={"reassoc", "contract", "nsz"})
