@@ -12,7 +12,7 @@ import numba
 
 log = logging.getLogger("chebsplat")
 
-_SOURCES = ("rasterize/kernels.py", "blur.py")
+_SOURCES = ("rasterize/kernels.py", "ssim.py")
 
 
 def _cache_folder() -> Path:

@@ -8,32 +8,31 @@ import numpy as np
 import torch
 from torch import Tensor
 
-C1, C2 = 0.01**2, 0.03**2
-
 
 def _blur(images: Tensor) -> Tensor:
-    """Separable window blur of [H, W, C] by numba in float32; plain torch for other types."""
-    from chebsplat import blur
+    """Window blur of [H, W, C] with zero padding, by plain convolutions."""
+    from chebsplat.ssim import TAPS, WINDOW
 
-    if images.dtype == torch.float32:
-        return torch.from_numpy(blur.blur(images.detach().contiguous().numpy()))
-    taps = torch.as_tensor(blur.TAPS, dtype=images.dtype)
+    taps = torch.as_tensor(TAPS, dtype=images.dtype)
     planes = images.permute(2, 0, 1)[:, None]
-    half = blur.WINDOW // 2
-    planes = torch.nn.functional.conv2d(planes, taps[None, None, :, None], padding=(half, 0))
-    return torch.nn.functional.conv2d(planes, taps[None, None, None, :], padding=(0, half))[:, 0].permute(1, 2, 0)
+    planes = torch.nn.functional.conv2d(planes, taps[None, None, :, None], padding=(WINDOW // 2, 0))
+    return torch.nn.functional.conv2d(planes, taps[None, None, None, :], padding=(0, WINDOW // 2))[:, 0].permute(
+        1, 2, 0
+    )
 
 
 def ssim_map(a: Tensor, b: Tensor) -> Tensor:
-    """Structural similarity [H, W, C] of images [H, W, C] in [0, 1]; the oracle, differentiable in float64.
+    """Structural similarity [H, W, C] of images [H, W, C] in [0, 1]; plain torch, the oracle of the fused loss.
 
     Choices: Gaussian window 11, σ 1.5, zero padding, biased variances, as 3DGS.
     """
+    from chebsplat.ssim import C1, C2
+
     mean_a, mean_b = _blur(a), _blur(b)
     var_a, var_b = _blur(a * a) - mean_a**2, _blur(b * b) - mean_b**2
     covariance = _blur(a * b) - mean_a * mean_b
-    top = (2 * mean_a * mean_b + C1) * (2 * covariance + C2)
-    return top / ((mean_a**2 + mean_b**2 + C1) * (var_a + var_b + C2))
+    top = (2 * mean_a * mean_b + float(C1)) * (2 * covariance + float(C2))
+    return top / ((mean_a**2 + mean_b**2 + float(C1)) * (var_a + var_b + float(C2)))
 
 
 def ssim(a: np.ndarray, b: np.ndarray) -> float:
@@ -43,48 +42,38 @@ def ssim(a: np.ndarray, b: np.ndarray) -> float:
     return float(ssim_map(torch.from_numpy(a).double() / 255, torch.from_numpy(b).double() / 255).mean())
 
 
-class _Ssim(torch.autograd.Function):
-    """Mean SSIM over the valid pixels, value and gradient together: 8 blurs in all."""
+class _Photometric(torch.autograd.Function):
+    """The fused loss: its gradient is computed with its value."""
 
     @staticmethod
-    def forward(ctx: Any, a: Tensor, b: Tensor, weight: Tensor) -> Tensor:  # type: ignore[override]
-        blurred = _blur(torch.cat([a, b, a * a, b * b, a * b], -1))
-        mean_a, mean_b, aa, bb, ab = blurred.split(3, -1)
-        var, cov = aa - mean_a**2 + bb - mean_b**2, ab - mean_a * mean_b
-        top_1, top_2 = 2 * mean_a * mean_b + C1, 2 * cov + C2
-        low_1, low_2 = mean_a**2 + mean_b**2 + C1, var + C2
-        values = top_1 * top_2 / (low_1 * low_2)
-        by_cov = 2 * top_1 / (low_1 * low_2) * weight
-        by_var = -values / low_2 * weight
-        by_mean = (2 * mean_b * top_2 / (low_1 * low_2) - 2 * mean_a * values / low_1) * weight
-        by_mean = by_mean - 2 * mean_a * by_var - mean_b * by_cov
-        back_mean, back_var, back_cov = _blur(torch.cat([by_mean, by_var, by_cov], -1)).split(3, -1)
-        ctx.save_for_backward(back_mean + 2 * a * back_var + b * back_cov)
-        return (values * weight).sum()
+    def forward(ctx: Any, render: Tensor, target: Tensor, weight: Tensor, weight_ssim: float) -> Tensor:  # type: ignore[override]
+        from chebsplat.ssim import photometric
+
+        arrays = (t.detach().numpy() for t in (render, target, weight))
+        loss, gradient = photometric(*arrays, weight_ssim)
+        ctx.save_for_backward(torch.from_numpy(gradient))
+        return render.new_tensor(loss)
 
     @staticmethod
     def backward(ctx: Any, grad: Tensor):  # type: ignore[no-untyped-def, override]
         (gradient,) = ctx.saved_tensors
-        return grad * gradient, None, None
+        return grad * gradient, None, None, None
 
 
 def photometric(render: Tensor, target: Tensor, mask: Tensor | None, weight_ssim: float) -> Tensor:
     """(1 − w) L1 + w (1 − SSIM) over the pixels that count.
 
-    Args: render, target [H, W, 3] in [0, 1]; mask [H, W] bool, true where a pixel counts; None: all.
+    Args: render, target [H, W, 3] float32 in [0, 1]; mask [H, W] bool, true where a pixel counts; None: all.
     Choices: masked pixels take the target's colour first, so they have no gradient, not even through SSIM's window.
       0 where nothing counts.
     """
-    if mask is not None:
-        render = torch.where(mask[..., None], render, target)
-        weight = mask[..., None].to(render.dtype).expand_as(render)
-        weight = weight / weight.sum().clamp_min(1)
+    if mask is None:
+        weight = torch.full_like(target, 1 / target.numel())
     else:
-        weight = torch.full_like(render, 1 / render.numel())
-    l1 = ((render - target).abs() * weight).sum()
-    if weight_ssim == 0:
-        return l1
-    return (1 - weight_ssim) * l1 + weight_ssim * (weight.sum() - _Ssim.apply(render, target, weight))
+        render = torch.where(mask[..., None], render, target)
+        weight = mask[..., None].to(target.dtype).expand_as(target)
+        weight = weight / weight.sum().clamp_min(1)
+    return _Photometric.apply(render, target, weight, weight_ssim)
 
 
 def feature_l1(render: Tensor, target: Tensor, mask: Tensor | None = None) -> Tensor:

@@ -19,6 +19,26 @@ from chebsplat.regions import Regions, build_regions, covering
 from chebsplat.sh import eval_sh, n_coefficients
 
 
+class _Take(torch.autograd.Function):
+    """Rows by an index without repeats: the gradient is one scatter, where plain indexing has to accumulate."""
+
+    @staticmethod
+    def forward(ctx: Any, values: Tensor, index: Tensor) -> Tensor:  # type: ignore[override]
+        ctx.save_for_backward(index)
+        ctx.shape = values.shape
+        return values.index_select(0, index)
+
+    @staticmethod
+    def backward(ctx: Any, grad: Tensor):  # type: ignore[no-untyped-def, override]
+        (index,) = ctx.saved_tensors
+        return grad.new_zeros(ctx.shape).index_copy_(0, index, grad), None
+
+
+def take(values: Tensor, index: Tensor) -> Tensor:
+    """values[index] for an index [V] that holds no row twice."""
+    return _Take.apply(values, index)
+
+
 @dataclass
 class View:
     """One camera at one resolution. K [3, 3] pixels, viewmat [4, 4], float32."""
@@ -128,7 +148,7 @@ class Shape(nn.Module):
             self.cache = self.cache.index_copy(0, chosen, fresh.detach())
         cover = self.cover[index]
         shape = propagate(encodings, cover, self.weights[index])
-        return self.gate(features[index], shape, cover[:, 0] >= 0)
+        return self.gate(take(features, index), shape, cover[:, 0] >= 0)
 
 
 class SceneModel:
@@ -168,11 +188,11 @@ class SceneModel:
         semantic = None
         if self.semantic_gate is not None and features is not None:
             semantic = self.semantic_gate(features.detach())
-        return adapt.soft_mask(self.raw["prune_logits"][index], semantic)
+        return adapt.soft_mask(take(self.raw["prune_logits"], index), semantic)
 
     def sh_mask(self, index: Tensor) -> Tensor | None:
         """Nested band masks [V, 3] with a straight-through gradient, None where SH pruning is off."""
-        return sh_prune.band_mask(self.raw["sh_logits"][index]) if "sh_logits" in self.raw else None
+        return sh_prune.band_mask(take(self.raw["sh_logits"], index)) if "sh_logits" in self.raw else None
 
     def render(
         self,
@@ -191,21 +211,23 @@ class SceneModel:
         with torch.no_grad():
             reach = 3 * raw["log_scales"].amax(1).exp()
             index = in_frustum(raw["means"], view, reach)
-        means, quats = raw["means"][index], raw["quats"][index]
-        scales, opacities = raw["log_scales"][index].exp(), raw["logit_opacities"][index].sigmoid()
+        means, quats = take(raw["means"], index), take(raw["quats"], index)
+        scales, opacities = take(raw["log_scales"], index).exp(), take(raw["logit_opacities"], index).sigmoid()
         aside: dict[str, Tensor] = {}
-        features = raw["features"][index] if "features" in raw else None
+        features = None
         if fused and self.shape is not None and self.shape.regions is not None:
             features, aside["gate"] = self.shape.fuse(raw["features"], index, generator)
+        elif "features" in raw:
+            features = take(raw["features"], index)
         if masked and (soft := self.soft_mask(index, features)) is not None:
             aside["mask"] = soft
             scales, opacities = adapt.apply_mask(adapt.hard_mask(soft), scales, opacities)
-        shN = raw["shN"][index, : n_coefficients(degree) - 1]
+        shN = take(raw["shN"], index)[:, : n_coefficients(degree) - 1]
         if masked and degree > 0 and (bands := self.sh_mask(index)) is not None:
             aside["bands"] = bands
             shN = sh_prune.masked_sh(shN, bands)
         eye = -view.viewmat[:3, :3].T @ view.viewmat[:3, 3]
-        colors = eval_sh(raw["sh0"][index], shN, means.detach() - eye, degree)
+        colors = eval_sh(take(raw["sh0"], index), shN, means.detach() - eye, degree)
         channels = colors if features is None else torch.cat([colors, features], -1)
         render, alpha, meta = rasterize(
             means, quats, scales, opacities, channels, view.viewmat[None], view.K[None], view.width, view.height

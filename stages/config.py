@@ -79,7 +79,6 @@ class DescribeSection(_Section):
 class TrainSection(_Section):
     steps: int = Field(3000, ge=1)
     seed: int = 0
-    device: Literal["auto", "cpu", "cuda"] = "auto"
     # what is built
     semantics: bool = True
     encoder: Literal["transformer", "mlp", "off"] = "transformer"  # mlp: the paper's "no TLE"
@@ -147,7 +146,6 @@ class CksSection(_Section):
 class EvaluateSection(_Section):
     boundary: int = Field(5, ge=1)  # pixels, half width of the boundary band
     timing_repeats: int = Field(3, ge=1)
-    lpips_weights: str | None = None
 
 
 class ReportSection(_Section):
