@@ -40,17 +40,20 @@ class Progress:
         """Yield (item, status); what the caller puts into `status` is shown beside rate and ETA."""
         status: dict[str, Any] = {}
         began = last = time.perf_counter()
-        for done, item in enumerate(items, start=1):
+        for done, item in enumerate(items):  # the first item warms up and is not counted in the rate
             yield item, status
             now = time.perf_counter()
-            if now - last >= (0.2 if self.show else self.every) or done + start == total:
+            if done == 0:
+                began = now
+            at = done + start + 1
+            if now - last >= (0.2 if self.show else self.every) or at == total:
                 last = now
                 rate = done / max(now - began, 1e-9)
-                eta = (total - start - done) / rate
+                eta = f"{(total - at) / rate:.0f} s" if rate > 0 else "unknown"
                 notes = "".join(f"  {k} {v}" for k, v in status.items())
-                line = f"{what} {done + start}/{total}{notes}  {rate:.1f}/s  ETA {eta:.0f} s"
+                line = f"{what} {at}/{total}{notes}  {rate:.1f}/s  ETA {eta}"
                 if self.show:
-                    end = "\n" if done + start == total else ""
+                    end = "\n" if at == total else ""
                     print(f"\r\x1b[K{line}", end=end, file=sys.stderr, flush=True)
                 else:
                     log.info("%s", line)
