@@ -26,9 +26,10 @@ def _cache_folder() -> Path:
 FOLDER = Path(os.environ.get("NUMBA_CACHE_DIR") or _cache_folder())
 if not FOLDER.exists():
     log.info("compiling kernels, about 20 s, once")
-numba.config.CACHE_DIR = str(FOLDER)
+settings: Any = numba.config
+settings.CACHE_DIR = str(FOLDER)
 # open3d brings a TBB that numba refuses with a warning: OpenMP comes first.
-numba.config.THREADING_LAYER_PRIORITY = ["omp", "workqueue", "tbb"]
+settings.THREADING_LAYER_PRIORITY = ["omp", "workqueue", "tbb"]
 
 # No fast-math beyond reassociation and contraction: NaN and infinity keep their meaning.
 kernel: Any = numba.njit(cache=True, parallel=True, error_model="numpy", fastmath={"reassoc", "contract", "nsz"})

@@ -49,8 +49,8 @@ class _Photometric(torch.autograd.Function):
     def forward(ctx: Any, render: Tensor, target: Tensor, weight: Tensor, weight_ssim: float) -> Tensor:  # type: ignore[override]
         from chebsplat.ssim import photometric
 
-        arrays = (t.detach().numpy() for t in (render, target, weight))
-        loss, gradient = photometric(*arrays, weight_ssim)
+        a, b, w = (t.detach().numpy() for t in (render, target, weight))
+        loss, gradient = photometric(a, b, w, weight_ssim)
         ctx.save_for_backward(torch.from_numpy(gradient))
         return render.new_tensor(loss)
 

@@ -17,6 +17,7 @@ from chebsplat.rasterize import rasterize
 from chebsplat.rasterize.projection import rotation_matrices
 from chebsplat.regions import Regions, build_regions, covering
 from chebsplat.sh import eval_sh, n_coefficients
+from chebsplat.views import View, in_frustum
 
 
 class _Take(torch.autograd.Function):
@@ -40,16 +41,6 @@ def take(values: Tensor, index: Tensor) -> Tensor:
 
 
 @dataclass
-class View:
-    """One camera at one resolution. K [3, 3] pixels, viewmat [4, 4], float32."""
-
-    K: Tensor
-    viewmat: Tensor
-    width: int
-    height: int
-
-
-@dataclass
 class Rendered:
     """rgb [H, W, 3], alpha [H, W, 1], features [H, W, C] or None; `index` [V] the Gaussians in the frustum."""
 
@@ -58,21 +49,6 @@ class Rendered:
     features: Tensor | None
     meta: dict[str, Any]
     index: Tensor
-
-
-def in_frustum(means: Tensor, view: View, reach: Tensor, margin: float = 0.15) -> Tensor:
-    """Indices of points whose sphere of radius `reach` [N] may touch the image; NaN never does."""
-    camera = means @ view.viewmat[:3, :3].T + view.viewmat[:3, 3]
-    x, y, z = camera.unbind(-1)
-    half_x, half_y = 0.5 * view.width * (1 + margin), 0.5 * view.height * (1 + margin)
-    fx, fy = view.K[0, 0], view.K[1, 1]
-    u = fx * x + (view.K[0, 2] - 0.5 * view.width) * z
-    v = fy * y + (view.K[1, 2] - 0.5 * view.height) * z
-    near = z + reach > 0.01
-    inside = (u.abs() <= half_x * z.clamp_min(0) + (fx + half_x) * reach) & (
-        v.abs() <= half_y * z.clamp_min(0) + (fy + half_y) * reach
-    )
-    return (near & inside).nonzero()[:, 0]
 
 
 class Shape(nn.Module):

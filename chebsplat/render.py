@@ -7,9 +7,9 @@ import torch
 from torch import Tensor
 
 from chebsplat.gaussians import activated
-from chebsplat.model import View, in_frustum
 from chebsplat.rasterize import rasterize
 from chebsplat.sh import eval_sh
+from chebsplat.views import View, in_frustum
 
 
 def colors_by_degree(sh0: Tensor, shN: Tensor, directions: Tensor, degrees: Tensor) -> Tensor:

@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
-from dataclasses import dataclass
+from collections.abc import Iterator
 from typing import Any
 
 import numpy as np
@@ -14,9 +13,10 @@ from chebsplat import adapt, cks, sh_prune
 from chebsplat.errors import DataFailure
 from chebsplat.losses import feature_l1, photometric
 from chebsplat.metrics import psnr
-from chebsplat.model import Rendered, SceneModel, View
+from chebsplat.model import Rendered, SceneModel
 from chebsplat.regions import Regions, build_regions
 from chebsplat.sh import MAX_DEGREE
+from chebsplat.views import Views
 
 RATES = {
     "means": "lr_means",
@@ -29,33 +29,6 @@ RATES = {
     "sh_logits": "lr_masks",
 }
 FASTER = {"means": 0.01, "features": 0.01}  # what a rate has fallen to at the end; 0.1 elsewhere
-
-
-@dataclass
-class Views:
-    """Training views. images [V, H, W, 3] u8; masks [V, H, W] bool or None; features: view index -> [h, w, C]."""
-
-    names: list[str]
-    images: Tensor
-    Ks: Tensor
-    viewmats: Tensor
-    masks: Tensor | None = None
-    features: Callable[[int], Tensor] | None = None
-
-    def camera(self, index: int, factor: int) -> View:
-        height, width = self.images.shape[1] // factor, self.images.shape[2] // factor
-        scale = torch.tensor([[width / self.images.shape[2]], [height / self.images.shape[1]], [1.0]])
-        return View(self.Ks[index] * scale, self.viewmats[index], width, height)
-
-    def target(self, index: int, factor: int) -> tuple[Tensor, Tensor | None]:
-        """Colours [H, W, 3] in [0, 1] and mask [H, W] at 1/factor; a reduced pixel counts if all of it does."""
-        image = self.images[index].float() / 255
-        mask = None if self.masks is None else self.masks[index]
-        if factor > 1:
-            image = torch.nn.functional.avg_pool2d(image.permute(2, 0, 1), factor).permute(1, 2, 0).contiguous()
-            if mask is not None:
-                mask = -torch.nn.functional.max_pool2d(-mask[None].float(), factor)[0] > 0.5
-        return image, mask
 
 
 class Trainer:

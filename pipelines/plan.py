@@ -16,6 +16,7 @@ from typing import Any
 from chebsplat.errors import ConfigError, InputError
 from chebsplat.pipelines import store
 from chebsplat.pipelines.code import Code, installed
+from chebsplat.pipelines.needs import left_out_stages, source_sentence, teacher_kind
 from chebsplat.stages.registry import STAGES
 
 CONFIGS = Path(__file__).parent / "configs"
@@ -194,51 +195,6 @@ class Planner:
             if not file.is_file():
                 raise InputError(f"{file} is missing; correct teacher.model or teacher.labels")
         return store.content_hash(files, self.file_memo.values)
-
-
-def teacher_kind(config: Any, probe: dict[str, bool]) -> tuple[str, str]:
-    """The teacher really meant, and why there is none if there is none."""
-    wanted = config.teacher.kind
-    if not config.train.semantics:
-        return "none", "train.semantics is false"
-    if wanted == "none":
-        return "none", "teacher.kind is none"
-    if wanted == "labels" and not probe["labels"]:
-        raise ConfigError(
-            "teacher.kind is labels, but the source has none; give teacher.model or use teacher.kind=auto"
-        )
-    if wanted == "auto":
-        wanted = "onnx" if config.teacher.model else "labels" if probe["labels"] else "none"
-    return wanted, "the source has no labels and teacher.model names no encoder: rendering only"
-
-
-def left_out_stages(config: Any, kind: str, why: str, probe: dict[str, bool], knowledge: bool) -> dict[str, str]:
-    """Stages that this scene does not need, and why."""
-    left_out: dict[str, str] = {}
-    if kind == "none":
-        left_out |= {"teacher": why, "describe": f"no semantics to describe shape for ({why})"}
-        left_out |= {"onnx": f"no encoder is trained ({why})"}
-    elif config.train.encoder == "off":
-        left_out |= {"describe": "train.encoder is off", "onnx": "train.encoder is off"}
-    elif not config.train.albo:
-        left_out |= {"describe": "train.albo is false: tokens hold no descriptor"}
-    if not knowledge or "onnx" in left_out:
-        left_out["cks"] = "no sequence is named" if not knowledge else left_out["onnx"]
-    if probe["poses"] and probe["depth"]:
-        left_out["sfm: matching"] = "poses and depth are given"
-    elif probe["poses"]:
-        left_out["sfm: pose estimation"] = "poses are given"
-    return left_out
-
-
-def source_sentence(name: str, asked: Any, source: Any) -> str:
-    """Which of the possible sources it is, for the console."""
-    if source.kind != "generated":
-        return f"{source.kind} source at {source.path}"
-    note = ""
-    if asked.kind == "named":
-        note = " (REPLICA_ROOT has no such scene)" if os.environ.get("REPLICA_ROOT") else " (REPLICA_ROOT is not set)"
-    return f"generated scene {name}: preset {source.preset}, seed {source.seed}{note}"
 
 
 def placeless(sections: dict[str, Any]) -> dict[str, Any]:

@@ -14,7 +14,7 @@ if TYPE_CHECKING:
     from chebsplat.formats.capture import Capture
     from chebsplat.formats.features import Features
     from chebsplat.formats.scene import Scene
-    from chebsplat.model import View
+    from chebsplat.views import View
 
 
 def run(job: Job) -> None:
@@ -66,7 +66,7 @@ def run(job: Job) -> None:
 def camera(scene: Scene, index: int) -> View:
     import torch
 
-    from chebsplat.model import View
+    from chebsplat.views import View
 
     cameras = scene.cameras
     K, pose = (torch.from_numpy(m[index]).float() for m in (cameras.Ks, cameras.cam_from_world))

@@ -14,7 +14,8 @@ if TYPE_CHECKING:
     from chebsplat.formats.capture import Capture
     from chebsplat.formats.features import Features
     from chebsplat.formats.points import Points
-    from chebsplat.trainer import Trainer, Views
+    from chebsplat.trainer import Trainer
+    from chebsplat.views import Views
 
 
 def run(job: Job) -> None:
@@ -84,7 +85,7 @@ def training_views(capture: Capture, points: Points, features: Features | None) 
     import numpy as np
     import torch
 
-    from chebsplat.trainer import Views
+    from chebsplat.views import Views
 
     row = {name: view for view, name in enumerate(capture.names)}
     unknown = [name for name in points.names if name not in row]

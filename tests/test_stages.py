@@ -260,8 +260,8 @@ def test_an_onnx_teacher_gives_features_of_its_own_channels(toy, tmp_path):
 
 
 def test_the_exported_scene_renders_like_the_checkpoint(toy):
-    from chebsplat.model import View
     from chebsplat.render import SceneRenderer
+    from chebsplat.views import View
 
     scene = read_scene(toy["export"])
     import torch

@@ -1,0 +1,61 @@
+"""Views: one camera at one resolution, what lies in its frustum, and the photos a training looks at."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+
+@dataclass
+class View:
+    """One camera at one resolution. K [3, 3] pixels, viewmat [4, 4], float32."""
+
+    K: Tensor
+    viewmat: Tensor
+    width: int
+    height: int
+
+
+def in_frustum(means: Tensor, view: View, reach: Tensor, margin: float = 0.15) -> Tensor:
+    """Indices of points whose sphere of radius `reach` [N] may touch the image; NaN never does."""
+    camera = means @ view.viewmat[:3, :3].T + view.viewmat[:3, 3]
+    x, y, z = camera.unbind(-1)
+    half_x, half_y = 0.5 * view.width * (1 + margin), 0.5 * view.height * (1 + margin)
+    fx, fy = view.K[0, 0], view.K[1, 1]
+    u = fx * x + (view.K[0, 2] - 0.5 * view.width) * z
+    v = fy * y + (view.K[1, 2] - 0.5 * view.height) * z
+    near = z + reach > 0.01
+    inside = (u.abs() <= half_x * z.clamp_min(0) + (fx + half_x) * reach) & (
+        v.abs() <= half_y * z.clamp_min(0) + (fy + half_y) * reach
+    )
+    return (near & inside).nonzero()[:, 0]
+
+
+@dataclass
+class Views:
+    """Training views. images [V, H, W, 3] u8; masks [V, H, W] bool or None; features: view index -> [h, w, C]."""
+
+    names: list[str]
+    images: Tensor
+    Ks: Tensor
+    viewmats: Tensor
+    masks: Tensor | None = None
+    features: Callable[[int], Tensor] | None = None
+
+    def camera(self, index: int, factor: int) -> View:
+        height, width = self.images.shape[1] // factor, self.images.shape[2] // factor
+        scale = torch.tensor([[width / self.images.shape[2]], [height / self.images.shape[1]], [1.0]])
+        return View(self.Ks[index] * scale, self.viewmats[index], width, height)
+
+    def target(self, index: int, factor: int) -> tuple[Tensor, Tensor | None]:
+        """Colours [H, W, 3] in [0, 1] and mask [H, W] at 1/factor; a reduced pixel counts if all of it does."""
+        image = self.images[index].float() / 255
+        mask = None if self.masks is None else self.masks[index]
+        if factor > 1:
+            image = torch.nn.functional.avg_pool2d(image.permute(2, 0, 1), factor).permute(1, 2, 0).contiguous()
+            if mask is not None:
+                mask = -torch.nn.functional.max_pool2d(-mask[None].float(), factor)[0] > 0.5
+        return image, mask
