@@ -24,13 +24,13 @@ class Additions(NamedTuple):
 
 
 class SemanticGate(nn.Module):
-    """Pruning logit [N] from semantic features [N, C]; starts open at 3."""
+    """Pruning logit [N] from semantic features [N, C]; starts open at 1."""
 
     def __init__(self, n_channels: int):
         super().__init__()
         self.linear = nn.Linear(n_channels, 1)
         nn.init.zeros_(self.linear.weight)
-        nn.init.constant_(self.linear.bias, 3.0)
+        nn.init.constant_(self.linear.bias, 1.0)
 
     def forward(self, features: Tensor) -> Tensor:
         return self.linear(features)[:, 0]

@@ -139,9 +139,9 @@ class SceneModel:
         if n_channels is not None:
             self.raw["features"] = torch.zeros(n, n_channels)
         if train["prune"]:
-            self.raw["prune_logits"] = torch.full((n,), 3.0)
+            self.raw["prune_logits"] = torch.full((n,), 1.0)
         if train["sh_prune"]:
-            self.raw["sh_logits"] = torch.full((n, 3), 3.0)
+            self.raw["sh_logits"] = torch.zeros(n, 3)
         for value in self.raw.values():
             value.requires_grad_(True)
         self.shape = Shape(n_channels, describe, train) if n_channels and train["encoder"] != "off" else None

@@ -26,7 +26,7 @@ RATES = {
     "sh0": "lr_sh0",
     "features": "lr_features",
     "prune_logits": "lr_masks",
-    "sh_logits": "lr_masks",
+    "sh_logits": "lr_sh_masks",
 }
 FASTER = {"means": 0.01, "features": 0.01}  # what a rate has fallen to at the end; 0.1 elsewhere
 

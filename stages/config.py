@@ -86,7 +86,7 @@ class TrainSection(_Section):
     prune: bool = True
     prune_semantic: bool = True  # false: "no semantic guidance"
     densify: Literal["region", "classic", "off"] = "region"
-    grow_threshold: float = Field(2e-4, gt=0)  # gradient to the 2D means, half image widths
+    grow_threshold: float = Field(1e-4, gt=0)  # gradient to the 2D means, half image widths
     sh_prune: bool = True
     sh_guided: bool = True  # false: the paper's "no semantic guidance" of SH pruning
     # sizes
@@ -118,6 +118,7 @@ class TrainSection(_Section):
     lr_features: float = 3e-3
     lr_encoder: float = 1e-3
     lr_masks: float = 1e-2
+    lr_sh_masks: float = 5e-2
     # weights
     weight_ssim: float = Field(0.2, ge=0, le=1)
     weight_features: float = Field(1.0, ge=0)

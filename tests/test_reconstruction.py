@@ -1,0 +1,73 @@
+"""Structure from motion on real photos: triangulation keeps the given poses, mapping finds them again."""
+
+import numpy as np
+import pytest
+from shared import data, run_stage
+
+from chebsplat.cameras import centers
+from chebsplat.formats.points import read_points
+
+pytestmark = [pytest.mark.data, pytest.mark.xdist_group("sfm")]
+
+
+def points_of(tmp_path, kind, folder, views):
+    config = {
+        "scene": {"name": "fox"},
+        "source": {"kind": kind, "path": str(folder)},
+        "ingest": {"max_side": 400, "max_views": views},
+    }
+    assert run_stage("ingest", tmp_path / kind, config=config) == 0
+    assert run_stage("sfm", tmp_path / f"{kind}-points", {"capture": tmp_path / kind}, config) == 0
+    return read_points(tmp_path / f"{kind}-points")
+
+
+@pytest.fixture(scope="module")
+def triangulated(tmp_path_factory):
+    return points_of(tmp_path_factory.mktemp("posed"), "transforms", data("fox"), 12)
+
+
+def test_triangulation_keeps_poses_and_finds_points_that_reproject(triangulated):
+    assert len(triangulated.names) == 12
+    assert triangulated.notes["how"] == "triangulation"
+    assert triangulated.notes["reprojection_error_px"] < 1
+    assert len(triangulated.means) > 300
+    point, view = triangulated.tracks.T
+    pose, K = triangulated.cam_from_world[view], triangulated.Ks[view]
+    camera = np.einsum("nij,nj->ni", pose[:, :3, :3], triangulated.means[point]) + pose[:, :3, 3]
+    assert (camera[:, 2] > 0).all()
+    image = np.einsum("nij,nj->ni", K, camera)
+    image = image[:, :2] / image[:, 2:]
+    assert ((image > -5) & (image < 405)).all()
+
+
+def test_normals_face_a_camera_and_covariances_are_anisotropic(triangulated):
+    spread = np.linalg.eigvalsh(triangulated.covariances)
+    assert (spread > 0).all()
+    assert np.median(spread[:, 2] / spread[:, 0]) > 4
+    assert np.allclose(np.linalg.norm(triangulated.normals, axis=1), 1, atol=1e-4)
+
+
+@pytest.mark.slow
+def test_mapping_finds_the_given_cameras_up_to_a_similarity(triangulated, tmp_path):
+    found = points_of(tmp_path, "photos", data("fox") / "images", 25)
+    given = points_of(tmp_path, "transforms", data("fox"), 25)
+    assert found.notes["how"] == "structure from motion"
+    common = [name for name in found.names if name in given.names]
+    assert len(common) >= 15
+    a, b = (centers(np.stack([p.cam_from_world[p.names.index(name)] for name in common])) for p in (found, given))
+    a, b = a - a.mean(0), b - b.mean(0)
+    left, scales, right = np.linalg.svd(a.T @ b)
+    rotation = left @ np.diag([1, 1, np.sign(np.linalg.det(left @ right))]) @ right
+    scale = scales.sum() / (a**2).sum()
+    error = np.linalg.norm(scale * a @ rotation - b, axis=1)
+    assert np.median(error) < 0.05 * np.linalg.norm(b, axis=1).mean()
+
+
+def test_too_few_registered_views_are_a_failure_that_counts_them(tmp_path):
+    from PIL import Image
+
+    for k in range(4):
+        Image.fromarray(np.full((60, 80, 3), 40 * k, np.uint8)).save(tmp_path / f"{k}.png")
+    config = {"source": {"kind": "photos", "path": str(tmp_path)}}
+    assert run_stage("ingest", tmp_path / "out/capture", config=config) == 0
+    assert run_stage("sfm", tmp_path / "out/points", {"capture": tmp_path / "out/capture"}, config) == 4
