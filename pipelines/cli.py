@@ -60,9 +60,9 @@ def plans(scene: str | None, sequence: str | None, settings: str, ablation: str)
             return [planner.plan(scene, settings, ablation)]
         found: list[Any] = []
         basis: Path | None = None
-        for name in planning.read_toml("sequences", str(sequence))["scenes"]:
+        for place, name in enumerate(planning.read_toml("sequences", str(sequence))["scenes"], start=1):
             plan = planner.plan(name, settings, ablation, basis, keep_knowledge=True)
-            plan.title = f"{sequence}/{plan.title}".replace("/", "--")
+            plan.title = f"{sequence}-{place}-{plan.title}"
             basis = plan.targets.get("cks", basis)
             found.append(plan)
         return found

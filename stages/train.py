@@ -163,17 +163,26 @@ def first_regions(job: Job, trainer: Trainer, n_points: int) -> None:
 
 
 def follow(job: Job, trainer: Trainer, train: dict[str, Any]) -> list[dict[str, float]]:
-    """Run the steps; returns the trace, whose seconds count training alone, not the held-in measurements."""
+    """Run the steps; returns the trace.
+
+    A row holds means of the losses since the row before; its seconds count training alone, not the held-in
+    measurements.
+    """
     n_views = len(trainer.views.names)
     watched = list(range(0, n_views, max(n_views // 4, 1)))[:4]
     trace: list[dict[str, float]] = []
+    since: list[dict[str, float]] = []
     began, spent_measuring = time.perf_counter(), 0.0
     for (step, figures), status in job.progress.track(trainer.steps(), train["steps"], "train"):
+        since.append(figures)
         status |= {"loss": f"{figures['loss']:.4f}", "n": figures["n"]}
         if step % train["report_every"] == 0 or step == train["steps"]:
             paused = time.perf_counter()
-            row = {"step": step, "seconds": paused - began - spent_measuring, **figures}
+            row = {"step": step, "seconds": paused - began - spent_measuring, "n": figures["n"]}
+            for name in figures.keys() - row.keys():
+                row[name] = sum(entry.get(name, 0.0) for entry in since) / len(since)
             row["psnr"] = trainer.held_in_psnr(watched, step)
+            since = []
             spent_measuring += time.perf_counter() - paused
             trace.append({k: float(v) for k, v in row.items()})
             job.progress.record(**trace[-1])

@@ -35,7 +35,8 @@ def scene(n=6, channels=5, seed=0, dtype=torch.float64):
 
 
 @pytest.mark.data
-def test_reference_image_of_four_gaussians_is_matched():
+@pytest.mark.parametrize("backend", ["reference", "cpu"])
+def test_reference_image_of_four_gaussians_is_matched(backend):
     file = DATA / "raster_reference/tiny_case.safetensors"
     if not file.exists():
         pytest.skip("raster_reference is missing")
@@ -50,7 +51,7 @@ def test_reference_image_of_four_gaussians_is_matched():
     colors = sh.eval_sh(coefficients[:, :1], coefficients[:, 1:], directions, 3)
     image, alpha, _ = rasterize(
         case["means"], case["quats"], case["scales"].exp(), case["opacities"].sigmoid(), colors,
-        viewmat[None], K[None], width, height, max_alpha=0.999,
+        viewmat[None], K[None], width, height, max_alpha=0.999, backend=backend,
     )  # fmt: skip
     error = (torch.cat([image, alpha], -1)[0] - case["out_img"]).abs().max()
     assert error < 1e-4
