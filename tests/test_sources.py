@@ -73,6 +73,13 @@ def test_opengl_cameras_become_opencv_and_names_sort_naturally(tmp_path):
     assert fields["images"][2, 0, 0, 0] == 40
 
 
+def test_natural_order_compares_numbers_and_keeps_spellings_apart():
+    names = ["a10", "a2", "a²", "b/a1", "a02", "10", "9"]
+    ordered = sorted(names, key=common.natural)
+    assert ordered[:2] == ["9", "10"] and ordered.index("a2") < ordered.index("a10")
+    assert common.natural("a02") != common.natural("a2")
+
+
 def test_frames_may_have_their_own_angles_of_view(tmp_path):
     folder = change_frame(write_transforms(tmp_path), 1, camera_angle_x=np.pi / 2, fl_x=20.0, fl_y=5.0)
     assert np.allclose(transforms.read(folder, SETTINGS)["Ks"][:, 0, 0], [10, 20, 10])

@@ -116,7 +116,10 @@ def geometry(camera: Camera, max_side: int) -> Geometry:
 
 
 def positions(camera: Camera, view: Geometry) -> np.ndarray:
-    """Where the centres of a view's pixels lie in its photo: f64 [2, H, W] (x, y) in photo pixels."""
+    """Where the centres of a view's pixels lie in its photo: f64 [2, H, W] (x, y) in photo pixels.
+
+    Choices: beyond the radius at which a distortion polynomial turns back, the photo has no such pixel: -1.
+    """
     if camera.model not in DISTORTED:
         x = (np.arange(view.width) + 0.5) * camera.width / view.width
         y = (np.arange(view.height) + 0.5) * camera.height / view.height
@@ -124,7 +127,10 @@ def positions(camera: Camera, view: Geometry) -> np.ndarray:
     grid = np.meshgrid(np.arange(view.width) + 0.5, np.arange(view.height) + 0.5)
     pixels = np.stack([*grid, np.ones((view.height, view.width))], -1).reshape(-1, 3)
     found = _pycolmap_camera(camera).img_from_cam(pixels @ np.linalg.inv(view.K).T)
-    return np.nan_to_num(np.asarray(found, float).T.reshape(2, view.height, view.width), nan=-1.0)
+    at = np.asarray(found, float).T.reshape(2, view.height, view.width)
+    (x_down, x_right), (y_down, y_right) = (np.gradient(side) for side in at)
+    plain = (x_right > 0) & (y_down > 0) & (x_right * y_down > x_down * y_right)  # not where at is nan
+    return np.where(plain, at, -1.0)
 
 
 def _pycolmap_camera(camera: Camera) -> Any:

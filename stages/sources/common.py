@@ -209,6 +209,8 @@ def _opened(path: Path, look: Any, remedy: str) -> Any:
             look(image)
     except FileNotFoundError:
         raise InputError(f"{path} is missing; {remedy}") from None
-    except (OSError, SyntaxError, ValueError, Image.DecompressionBombError) as error:
+    except Image.DecompressionBombError as error:
+        raise InputError(f"{path} is too large ({error}); reduce it") from None
+    except (OSError, SyntaxError, ValueError) as error:
         raise InputError(f"{path} is not a readable image ({error}); copy it again") from None
     return image
