@@ -1,42 +1,34 @@
 """Every layout on disk becomes the same capture, and a bad one is named with its remedy."""
 
 import json
+import time
 
 import numpy as np
 import pytest
-from PIL import Image
 from shared import data
+from source_folders import SETTINGS, SMALL, change_frame, image, write_transforms
 
 from chebsplat.cameras import unproject
 from chebsplat.errors import DataFailure, InputError
 from chebsplat.stages.config import IngestSection
 from chebsplat.stages.sources import colmap, common, photos, replica, transforms
 
-SETTINGS = IngestSection(max_side=160, min_views=2)
-SMALL = IngestSection(max_side=160, max_views=6, min_views=2)
 
-
-def image(path, size=(8, 6), value=100, mode="RGB"):
-    path.parent.mkdir(parents=True, exist_ok=True)
-    fill = (value,) * 3 if mode == "RGB" else value
-    Image.new(mode, size, fill).save(path)
-
-
-def agreement(fields, a=0, b=1):
-    """Share of pixels of view a whose label agrees where they land in view b, at the same depth."""
+def agreement(fields, a, b):
+    """(share of view a's pixels that view b sees at their depth, share of these whose labels agree)."""
     pixels = np.argwhere(np.isfinite(fields["depth"][a]))
     points = unproject(fields["depth"][a], fields["Ks"][a], fields["cam_from_world"][a], pixels)
     pose = fields["cam_from_world"][b]
     camera = points @ pose[:3, :3].T + pose[:3, 3]
-    seen = camera @ fields["Ks"][b].T
-    with np.errstate(divide="ignore", invalid="ignore"):
-        u, v = np.floor(seen[:, :2] / seen[:, 2:]).T
+    front = camera[:, 2] > 0.1
+    pixels, camera = pixels[front], camera[front]
+    u, v = np.floor((camera @ fields["Ks"][b].T)[:, :2] / camera[:, 2:]).astype(int).T
     height, width = fields["depth"][b].shape
-    inside = (camera[:, 2] > 0.1) & (u >= 0) & (u < width) & (v >= 0) & (v < height)
-    u, v = u[inside].astype(int), v[inside].astype(int)
-    same = np.abs(fields["depth"][b][v, u] - camera[inside, 2]) < 0.02 * camera[inside, 2]
-    first = fields["labels"][a][pixels[inside, 0], pixels[inside, 1]]
-    return same.mean(), (first == fields["labels"][b][v, u])[same].mean()
+    inside = (u >= 0) & (u < width) & (v >= 0) & (v < height)
+    u, v, pixels, z = u[inside], v[inside], pixels[inside], camera[inside, 2]
+    same = np.abs(fields["depth"][b][v, u] - z) < 0.02 * z
+    equal = fields["labels"][a][pixels[:, 0], pixels[:, 1]] == fields["labels"][b][v, u]
+    return same.sum() / (height * width), equal[same].sum() / max(same.sum(), 1)
 
 
 @pytest.mark.data
@@ -44,12 +36,13 @@ def test_house_kitchen_poses_depth_and_labels_agree_between_views():
     folder = data("house_kitchen")
     assert common.detect(folder) == "colmap"
     assert colmap.probe(folder) == {"poses": True, "depth": True, "labels": True}
-    fields = colmap.read(folder, IngestSection(max_side=320, max_views=20))
-    best = max((agreement(fields, 0, k) for k in range(1, 20)), key=lambda pair: pair[0])
-    assert best[0] > 0.3
-    assert best[1] > 0.95
+    fields = colmap.read(folder, IngestSection(max_side=160, max_views=20))
+    shares = np.array([agreement(fields, a, b) for a in range(20) for b in range(20) if a != b])
+    labels = shares[shares[:, 0] > 0.2, 1]
+    assert len(labels) >= 180  # 197; a principal point 3 pixels off leaves 139
+    assert labels.min() > 0.97  # 0.977; what disagrees are object borders, at nearest pixels of a quarter of the size
     assert "void" not in fields["class_names"]
-    assert fields["is_test"].sum() == 3
+    assert [int(name[-4:]) % 8 == 0 for name in fields["names"]] == fields["is_test"].tolist()
 
 
 @pytest.mark.data
@@ -57,32 +50,19 @@ def test_fox_lists_absent_frames_and_is_undistorted():
     folder = data("fox")
     assert common.detect(folder) == "transforms"
     assert len(transforms.files(folder)) == 51
-    fields = transforms.read(folder, SMALL)
-    assert fields["images"].shape[0] == 6
+    fields = transforms.read(folder, IngestSection(max_side=64))
+    assert fields["images"].shape[0] == 50 and max(fields["images"].shape[1:3]) == 64
     assert any("17 of 67" in note for note in fields["source"]["notes"])
     assert any("undistorted" in note for note in fields["source"]["notes"])
-    assert np.allclose(fields["Ks"][:, 0, 0] / 160, 1375.52 / 1920, rtol=0.05)
+    assert np.allclose(fields["Ks"][:, 0, 0] / 64, 1375.52 / 1920, rtol=0.05)
 
 
 @pytest.mark.data
 def test_statue_with_images_of_several_sizes_is_padded_and_masked():
-    folder = data("statue_colmap") / "dense/0"
-    fields = colmap.read(folder, SMALL)
+    fields = colmap.read(data("statue_colmap") / "dense/0", SMALL)
     assert fields["images"].shape[0] == 6
     assert not fields["loss_mask"].all()
     assert (fields["images"][~fields["loss_mask"]] == 0).all()
-
-
-def write_transforms(folder, n=3, **changes):
-    frames = []
-    for k in range(n):
-        image(folder / f"images/frame_{k + 9}.png", value=20 * k)
-        matrix = np.eye(4)
-        matrix[0, 3] = k
-        frames.append({"file_path": f"images/frame_{k + 9}", "transform_matrix": matrix.tolist()})
-    document = {"w": 8, "h": 6, "fl_x": 10.0, "cx": 4, "cy": 3, "frames": frames} | changes
-    (folder / "transforms.json").write_text(json.dumps(document))
-    return folder
 
 
 def test_opengl_cameras_become_opencv_and_names_sort_naturally(tmp_path):
@@ -93,24 +73,71 @@ def test_opengl_cameras_become_opencv_and_names_sort_naturally(tmp_path):
     assert fields["images"][2, 0, 0, 0] == 40
 
 
-def test_a_pose_that_is_not_finite_is_dropped_with_a_note(tmp_path):
-    folder = write_transforms(tmp_path, 4)
+def test_natural_order_compares_numbers_and_keeps_spellings_apart():
+    names = ["a10", "a2", "a²", "b/a1", "a02", "10", "9"]
+    ordered = sorted(names, key=common.natural)
+    assert ordered[:2] == ["9", "10"] and ordered.index("a2") < ordered.index("a10")
+    assert common.natural("a02") != common.natural("a2")
+
+
+def test_frames_may_have_their_own_angles_of_view(tmp_path):
+    folder = change_frame(write_transforms(tmp_path), 1, camera_angle_x=np.pi / 2, fl_x=20.0, fl_y=5.0)
+    assert np.allclose(transforms.read(folder, SETTINGS)["Ks"][:, 0, 0], [10, 20, 10])
+    folder = write_transforms(tmp_path, fl_x="absent", camera_angle_x=np.pi / 2, camera_angle_y=2 * np.arctan(1.5))
+    assert np.allclose(transforms.read(folder, SETTINGS)["Ks"][:, [0, 1], [0, 1]], [4, 2])
+
+
+def test_depth_and_masks_that_transforms_list_are_read(tmp_path):
+    folder = write_transforms(tmp_path)
+    for k in range(3):
+        image(folder / f"depth/{k}.png", mode="I;16", value=2500)
+        image(folder / f"masks/{k}.png", mode="L", value=0 if k == 1 else 255)
+        change_frame(folder, k, depth_file_path=f"depth/{k}.png", mask_path=f"masks/{k}.png")
+    assert transforms.probe(folder) == {"poses": True, "depth": True, "labels": False}
+    fields = transforms.read(folder, SETTINGS)
+    assert np.allclose(fields["depth"], 2.5)
+    assert fields["loss_mask"].mean((1, 2)).tolist() == [1, 0, 1]
+    assert len(transforms.files(folder)) == 1 + 9
     document = json.loads((folder / "transforms.json").read_text())
-    document["frames"][0]["transform_matrix"][0][3] = float("inf")
+    del document["frames"][0]["depth_file_path"]
     (folder / "transforms.json").write_text(json.dumps(document))
     fields = transforms.read(folder, SETTINGS)
+    assert "depth" not in fields and not transforms.probe(folder)["depth"]
+    assert "Only 2 of 3 frames have depth" in fields["source"]["notes"][0]
+
+
+@pytest.mark.parametrize("value", [float("inf"), float("nan")])
+def test_a_pose_that_is_not_finite_is_dropped_with_a_note(tmp_path, value):
+    folder = change_frame(write_transforms(tmp_path, 4), transform_matrix=[[value] * 4] * 4)
+    fields = transforms.read(folder, SETTINGS)
     assert len(fields["names"]) == 3
-    assert "not finite" in fields["source"]["notes"][0]
+    assert "1 of 4 frames have a pose that is not finite" in fields["source"]["notes"][0]
+
+
+@pytest.mark.parametrize("diagonal", [(2, 2, 2, 1), (-1, 1, 1, 1), (0, 0, 0, 1), (1, 1, 1, 2)])
+def test_a_pose_that_is_not_rigid_is_named(tmp_path, diagonal):
+    folder = change_frame(write_transforms(tmp_path), 1, transform_matrix=np.diag(diagonal).tolist())
+    with pytest.raises(InputError, match="frame_10 is not a rotation"):
+        transforms.read(folder, SETTINGS)
 
 
 @pytest.mark.parametrize(
     ("changes", "message"),
     [
         ({"frames": []}, "no frames"),
+        ({"frames": 3}, "no frames"),
+        ({"frames": ["a"]}, "no object"),
         ({"frames": [{"file_path": "a"}]}, "transform_matrix"),
         ({"frames": [{"file_path": "images/frame_9", "transform_matrix": [[1]]}]}, r"not \(4, 4\)"),
-        ({"fl_x": 10.0, "k3": 0.1}, "undistort"),
+        ({"frames": [{"file_path": "images/frame_9", "transform_matrix": "x"}]}, "transform_matrix"),
+        ({"k3": 0.1}, "undistort"),
+        ({"camera_model": "OPENCV_FISHEYE", "k1": 0.1}, "OPENCV_FISHEYE"),
         ({"w": 9}, "restore"),
+        ({"w": None}, "no numbers"),
+        ({"fl_x": "a"}, "no numbers"),
+        ({"fl_x": 0}, "not usable"),
+        ({"fl_x": float("nan")}, "not usable"),
+        ({"fl_x": "absent"}, "camera_angle_x"),
     ],
 )
 def test_bad_transforms_are_named(tmp_path, changes, message):
@@ -118,16 +145,12 @@ def test_bad_transforms_are_named(tmp_path, changes, message):
         transforms.read(write_transforms(tmp_path, **changes), SETTINGS)
 
 
-def test_transforms_without_focal_length_or_syntax_are_named(tmp_path):
-    folder = write_transforms(tmp_path)
-    document = json.loads((folder / "transforms.json").read_text())
-    del document["fl_x"]
-    (folder / "transforms.json").write_text(json.dumps(document))
-    with pytest.raises(InputError, match="camera_angle_x"):
-        transforms.read(folder, SETTINGS)
-    (folder / "transforms.json").write_text("{")
-    with pytest.raises(InputError, match="does not parse"):
-        transforms.read(folder, SETTINGS)
+@pytest.mark.parametrize(("text", "message"), [("{", "does not parse"), ("[]", "not an object"), ("\xff", "parse")])
+def test_json_that_is_no_object_is_named(tmp_path, text, message):
+    (tmp_path / "transforms.json").write_bytes(text.encode("latin-1"))
+    for job in (transforms.probe, transforms.files, lambda folder: transforms.read(folder, SETTINGS)):
+        with pytest.raises(InputError, match=message):
+            job(tmp_path)
 
 
 def test_too_few_frames_are_a_failure_that_counts_them(tmp_path):
@@ -138,135 +161,44 @@ def test_too_few_frames_are_a_failure_that_counts_them(tmp_path):
         transforms.read(folder, SETTINGS)
 
 
-def write_colmap(folder, model="PINHOLE 8 6 10 10 4 3", names=("a.png", "b.png", "c.png")):
-    (folder / "sparse/0").mkdir(parents=True)
-    (folder / "sparse/0/cameras.txt").write_text(f"1 {model}\n")
-    rows = [f"{k + 1} 1 0 0 0 {k} 0 0 1 {name}\n\n" for k, name in enumerate(names)]
-    (folder / "sparse/0/images.txt").write_text("".join(rows))
-    (folder / "sparse/0/points3D.txt").write_text("")
-    for name in names:
-        image(folder / "images" / name)
-        image(folder / "depth" / name, mode="I;16", value=1500)
-        image(folder / "semantic" / name, mode="L", value=7)
-    (folder / "labels.json").write_text(json.dumps({"7": "sofa", "8": "void"}))
-    return folder
-
-
-def test_a_colmap_text_model_with_depth_and_labels_reads(tmp_path):
-    folder = write_colmap(tmp_path)
-    image(folder / "semantic/b.png", mode="L", value=8)
-    fields = colmap.read(folder, SETTINGS)
-    assert np.allclose(fields["depth"], 1.5)
-    assert fields["class_names"] == ["sofa"]
-    assert [int(v[0, 0]) for v in fields["labels"]] == [0, -1, 0]
-    assert fields["cam_from_world"][2][0, 3] == 2
-    assert len(colmap.files(folder)) == 3 + 1 + 9
-
-
-def test_images_that_model_and_disk_do_not_share_are_counted(tmp_path):
-    folder = write_colmap(tmp_path)
-    (folder / "images/a.png").unlink()
-    image(folder / "images/z.png")
-    fields = colmap.read(folder, SETTINGS)
-    assert len(fields["names"]) == 2
-    assert len(fields["source"]["notes"]) == 2
-
-
-def test_a_mask_becomes_a_loss_mask(tmp_path):
-    folder = write_colmap(tmp_path)
-    for name in ("a", "b", "c"):
-        image(folder / f"masks/{name}.png", mode="L", value=255 * (name != "b"))
-    masks = colmap.read(folder, SETTINGS)["loss_mask"]
-    assert masks.mean((1, 2)).tolist() == [1, 0, 1]
-
-
-def test_distorted_cameras_undistort_labels_and_depth_too(tmp_path):
-    fields = colmap.read(write_colmap(tmp_path, "SIMPLE_RADIAL 8 6 10 4 3 0.05"), SETTINGS)
-    assert np.nanmin(fields["depth"]) == 1.5
-    assert fields["labels"].max() == 0
-    assert fields["images"].shape == (*fields["labels"].shape, 3)
-
-
-def test_an_unsupported_camera_model_is_named(tmp_path):
-    with pytest.raises(InputError, match="OPENCV_FISHEYE"):
-        colmap.read(write_colmap(tmp_path, "OPENCV_FISHEYE 8 6 10 10 4 3 0 0 0 0"), SETTINGS)
-
-
-@pytest.mark.parametrize("damage", ["truncated image", "depth of another size", "no images", "no model"])
-def test_a_damaged_colmap_source_is_named(tmp_path, damage):
-    import shutil
-
-    folder = write_colmap(tmp_path)
-    if damage == "truncated image":
-        file = folder / "images/b.png"
-        file.write_bytes(file.read_bytes()[:-30])
-    elif damage == "depth of another size":
-        image(folder / "depth/b.png", (4, 3), 1500, "I;16")
-    else:
-        shutil.rmtree(folder / ("images" if damage == "no images" else "sparse"))
-    with pytest.raises(InputError, match=str(folder)):
-        colmap.read(folder, SETTINGS)
-
-
-def test_photos_have_no_poses_and_mixed_sizes_are_masked(tmp_path):
-    for k, size in enumerate([(80, 60), (60, 80), (40, 30)]):
-        image(tmp_path / f"{k}.jpg", size)
-    assert common.detect(tmp_path) == "photos"
-    fields = photos.read(tmp_path, SETTINGS)
-    assert fields["cam_from_world"] is None
-    assert fields["images"].shape == (3, 80, 80, 3)
-    assert fields["loss_mask"].sum() == 80 * 60 * 2 + 40 * 30
-    assert fields["Ks"][0][0, 0] == pytest.approx(1.2 * 80)
-    assert photos.probe(tmp_path)["poses"] is False
-
-
-def test_images_are_reduced_but_never_enlarged(tmp_path):
-    for k in range(3):
-        image(tmp_path / f"{k}.jpg", (320, 160))
-    fields = photos.read(tmp_path, SETTINGS)
-    assert fields["images"].shape == (3, 80, 160, 3)
-    assert fields["Ks"][0][0, 0] == pytest.approx(1.2 * 160)
-    assert photos.read(tmp_path, IngestSection(max_side=9999))["images"].shape == (3, 160, 320, 3)
-
-
-def test_nice_slam_layout_reads(tmp_path):
-    folder = tmp_path / "office0"
-    for k in range(3):
-        image(folder / f"results/frame{k:06d}.jpg")
-        image(folder / f"results/depth{k:06d}.png", mode="I;16", value=13107)
-    (folder / "traj.txt").write_text("1 0 0 2 0 1 0 0 0 0 1 0 0 0 0 1\n" * 3)
-    camera = {"w": 8, "h": 6, "fx": 10, "fy": 10, "cx": 3.5, "cy": 2.5, "scale": 6553.5}
-    (tmp_path / "cam_params.json").write_text(json.dumps({"camera": camera}))
-    assert common.detect(folder) == "replica"
-    fields = replica.read(folder, SETTINGS)
-    assert np.allclose(fields["depth"], 2.0)
-    assert fields["Ks"][0][0, 2] == 4.0
-    assert fields["cam_from_world"][0][0, 3] == -2
-    assert "labels" not in fields
-    (folder / "traj.txt").write_text("1 0 0 2 0 1 0 0 0 0 1 0 0 0 0 1\n" * 2)
-    with pytest.raises(InputError, match="2 poses for 3 images"):
-        replica.read(folder, SETTINGS)
-
-
-def test_semantic_nerf_layout_reads_and_joins_on_number(tmp_path):
-    folder = tmp_path / "office_0"
-    for k in range(11):
-        image(folder / f"Sequence_1/rgb/rgb_{k}.png", value=k)
-        image(folder / f"Sequence_1/depth/depth_{k}.png", mode="I;16", value=1000 + k)
-        image(folder / f"Sequence_1/semantic_class/semantic_class_{k}.png", mode="L", value=k % 3)
-    rows = [f"1 0 0 {k} 0 1 0 0 0 0 1 0 0 0 0 1\n" for k in range(11)]
-    (folder / "Sequence_1/traj_w_c.txt").write_text("".join(rows))
-    classes = [{"id": 1, "name": "wall"}, {"id": 2, "name": "floor"}]
-    (folder / "info_semantic.json").write_text(json.dumps({"classes": classes}))
-    fields = replica.read(folder, SETTINGS)
-    assert fields["images"][10, 0, 0, 0] == 10
-    assert fields["depth"][10, 0, 0] == pytest.approx(1.010)
-    assert fields["cam_from_world"][10][0, 3] == -10
-    assert fields["class_names"] == ["wall", "floor"]
-    assert fields["labels"][:3, 0, 0].tolist() == [-1, 0, 1]
-    assert fields["Ks"][0][0, 2] == 4.0
+def test_no_name_of_a_view_tells_where_the_folder_lies(tmp_path):
+    folder = write_transforms(tmp_path)
+    for k, listed in enumerate(("./images/frame_9.png", "images\\frame_10.png", str(folder / "images/frame_11.png"))):
+        change_frame(folder, k, file_path=listed)
+    fields = transforms.read(folder, SETTINGS)
+    assert fields["names"] == ["frame_9", "frame_10", "frame_11"]
+    assert str(tmp_path) not in json.dumps(fields["source"])
+    elsewhere = image(tmp_path.parent / f"{tmp_path.name}-elsewhere" / "x.png")
+    with pytest.raises(InputError, match="relative"):
+        transforms.read(change_frame(folder, file_path=str(elsewhere)), SETTINGS)
 
 
 def test_a_folder_without_photos_is_no_source(tmp_path):
     with pytest.raises(InputError, match=r"transforms\.json"):
         common.detect(tmp_path)
+    image(tmp_path / "images/a.png")
+    with pytest.raises(InputError, match="images may be meant"):
+        common.detect(tmp_path)
+
+
+def test_probes_take_under_20_ms_for_a_thousand_frames(tmp_path):
+    folders = {n: tmp_path / n for n in ("slam", "nerf", "colmap", "transforms", "photos")}
+    pixels = image(tmp_path / "x.png").read_bytes()
+    (tmp_path / "x.png").unlink()
+    for part in ("slam/results/frame{:06d}.jpg", "slam/results/depth{:06d}.png", "nerf/Sequence_1/rgb/rgb_{}.png",
+                 "nerf/Sequence_1/depth/depth_{}.png", "nerf/Sequence_1/semantic_class/semantic_class_{}.png",
+                 "colmap/images/{}.png", "colmap/depth/{}.png", "colmap/semantic/{}.png", "photos/{}.png",
+                 "transforms/images/{}.png"):  # fmt: skip
+        (tmp_path / part).parent.mkdir(parents=True, exist_ok=True)
+        for k in range(1000):
+            (tmp_path / part.format(k)).write_bytes(pixels)
+    frames = [{"file_path": f"images/{k}.png", "transform_matrix": np.eye(4).tolist()} for k in range(1000)]
+    (folders["transforms"] / "transforms.json").write_text(json.dumps({"fl_x": 1.0, "frames": frames}))
+    modules = {"slam": replica, "nerf": replica, "colmap": colmap, "transforms": transforms, "photos": photos}
+    for kind, module in modules.items():
+        seconds = []
+        for _ in range(5):
+            start = time.perf_counter()
+            module.probe(folders[kind])
+            seconds.append(time.perf_counter() - start)
+        assert min(seconds) < 0.02, (kind, seconds)

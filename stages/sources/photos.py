@@ -6,15 +6,16 @@ from pathlib import Path
 from typing import Any
 
 from chebsplat.errors import InputError
-from chebsplat.stages.sources import common
-from chebsplat.stages.sources.common import Camera, Frame, Listing
+from chebsplat.stages.sources import assembly, common
+from chebsplat.stages.sources.common import Frame, Listing
 
-FOCAL_35MM, GUESS = 0xA405, 1.2
+GUESS = 1.2  # focal length in longer sides, where EXIF says nothing
+FILM = 36.0  # mm, the longer side of the frame that 35 mm equivalents refer to
 
 
-def read(folder: Path, settings: Any) -> dict[str, Any]:
-    """The fields of a capture, without poses."""
-    return common.assemble(_listing(folder), settings)
+def read(folder: Path, settings: Any, class_names: tuple[str, ...] | None = None) -> dict[str, Any]:
+    """The fields of a capture, without poses. `class_names` is of no use here: photos have no labels."""
+    return assembly.assemble(_listing(folder), settings, class_names)
 
 
 def probe(folder: Path) -> dict[str, bool]:
@@ -22,26 +23,27 @@ def probe(folder: Path) -> dict[str, bool]:
 
 
 def files(folder: Path) -> list[Path]:
-    return _images(folder)
-
-
-def _images(folder: Path) -> list[Path]:
-    found = [path for path in folder.iterdir() if path.suffix.lower() in common.IMAGE_TYPES]
+    """The photos; subfolders are not searched. Raises InputError if there are none."""
+    try:
+        found = sorted(path for path in folder.iterdir() if common.is_image(path.name))
+    except OSError as error:
+        raise InputError(f"{folder}: {error.strerror}; correct source.path") from None
     if not found:
         raise InputError(f"{folder} holds no .jpg or .png image; correct source.path")
-    return sorted(found, key=lambda path: common.natural(path.name))
+    return found
 
 
 def _listing(folder: Path) -> Listing:
     frames, guessed = [], 0
-    for path in _images(folder):
-        image = common.open_image(path, upright=True)
-        focal = image.getexif().get_ifd(0x8769).get(FOCAL_35MM)
-        width, height = image.size
-        guessed += not focal
-        pixels = float(focal) / 36.0 * max(width, height) if focal else GUESS * max(width, height)
-        frames.append(Frame(path.stem, path, Camera("SIMPLE_PINHOLE", [pixels, width / 2, height / 2], width, height)))
-    notes = (
-        [f"{guessed} photos have no focal length; {GUESS} times the longer side is the first guess."] if guessed else []
-    )
+    for path in files(folder):
+        (width, height), focal = common.header(path)
+        guessed += focal is None
+        pixels = max(width, height) * (GUESS if focal is None else focal / FILM)
+        camera = common.camera_of(path, "SIMPLE_PINHOLE", (pixels, width / 2, height / 2), width, height)
+        frames.append(Frame(path.stem, path, camera))
+    notes = []
+    if guessed:
+        notes.append(
+            f"{guessed} of {len(frames)} photos have no focal length; {GUESS} times the longer side is the first guess."
+        )
     return Listing("photos", frames, notes=notes, upright=True)

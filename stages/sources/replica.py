@@ -2,30 +2,40 @@
 
 from __future__ import annotations
 
+import re
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from chebsplat.errors import InputError
-from chebsplat.stages.sources import common
-from chebsplat.stages.sources.common import Camera, Frame, Listing
+from chebsplat.stages.sources import assembly, common
+from chebsplat.stages.sources.common import Frame, Listing
+
+VOID = 0  # Semantic-NeRF's id of pixels without a class
+SEQUENCE = "Sequence_1"
 
 
-def read(folder: Path, settings: Any) -> dict[str, Any]:
+def read(folder: Path, settings: Any, class_names: tuple[str, ...] | None = None) -> dict[str, Any]:
     """The fields of a capture."""
-    return common.assemble(_listing(folder), settings)
+    return assembly.assemble(_listing(folder), settings, class_names)
 
 
 def probe(folder: Path) -> dict[str, bool]:
-    semantic = (folder / "Sequence_1/semantic_class").is_dir()
-    return {"poses": True, "depth": True, "labels": semantic}
+    """Light: reads names only. What some image has, every image must have: `read` fails otherwise."""
+    if (folder / "results").is_dir():
+        depth = any(name.startswith("depth") for name in common.names_below(folder / "results"))
+        return {"poses": True, "depth": depth, "labels": False}
+    depth, labels = (any(common.names_below(folder / SEQUENCE / part)) for part in ("depth", "semantic_class"))
+    return {"poses": True, "depth": depth, "labels": labels}
 
 
 def files(folder: Path) -> list[Path]:
-    extra = [p for p in (folder / "traj.txt", folder / "Sequence_1/traj_w_c.txt", *_parameter_files(folder),
-                         *_class_files(folder)) if p.is_file()]  # fmt: skip
-    return sorted([*extra, *_listing(folder).files()])
+    """Trajectory, camera, class names, and every image, depth and label."""
+    tables = [folder / "traj.txt", folder / SEQUENCE / "traj_w_c.txt", *_parameter_files(folder), *_class_files(folder)]
+    places = [folder / "results", *(folder / SEQUENCE / part for part in ("rgb", "depth", "semantic_class"))]
+    data = [place / name for place in places for name in common.names_below(place)]
+    return sorted([*(path for path in tables if path.is_file()), *data])
 
 
 def _parameter_files(folder: Path) -> list[Path]:
@@ -33,86 +43,107 @@ def _parameter_files(folder: Path) -> list[Path]:
 
 
 def _class_files(folder: Path) -> list[Path]:
-    places = (folder, folder / "habitat", folder / "Sequence_1", folder.parent)
+    places = (folder, folder / "habitat", folder / SEQUENCE, folder.parent)
     return [place / "info_semantic.json" for place in places]
 
 
 def _listing(folder: Path) -> Listing:
     if (folder / "results").is_dir():
         return _nice_slam(folder)
-    if (folder / "Sequence_1").is_dir():
+    if (folder / SEQUENCE).is_dir():
         return _semantic_nerf(folder)
     raise InputError(
-        f"{folder} holds neither results/ (NICE-SLAM) nor Sequence_1/ (Semantic-NeRF); correct source.path"
+        f"{folder} holds neither results/ (NICE-SLAM) nor {SEQUENCE}/ (Semantic-NeRF); correct source.path"
     )
 
 
-def _trajectory(path: Path, count: int) -> np.ndarray:
-    """cam_from_world [V, 4, 4] of rows of 16 camera-to-world entries."""
+def _trajectory(path: Path, names: list[str]) -> np.ndarray:
+    """cam_from_world [V, 4, 4] of the named images from rows of 16 camera-to-world entries, a row for each frame.
+
+    Raises:  InputError unless the images are numbered 0 to V − 1 and there are V rows. A row is found by the number
+      in the image's name, so a missing frame cannot shift the others.
+    """
     try:
-        rows = np.loadtxt(path, ndmin=2)
-    except FileNotFoundError:
-        raise InputError(f"{path} is missing; the source is incomplete") from None
+        rows = [line.split() for line in path.read_text().splitlines() if line.strip()]
+    except OSError as error:
+        raise InputError(f"{path}: {error.strerror}; the source is incomplete") from None
     except ValueError as error:
-        raise InputError(f"{path} does not parse ({error}); restore the file") from None
-    if rows.size != 16 * count:
-        raise InputError(f"{path} has {rows.size / 16:g} poses for {count} images; restore the file")
-    matrices = rows.reshape(count, 4, 4)
-    usable = np.isfinite(matrices).all((1, 2))
-    poses = np.full((count, 4, 4), np.nan)
-    poses[usable] = np.linalg.inv(matrices[usable])
-    return poses
+        raise InputError(f"{path} is no text ({error}); restore the file") from None
+    if len(rows) != len(names):
+        raise InputError(f"{path} has {len(rows)} poses for {len(names)} images; restore the file or the images")
+    found = [re.search(r"(\d+)$", name) for name in names]
+    numbers = [int(match[1]) if match else -1 for match in found]
+    if sorted(numbers) != list(range(len(names))):
+        lacking = next(k for k in range(len(names)) if numbers.count(k) != 1)
+        raise InputError(f"{path} counts frames from 0, but image {lacking} is missing or there twice; restore it")
+    matrices = np.empty((len(rows), 16))
+    for k, row in enumerate(rows):
+        try:
+            matrices[k] = [float(v) for v in row]
+        except ValueError as error:
+            raise InputError(f"{path}: row {k + 1} does not hold 16 numbers ({error}); restore the file") from None
+    return common.cam_from_world(path, matrices[numbers].reshape(-1, 4, 4), names)
 
 
 def _nice_slam(folder: Path) -> Listing:
-    files_ = [path for path in _parameter_files(folder) if path.is_file()]
-    if not files_:
+    place = folder / "results"
+    images = [name for name in common.images_in(place) if name.startswith("frame")]
+    if not images:
+        raise InputError(f"{place} holds no frame*.jpg; the source is incomplete")
+    parameters = next((path for path in _parameter_files(folder) if path.is_file()), None)
+    if parameters is None:
         raise InputError(f"{folder / 'cam_params.json'} is missing, here and one level up; the source is incomplete")
     try:
-        values = common.read_json(files_[0])["camera"]
-        size = (int(values["w"]), int(values["h"]))
+        v = common.read_json(parameters)["camera"]
         # Their principal point counts from the centre of the first pixel.
-        params = [values["fx"], values["fy"], values["cx"] + 0.5, values["cy"] + 0.5]
-        scale = float(values["scale"])
-    except (KeyError, TypeError) as error:
-        raise InputError(f"{files_[0]} lacks {error}; restore the file") from None
-    images = [p for p in common.images_in(folder / "results") if p.stem.startswith("frame")]
-    poses = _trajectory(folder / "traj.txt", len(images))
-    camera = Camera("PINHOLE", [float(v) for v in params], *size)
-    frames = [
-        Frame(path.stem, path, camera, pose, common.beside(folder / "results", path.stem.replace("frame", "depth")))
-        for path, pose in zip(images, poses, strict=True)
-    ]
-    return Listing("replica", frames, depth_scale=scale, notes=["NICE-SLAM layout."])
+        params = (v["fx"], v["fy"], float(v["cx"]) + 0.5, float(v["cy"]) + 0.5)
+        camera = common.camera_of(parameters, "PINHOLE", params, v["w"], v["h"])
+        scale = float(v["scale"])
+    except (KeyError, TypeError, ValueError) as error:
+        raise InputError(f"{parameters} lacks a camera's fx, fy, cx, cy, w, h or scale ({error}); restore it") from None
+    if not 0 < scale < float("inf"):
+        raise InputError(f"{parameters}: a depth scale of {scale} is not usable; restore it")
+    names = [common.stem(name) for name in images]
+    has_depth = probe(folder)["depth"]
+    frames = []
+    for name, image, pose in zip(names, images, _trajectory(folder / "traj.txt", names), strict=True):
+        depth = place / f"depth{name.removeprefix('frame')}.png"
+        frames.append(Frame(name, place / image, camera, pose, depth if has_depth else None))
+    return Listing("replica", frames, depth_scale=scale, notes=["Replica as NICE-SLAM renders it."])
 
 
 def _semantic_nerf(folder: Path) -> Listing:
-    sequence = folder / "Sequence_1"
-    images = common.images_in(sequence / "rgb")
-    poses = _trajectory(sequence / "traj_w_c.txt", len(images))
-    width, height = common.open_image(images[0]).size
-    camera = Camera("PINHOLE", [width / 2, width / 2, width / 2, height / 2], width, height)
+    sequence = folder / SEQUENCE
+    images = [name for name in common.images_in(sequence / "rgb") if name.startswith("rgb_")]
+    if not images:
+        raise InputError(f"{sequence / 'rgb'} holds no rgb_N.png; the source is incomplete")
+    (width, height), _ = common.header(sequence / "rgb" / images[0])
+    camera = common.camera_of(sequence, "PINHOLE", (width / 2, width / 2, width / 2, height / 2), width, height)
+    has = probe(folder)
+    names = [common.stem(name) for name in images]
     frames = []
-    for path, pose in zip(images, poses, strict=True):
-        number = path.stem.rsplit("_", 1)[-1]
+    for name, image, pose in zip(names, images, _trajectory(sequence / "traj_w_c.txt", names), strict=True):
+        n = name.removeprefix("rgb_")
         frames.append(
             Frame(
-                f"frame{int(number):06d}",
-                path,
+                name,
+                sequence / "rgb" / image,
                 camera,
                 pose,
-                common.beside(sequence / "depth", f"depth_{number}"),
-                common.beside(sequence / "semantic_class", f"semantic_class_{number}"),
+                sequence / f"depth/depth_{n}.png" if has["depth"] else None,
+                sequence / f"semantic_class/semantic_class_{n}.png" if has["labels"] else None,
             )
         )
-    return Listing("replica", frames, _class_names(folder), notes=["Semantic-NeRF layout."])
+    return Listing("replica", frames, _class_names(folder), notes=["Replica as Semantic-NeRF renders it."])
 
 
 def _class_names(folder: Path) -> dict[int, str] | None:
-    for path in _class_files(folder):
-        if path.is_file():
-            try:
-                return {int(entry["id"]): str(entry["name"]) for entry in common.read_json(path)["classes"]}
-            except (KeyError, TypeError, ValueError) as error:
-                raise InputError(f"{path} lacks classes with id and name ({error}); restore the file") from None
-    return None
+    """Class names by id, of the nearest info_semantic.json; void is none of them."""
+    path = next((path for path in _class_files(folder) if path.is_file()), None)
+    if path is None:
+        return None
+    try:
+        names = {int(entry["id"]): str(entry["name"]) for entry in common.read_json(path)["classes"]}
+    except (KeyError, TypeError, ValueError) as error:
+        raise InputError(f"{path} lacks classes with id and name ({error}); restore the file") from None
+    return {k: name for k, name in names.items() if k != VOID}

@@ -3,87 +3,135 @@
 from __future__ import annotations
 
 import math
+import os
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from chebsplat.errors import InputError
-from chebsplat.stages.sources import common
+from chebsplat.stages.sources import assembly, common
 from chebsplat.stages.sources.common import Camera, Frame, Listing
 
+PARTS = ("file_path", "depth_file_path", "mask_path")
+DISTORTION = ("k1", "k2", "p1", "p2")
+HIGHER = ("k3", "k4", "k5", "k6")
+PERSPECTIVE = ("OPENCV", "PINHOLE", "SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RADIAL", "PERSPECTIVE")  # subsets of OPENCV
+OPENGL = np.array([1.0, -1.0, -1.0, 1.0])  # y up, z backward -> y down, z forward
 
-def read(folder: Path, settings: Any) -> dict[str, Any]:
-    """The fields of a capture."""
-    return common.assemble(_listing(folder), settings)
+
+def read(folder: Path, settings: Any, class_names: tuple[str, ...] | None = None) -> dict[str, Any]:
+    """The fields of a capture. `class_names` is of no use here: the format has no labels."""
+    return assembly.assemble(_listing(folder), settings, class_names)
 
 
 def probe(folder: Path) -> dict[str, bool]:
-    return _listing(folder).probe()
+    """Light: reads the JSON, and asks which files exist only if it lists depth at all."""
+    depth = any(entry.get("depth_file_path") for entry in _document(folder)[1])
+    if depth:
+        present, _ = _present(folder)
+        depth = bool(present) and all(entry.get("depth_file_path") for entry, _ in present)
+    return {"poses": True, "depth": depth, "labels": False}
 
 
 def files(folder: Path) -> list[Path]:
-    return sorted([folder / "transforms.json", *_listing(folder).files()])
+    """The JSON, and every image, depth and mask of a frame that is on disk."""
+    present, _ = _present(folder)
+    beside = [folder / entry[key] for entry, _ in present for key in PARTS[1:] if entry.get(key)]
+    return sorted([folder / "transforms.json", *(Path(image) for _, image in present), *beside])
+
+
+def _document(folder: Path) -> tuple[dict[str, Any], list[dict[str, Any]]]:
+    """What all frames share, and the frames as they are listed."""
+    path = folder / "transforms.json"
+    shared = common.read_json(path)
+    entries = shared.pop("frames", None)
+    if not isinstance(entries, list) or not entries:
+        raise InputError(f"{path} lists no frames; write it again")
+    for entry in entries:
+        if not isinstance(entry, dict) or not all(isinstance(entry.get(part, ""), str) for part in PARTS):
+            raise InputError(f"{path}: a frame is no object with paths as text; write it again")
+        if not entry.get("file_path") or "transform_matrix" not in entry:
+            raise InputError(f"{path}: a frame lacks file_path or transform_matrix; write it again")
+    return shared, entries
+
+
+def _present(folder: Path) -> tuple[list[tuple[dict[str, Any], str]], int]:
+    """(entry, image) of the frames that are on disk; how many are not."""
+    _, entries = _document(folder)
+    images = [_on_disk(os.path.join(folder, entry["file_path"].replace("\\", "/"))) for entry in entries]
+    present = [(entry, image) for entry, image in zip(entries, images, strict=True) if image is not None]
+    return present, len(entries) - len(present)
+
+
+def _on_disk(path: str) -> str | None:
+    """The file itself, or with an image suffix where the listing leaves it away."""
+    return next((path + end for end in ("", ".png", ".jpg", ".jpeg") if os.path.isfile(path + end)), None)
+
+
+def _name(folder: Path, listed: str) -> str:
+    """Relative to images/, or else to the folder. Raises InputError on an absolute path that leads out of it."""
+    path = listed.replace("\\", "/")
+    if os.path.isabs(path):
+        path = os.path.relpath(path, os.path.abspath(folder))
+        if path.startswith(".."):
+            raise InputError(
+                f"{folder / 'transforms.json'}: {listed} lies elsewhere; write paths relative to the folder"
+            )
+    parts = [part for part in path.split("/") if part not in ("", ".", "..")]
+    return common.stem("/".join(parts[1:] if parts[0] == "images" and len(parts) > 1 else parts))
 
 
 def _listing(folder: Path) -> Listing:
     path = folder / "transforms.json"
-    document = common.read_json(path)
-    if not isinstance(document, dict) or not document.get("frames"):
-        raise InputError(f"{path} lists no frames; write it again")
-    frames, absent = [], 0
-    for entry in document["frames"]:
+    shared, _ = _document(folder)
+    present, absent = _present(folder)
+    names = [_name(folder, entry["file_path"]) for entry, _ in present]
+    matrices = []
+    for (entry, _), name in zip(present, names, strict=True):
         try:
-            relative, matrix = str(entry["file_path"]), np.array(entry["transform_matrix"], float)
-        except (KeyError, TypeError, ValueError) as error:
-            raise InputError(f"{path}: a frame lacks file_path or transform_matrix ({error}); write it again") from None
+            matrix = np.array(entry["transform_matrix"], float)
+        except (TypeError, ValueError) as error:
+            raise InputError(f"{path}: {name} has no usable transform_matrix ({error}); write it again") from None
         if matrix.shape != (4, 4):
-            raise InputError(f"{path}: transform_matrix of {relative} is {matrix.shape}, not (4, 4); write it again")
-        image = _on_disk(folder / relative)
-        if image is None:
-            absent += 1
-            continue
-        depth = folder / entry["depth_file_path"] if "depth_file_path" in entry else None
-        name = str(Path(relative).with_suffix("")).removeprefix("./").removeprefix("images/")
-        frames.append(Frame(name, image, _camera(document | entry, image, path), _pose(matrix), depth))
-    notes = [f"{absent} of {len(document['frames'])} listed frames are absent on disk."] if absent else []
+            raise InputError(f"{path}: transform_matrix of {name} is {matrix.shape}, not (4, 4); write it again")
+        matrices.append(matrix * OPENGL)
+    poses = common.cam_from_world(path, np.reshape(matrices, (-1, 4, 4)), names)
+    frames = []
+    for (entry, image), name, pose in zip(present, names, poses, strict=True):
+        depth, mask = (folder / entry[part] if entry.get(part) else None for part in PARTS[1:])
+        camera = _camera(shared | entry, Path(image), path)
+        frames.append(Frame(name, Path(image), camera, pose, depth, mask=mask))
+    notes = [f"{absent} of {absent + len(present)} listed frames are absent on disk."] if absent else []
     return Listing("transforms", frames, notes=notes)
 
 
-def _on_disk(path: Path) -> Path | None:
-    """The file itself, or with an image suffix where the listing leaves it away."""
-    candidates = [path, *(path.with_name(path.name + end) for end in common.IMAGE_TYPES)]
-    return next((c for c in candidates if c.is_file()), None)
-
-
-def _pose(matrix: np.ndarray) -> np.ndarray:
-    """cam_from_world in OpenCV axes of a camera-to-world matrix in OpenGL axes; nan where it has no inverse."""
-    if not np.isfinite(matrix).all() or abs(np.linalg.det(matrix[:3, :3])) < 1e-12:
-        return np.full((4, 4), np.nan)
-    world_from_cam = matrix @ np.diag([1.0, -1.0, -1.0, 1.0])
-    left, _, right = np.linalg.svd(world_from_cam[:3, :3])
-    rotation = (left @ right).T
-    pose = np.eye(4)
-    pose[:3, :3], pose[:3, 3] = rotation, -rotation @ world_from_cam[:3, 3]
-    return pose
-
-
 def _camera(values: dict[str, Any], image: Path, path: Path) -> Camera:
+    """The camera of one frame. Raises InputError on a fisheye, a higher distortion or no focal length."""
+    model = "OPENCV_FISHEYE" if values.get("is_fisheye") else str(values.get("camera_model") or "OPENCV")
+    if model not in PERSPECTIVE or any(values.get(k) for k in HIGHER):
+        model = model if model not in PERSPECTIVE else "FULL_OPENCV"
+        return common.camera_of(path, model, (), 0, 0)  # raises: says what is supported
+    size = (values["w"], values["h"]) if "w" in values and "h" in values else common.header(image)[0]
     try:
-        width, height = int(values["w"]), int(values["h"])
-    except KeyError:
-        width, height = common.open_image(image).size
-    if "fl_x" in values:
-        fx = float(values["fl_x"])
-    elif "camera_angle_x" in values:
-        fx = 0.5 * width / math.tan(0.5 * float(values["camera_angle_x"]))
-    else:
+        width, height = (float(v) for v in size)
+        fx = _focal(values, "x", width)
+        fy = _focal(values, "y", height) or fx
+        centre = [float(values.get("cx", width / 2)), float(values.get("cy", height / 2))]
+        distortion = [float(values.get(k) or 0.0) for k in DISTORTION]
+    except (TypeError, ValueError) as error:
+        raise InputError(f"{path}: intrinsics are no numbers ({error}); write it again") from None
+    if fx is None or fy is None:
         raise InputError(f"{path} has neither fl_x nor camera_angle_x; write it again")
-    fy = float(values.get("fl_y", fx))
-    pinhole = [fx, fy, float(values.get("cx", width / 2)), float(values.get("cy", height / 2))]
-    distortion = [float(values.get(k, 0.0)) for k in ("k1", "k2", "p1", "p2")]
-    if any(values.get(k) for k in ("k3", "k4")):
-        raise InputError(f"{path}: distortion k3 or k4 is not supported; undistort the images first")
     if any(distortion):
-        return Camera("OPENCV", pinhole + distortion, width, height)
-    return Camera("PINHOLE", pinhole, width, height)
+        return common.camera_of(path, "OPENCV", (fx, fy, *centre, *distortion), width, height)
+    return common.camera_of(path, "PINHOLE", (fx, fy, *centre), width, height)
+
+
+def _focal(values: dict[str, Any], axis: str, pixels: float) -> float | None:
+    """Focal length of an axis in pixels, from fl_* or from the whole angle of view."""
+    if f"fl_{axis}" in values:
+        return float(values[f"fl_{axis}"])
+    if f"camera_angle_{axis}" in values:
+        return 0.5 * pixels / math.tan(0.5 * float(values[f"camera_angle_{axis}"]))
+    return None

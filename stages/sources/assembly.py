@@ -1,0 +1,244 @@
+"""From frames to the fields of a capture: images and what belongs to them as pinhole views of one size."""
+
+from __future__ import annotations
+
+import functools
+import itertools
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from chebsplat.errors import DataFailure, InputError
+from chebsplat.stages.sources.common import DISTORTED, Camera, Frame, Listing, natural, open_image
+
+if TYPE_CHECKING:
+    from pathlib import Path
+
+    from chebsplat.stages.config import IngestSection
+
+IGNORED = {"void", "ignore", "ignored", "unlabeled", "unlabelled", "undefined", "unknown"}
+EIGHT_BIT = {"1", "L", "LA", "P", "PA", "RGB", "RGBA", "CMYK", "YCbCr"}  # PIL's modes of photos
+DEEP = {"I", "I;16", "I;16B"}  # 16-bit
+GREY = DEEP | {"L", "P"}
+MAX_ID, WORKERS = 65_535, 4
+
+
+def assemble(listing: Listing, settings: IngestSection, class_names: tuple[str, ...] | None = None) -> dict[str, Any]:
+    """Read all frames into the fields of a capture.
+
+    Choices: `max_views` picks evenly from the naturally sorted frames. Images are reduced to `max_side` by averaging
+      and then undistorted; depth, labels and masks take the nearest pixel of the file. Smaller views are padded at
+      the right and the bottom, where the loss mask is false, as it is where an image is transparent. Depth and
+      labels are taken only if every frame of the source has them.
+    Raises:  InputError naming a bad file, DataFailure under `min_views` or where no label has a name.
+    """
+    frames, notes = chosen(listing, settings)
+    shapes = [geometry(frame.camera, settings.max_side) for frame in frames]
+    full = (len(frames), max(shape.height for shape in shapes), max(shape.width for shape in shapes))
+    stacks = {"images": np.zeros((*full, 3), np.uint8), "loss_mask": np.zeros(full, bool)}
+    for name, empty in (("depth", np.float32(np.nan)), ("labels", np.int32(-1))):
+        if listing.has(name):
+            stacks[name] = np.full(full, empty)
+        elif n := sum(getattr(frame, name) is not None for frame in listing.frames):
+            notes.append(f"Only {n} of {len(listing.frames)} frames have {name}, which are left out.")
+    lookup = functools.lru_cache(8)(positions)  # frames of one camera share it
+
+    def fill(k: int) -> None:
+        view = read_view(frames[k], listing, shapes[k], lookup(frames[k].camera, shapes[k]), set(stacks))
+        for name in stacks:
+            stacks[name][k, : shapes[k].height, : shapes[k].width] = view[name]
+
+    with ThreadPoolExecutor(WORKERS) as pool:
+        list(pool.map(fill, range(len(frames))))
+    fields: dict[str, Any] = {"names": [frame.name for frame in frames], "images": stacks["images"]}
+    fields["Ks"] = np.stack([shape.K for shape in shapes])
+    fields["cam_from_world"] = np.stack([frame.pose for frame in frames]) if listing.has("pose") else None  # type: ignore[misc]
+    if "depth" in stacks:
+        fields["depth"] = stacks["depth"]
+    if "labels" in stacks:
+        fields["labels"], fields["class_names"], said = indexed(stacks["labels"], listing.label_names, class_names)
+        notes += said
+    if not stacks["loss_mask"].all():
+        fields["loss_mask"] = stacks["loss_mask"]
+        notes.append(f"{1 - stacks['loss_mask'].mean():.1%} of the pixels are masked.")
+    if (least := min(shape.factor for shape in shapes)) < 1:
+        notes.append(f"Images are reduced by {least:.3f} (ingest.max_side).")
+    if models := sorted({frame.camera.model for frame in frames} & set(DISTORTED)):
+        notes.append(f"Images are undistorted ({', '.join(models)}).")
+    return fields | {"source": {"kind": listing.kind, "notes": notes}}
+
+
+def chosen(listing: Listing, settings: IngestSection) -> tuple[list[Frame], list[str]]:
+    """The frames to read, and the notes so far."""
+    notes, given = list(listing.notes), len(listing.frames)
+    frames = [frame for frame in listing.frames if frame.pose is None or np.isfinite(frame.pose).all()]
+    if len(frames) < given:
+        notes.append(f"{given - len(frames)} of {given} frames have a pose that is not finite and are left out.")
+    if len(frames) < settings.min_views:
+        raise DataFailure(f"{len(frames)} usable frames; ingest.min_views is {settings.min_views}. {' '.join(notes)}")
+    frames = sorted(frames, key=lambda frame: natural(frame.name))
+    for first, second in itertools.pairwise(frames):
+        if first.name == second.name:
+            raise InputError(f"{first.image} and {second.image} are both view {first.name}; rename or remove one")
+    if settings.max_views is not None and len(frames) > settings.max_views:
+        picked = np.linspace(0, len(frames) - 1, settings.max_views).round().astype(int)
+        notes.append(f"{len(picked)} of {len(frames)} views are used (ingest.max_views).")
+        frames = [frames[k] for k in picked]
+    return frames, notes
+
+
+@dataclass(frozen=True, eq=False)
+class Geometry:
+    """The pinhole view made of a photo: K [3, 3] and size in its own pixels; factor: its pixels per photo pixel."""
+
+    K: np.ndarray
+    width: int
+    height: int
+    factor: float
+
+
+def geometry(camera: Camera, max_side: int) -> Geometry:
+    """The view's camera: undistorted first, then reduced until no side exceeds `max_side`; never enlarged."""
+    (fx, fy, cx, cy), width, height = camera.pinhole, camera.width, camera.height
+    if camera.model in DISTORTED:
+        import pycolmap
+
+        options = pycolmap.UndistortCameraOptions()
+        options.blank_pixels = 0.0
+        plain = pycolmap.undistort_camera(options, _pycolmap_camera(camera))
+        (fx, fy, cx, cy), width, height = plain.params, plain.width, plain.height
+    factor = min(1.0, max_side / max(width, height))
+    w, h = max(round(width * factor), 1), max(round(height * factor), 1)
+    K = np.array([[fx * w / width, 0, cx * w / width], [0, fy * h / height, cy * h / height], [0, 0, 1.0]])
+    return Geometry(K, w, h, factor)
+
+
+def positions(camera: Camera, view: Geometry) -> np.ndarray:
+    """Where the centres of a view's pixels lie in its photo: f64 [2, H, W] (x, y) in photo pixels.
+
+    Choices: beyond the radius at which a distortion polynomial turns back, the photo has no such pixel: -1.
+    """
+    if camera.model not in DISTORTED:
+        x = (np.arange(view.width) + 0.5) * camera.width / view.width
+        y = (np.arange(view.height) + 0.5) * camera.height / view.height
+        return np.stack(np.meshgrid(x, y))
+    grid = np.meshgrid(np.arange(view.width) + 0.5, np.arange(view.height) + 0.5)
+    pixels = np.stack([*grid, np.ones((view.height, view.width))], -1).reshape(-1, 3)
+    found = _pycolmap_camera(camera).img_from_cam(pixels @ np.linalg.inv(view.K).T)
+    at = np.asarray(found, float).T.reshape(2, view.height, view.width)
+    (x_down, x_right), (y_down, y_right) = (np.gradient(side) for side in at)
+    plain = (x_right > 0) & (y_down > 0) & (x_right * y_down > x_down * y_right)  # not where at is nan
+    return np.where(plain, at, -1.0)
+
+
+def _pycolmap_camera(camera: Camera) -> Any:
+    import pycolmap
+
+    return pycolmap.Camera(model=camera.model, width=camera.width, height=camera.height, params=list(camera.params))
+
+
+def read_view(
+    frame: Frame, listing: Listing, view: Geometry, at: np.ndarray, wanted: set[str]
+) -> dict[str, np.ndarray]:
+    """images u8 [H, W, 3] and loss_mask bool [H, W]; where `wanted`, depth f32 and labels i32 [H, W]."""
+    camera, size = frame.camera, (frame.camera.width, frame.camera.height)
+    limit = np.array(size)[:, None, None]
+    column, row = np.clip(np.floor(at).astype(int), 0, limit - 1)
+    inside = np.asarray(((at >= 0) & (at <= limit)).all(0))
+    image, opaque = open_photo(frame.image, size, listing.upright)
+    counts = inside.copy() if opaque is None else inside & opaque[row, column]
+    if frame.mask is not None:
+        counts &= companion(frame.mask, size)[row, column] > 0
+    fields = {"images": resampled(image, camera, view, at), "loss_mask": counts}
+    if "depth" in wanted and frame.depth is not None:
+        stored = companion(frame.depth, size, DEEP, "16-bit depth")[row, column].astype(np.float32)
+        fields["depth"] = np.where(inside & (stored > 0), stored / np.float32(listing.depth_scale), np.float32(np.nan))
+    if "labels" in wanted and frame.labels is not None:
+        ids = companion(frame.labels, size, GREY, "8- or 16-bit ids")[row, column].astype(np.int32)
+        if ids.max() > MAX_ID:
+            raise InputError(f"{frame.labels} holds id {ids.max()}; ids up to {MAX_ID} are supported")
+        fields["labels"] = np.where(inside, ids, np.int32(-1))
+    return fields
+
+
+def resampled(image: Any, camera: Camera, view: Geometry, at: np.ndarray) -> np.ndarray:
+    """The RGB photo as u8 [H, W, 3] of the view: area averages, then bilinear where the photo is distorted."""
+    from PIL import Image
+
+    distorted = camera.model in DISTORTED
+    size = (view.width, view.height)
+    if distorted:
+        size = (max(round(camera.width * view.factor), 1), max(round(camera.height * view.factor), 1))
+    small = np.asarray(image if size == image.size else image.resize(size, Image.Resampling.BOX))
+    if not distorted:
+        return small
+    from scipy.ndimage import map_coordinates
+
+    x, y = at[0] * size[0] / camera.width - 0.5, at[1] * size[1] / camera.height - 0.5
+    return np.stack([map_coordinates(small[..., c], [y, x], order=1, mode="nearest") for c in range(3)], -1)
+
+
+def open_photo(path: Path, size: tuple[int, int], upright: bool) -> tuple[Any, np.ndarray | None]:
+    """An RGB image of (width, height) `size`, and where it is opaque (None: everywhere).
+
+    Choices: a model's own photos are turned by EXIF only if they fit its camera no other way, since COLMAP counts
+      pixels as they are stored; alpha under one half is transparent.
+    """
+    from PIL import ImageOps
+
+    image = open_image(path)
+    if image.mode not in EIGHT_BIT:
+        raise InputError(f"{path} is no 8-bit photo (mode {image.mode}); convert it to 8 bits")
+    if upright or image.size != size:
+        image = ImageOps.exif_transpose(image)
+    if image.size != size:
+        raise InputError(f"{path} is {_by(image.size)}, its camera {_by(size)}; restore the image or its camera")
+    if "A" not in image.mode and "transparency" not in image.info:
+        return image.convert("RGB"), None
+    opaque = np.asarray(image.convert("RGBA"))[..., 3] >= 128
+    return image.convert("RGBA").convert("RGB"), None if opaque.all() else opaque
+
+
+def companion(path: Path, size: tuple[int, int], modes: set[str] | None = None, wanted: str = "") -> np.ndarray:
+    """A one-channel image [H, W] that must be as large as its photo; without `modes`, as grey values. InputError."""
+    image = open_image(path, "add it, or take its folder away to do without")
+    if modes is not None and image.mode not in modes:
+        raise InputError(f"{path} has mode {image.mode}, not {wanted} in one channel; convert it")
+    if image.size != size:
+        raise InputError(f"{path} is {_by(image.size)}, its photo {_by(size)}; restore it")
+    return np.asarray(image if modes is not None or image.mode in DEEP else image.convert("L"))
+
+
+def _by(size: tuple[int, int]) -> str:
+    return f"{size[0]}x{size[1]}"
+
+
+def indexed(
+    raw: np.ndarray, names: dict[int, str] | None, class_names: tuple[str, ...] | None
+) -> tuple[np.ndarray, list[str], list[str]]:
+    """Raw ids [V, H, W] (-1: none) as indices i16 into class names; the names, and notes on what became -1.
+
+    Choices: the classes are those that occur, in the order of their ids, or `class_names` where given. Ids are named
+      by `names`, else by their place in `class_names`, else class_<id> with 0 ignored.
+    Raises:  DataFailure if nothing is left.
+    """
+    counts = sum(np.bincount(view.ravel() + 1, minlength=MAX_ID + 2) for view in raw)
+    present = [int(v) for v in np.flatnonzero(counts) - 1 if v >= 0]
+    known = names if names is not None else dict(enumerate(class_names or ()))
+    if names is None and class_names is None:
+        known = {v: f"class_{v}" for v in present if v != 0}
+    named = {v: known[v] for v in present if v in known and known[v].lower() not in IGNORED}
+    result = list(class_names or dict.fromkeys(named.values()))
+    notes = []
+    if nameless := [str(v) for v in present if v not in known and v != 0]:
+        notes.append(f"Label ids without a name are ignored: {', '.join(nameless)}.")
+    if foreign := sorted(set(named.values()) - set(result)):
+        notes.append(f"Labels that are not among the class names are ignored: {', '.join(foreign)}.")
+    table = np.full(MAX_ID + 2, -1, np.int16)
+    for value, name in named.items():
+        table[value + 1] = result.index(name) if name in result else -1
+    if (table < 0).all():
+        raise DataFailure(f"no label has a name (ids {present[:8]}); give names, or take the labels away")
+    return table[raw + 1], result, notes

@@ -1,0 +1,250 @@
+"""COLMAP models and photos become pinhole views of one size, and nothing vanishes without a note."""
+
+import json
+import shutil
+
+import numpy as np
+import pytest
+from PIL import Image
+from source_folders import SETTINGS, image, save, write_colmap
+
+from chebsplat.errors import DataFailure, InputError
+from chebsplat.stages.config import IngestSection
+from chebsplat.stages.sources import colmap, common, photos
+
+SIZE, FOCAL = (240, 180), 200.0
+MODELS = {
+    "SIMPLE_RADIAL": f"{FOCAL} 120 90 {{}}",
+    "RADIAL": f"{FOCAL} 120 90 {{}} 0.05",
+    "OPENCV": f"{FOCAL} {FOCAL} 120 90 {{}} 0.05 0.002 -0.003",
+}
+
+
+def test_a_colmap_text_model_with_depth_and_labels_reads(tmp_path):
+    folder = write_colmap(tmp_path)
+    image(folder / "semantic/b.png", mode="L", value=8)
+    fields = colmap.read(folder, SETTINGS)
+    assert np.allclose(fields["depth"], 1.5)
+    assert fields["class_names"] == ["sofa"]
+    assert [int(v[0, 0]) for v in fields["labels"]] == [0, -1, 0]
+    assert fields["cam_from_world"][2][0, 3] == 2
+    assert len(colmap.files(folder)) == 3 + 1 + 9
+    dtypes = {k: str(fields[k].dtype) for k in ("images", "Ks", "cam_from_world", "depth", "labels")}
+    assert list(dtypes.values()) == ["uint8", "float64", "float64", "float32", "int16"]
+
+
+@pytest.mark.parametrize("suffix", ["bin", "txt"])
+def test_models_that_colmap_writes_today_read(tmp_path, suffix):
+    import pycolmap
+
+    options = pycolmap.SyntheticDatasetOptions()
+    options.num_rigs, options.num_cameras_per_rig, options.num_frames_per_rig, options.num_points3D = 1, 2, 3, 20
+    model = pycolmap.synthesize_dataset(options)
+    place = tmp_path / "sparse/0"
+    place.mkdir(parents=True)
+    model.write_text(place) if suffix == "txt" else model.write_binary(place)
+    assert any(path.name.startswith("frames") for path in place.iterdir())
+    for view in model.images.values():
+        camera = model.cameras[view.camera_id]
+        image(tmp_path / "images" / view.name, (camera.width, camera.height))
+    fields = colmap.read(tmp_path, IngestSection(max_side=64))
+    expected = {common.stem(v.name): v.cam_from_world().matrix() for v in model.images.values()}
+    assert set(fields["names"]) == set(expected) and len(expected) == 6
+    for name, pose in zip(fields["names"], fields["cam_from_world"], strict=True):
+        assert np.allclose(pose[:3], expected[name])
+
+
+def test_images_that_model_and_disk_do_not_share_are_counted(tmp_path):
+    folder = write_colmap(tmp_path)
+    (folder / "images/a.png").unlink()
+    image(folder / "images/z.png")
+    fields = colmap.read(folder, SETTINGS)
+    assert fields["names"] == ["b", "c"]
+    assert "labels" in fields
+    assert [note.split(" of the")[0] for note in fields["source"]["notes"]] == [
+        "1 of 3 images", "1 of 3 images on disk are not in the model and are left out."]  # fmt: skip
+
+
+def test_a_split_of_scene_json_does_not_move_with_max_views(tmp_path):
+    names = tuple(f"{k}.png" for k in range(12))
+    folder = write_colmap(tmp_path, names=names)
+    (folder / "scene.json").write_text(json.dumps({"test_every": 4, "labels": {"7": "sofa"}}))
+    assert np.flatnonzero(colmap.read(folder, SETTINGS)["is_test"]).tolist() == [0, 4, 8]
+    fields = colmap.read(folder, IngestSection(max_views=5))
+    assert [n for n, t in zip(fields["names"], fields["is_test"], strict=True) if t] == ["0", "8"]
+    (folder / "scene.json").write_text(json.dumps({"test_every": 4, "frames": [{"file": "z.png"}]}))
+    fields = colmap.read(folder, SETTINGS)
+    assert "is_test" not in fields
+    assert "not used" in fields["source"]["notes"][-1]
+
+
+def test_a_mask_becomes_a_loss_mask(tmp_path):
+    folder = write_colmap(tmp_path)
+    image(folder / "masks/a.png", mode="L", value=255)
+    image(folder / "masks/b.png.png", mode="RGB", value=0)
+    fields = colmap.read(folder, SETTINGS)
+    assert fields["loss_mask"].mean((1, 2)).tolist() == [1, 0, 1]
+    assert "1 of 3 views have no mask" in fields["source"]["notes"][0]
+
+
+@pytest.mark.parametrize(("model", "k"), [(m, k) for m in MODELS for k in (-0.3, 0.3)])
+def test_undistortion_follows_the_polynomial_for_images_depth_and_labels(tmp_path, model, k):
+    """Photos whose value is their own coordinate; the expected coordinate is written out here."""
+    folder = write_colmap(tmp_path, f"{model} {SIZE[0]} {SIZE[1]} {MODELS[model].format(k)}")
+    ys, xs = np.mgrid[: SIZE[1], : SIZE[0]]
+    for name in "abc":
+        save(folder / f"images/{name}.png", np.stack([xs, ys, 0 * xs], -1).astype(np.uint8))
+        save(folder / f"depth/{name}.png", (1000 + xs).astype(np.uint16))
+        save(folder / f"semantic/{name}.png", (ys // 20 + 1).astype(np.uint8))
+    (folder / "labels.json").unlink()
+    fields = colmap.read(folder, IngestSection(max_side=150))
+    assert max(fields["images"].shape[1:3]) == 150
+    height, width = fields["labels"].shape[1:]
+    x, y = np.meshgrid(np.arange(width) + 0.5, np.arange(height) + 0.5)
+    K = fields["Ks"][0]
+    u, v = (x - K[0, 2]) / K[0, 0], (y - K[1, 2]) / K[1, 1]
+    second, p1, p2 = {"SIMPLE_RADIAL": (0, 0, 0), "RADIAL": (0.05, 0, 0), "OPENCV": (0.05, 0.002, -0.003)}[model]
+    r2 = u * u + v * v
+    radial = 1 + k * r2 + second * r2 * r2
+    u, v = (u * radial + 2 * p1 * u * v + p2 * (r2 + 2 * u * u), v * radial + 2 * p2 * u * v + p1 * (r2 + 2 * v * v))
+    at_x, at_y = FOCAL * u + 120, FOCAL * v + 90  # photo pixels
+    # Averaging and bilinear sampling of a ramp are exact inside; at the border they clamp to the last pixel.
+    inner = np.s_[2:-2, 2:-2]
+    assert np.abs(fields["images"][0, ..., 0] + 0.5 - at_x)[inner].max() < 1.5
+    assert np.abs(fields["images"][0, ..., 1] + 0.5 - at_y)[inner].max() < 1.5
+    assert np.abs((fields["depth"][0] - 1) * 1000 + 0.5 - at_x)[inner].max() < 0.51
+    ids = np.array([int(name.removeprefix("class_")) for name in fields["class_names"]])[fields["labels"][0]]
+    whole = np.abs((at_y + 10) % 20 - 10) > 0.01  # off the edges of stripes
+    assert (ids == np.floor(at_y / 20) + 1)[inner][whole[inner]].all()
+
+
+def test_pixels_where_a_distortion_folds_back_do_not_count(tmp_path):
+    """r (1 - 5 r^2) turns back at r = 1 / sqrt(15): 18 pixels of 70 from the centre."""
+    fields = colmap.read(write_colmap(tmp_path, "SIMPLE_RADIAL 80 60 70 40 30 -5"), SETTINGS)
+    height, width = fields["loss_mask"].shape[1:]
+    x, y = np.meshgrid(np.arange(width) + 0.5 - width / 2, np.arange(height) + 0.5 - height / 2)
+    counted = np.hypot(x, y)[fields["loss_mask"][0]]
+    assert 17 < counted.max() < 20  # the gradient is taken between neighbouring pixels
+
+
+def test_focal_lengths_follow_each_side_as_it_was_rounded(tmp_path):
+    fields = colmap.read(write_colmap(tmp_path, "SIMPLE_PINHOLE 101 37 50 50.5 18.5"), IngestSection(max_side=20))
+    assert fields["images"].shape == (3, 7, 20, 3)
+    assert np.allclose(fields["Ks"][0], [[50 * 20 / 101, 0, 10], [0, 50 * 7 / 37, 3.5], [0, 0, 1]])
+
+
+def test_an_unsupported_camera_model_is_named(tmp_path):
+    with pytest.raises(InputError, match="OPENCV_FISHEYE"):
+        colmap.read(write_colmap(tmp_path, "OPENCV_FISHEYE 8 6 10 10 4 3 0 0 0 0"), SETTINGS)
+
+
+@pytest.mark.parametrize(
+    "damage",
+    ["truncated image", "small depth", "8-bit depth", "coloured labels", "no depth", "no images", "no model",
+     "text model", "cut model", "empty model", "list", "labels", "test_every"],
+)  # fmt: skip
+def test_a_damaged_colmap_source_is_named(tmp_path, damage):
+    folder = write_colmap(tmp_path)
+    if damage == "truncated image":
+        file = folder / "images/b.png"
+        file.write_bytes(file.read_bytes()[:-30])
+    elif damage == "small depth":
+        image(folder / "depth/b.png", (4, 3), 1500, "I;16")
+    elif damage == "8-bit depth":
+        image(folder / "depth/b.png", mode="L")
+    elif damage == "coloured labels":
+        image(folder / "semantic/b.png")
+    elif damage == "no depth":
+        (folder / "depth/b.png").unlink()
+    elif damage in ("no images", "no model"):
+        shutil.rmtree(folder / ("images" if damage == "no images" else "sparse"))
+    elif damage == "text model":
+        (folder / "sparse/0/cameras.txt").write_text("nonsense\n")
+    elif damage in ("cut model", "empty model"):
+        for name in ("cameras", "images", "points3D"):
+            content = b"" if damage == "empty model" else b"\x05" + bytes(40)
+            (folder / f"sparse/0/{name}.bin").write_bytes(content)
+    else:
+        document = {"list": [], "labels": {"labels": {"a": 1}}, "test_every": {"test_every": "x"}}[damage]
+        (folder / "scene.json").write_text(json.dumps(document))
+    with pytest.raises(InputError, match=str(folder)):
+        colmap.read(folder, SETTINGS)
+
+
+def test_labels_without_a_name_are_noted_and_class_names_can_be_given(tmp_path):
+    folder = write_colmap(tmp_path)
+    image(folder / "semantic/b.png", mode="L", value=9)
+    image(folder / "semantic/c.png", mode="I;16", value=300)
+    fields = colmap.read(folder, SETTINGS)
+    assert fields["class_names"] == ["sofa", "lamp"]
+    assert fields["labels"][:, 0, 0].tolist() == [0, 1, -1]
+    assert "300" in fields["source"]["notes"][0]
+    fields = colmap.read(folder, SETTINGS, ("lamp", "chair"))
+    assert fields["class_names"] == ["lamp", "chair"]
+    assert fields["labels"][:, 0, 0].tolist() == [-1, 0, -1]
+    assert any("sofa" in note for note in fields["source"]["notes"])
+    (folder / "labels.json").write_text("{}")
+    with pytest.raises(DataFailure, match="no label has a name"):
+        colmap.read(folder, SETTINGS)
+
+
+def test_photos_have_no_poses_and_mixed_sizes_are_masked(tmp_path):
+    for k, size in enumerate([(80, 60), (60, 80), (40, 30)]):
+        image(tmp_path / f"{k}.{'JPG' if k else 'jpeg'}", size)
+    image(tmp_path / "thumbs/0.jpg")
+    (tmp_path / "._0.jpg").write_bytes(b"not a photo")
+    assert common.detect(tmp_path) == "photos"
+    fields = photos.read(tmp_path, SETTINGS)
+    assert fields["cam_from_world"] is None
+    assert fields["images"].shape == (3, 80, 80, 3)
+    assert fields["loss_mask"].sum() == 80 * 60 * 2 + 40 * 30
+    assert fields["Ks"][0][0, 0] == pytest.approx(1.2 * 80)
+    assert "3 of 3 photos" in fields["source"]["notes"][0]
+    assert photos.probe(tmp_path)["poses"] is False
+    assert len(photos.files(tmp_path)) == 3
+
+
+def test_exif_turns_a_photo_and_gives_its_focal_length(tmp_path):
+    for k in range(3):
+        exif = Image.Exif()
+        exif[0x0112] = 6  # to be turned clockwise
+        exif.get_ifd(0x8769)[0xA405] = 28 if k < 2 else 0
+        pixels = np.zeros((60, 80, 3), np.uint8)
+        pixels[:, :40] = 255
+        Image.fromarray(pixels).save(tmp_path / f"{k}.jpg", exif=exif)
+    fields = photos.read(tmp_path, SETTINGS)
+    assert fields["images"].shape == (3, 80, 60, 3)
+    assert fields["images"][0, :30].min() > 200 and fields["images"][0, 50:].max() < 50
+    assert np.allclose(fields["Ks"][:, 0, 0], [28 / 36 * 80, 28 / 36 * 80, 96])
+    assert "1 of 3 photos have no focal length" in fields["source"]["notes"][0]
+
+
+def test_transparent_pixels_do_not_count(tmp_path):
+    for k in range(3):
+        pixels = np.full((6, 8, 4), 255, np.uint8)
+        pixels[:, : 2 * k, 3] = 0
+        save(tmp_path / f"{k}.png", pixels)
+    assert photos.read(tmp_path, SETTINGS)["loss_mask"].sum((1, 2)).tolist() == [48, 36, 24]
+
+
+@pytest.mark.parametrize("bad", ["same stem", "16 bit", "text"])
+def test_photos_that_cannot_be_told_apart_or_read_are_named(tmp_path, bad):
+    image(tmp_path / "a.png")
+    image(tmp_path / "b.png")
+    if bad == "same stem":
+        image(tmp_path / "a.jpg")
+    elif bad == "16 bit":
+        image(tmp_path / "c.png", mode="I;16", value=30000)
+    else:
+        (tmp_path / "c.jpg").write_text("<html>")
+    with pytest.raises(InputError, match=str(tmp_path)):
+        photos.read(tmp_path, SETTINGS)
+
+
+def test_images_are_reduced_but_never_enlarged(tmp_path):
+    for k in range(3):
+        image(tmp_path / f"{k}.jpg", (320, 160))
+    fields = photos.read(tmp_path, SETTINGS)
+    assert fields["images"].shape == (3, 80, 160, 3)
+    assert fields["Ks"][0][0, 0] == pytest.approx(1.2 * 160)
+    assert photos.read(tmp_path, IngestSection(max_side=9999))["images"].shape == (3, 160, 320, 3)
