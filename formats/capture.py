@@ -117,7 +117,7 @@ def _check(capture: Capture, where: str) -> None:
         if data is not None and tuple(data.shape) != tuple(capture.images.shape[:3]):
             raise InputError(f"{where}: {name} is {data.shape}, images are {capture.images.shape}")
     if capture.labels is not None and not capture.class_names:
-        raise InputError(f"{where}: labels without class names; give source.class_names")
+        raise InputError(f"{where}: labels without class names; name them in scene.json or labels.json")
     if capture.cam_from_world is not None:
         rotations = capture.cam_from_world[:, :3, :3]
         error = np.abs(rotations @ rotations.transpose(0, 2, 1) - np.eye(3)).max(axis=(1, 2))

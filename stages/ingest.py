@@ -54,9 +54,11 @@ def run(job: Job) -> None:
     fields = read(name, source, settings)
     fields["source"] = {"name": name} | fields["source"]
     n_views = len(fields["names"])
-    offset = settings.test_offset % settings.test_every
-    fields.setdefault("is_test", np.arange(n_views) % settings.test_every == offset)
-    protocol = {"name": settings.protocol, "test_every": settings.test_every, "test_offset": settings.test_offset}
+    protocol = {"name": settings.protocol, "split": "the source's own"}
+    if "is_test" not in fields:
+        offset = settings.test_offset % settings.test_every
+        fields["is_test"] = np.arange(n_views) % settings.test_every == offset
+        protocol |= {"split": f"view index % {settings.test_every} == {offset} is test"}
     optional: dict[str, Any] = {"depth": None, "labels": None, "loss_mask": None, "class_names": None}
     capture = Capture(**(optional | fields), protocol=protocol)
     for what in ("depth", "labels"):

@@ -14,7 +14,7 @@ figcaption { font-size: .8em; color: #4a5568 } .key { display: inline-block; mar
 </style></head><body>
 <h1>{{ name }}</h1>
 <p>Source: <b>{{ source.kind }}</b>{% if source.seed is defined %}, preset {{ source.preset }}, seed {{ source.seed }}{% endif %}.
-Protocol <b>{{ protocol.name }}</b>: every {{ protocol.test_every }}th view from {{ protocol.test_offset }} is test.
+Protocol <b>{{ protocol.name }}</b>, split: {{ protocol.split }}.
 {% for note in source.notes or [] %}{{ note }} {% endfor %}</p>
 <h2>Figures on the test views</h2>
 <table><tr><th>figure</th><th class="n">scene</th><th class="n">2D teacher</th></tr>
