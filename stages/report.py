@@ -12,6 +12,7 @@ if TYPE_CHECKING:
     from pathlib import Path
 
     from chebsplat.formats.evaluation import Evaluation
+    from chebsplat.formats.gaussians import Gaussians
 
 STAGE_OF = {
     "capture": "ingest",
@@ -41,7 +42,7 @@ def run(job: Job) -> None:
         raise DataFailure("the training left no trace of error against run time; train the scene again")
     manifests = {role: read_manifest(job.inputs[role]) for role in STAGE_OF if role in job.inputs}
     figures = evaluation.figures
-    left_out = dict(figures["left_out"])
+    left_out = absent_stages(job, gaussians) | figures["left_out"]
     for manifest in manifests.values():
         left_out |= manifest.facts.get("left_out", {})
     stages = [(STAGE_OF[role], m.seconds, m.key, m.device, m.threads) for role, m in manifests.items()]
@@ -74,6 +75,20 @@ def run(job: Job) -> None:
     )
     (job.out / "report.html").write_text(text)
     job.facts |= {"page": "report.html", "psnr": figures["image"]["psnr"]}
+
+
+def absent_stages(job: Job, gaussians: Gaussians) -> dict[str, str]:
+    """Stages of which this scene has no artifact, and why."""
+    encoder = gaussians.notes.get("encoder")
+    unneeded = "no shape encoder is trained"
+    reasons = {
+        "features": "rendering only: the scene has no semantics" if "features" not in gaussians.parameters else "",
+        "descriptors": unneeded if encoder is None else "the encoder's tokens hold no descriptor",
+        "encoder": unneeded if encoder is None else "",
+        "basis": "no sequence is named",
+    }
+    absent = {role: why for role, why in reasons.items() if role not in job.inputs}
+    return {f"stage {STAGE_OF[role]}": why or "its artifact was not given" for role, why in absent.items()}
 
 
 def summary_rows(figures: dict[str, Any]) -> list[list[str]]:
