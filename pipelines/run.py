@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import json
+import os
 import subprocess
 import sys
 import time
@@ -75,7 +76,8 @@ def snakemake(steps: list[Step], cores: int) -> int:
     command = [sys.executable, "-m", "snakemake", "--snakefile", str(HERE / "Snakefile"), "--directory", str(work)]
     command += ["--profile", str(HERE / "profiles/default"), "--cores", str(cores), "--config", f"plan={plan}"]
     # Jobs inherit stderr, which stays readable because Snakemake itself keeps quiet; stdout is ours.
-    done = subprocess.run(command, stdout=subprocess.DEVNULL)
+    threads = {"OMP_NUM_THREADS": str(cores), "NUMBA_NUM_THREADS": str(cores)}
+    done = subprocess.run(command, stdout=subprocess.DEVNULL, env=os.environ | threads)
     if done.returncode == 0:
         return 0
     failed = sorted(folder.glob("exit-*"))

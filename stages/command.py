@@ -112,7 +112,7 @@ def _run(name: str, run: Callable[[Job], None], options: dict[str, Any], out: Pa
     key = options["key"] or artifact.digest({"stage": name, "config": settings, "inputs": sources})
     seed = next((settings[s]["seed"] for s in reversed(stage.sections) if "seed" in settings[s]), None)
     device = resolve_device(options["device"])
-    manifest = Manifest(stage.schema, key, name, sources, settings, seed, device=device, threads=os.cpu_count() or 1,
+    manifest = Manifest(stage.schema, key, name, sources, settings, seed, device=device, threads=n_threads(),
                         code=json.loads(options["code"] or "{}"))  # fmt: skip
     progress = Progress(options["progress"])
     scratch = out.parent / f".part-{out.name}"
@@ -134,6 +134,12 @@ def resolve_device(wanted: str) -> str:
     if wanted == "auto":
         wanted = "cuda" if Path("/proc/driver/nvidia/version").exists() else "cpu"
     return wanted
+
+
+def n_threads() -> int:
+    """Threads that the kernels may use: OMP_NUM_THREADS where it is set, all cores otherwise."""
+    wanted = os.environ.get("OMP_NUM_THREADS", "")
+    return int(wanted) if wanted.isdigit() else os.cpu_count() or 1
 
 
 def _versions() -> dict[str, str]:
