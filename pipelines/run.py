@@ -76,8 +76,7 @@ def snakemake(steps: list[Step], cores: int) -> int:
     command = [sys.executable, "-m", "snakemake", "--snakefile", str(HERE / "Snakefile"), "--directory", str(work)]
     command += ["--profile", str(HERE / "profiles/default"), "--cores", str(cores), "--config", f"plan={plan}"]
     # Jobs inherit stderr, which stays readable because Snakemake itself keeps quiet; stdout is ours.
-    threads = {"OMP_NUM_THREADS": str(cores), "NUMBA_NUM_THREADS": str(cores)}
-    done = subprocess.run(command, stdout=subprocess.DEVNULL, env=os.environ | threads)
+    done = subprocess.run(command, stdout=subprocess.DEVNULL, env=os.environ | {"CHEBSPLAT_THREADS": str(cores)})
     if done.returncode == 0:
         return 0
     failed = sorted(folder.glob("exit-*"))
@@ -104,6 +103,9 @@ def job(plan: Path, key: str) -> int:
     """One Snakemake job: the stage's own command, in this process."""
     from importlib import import_module
 
+    # Snakemake sets OMP_NUM_THREADS to the one thread that a rule declares; a stage may use all cores of the run.
+    if threads := os.environ.get("CHEBSPLAT_THREADS"):
+        os.environ |= {"OMP_NUM_THREADS": threads, "NUMBA_NUM_THREADS": threads}
     step = next(s for s in json.loads(plan.read_text())["steps"] if s["key"] == key)
     arguments = ["--config", str(plan.parent / f"{step['stage']}-{key}.json"), "--out", step["path"], "--key", key]
     arguments += ["--code", json.dumps(step["code"])]
