@@ -270,3 +270,17 @@ def test_a_17_float_ply_reads(tmp_path):
 def test_a_compressed_ply_is_refused_with_advice():
     with pytest.raises(InputError, match="convert it first"):
         ply.read_ply(third_party("guitar.compressed.ply"))
+
+
+@pytest.mark.parametrize("damage", ["truncate", "flip", "remove"])
+def test_verify_names_a_damaged_ply_of_a_scene(tmp_path, damage):
+    with artifact.publish(tmp_path / "scene", Manifest(scene.SCHEMA, "k", "s")) as tmp:
+        scene.write_scene(tmp, make_scene())
+    file = tmp_path / "scene/scene.ply"
+    good = file.read_bytes()
+    if damage == "remove":
+        file.unlink()
+    else:
+        file.write_bytes(good[:-1] if damage == "truncate" else good[:-9] + bytes([good[-9] ^ 1]) + good[-8:])
+    with pytest.raises(InputError, match=r"scene\.ply.*run its stage again"):
+        artifact.verify(tmp_path / "scene")
