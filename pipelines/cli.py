@@ -20,17 +20,16 @@ class Commands(click.Group):
         return [*super().list_commands(context), *STAGES]
 
     def get_command(self, context: click.Context, name: str) -> click.Command | None:
-        if name in STAGES and not self._listing(context):
-            from importlib import import_module
-
-            return import_module(f"chebsplat.stages.{name}").main
-        if name in STAGES:
+        if name in STAGES:  # for the listing, which shows a name and a line
             return click.Command(name, help=STAGES[name].help)
         return super().get_command(context, name)
 
-    @staticmethod
-    def _listing(context: click.Context) -> bool:
-        return not context.args and not getattr(context, "_protected_args", None)
+    def resolve_command(self, context: click.Context, args: list[str]) -> Any:
+        if args[0] in STAGES:
+            from importlib import import_module
+
+            return args[0], import_module(f"chebsplat.stages.{args[0]}").main, args[1:]
+        return super().resolve_command(context, args)
 
 
 @click.group(cls=Commands)
@@ -124,7 +123,7 @@ def plan(scene: str | None, sequence: str | None, settings: str, ablation: str) 
         for found in plans(scene, sequence, settings, ablation):
             print(f"{found.title}: {found.source}")
             for step in found.steps:
-                print(f"  {'fresh   ' if step.fresh else 'would run'} {step.stage:9s} {step.key}")
+                print(f"  {'fresh' if step.fresh else 'would run':9s} {step.stage:9s} {step.key}")
             for what, why in found.left_out.items():
                 print(f"  left out  {what}: {why}")
         return 0

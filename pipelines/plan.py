@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import difflib
 import hashlib
-import json
 import os
 import re
 import subprocess
@@ -16,6 +15,7 @@ from typing import Any
 from chebsplat.errors import ConfigError, InputError
 from chebsplat.pipelines import store
 from chebsplat.pipelines.code import Code, installed
+from chebsplat.pipelines.keys import PLACES, content_hash, step_key
 from chebsplat.pipelines.needs import left_out_stages, source_sentence, teacher_kind
 from chebsplat.stages.registry import STAGES
 
@@ -68,23 +68,38 @@ def read_toml(kind: str, name: str) -> dict[str, Any]:
 def scene_values(scene: str) -> tuple[str, dict[str, Any]]:
     """(name, config values) of a named scene, or of a folder of photos, a COLMAP model or a transforms.json."""
     folder = Path(scene).expanduser()
-    if "/" in scene or scene in (".", ".."):
+    if "/" in scene or scene in (".", "..") or (scene not in names("scenes") and folder.is_dir()):
         if not folder.is_dir():
             raise InputError(f"{folder} is not a folder; correct scene=")
         from chebsplat.stages.sources.common import detect
 
-        name = re.sub(r"[^\w.-]+", "-", folder.resolve().name)
-        return name, {"scene": {"name": name}, "source": {"kind": detect(folder), "path": str(folder.resolve())}}
+        name = re.sub(r"[^\w.-]+", "-", folder.resolve().name).lstrip(".") or "scene"
+        name += "-scene" if name == "store" else ""  # links lie beside the store
+        return name, {"scene": {"name": name}, "source": {"kind": detect(folder), "path": str(folder)}}
     values = read_toml("scenes", scene)
     values.setdefault("scene", {})["name"] = scene
-    if path := values.get("source", {}).get("path"):
-        values["source"]["path"] = str(Path(expanded(path)).resolve())
     return scene, values
+
+
+def placed(values: dict[str, Any]) -> dict[str, Any]:
+    """Values whose paths are absolute: stages run in another folder than the one that the user means."""
+    values = dict(values)
+    for section, key in PLACES:
+        path = values.get(section, {}).get(key)
+        if isinstance(path, str):
+            values[section] = values[section] | {key: str(Path(expanded(path)).expanduser().resolve())}
+    return values
 
 
 def expanded(text: str) -> str:
     """`${NAME:-default}` by the environment."""
     return re.sub(r"\$\{(\w+):-([^}]*)\}", lambda m: os.environ.get(m[1]) or m[2], text)
+
+
+def suffix(settings: str) -> str:
+    """`set=` as part of a folder's name: as it is where it fits, otherwise cut and told apart by a digest."""
+    text = re.sub(r"[^\w.=+-]+", "_", settings)
+    return text if len(text) <= 80 else f"{text[:71]}-{hashlib.sha256(settings.encode()).hexdigest()[:8]}"
 
 
 def merged(base: dict[str, Any], over: dict[str, Any]) -> dict[str, Any]:
@@ -143,37 +158,31 @@ class Planner:
             title += f"@{ablation}"
         if settings:
             values = merged(values, overrides(settings))
-            title += ("+" if ablation else "@") + re.sub(r"[^\w.=+-]+", "_", settings)[:80]
-        config = configs.build(values, f"scene {scene}")
+            title += ("+" if ablation else "@") + suffix(settings)
+        config = configs.build(placed(values), f"scene {scene}")
         asked = config.source
         source = ingest.resolve(name, asked)
+        if source.path:  # REPLICA_ROOT may be relative
+            source = source.model_copy(update={"path": str(Path(source.path).expanduser().resolve())})
         probe, files = self._probe(source)
         kind, why = teacher_kind(config, probe)
         teacher = config.teacher.model_copy(update={"kind": kind})
         config = config.model_copy(update={"source": source, "teacher": teacher})
         left_out = left_out_stages(config, kind, why, probe, basis is not None or keep_knowledge)
         steps: dict[str, Step] = {}
-        extra = {
-            "ingest": {"raw": store.content_hash(files, self.file_memo.values)},
-            "teacher": {"raw": self._hash_named(teacher.model, teacher.labels)} if kind == "onnx" else {},
-        }
+        root = Path(source.path) if source.path else None
+        raw = {"ingest": content_hash(files, root, self.file_memo.values)}
+        if kind == "onnx":
+            raw["teacher"] = self._hash_named(teacher.model, teacher.labels)
         for stage in STAGES.values():
             if stage.name in left_out or (stage.name == "cks" and not keep_knowledge):
                 continue
             inputs = {role: steps[of].path for role, of in stage.roles.items() if of in steps}
-            if basis is not None and "basis" in stage.roles and stage.name in ("train", "cks"):
+            if basis is not None and "cks" not in left_out and stage.name in ("train", "cks"):
                 inputs["basis"] = basis
             sections = config.sections(stage.sections)
             code = self.code.stage(stage.name)
-            identity = {
-                "stage": stage.name,
-                "schema": stage.schema,
-                "config": placeless(sections),
-                "inputs": {role: path.name for role, path in inputs.items()},
-                "code": code,
-                **extra.get(stage.name, {}),
-            }
-            key = _digest(identity)
+            key = step_key(stage, sections, inputs, code, raw.get(stage.name))
             steps[stage.name] = Step(stage.name, key, store.artifact_path(stage.name, key), inputs, sections, code)
         return Plan(title, source_sentence(name, asked, source), list(steps.values()), left_out)
 
@@ -194,17 +203,7 @@ class Planner:
         for file in files:
             if not file.is_file():
                 raise InputError(f"{file} is missing; correct teacher.model or teacher.labels")
-        return store.content_hash(files, self.file_memo.values)
-
-
-def placeless(sections: dict[str, Any]) -> dict[str, Any]:
-    """Sections without the folders that hold the raw files: their content is hashed, where they lie is no matter."""
-    kept = {name: dict(section) for name, section in sections.items()}
-    for section, keys in (("source", ("path",)), ("teacher", ("model", "labels"))):
-        for key in keys:
-            if kept.get(section, {}).get(key):
-                kept[section][key] = Path(kept[section][key]).name
-    return kept
+        return content_hash(files, None, self.file_memo.values)
 
 
 def git_state(root: Path) -> dict[str, Any]:
@@ -216,8 +215,3 @@ def git_state(root: Path) -> dict[str, Any]:
     except (OSError, subprocess.CalledProcessError):
         return {}
     return {"commit": commit, "dirty": bool(status)}
-
-
-def _digest(identity: dict[str, Any]) -> str:
-    text = json.dumps(identity, sort_keys=True, separators=(",", ":"), allow_nan=False)
-    return hashlib.sha256(text.encode()).hexdigest()[:16]

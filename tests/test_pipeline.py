@@ -12,7 +12,8 @@ from shared import ROOT
 from chebsplat.errors import ConfigError, InputError
 from chebsplat.pipelines import store
 from chebsplat.pipelines.code import installed
-from chebsplat.pipelines.plan import Planner, overrides
+from chebsplat.pipelines.keys import content_hash
+from chebsplat.pipelines.plan import CONFIGS, Planner, names, overrides, read_toml, suffix
 from chebsplat.stages.registry import STAGES
 
 ALL = [stage for stage in STAGES if stage != "cks"]
@@ -167,6 +168,53 @@ def test_content_of_raw_files_counts_and_their_time_and_place_do_not(tmp_path):
     assert stale(scene=f"{moved}/photos/") == ["ingest", "sfm", "train", "export", "evaluate", "report"]
 
 
+def test_a_raw_file_under_another_folder_is_other_content(tmp_path):
+    for part in ("semantic", "instance"):
+        (tmp_path / part).mkdir()
+        (tmp_path / part / "0.png").write_bytes(b"same")
+    semantic, instance = (content_hash([tmp_path / p / "0.png"], tmp_path, {}) for p in ("semantic", "instance"))
+    assert semantic != instance
+
+
+def test_paths_are_those_of_the_user_s_folder_not_of_the_stage_s(tmp_path, monkeypatch):
+    photo_folder(tmp_path / "photos")
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setenv("HOME", str(tmp_path))
+    keys = set()
+    for path in ("photos", "~/photos", "${NO_SUCH_VARIABLE:-.}/photos", str(tmp_path / "photos")):
+        plan = Planner().plan("toy", f"source.kind=photos,source.path={path}")
+        assert plan.steps[0].sections["source"]["path"] == str(tmp_path / "photos")
+        keys.add(plan.steps[-1].key)
+    assert len(keys) == 1
+    for name in ("model.onnx", "labels.npz"):
+        (tmp_path / name).write_bytes(b"x")
+    plan = Planner().plan("toy", "teacher.model=model.onnx,teacher.labels=labels.npz")
+    teacher = next(step for step in plan.steps if step.stage == "teacher")
+    assert teacher.sections["teacher"]["kind"] == "onnx"
+    assert teacher.sections["teacher"]["model"] == str(tmp_path / "model.onnx")
+    (tmp_path / "model.onnx").write_bytes(b"another")
+    again = Planner().plan("toy", "teacher.model=model.onnx,teacher.labels=labels.npz")
+    changed = [a.stage for a, b in zip(plan.steps, again.steps, strict=True) if a.key != b.key]
+    assert changed == [s.stage for s in plan.steps if s.stage not in ("ingest", "sfm", "describe")]
+
+
+def test_a_scene_may_be_any_folder_that_no_scene_is_named_after(tmp_path, monkeypatch):
+    for name in ("photos", "store", ".hidden", "toy"):
+        photo_folder(tmp_path / name)
+    monkeypatch.chdir(tmp_path)
+    assert Planner().plan("photos").title == "photos"
+    assert Planner().plan("store").title == "store-scene"
+    assert Planner().plan(".hidden").title == "hidden"
+    assert "generated" in Planner().plan("toy").source
+
+
+def test_long_settings_name_different_folders():
+    text = "train.steps=12,train.n_densify=1,sfm.max_points=200,describe.n_regions=12,train.seed="
+    assert suffix("train.albo=off") == "train.albo=off"
+    assert suffix(text + "1") != suffix(text + "2")
+    assert len(suffix(text + "1")) == 80
+
+
 def test_generated_and_replica_scenes_never_share_a_key(tmp_path, monkeypatch):
     generated = Planner().plan("office0")
     assert "generated" in generated.source
@@ -201,6 +249,30 @@ def test_a_scene_leaves_out_what_it_does_not_need_and_says_why(settings, left_ou
     assert {what for what in plan.left_out if what in STAGES} == left_out
     assert all(plan.left_out.values())
     assert set(STAGES) - left_out == set(plan.targets)
+
+
+@pytest.mark.parametrize("settings", ["train.semantics=false", "train.encoder=off"])
+def test_a_scene_without_an_encoder_takes_no_knowledge(settings):
+    basis = Planner().plan("toy", keep_knowledge=True).targets["cks"]
+    plan = Planner().plan("toy", settings, basis=basis, keep_knowledge=True)
+    assert all("basis" not in step.inputs for step in plan.steps)
+    assert "cks" in plan.left_out
+
+
+@pytest.mark.parametrize("kind", ["scenes", "ablations", "sequences"])
+def test_every_config_of_ours_can_be_planned(kind, tmp_path, monkeypatch):
+    monkeypatch.setenv("CHEBSPLAT_TEST_DATA", str(tmp_path))
+    assert len(names(kind)) == len(list((CONFIGS / kind).iterdir()))
+    for name in names(kind):
+        if kind == "ablations":
+            assert Planner().plan("toy", ablation=name).title == f"toy@{name}"
+        elif kind == "sequences":
+            assert set(read_toml(kind, name)["scenes"]) <= set(names("scenes"))
+        elif "path" in read_toml(kind, name)["source"]:
+            with pytest.raises(InputError, match=str(tmp_path / name)):
+                Planner().plan(name)
+        else:
+            assert Planner().plan(name).title == name
 
 
 def test_an_ablation_reuses_everything_before_training():
@@ -328,7 +400,7 @@ def test_the_command_line_fails_with_documented_codes(arguments, code, message):
     assert message in found.stderr
 
 
-def test_help_of_every_stage_needs_no_heavy_import():
+def test_help_of_every_stage_shows_its_options_and_needs_no_heavy_import():
     script = (
         "import sys\nfrom chebsplat.pipelines.cli import main\n"
         f"for stage in {list(STAGES)!r}:\n"
@@ -339,3 +411,15 @@ def test_help_of_every_stage_needs_no_heavy_import():
     )
     done = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True)
     assert done.returncode == 0, done.stderr
+    assert done.stdout.count("--out PATH") == len(STAGES)
+    for stage in STAGES.values():
+        assert all(f"--in-{role}" in done.stdout for role in stage.roles)
+
+
+def test_every_stage_is_a_plain_command(tmp_path):
+    (tmp_path / "toy.json").write_text(json.dumps({"source": {"kind": "generated", "preset": "toy", "seed": 1}}))
+    ingest = chebsplat("ingest", "--config", str(tmp_path / "toy.json"), "--out", str(tmp_path / "capture"))
+    assert (ingest.returncode, ingest.stdout.strip()) == (0, str(tmp_path / "capture")), ingest.stderr
+    wrong = chebsplat("sfm", "--in-capture", str(tmp_path / "nowhere"), "--out", str(tmp_path / "points"))
+    assert wrong.returncode == 3
+    assert chebsplat("ingest", "--no-such-option").returncode == 2

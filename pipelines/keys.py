@@ -1,0 +1,62 @@
+"""Identity of a step: one digest of all that its result depends on, and of nothing else."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import os
+from collections.abc import Iterable
+from pathlib import Path
+from typing import Any
+
+from chebsplat.stages.registry import Stage
+
+# Settings that say where raw files lie. Their content is hashed instead: where it lies is no matter.
+PLACES = (("source", "path"), ("teacher", "model"), ("teacher", "labels"))
+
+
+def step_key(
+    stage: Stage, sections: dict[str, Any], inputs: dict[str, Path], code: dict[str, Any], raw: str | None = None
+) -> str:
+    """Key of a stage's artifact, 16 hex digits.
+
+    Args: sections: the config that the stage reads; inputs: artifacts by role, whose names are their keys;
+          code: of `Code.stage`; raw: `content_hash` of the files outside the store that the stage reads.
+    """
+    identity = {
+        "stage": stage.name,
+        "schema": stage.schema,
+        "config": placeless(sections),
+        "inputs": {role: path.name for role, path in inputs.items()},
+        "code": code,
+    } | ({} if raw is None else {"raw": raw})
+    text = json.dumps(identity, sort_keys=True, separators=(",", ":"), allow_nan=False)
+    return hashlib.sha256(text.encode()).hexdigest()[:16]
+
+
+def placeless(sections: dict[str, Any]) -> dict[str, Any]:
+    """Sections that name raw files by their last part only."""
+    kept = {name: dict(section) for name, section in sections.items()}
+    for section, key in PLACES:
+        if kept.get(section, {}).get(key):
+            kept[section][key] = Path(kept[section][key]).name
+    return kept
+
+
+def content_hash(files: Iterable[Path], root: Path | None, memo: dict[str, Any]) -> str:
+    """One hash of files: their contents, and their paths below `root`, which tell a label from a depth image.
+
+    Args: root: the source's folder; None: only the files' names count. memo: path -> [(mtime, size), sha256]; a file
+          is read again only if its time or size changed.
+    """
+    total = hashlib.sha256()
+    for path in files:
+        state = path.stat()
+        stamp, key = [state.st_mtime_ns, state.st_size], str(path)
+        held = memo.get(key)
+        if held is None or held[0] != stamp:
+            with path.open("rb") as handle:
+                held = memo[key] = [stamp, hashlib.file_digest(handle, "sha256").hexdigest()]
+        place = path.name if root is None else Path(os.path.relpath(path, root)).as_posix()
+        total.update(f"{place} {held[1]}\n".encode())
+    return total.hexdigest()[:16]
