@@ -5,9 +5,13 @@ from __future__ import annotations
 import hashlib
 import json
 import os
+import shlex
+import shutil
 import subprocess
 import sys
 import time
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -15,6 +19,8 @@ from chebsplat.pipelines import store
 from chebsplat.pipelines.plan import Plan, Step, git_state
 
 HERE = Path(__file__).parent
+# Snakemake's own words go to a file; its jobs inherit the real stderr, which may be a terminal.
+SNAKEMAKE = "import sys; sys.stderr = open(sys.argv.pop(1), 'w', 1); from snakemake.cli import main; main()"
 
 
 def say(text: str) -> None:
@@ -33,9 +39,9 @@ def execute(plans: list[Plan], stage: str | None, cores: int) -> int:
     code = 0
     if stale:
         say(f"  to run: {' '.join(step.stage for step in stale)}   fresh: {len(steps) - len(stale)}")
-        code = snakemake(list(steps.values()), cores)
-    for plan, some in zip(plans, wanted, strict=True):
-        store.link(plan.title, {step.stage: step.path for step in some if step.fresh})
+        code = snakemake(stale, cores)
+    for plan in plans:
+        store.link(plan.title, plan.targets)
     if code:
         return code
     if stale:
@@ -60,31 +66,43 @@ def wanted_steps(plan: Plan, stage: str | None) -> list[Step]:
 
 
 def snakemake(steps: list[Step], cores: int) -> int:
-    """Run what is not fresh. Returns 0, or the exit code of the stage that failed."""
+    """Run these steps. Returns 0, or the exit code of the stage that failed; its log stays in `work/.plans`."""
     work = store.work()
     state = git_state(HERE)
     entries = [entry(step, state) for step in steps]
     text = json.dumps({"steps": entries}, indent=1)
-    folder = work / ".plans" / hashlib.sha256(text.encode()).hexdigest()[:16]
-    folder.mkdir(parents=True, exist_ok=True)
-    for old in folder.glob("exit-*"):
-        old.unlink()
-    plan = folder / "plan.json"
-    plan.write_text(text)
+    folder = work / ".plans" / f"{hashlib.sha256(text.encode()).hexdigest()[:16]}-{os.getpid()}"
+    shutil.rmtree(folder, ignore_errors=True)
+    folder.mkdir(parents=True)
     for item in entries:
         (folder / f"{item['stage']}-{item['key']}.json").write_text(json.dumps(item["config"], indent=1))
-    command = [sys.executable, "-m", "snakemake", "--snakefile", str(HERE / "Snakefile"), "--directory", str(work)]
+    plan, words = folder / "plan.json", folder / "snakemake.log"
+    plan.with_suffix(".part").write_text(text)
+    os.replace(plan.with_suffix(".part"), plan)
+    command = [sys.executable, "-c", SNAKEMAKE, str(words), "--workflow-profile", "none"]
+    command += ["--snakefile", str(HERE / "Snakefile"), "--directory", str(work)]
     command += ["--profile", str(HERE / "profiles/default"), "--cores", str(cores), "--config", f"plan={plan}"]
-    # Jobs inherit stderr, which stays readable because Snakemake itself keeps quiet; stdout is ours.
     done = subprocess.run(command, stdout=subprocess.DEVNULL, env=os.environ | {"CHEBSPLAT_THREADS": str(cores)})
     if done.returncode == 0:
+        shutil.rmtree(folder, ignore_errors=True)
         return 0
-    failed = sorted(folder.glob("exit-*"))
-    for file in failed:
-        say(f"{file.name.split('-')[1]} failed with exit code {file.read_text()}")
-    if not failed:
-        say(f"the run stopped before a stage could report; Snakemake's log is in {work / '.snakemake/log'}")
-    return max((int(file.read_text()) for file in failed), default=1)
+    return failures(steps, folder, words)
+
+
+def failures(steps: list[Step], folder: Path, words: Path) -> int:
+    """Say which steps failed, and where their log is; the highest of their exit codes."""
+    codes = []
+    for step in steps:
+        log, exit_file = (folder / f"{step.stage}-{step.key}.{kind}" for kind in ("log", "exit"))
+        if exit_file.is_file():
+            codes.append(int(exit_file.read_text()))
+            say(f"{step.stage} failed with exit code {codes[-1]}; log: {log}")
+        elif log.is_file() and not step.fresh:
+            codes.append(1)
+            say(f"{step.stage} was killed before it could report; log: {log}")
+    if not codes:
+        say(f"the run stopped before a stage began; log: {words}")
+    return max(codes, default=1)
 
 
 def entry(step: Step, state: dict[str, Any]) -> dict[str, Any]:
@@ -99,26 +117,51 @@ def entry(step: Step, state: dict[str, Any]) -> dict[str, Any]:
     }
 
 
+def job_command(plan: Path, step: dict[str, Any]) -> str:
+    """The shell line that the Snakefile runs for a step."""
+    return shlex.join([sys.executable, "-m", "chebsplat.pipelines.cli", "job", str(plan), step["key"]])
+
+
 def job(plan: Path, key: str) -> int:
-    """One Snakemake job: the stage's own command, in this process."""
+    """One Snakemake job: the stage's own command, in this process; a twin in another run is waited for."""
+    import logging
     from importlib import import_module
 
     # Snakemake sets OMP_NUM_THREADS to the one thread that a rule declares; a stage may use all cores of the run.
     if threads := os.environ.get("CHEBSPLAT_THREADS"):
         os.environ |= {"OMP_NUM_THREADS": threads, "NUMBA_NUM_THREADS": threads}
     step = next(s for s in json.loads(plan.read_text())["steps"] if s["key"] == key)
-    arguments = ["--config", str(plan.parent / f"{step['stage']}-{key}.json"), "--out", step["path"], "--key", key]
+    files = plan.parent / f"{step['stage']}-{key}"
+    logging.getLogger("chebsplat").addHandler(logging.FileHandler(f"{files}.log"))
+    arguments = ["--config", f"{files}.json", "--out", step["path"], "--key", key]
     arguments += ["--code", json.dumps(step["code"])]
     for role, path in step["inputs"].items():
         arguments += [f"--in-{role}", path]
     code = 0
     try:
-        import_module(f"chebsplat.stages.{step['stage']}").main(arguments, prog_name=step["stage"])
+        with alone(Path(step["path"])):
+            import_module(f"chebsplat.stages.{step['stage']}").main(arguments, prog_name=step["stage"])
     except SystemExit as stop:
         code = stop.code if isinstance(stop.code, int) else 1
     if code:
-        (plan.parent / f"exit-{step['stage']}-{key}").write_text(str(code))
+        Path(f"{files}.exit").write_text(str(code))
     return code
+
+
+@contextmanager
+def alone(path: Path) -> Iterator[None]:
+    """Hold the lock of one artifact; the system releases it when the process ends, however it ends."""
+    import fcntl
+
+    file = path.parents[2] / ".locks" / f"{path.parent.name}-{path.name}"
+    file.parent.mkdir(exist_ok=True)
+    with file.open("w") as handle:
+        try:
+            fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError:
+            say(f"{path.parent.name}: another run is making it; waiting")
+            fcntl.flock(handle, fcntl.LOCK_EX)
+        yield
 
 
 def seconds(steps: list[Step], ran: set[str]) -> None:

@@ -2,14 +2,15 @@
 
 from __future__ import annotations
 
-import hashlib
 import json
 import os
 import shutil
 import time
-from collections.abc import Iterable
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
+
+from chebsplat.errors import InputError
 
 
 def work() -> Path:
@@ -46,28 +47,18 @@ class Memo:
             os.replace(tmp, self.path)
 
 
-def content_hash(files: Iterable[Path], memo: dict[str, Any]) -> str:
-    """One hash of the files' names and contents; a file is read again only if its time or size changed."""
-    total = hashlib.sha256()
-    for path in files:
-        state = path.stat()
-        stamp, key = [state.st_mtime_ns, state.st_size], str(path)
-        held = memo.get(key)
-        if held is None or held[0] != stamp:
-            with path.open("rb") as handle:
-                held = memo[key] = [stamp, hashlib.file_digest(handle, "sha256").hexdigest()]
-        total.update(f"{path.name} {held[1]}\n".encode())
-    return total.hexdigest()[:16]
-
-
 def link(scene: str, targets: dict[str, Path]) -> Path:
-    """Point `work/<scene>/<stage>` at the artifacts; stages that are left out lose their link."""
+    """Point `work/<scene>/<stage>` at the finished of `targets`. Stages that the scene leaves out lose their link;
+    those that are still to run keep it, and with it the artifact that it names.
+    """
     folder = work() / scene
     folder.mkdir(parents=True, exist_ok=True)
     for old in folder.iterdir():
         if old.is_symlink() and old.name not in targets:
-            old.unlink()
+            old.unlink(missing_ok=True)
     for stage, target in targets.items():
+        if not is_fresh(target):
+            continue
         relative = os.path.relpath(target, folder)
         place = folder / stage
         if place.is_symlink() and os.readlink(place) == relative:
@@ -80,11 +71,15 @@ def link(scene: str, targets: dict[str, Path]) -> Path:
 
 
 def unnamed() -> list[tuple[Path, int]]:
-    """Artifacts that no link reaches, neither directly nor as an input, and leftovers of killed runs; with bytes."""
+    """Artifacts that no link and no running plan reaches, neither directly nor as an input, and leftovers of runs that
+    failed or were killed; with bytes. Raises InputError if a manifest is damaged.
+    """
     base = work()
     if not (base / "store").is_dir():
         return []
     waiting = [p.resolve() for p in base.glob("*/*") if p.is_symlink()]
+    running = _running(base)
+    waiting += [path.resolve() for path in running]
     by_key = {p.name: p.resolve() for p in base.glob("store/*/*") if not p.name.startswith(".")}
     named: set[Path] = set()
     while waiting:
@@ -92,20 +87,51 @@ def unnamed() -> list[tuple[Path, int]]:
         if path in named or not is_fresh(path):
             continue
         named.add(path)
-        inputs = json.loads((path / "artifact.json").read_text()).get("inputs", {})
-        waiting += [by_key[entry["key"]] for entry in inputs.values() if entry["key"] in by_key]
-    found = [p for p in sorted(base.glob("store/*/*")) if p.resolve() not in named and not _in_use(p)]
+        try:
+            inputs = json.loads((path / "artifact.json").read_text())["inputs"]
+            keys = [entry["key"] for entry in inputs.values()]
+        except (ValueError, KeyError, TypeError, AttributeError):
+            raise InputError(f"{path / 'artifact.json'} is damaged; delete {path} and run its stage again") from None
+        waiting += [by_key[key] for key in keys if key in by_key]
+    found = [p for p in sorted(base.glob("store/*/*")) if p.resolve() not in named and not _in_use(p, running)]
+    found += [p for p in sorted(base.glob(".plans/*")) if not _owner_lives(p)]
     return [(p, sum(f.stat().st_size for f in p.rglob("*") if f.is_file())) for p in found]
 
 
-def _in_use(path: Path) -> bool:
-    """A hidden folder of a running process, or younger than an hour."""
+def _running(base: Path) -> set[Path]:
+    """Artifacts that a run under way makes or reads."""
+    found: set[Path] = set()
+    for plan in base.glob(".plans/*/plan.json"):
+        with suppress(FileNotFoundError):  # it has just ended
+            if _owner_lives(plan.parent):
+                for step in json.loads(plan.read_text())["steps"]:
+                    found |= {Path(step["path"]), *map(Path, step["inputs"].values())}
+    return found
+
+
+def _in_use(path: Path, running: set[Path]) -> bool:
+    """A hidden folder of a running process or of a run under way, or younger than an hour."""
     if not path.name.startswith("."):
         return False
-    owner = path.name.rsplit("-", 1)[-1]
-    if path.name.startswith(".tmp-") and owner.isdigit() and Path(f"/proc/{owner}").exists():
+    if path.name.startswith(".tmp-") and _owner_lives(path):
         return True
-    return path.name.startswith(".part-") and time.time() - path.stat().st_mtime < 3600
+    if not path.name.startswith(".part-"):
+        return False
+    return path.with_name(path.name[len(".part-") :]) in running or time.time() - path.stat().st_mtime < 3600
+
+
+def _owner_lives(path: Path) -> bool:
+    """Whether the process whose number ends the folder's name still runs."""
+    owner = path.name.rsplit("-", 1)[-1]
+    if not owner.isdigit():
+        return False
+    try:
+        os.kill(int(owner), 0)
+    except PermissionError:  # another user's
+        return True
+    except (ProcessLookupError, OverflowError):
+        return False
+    return True
 
 
 def remove(path: Path) -> None:

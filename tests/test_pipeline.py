@@ -14,6 +14,7 @@ from chebsplat.pipelines import store
 from chebsplat.pipelines.code import installed
 from chebsplat.pipelines.keys import content_hash
 from chebsplat.pipelines.plan import CONFIGS, Planner, names, overrides, read_toml, suffix
+from chebsplat.pipelines.run import failures
 from chebsplat.stages.registry import STAGES
 
 ALL = [stage for stage in STAGES if stage != "cks"]
@@ -22,10 +23,10 @@ AFTER_TRAIN = ["train", "export", "onnx", "evaluate", "report"]
 
 @pytest.fixture(autouse=True)
 def work(tmp_path, monkeypatch):
-    monkeypatch.setenv("CHEBSPLAT_WORK", str(tmp_path / "work"))
+    monkeypatch.setenv("CHEBSPLAT_WORK", str(tmp_path / "work folder"))
     monkeypatch.delenv("REPLICA_ROOT", raising=False)
     monkeypatch.chdir(ROOT)
-    return tmp_path / "work"
+    return tmp_path / "work folder"
 
 
 @pytest.fixture
@@ -340,10 +341,58 @@ def test_links_name_artifacts_and_clean_stale_finds_what_nothing_names(work):
     assert all(store.is_fresh(path) for path in plan.targets.values())
 
 
-def test_relinking_drops_stages_that_are_left_out(work):
-    store.link("toy", Planner().plan("toy").targets)
-    store.link("toy", Planner().plan("toy", "train.semantics=false").targets)
+def test_relinking_drops_stages_that_are_left_out_and_keeps_those_still_to_run(work):
+    whole, less = Planner().plan("toy"), Planner().plan("toy", "train.semantics=false")
+    finish(whole)
+    store.link("toy", whole.targets)
+    store.link("toy", less.targets)
     assert not (work / "toy/teacher").is_symlink()
+    assert (work / "toy/ingest").resolve() == less.targets["ingest"]
+    assert (work / "toy/train").resolve() == whole.targets["train"]
+
+
+def running_plan(work, plan, pid):
+    steps = [{"path": str(s.path), "inputs": {r: str(p) for r, p in s.inputs.items()}} for s in plan.steps]
+    folder = work / f".plans/abc-{pid}"
+    folder.mkdir(parents=True)
+    (folder / "plan.json").write_text(json.dumps({"steps": steps}))
+    return folder
+
+
+def test_clean_stale_spares_what_a_running_plan_makes_and_reads(work):
+    plan = Planner().plan("toy")
+    finish(plan)
+    scratch = plan.targets["sfm"].with_name(f".part-{plan.targets['sfm'].name}")
+    scratch.mkdir()
+    os.utime(scratch, (1, 1))
+    folder = running_plan(work, plan, os.getpid())
+    assert store.unnamed() == []
+    folder.rename(dead := folder.with_name("abc-999999999"))
+    assert {path for path, _ in store.unnamed()} == {dead, scratch, *plan.targets.values()}
+
+
+def test_clean_stale_names_a_damaged_manifest_and_removes_nothing(work):
+    plan = Planner().plan("toy")
+    finish(plan)
+    store.link(plan.title, plan.targets)
+    (plan.targets["train"] / "artifact.json").write_text("{")
+    done = chebsplat("clean-stale", "--yes")
+    assert done.returncode == 3
+    assert str(plan.targets["train"]) in done.stderr
+    assert all(path.is_dir() for path in plan.targets.values())
+
+
+def test_a_failed_run_tells_a_stage_that_failed_from_one_that_was_killed(tmp_path, capfd):
+    steps = {step.stage: step for step in Planner().plan("toy").steps}
+    for stage in ("onnx", "train"):
+        (tmp_path / f"{stage}-{steps[stage].key}.log").touch()
+    (tmp_path / f"onnx-{steps['onnx'].key}.exit").write_text("4")
+    assert failures(list(steps.values()), tmp_path, tmp_path / "snakemake.log") == 4
+    told = capfd.readouterr().err
+    assert "onnx failed with exit code 4" in told
+    assert "train was killed" in told
+    assert failures([steps["report"]], tmp_path, tmp_path / "snakemake.log") == 1
+    assert "snakemake.log" in capfd.readouterr().err
 
 
 def chebsplat(*arguments, **environment):
@@ -371,6 +420,13 @@ def test_a_run_makes_the_report_and_a_second_run_does_nothing(work):
     assert times == {p: p.stat().st_mtime_ns for p in work.glob("store/*/*/artifact.json")}
     only = chebsplat("run", "--scene", "toy", "--set", FAST + ",report.n_pictures=1")
     assert "to run: report   fresh: 8" in only.stderr
+    assert "report: done" in only.stderr
+    assert "already there" not in only.stderr
+    assert "profile" not in first.stderr + only.stderr
+    assert not list(work.glob(".plans/*"))
+    part = chebsplat("run", "--scene", "toy", "--set", FAST, "--stage", "sfm")
+    assert f"{os.sep}sfm{os.sep}" in part.stdout
+    assert chebsplat("clean-stale").stdout.split()[:2] == ["0.0", "MB"]
     checked = chebsplat("verify", *(str(p.parent) for p in times))
     assert checked.returncode == 0, checked.stderr
 
@@ -379,8 +435,27 @@ def test_a_run_makes_the_report_and_a_second_run_does_nothing(work):
 def test_a_failing_stage_gives_its_exit_code_and_nothing_half_made(work):
     failed = chebsplat("run", "--scene", "toy", "--set", "onnx.tolerance=1e-30," + FAST)
     assert failed.returncode == 4
-    assert "onnx failed with exit code 4" in failed.stderr
+    told = next(line for line in failed.stderr.splitlines() if line.startswith("onnx failed with exit code 4; log: "))
+    with open(told.split("log: ")[1]) as log:
+        assert "onnx.tolerance is 1.0e-30" in log.read()
+    assert list(work.glob("toy*/train"))
     assert not list(work.glob("store/onnx/*"))
+
+
+@pytest.mark.xdist_group("cli")
+def test_runs_at_the_same_time_make_every_artifact_once(work):
+    command = [sys.executable, "-m", "chebsplat.pipelines.cli", "run", "--scene", "toy", "--stage", "describe", "--set"]
+    settings = [FAST, FAST, FAST, FAST + ",describe.bandwidth=0.8"]
+    runs = [
+        subprocess.Popen([*command, some], cwd=ROOT, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
+        for some in settings
+    ]
+    said = [run.communicate() for run in runs]
+    assert [run.returncode for run in runs] == [0] * len(runs), said
+    lines = "".join(error for _, error in said)
+    assert [lines.count(f"{stage}: done") for stage in ("ingest", "sfm", "describe")] == [1, 1, 2]
+    assert len({out for out, _ in said}) == 2
+    assert not [path for path in work.glob("store/*/.*") if path.is_dir()]
 
 
 @pytest.mark.parametrize(
