@@ -12,7 +12,7 @@ import numba
 
 log = logging.getLogger("chebsplat")
 
-_SOURCES = ("rasterize/kernels.py", "ssim.py")
+_SOURCES = ("rasterize/binning.py", "rasterize/ellipses.py", "rasterize/lanes.py", "rasterize/tiles.py", "ssim.py")
 
 
 def _cache_folder() -> Path:
@@ -34,5 +34,7 @@ settings.THREADING_LAYER_PRIORITY = ["omp", "workqueue", "tbb"]
 # No fast-math beyond reassociation and contraction: NaN and infinity keep their meaning.
 kernel: Any = numba.njit(cache=True, parallel=True, error_model="numpy", fastmath={"reassoc", "contract", "nsz"})
 inline: Any = numba.njit(cache=True, error_model="numpy", fastmath={"reassoc", "contract", "nsz"}, inline="always")
+# Short loops, compiled by themselves: inside a large kernel the vectoriser gives up on them.
+lanes: Any = numba.njit(cache=True, error_model="numpy", fastmath={"reassoc", "contract", "nsz"})
 serial: Any = numba.njit(cache=True, error_model="numpy")
 prange = numba.prange

@@ -55,7 +55,7 @@ def test_cpu_equals_the_oracle_in_value_and_gradient(channels, background):
 def test_absolute_gradient_bounds_the_plain_one():
     weights = torch.randn(1, 37, 53, 3, generator=torch.Generator().manual_seed(1))
     *_, grads, meta = gradients(scene(channels=3), torch.float32, "cpu", weights)
-    absolute = meta["absgrad"][0]["absgrad"]
+    absolute = meta["means2d"].absgrad[0]
     assert (absolute >= grads[-1][0].abs() * (1 - 1e-4) - 1e-6).all()
     assert (absolute > 0).any()
 

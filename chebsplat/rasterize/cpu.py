@@ -1,53 +1,65 @@
-"""The CPU backend: projection in torch, tiles in numba, one pass for all channels; float32."""
+"""The CPU backend: projection, binning and tiles in numba, one pass for all channels; float32."""
 
 from __future__ import annotations
 
 from typing import Any
 
+import numpy as np
 import torch
 from torch import Tensor
 
-from chebsplat.rasterize import kernels
-from chebsplat.rasterize.projection import project
-from chebsplat.rasterize.reference import ALPHA_MIN
+from chebsplat.rasterize import binning, ellipses, tiles
+
+NAMES = ("means", "quats", "scales", "opacities", "colors", "viewmats", "Ks")
+
+
+class _Project(torch.autograd.Function):
+    """means2d [N, 2] and covariances [N, 3] of one view; conics, depths, radii and whitening come without gradient."""
+
+    @staticmethod
+    def forward(ctx: Any, means, quats, scales, camera):  # type: ignore[no-untyped-def, override]
+        gaussians = [t.detach().contiguous().numpy() for t in (means, quats, scales)]
+        found = [torch.from_numpy(a) for a in ellipses.project(*gaussians, *camera)]
+        means2d, covariances, whitening, conics, depths, radii = found
+        ctx.gaussians, ctx.camera, ctx.radii = gaussians, camera[:4], radii.numpy()
+        ctx.mark_non_differentiable(whitening, conics, depths, radii)
+        return means2d, covariances, whitening, conics, depths, radii
+
+    @staticmethod
+    def backward(ctx: Any, grad_means2d, grad_covariances, *_):  # type: ignore[no-untyped-def, override]
+        slopes = [g.contiguous().numpy() for g in (grad_means2d, grad_covariances)]
+        found = ellipses.project_adjoint(*ctx.gaussians, *ctx.camera, ctx.radii, *slopes)
+        return *(torch.from_numpy(a) for a in found), None
 
 
 class _Composite(torch.autograd.Function):
-    """Tiles of one view. Gradients to means2d, conics, opacities and colors; `means2d.absgrad` is filled aside."""
+    """Render [H, W, D] and alpha [H, W] of one view; backward also adds to `absgrad` [N, 2], in place."""
 
     @staticmethod
-    def forward(ctx: Any, means2d, conics, opacities, colors, holder, order, width, height, max_alpha):  # type: ignore[no-untyped-def]
-        arrays = [t.detach().contiguous().numpy() for t in (means2d, conics, opacities, colors)]
-        bins = kernels.bin_gaussians(*arrays[:3], order.numpy(), width, height)
-        alpha_limit = kernels.np.float32(max_alpha)
-        render, transmittance = kernels.forward(*arrays, bins[0], bins[1], width, height, alpha_limit)
-        alpha = 1 - torch.from_numpy(transmittance)
-        rendered = torch.from_numpy(render)
-        ctx.arrays, ctx.bins, ctx.sizes, ctx.holder = arrays, bins, (width, height, alpha_limit), holder
-        ctx.save_for_backward(rendered, alpha)
-        return rendered, alpha
-
-    @staticmethod
-    def backward(ctx: Any, grad_render: Tensor, grad_alpha: Tensor):  # type: ignore[no-untyped-def]
-        rendered, alpha = ctx.saved_tensors
-        if not (torch.isfinite(grad_render).all() and torch.isfinite(grad_alpha).all()):
-            raise ValueError("the gradient of the image is not finite")
-        total = (grad_render * rendered).sum(-1) + grad_alpha * alpha
-        tile_starts, gaussian, pair, pair_starts = ctx.bins
-        records = kernels.backward(
-            *ctx.arrays,
-            tile_starts,
-            gaussian,
-            pair,
-            *ctx.sizes,
-            grad_render.contiguous().numpy(),
-            total.numpy(),
-            grad_alpha.contiguous().numpy(),
+    def forward(  # type: ignore[override]
+        ctx: Any, means2d: Tensor, covariances: Tensor, opacities: Tensor, colors: Tensor,
+        whitening: Tensor, depths: Tensor, radii: Tensor, absgrad: Tensor, size: tuple[int, int], max_alpha: float,
+    ) -> tuple[Tensor, Tensor]:  # fmt: skip
+        centers, spreads, strengths, channels, whitened, z, reach = (
+            t.detach().contiguous().numpy() for t in (means2d, covariances, opacities, colors, whitening, depths, radii)
         )
-        sums = torch.from_numpy(kernels.reduce_records(records, pair_starts))
-        ctx.holder["absgrad"] = sums[:, 6:8]
-        n = kernels.N_GEOMETRY
-        return sums[:, :2], sums[:, 2:5], sums[:, 5], sums[:, n:], None, None, None, None, None
+        bins = binning.bin_gaussians(centers, spreads, z, reach, strengths, channels, *size)
+        limit = np.float32(max_alpha)
+        render, transmittance = tiles.forward(centers, whitened, strengths, channels, *bins[:2], *size, limit)
+        ctx.arrays, ctx.bins, ctx.absgrad = (centers, whitened, strengths, channels), bins, absgrad
+        ctx.size, ctx.limit = size, limit
+        return torch.from_numpy(render), 1 - torch.from_numpy(transmittance)
+
+    @staticmethod
+    def backward(ctx: Any, grad_render, grad_alpha):  # type: ignore[no-untyped-def, override]
+        slopes = [g.contiguous().numpy() for g in (grad_render, grad_alpha)]
+        records, finite = tiles.backward(*ctx.arrays, *ctx.bins[:3], *ctx.size, ctx.limit, *slopes)
+        if not finite:
+            raise ValueError("the gradient of the image is not finite")
+        found = tiles.reduce(records, ctx.bins[3], ctx.arrays[1], ctx.arrays[2])
+        to_means2d, to_covariances, to_opacities, absolute, to_colors = (torch.from_numpy(a) for a in found)
+        ctx.absgrad += absolute
+        return to_means2d, to_covariances, to_opacities, to_colors, None, None, None, None, None, None
 
 
 def rasterize(
@@ -67,38 +79,41 @@ def rasterize(
     max_alpha: float = 0.99,
     backgrounds: Tensor | None = None,
 ) -> tuple[Tensor, Tensor, dict[str, Any]]:
-    """As `reference.rasterize`, in float32, and fast. meta also holds `absgrad`: after backward, one dict a view whose
-    `absgrad` [N, 2] is the sum over pixels of the absolute gradient to the 2D means.
+    """As `reference.rasterize`, in float32, and fast.
 
-    Raises: ValueError unless all inputs are float32 on the CPU, or, in backward, on a non-finite image gradient.
+    meta's `means2d` carries `absgrad` [C, N, 2]: after backward, the sum over pixels of the absolute gradient.
+
+    Raises: ValueError unless all inputs are float32 on the CPU, if a gradient to a camera is asked for, or, in
+      backward, on a gradient of the image that is not finite.
+    Choices: `conics`, `depths` and `radii` have no gradient here. Bitwise equal for any number of threads.
     """
-    for name, tensor in (("means", means), ("quats", quats), ("scales", scales), ("colors", colors)):
+    for name, tensor in zip(NAMES, (means, quats, scales, opacities, colors, viewmats, Ks), strict=True):
         if tensor.dtype != torch.float32 or tensor.device.type != "cpu":
             raise ValueError(f"{name} is {tensor.dtype} on {tensor.device}; the cpu backend takes float32 on the CPU")
-    views = [project(means, quats, scales, v, k, width, height, near_plane, far_plane, eps2d)
-             for v, k in zip(viewmats, Ks, strict=True)]  # fmt: skip
-    means2d = torch.stack([view.means2d for view in views])
+    if viewmats.requires_grad or Ks.requires_grad:
+        raise ValueError("the cpu backend gives cameras no gradient: use the reference")
+    cameras = [(*(t.detach().double().contiguous().numpy() for t in pair), width, height, near_plane, far_plane, eps2d)
+               for pair in zip(viewmats, Ks, strict=True)]  # fmt: skip
+    views = [_Project.apply(means, quats, scales, camera) for camera in cameras]
+    means2d, covariances, whitening, conics, depths, radii = (_stack(parts) for parts in zip(*views, strict=True))
+    absgrad = torch.zeros(means2d.shape)
     if means2d.requires_grad:
         means2d.retain_grad()
-    holders: list[dict[str, Tensor]] = [{} for _ in views]
-    renders, alphas = [], []
-    for c, view in enumerate(views):
-        channels = colors if colors.ndim == 2 else colors[c]
-        shown = view.visible & (opacities >= ALPHA_MIN) & torch.isfinite(opacities) & torch.isfinite(channels).all(-1)
-        index = shown.nonzero()[:, 0]
-        order = index[torch.argsort(view.depths.detach()[index], stable=True)]
-        render, alpha = _Composite.apply(
-            means2d[c], view.conics, opacities, channels, holders[c], order, width, height, max_alpha
+    means2d.absgrad = absgrad  # type: ignore[attr-defined]
+    composed = [
+        _Composite.apply(
+            means2d[c], covariances[c], opacities, colors if colors.ndim == 2 else colors[c],
+            whitening[c], depths[c], radii[c], absgrad[c], (width, height), max_alpha,
         )
-        if backgrounds is not None:
-            render = render + (1 - alpha)[..., None] * backgrounds[c]
-        renders.append(render)
-        alphas.append(alpha[..., None])
-    meta = {
-        "means2d": means2d,
-        "conics": torch.stack([view.conics for view in views]),
-        "depths": torch.stack([view.depths for view in views]),
-        "radii": torch.stack([view.radii for view in views]),
-        "absgrad": holders,
-    }
-    return torch.stack(renders), torch.stack(alphas), meta
+        for c in range(len(cameras))
+    ]  # fmt: skip
+    renders, alphas = (_stack(parts) for parts in zip(*composed, strict=True))
+    if backgrounds is not None:
+        renders = renders + (1 - alphas)[..., None] * backgrounds[:, None, None]
+    meta = {"means2d": means2d, "conics": conics, "depths": depths, "radii": radii}
+    return renders, alphas[..., None], meta
+
+
+def _stack(parts: tuple[Tensor, ...]) -> Tensor:
+    """torch.stack, without a copy for one view."""
+    return parts[0][None] if len(parts) == 1 else torch.stack(parts)

@@ -1,0 +1,183 @@
+"""Numba twin of `projection.project` for one view, and its adjoint: parallel over Gaussians, float64 inside.
+
+Beside mean and covariance each Gaussian gets its whitening W = [[p, q], [0, r]], WᵀW = ½ log₂e Σ⁻¹, so that at an
+offset d from the mean log₂ α = log₂ opacity − |W d|². W comes from the determinant by Cauchy-Binet, which cannot
+cancel, and gradients are gathered in W d: a needle's are as exact as a ball's.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+
+from chebsplat.jit import inline, kernel, prange
+
+HALF_LOG2E = 0.5 * math.log2(math.e)
+LN2 = math.log(2.0)
+LARGEST = 1e30  # of any result, so that float32 can hold it and its square root's square
+
+
+@inline
+def _matmul(a, b, out):
+    for i in range(out.shape[0]):
+        for j in range(out.shape[1]):
+            total = 0.0
+            for k in range(a.shape[1]):
+                total += a[i, k] * b[k, j]
+            out[i, j] = total
+
+
+@inline
+def _rotation(quat, unit, out):
+    """Fill the unit quaternion [4] and its matrix [3, 3]; returns the length of `quat`."""
+    largest = max(max(abs(quat[0]), abs(quat[1])), max(abs(quat[2]), abs(quat[3])))
+    total = 0.0
+    for k in range(4):
+        unit[k] = quat[k] / largest
+        total += unit[k] * unit[k]
+    root = math.sqrt(total)
+    for k in range(4):
+        unit[k] /= root
+    w, x, y, z = unit[0], unit[1], unit[2], unit[3]
+    out[0, 0], out[0, 1], out[0, 2] = 1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)
+    out[1, 0], out[1, 1], out[1, 2] = 2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)
+    out[2, 0], out[2, 1], out[2, 2] = 2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)
+    return largest * root
+
+
+@inline
+def _clamped(slope, center, focal, size):
+    """The ray's slope, kept within 1.3 fields of view."""
+    slack = 0.15 * size / focal
+    return min(max(slope, -(center / focal + slack)), (size - center) / focal + slack)
+
+
+@inline
+def _jacobian(point, viewmat, K, width, height, out, jacobian):
+    """Fill the camera-space point [3] into `out` and d(pixel)/d(camera) [2, 3], slopes clamped, into `jacobian`."""
+    for i in range(3):
+        out[i] = viewmat[i, 3]
+        for k in range(3):
+            out[i] += viewmat[i, k] * point[k]
+    z = out[2]
+    jacobian[0, 0], jacobian[0, 1] = K[0, 0] / z, 0.0
+    jacobian[1, 0], jacobian[1, 1] = 0.0, K[1, 1] / z
+    jacobian[0, 2] = -K[0, 0] / z * _clamped(out[0] / z, K[0, 2], K[0, 0], width)
+    jacobian[1, 2] = -K[1, 1] / z * _clamped(out[1] / z, K[1, 2], K[1, 1], height)
+
+
+@kernel
+def project(means, quats, scales, viewmat, K, width, height, near_plane, far_plane, eps2d):
+    """Ellipses of one view.
+
+    Args: means, scales [N, 3], quats [N, 4] float32; viewmat [4, 4], K [3, 3] float64.
+    Returns: float32 means2d [N, 2], covariances [N, 3] (xx, xy, yy; ε included), whitening [N, 3] (p, q, r),
+      conics [N, 3], depths [N]; radii [N] i32. Rows of culled Gaussians are zero; a visible one's radius is not.
+    """
+    n = len(means)
+    means2d, covariances = np.zeros((n, 2), np.float32), np.zeros((n, 3), np.float32)
+    whitening, conics = np.zeros((n, 3), np.float32), np.zeros((n, 3), np.float32)
+    depths, radii = np.zeros(n, np.float32), np.zeros(n, np.int32)
+    for i in prange(n):
+        depth = viewmat[2, 3]
+        for k in range(3):
+            depth += viewmat[2, k] * means[i, k]
+        if not (depth > near_plane and depth < far_plane):
+            continue
+        largest = max(max(abs(quats[i, 0]), abs(quats[i, 1])), max(abs(quats[i, 2]), abs(quats[i, 3])))
+        sums = 1.0 * quats[i, 0] + quats[i, 1] + quats[i, 2] + quats[i, 3]
+        if not (largest > 1e-12 and math.isfinite(largest) and math.isfinite(sums - sums)):
+            continue
+        unit, camera = np.empty(4), np.empty(3)
+        rotation, jacobian, screen, factor = np.empty((3, 3)), np.empty((2, 3)), np.empty((2, 3)), np.empty((2, 3))
+        _rotation(quats[i], unit, rotation)
+        _jacobian(means[i], viewmat, K, width, height, camera, jacobian)
+        _matmul(jacobian, viewmat[:3, :3], screen)
+        _matmul(screen, rotation, factor)
+        a = b = c = 0.0
+        for k in range(3):
+            factor[0, k] *= scales[i, k]
+            factor[1, k] *= scales[i, k]
+            a += factor[0, k] * factor[0, k]
+            b += factor[0, k] * factor[1, k]
+            c += factor[1, k] * factor[1, k]
+        cross_0 = factor[0, 1] * factor[1, 2] - factor[0, 2] * factor[1, 1]
+        cross_1 = factor[0, 2] * factor[1, 0] - factor[0, 0] * factor[1, 2]
+        cross_2 = factor[0, 0] * factor[1, 1] - factor[0, 1] * factor[1, 0]
+        determinant = eps2d * eps2d + eps2d * (a + c) + cross_0 * cross_0 + cross_1 * cross_1 + cross_2 * cross_2
+        u, v = K[0, 0] * camera[0] / depth + K[0, 2], K[1, 1] * camera[1] / depth + K[1, 2]
+        biggest = 0.5 * (a + c) + eps2d + math.sqrt(0.25 * (a - c) * (a - c) + b * b)
+        if not (determinant > 0 and determinant < LARGEST * LARGEST and biggest < LARGEST):
+            continue
+        reach = min(math.ceil(3 * math.sqrt(biggest)), 2.0**30)
+        if not (u + reach > 0 and u - reach < width and v + reach > 0 and v - reach < height):
+            continue
+        a, c = a + eps2d, c + eps2d
+        means2d[i, 0], means2d[i, 1], depths[i], radii[i] = u, v, depth, int(reach)
+        covariances[i, 0], covariances[i, 1], covariances[i, 2] = a, b, c
+        conics[i, 0], conics[i, 1], conics[i, 2] = c / determinant, -b / determinant, a / determinant
+        p = math.sqrt(HALF_LOG2E * c / determinant)
+        whitening[i, 0], whitening[i, 1], whitening[i, 2] = p, -p * b / c, math.sqrt(HALF_LOG2E / c)
+    return means2d, covariances, whitening, conics, depths, radii
+
+
+@kernel
+def project_adjoint(means, quats, scales, viewmat, K, width, height, radii, grad_means2d, grad_covariances):
+    """Gradients [N, 3], [N, 4], [N, 3] to means, quats and scales; zero rows where culled.
+
+    Args: grad_means2d [N, 2]; grad_covariances [N, 3], xy being the sum over both off-diagonal entries.
+    """
+    n = len(means)
+    to_means, to_quats, to_scales = np.zeros((n, 3)), np.zeros((n, 4)), np.zeros((n, 3))
+    for i in prange(n):
+        if radii[i] == 0:
+            continue
+        unit, camera = np.empty(4), np.empty(3)
+        rotation, jacobian, screen, axes = np.empty((3, 3)), np.empty((2, 3)), np.empty((2, 3)), np.empty((2, 3))
+        length = _rotation(quats[i], unit, rotation)
+        _jacobian(means[i], viewmat, K, width, height, camera, jacobian)
+        _matmul(jacobian, viewmat[:3, :3], screen)
+        _matmul(screen, rotation, axes)
+        # Σ = A S² Aᵀ, A = P R, P = J V: down to A, to the scales, and on to R and P.
+        xx, xy, yy = 1.0 * grad_covariances[i, 0], 0.5 * grad_covariances[i, 1], 1.0 * grad_covariances[i, 2]
+        by_axes, by_screen, by_rotation = np.empty((2, 3)), np.empty((2, 3)), np.empty((3, 3))
+        for k in range(3):
+            s = 1.0 * scales[i, k]
+            top, low = 2 * (xx * axes[0, k] + xy * axes[1, k]), 2 * (xy * axes[0, k] + yy * axes[1, k])
+            to_scales[i, k] = s * (top * axes[0, k] + low * axes[1, k])
+            by_axes[0, k], by_axes[1, k] = s * s * top, s * s * low
+        _matmul(by_axes, rotation.T, by_screen)
+        _matmul(screen.T, by_axes, by_rotation)
+        by_jacobian = np.empty((2, 3))
+        _matmul(by_screen, viewmat[:3, :3].T, by_jacobian)
+        x, y, z, fx, fy = camera[0], camera[1], camera[2], K[0, 0], K[1, 1]
+        slope_x, slope_y = _clamped(x / z, K[0, 2], fx, width), _clamped(y / z, K[1, 2], fy, height)
+        by_x, by_y = fx / z * grad_means2d[i, 0], fy / z * grad_means2d[i, 1]
+        by_z = -(by_x * x + by_y * y) / z
+        by_z += (-fx * by_jacobian[0, 0] - fy * by_jacobian[1, 1]) / (z * z)
+        by_z += (fx * slope_x * by_jacobian[0, 2] + fy * slope_y * by_jacobian[1, 2]) / (z * z)
+        if slope_x == x / z:
+            by_x -= fx / (z * z) * by_jacobian[0, 2]
+            by_z += fx * slope_x / (z * z) * by_jacobian[0, 2]
+        if slope_y == y / z:
+            by_y -= fy / (z * z) * by_jacobian[1, 2]
+            by_z += fy * slope_y / (z * z) * by_jacobian[1, 2]
+        for k in range(3):
+            to_means[i, k] = viewmat[0, k] * by_x + viewmat[1, k] * by_y + viewmat[2, k] * by_z
+        _rotation_adjoint(unit, length, by_rotation, to_quats[i])
+    return to_means.astype(np.float32), to_quats.astype(np.float32), to_scales.astype(np.float32)
+
+
+@inline
+def _rotation_adjoint(unit, length, by, out):
+    """Gradient [4] to a quaternion of this length from that to its matrix [3, 3]."""
+    w, x, y, z = unit[0], unit[1], unit[2], unit[3]
+    skew_x, skew_y, skew_z = by[2, 1] - by[1, 2], by[0, 2] - by[2, 0], by[1, 0] - by[0, 1]
+    out[0] = 2 * (x * skew_x + y * skew_y + z * skew_z)
+    out[1] = 2 * (w * skew_x + y * (by[0, 1] + by[1, 0]) + z * (by[0, 2] + by[2, 0]) - 2 * x * (by[1, 1] + by[2, 2]))
+    out[2] = 2 * (w * skew_y + x * (by[0, 1] + by[1, 0]) + z * (by[1, 2] + by[2, 1]) - 2 * y * (by[0, 0] + by[2, 2]))
+    out[3] = 2 * (w * skew_z + x * (by[0, 2] + by[2, 0]) + y * (by[1, 2] + by[2, 1]) - 2 * z * (by[0, 0] + by[1, 1]))
+    along = out[0] * w + out[1] * x + out[2] * y + out[3] * z
+    for k in range(4):
+        out[k] = (out[k] - along * unit[k]) / length
