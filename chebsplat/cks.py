@@ -2,19 +2,26 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from typing import Any
 
+import numpy as np
 import torch
-from torch import Tensor
+from torch import Tensor, nn
 
 EPS = torch.finfo(torch.float64).eps
+DROPPED = 1e-6  # a column that keeps less of its length than this beside the others is dropped
 
 
-def residual_of(W: Tensor, basis: Tensor) -> Tensor:
-    """W − B Bᵀ W in float64, projected twice: once leaves rounding of the size of what is captured."""
+def project(W: Tensor, basis: Tensor) -> tuple[Tensor, Tensor]:
+    """Split W [q, p] into what the basis [q, r] captures and what it misses, both float64 [q, p].
+
+    Choices: projected twice: once leaves in the residual rounding of the size of what is captured.
+    """
     W, basis = W.double(), basis.double()
-    W = W - basis @ (basis.T @ W)
-    return W - basis @ (basis.T @ W)
+    residual = W - basis @ (basis.T @ W)
+    residual = residual - basis @ (basis.T @ residual)
+    return W - residual, residual
 
 
 def update(
@@ -29,64 +36,154 @@ def update(
     """Extend a basis by what it misses of W (Eq 15).
 
     Args:
-      basis:     [q, r] orthonormal, or None before the first scene.
+      basis:     [q, r] orthonormal to 1e-4, or None before the first scene.
       W:         [q, p] projection of the new scene.
       energy:    fraction of energy to reach: of captured + residual (`total`), or of the residual alone (the
                  printed rule, which always adds a vector).
-      tolerance: relative residual √(residual/total) below which nothing is added (κ, with ε = 0.2).
-      max_rank:  ceiling of r as a fraction of q: at r = q the regulariser would vanish for ever.
-    Returns: basis [q, r'] float32 with orthonormal columns, and a report of ranks and residuals.
-    Raises:  ValueError on non-finite values or shapes that disagree.
-    Choices: scaled by max|W|; no update if the residual is rounding, ρ ≤ 10 eps √q; new columns are orthogonalised
-      twice and dropped below 1e-6; the first basis comes from the SVD of W.
+      tolerance: κ below which the scene is no news and nothing is added (ε = 0.2).
+      max_rank:  ceiling of r as a fraction of q, below 1: at r = q the regulariser would vanish for ever.
+    Returns: basis [q, r'] float32 with BᵀB = I to 3e-8 (dense columns of q ≥ 32; 6e-8 else); the given columns
+      come first, untouched where nothing is added. Report: `rank_before`, `rank_after`, `added`; `rho`, the relative
+      residual before; `energy`, the fraction of ‖W‖² captured after.
+    Raises:  ValueError on values that are not finite, shapes that disagree, a basis that is not orthonormal, or a
+      rule or fraction that does not exist.
+    Choices: scaled by max|W|. κ is the residual's σ_f / √Q, its rms entry, in units of W's own: √Q cancels and κ = ρ.
+      No update if the residual is rounding, ρ ≤ 10 eps √q, nor, by `total`, if W is captured to `energy` already. New
+      columns are orthogonalised twice. The first basis comes from the SVD of W. A basis beyond the ceiling is kept,
+      never cut.
     """
-    if not torch.isfinite(W).all() or (basis is not None and basis.shape[0] != W.shape[0]):
-        raise ValueError(f"W {tuple(W.shape)} is not finite, or does not fit the basis")
+    _check(basis, W, energy, max_rank, rule)
     q = W.shape[0]
-    old = torch.zeros(q, 0, dtype=torch.float64) if basis is None else _orthonormal(basis.double())
-    report: dict[str, Any] = {"rank_before": old.shape[1], "rank_after": old.shape[1], "rho": 0.0, "energy": 1.0}
+    given = torch.zeros(q, 0) if basis is None else basis.float()
+    rank = given.shape[1]
+    report: dict[str, Any] = {"rank_before": rank, "rank_after": rank, "added": 0, "rho": 0.0, "energy": 1.0}
     largest = W.double().abs().max() if W.numel() else torch.tensor(0.0)
     if largest == 0:
-        return old.float(), report
-    scaled = W.double() / largest
-    residual = residual_of(scaled, old)
+        return given, report
+    old, scaled = _orthonormal(given.double()), W.double() / largest
+    _, residual = project(scaled, old)
     total, missed = float((scaled**2).sum()), float((residual**2).sum())
-    rho = (missed / total) ** 0.5
-    report |= {"rho": rho, "energy": 1 - missed / total}
-    room = int(max_rank * q) - old.shape[1]
-    if rho <= max(10 * EPS * q**0.5, tolerance if basis is not None else 0.0) or room <= 0:
-        return old.float(), report
+    rho = min((missed / total) ** 0.5, 1.0)
+    report |= {"rho": rho, "energy": 1 - rho**2}
+    room = int(max_rank * q) - rank
+    if rho <= max(10 * EPS * q**0.5, tolerance if rank else 0.0) or room <= 0:
+        return given, report
     vectors, values, _ = torch.linalg.svd(residual, full_matrices=False)
-    gained = torch.cumsum(values**2, 0)
+    gained = nn.functional.pad(torch.cumsum(values**2, 0), (1, 0))  # by 0, 1, 2, ... of the vectors
     reached = (total - missed + gained) / total if rule == "total" else gained / missed
-    count = min(int((reached < energy).sum()) + 1, room, len(values))
+    count = min(int((reached < energy).sum()), room, len(values))
+    if count == 0:
+        return given, report
     grown = _orthonormal(torch.cat([old, vectors[:, :count]], 1))
-    left = residual_of(scaled, grown)
-    report |= {"rank_after": grown.shape[1], "energy": 1 - float((left**2).sum()) / total}
-    return grown.float(), report
+    left = float((project(scaled, grown)[1] ** 2).sum())
+    report |= {"rank_after": grown.shape[1], "added": grown.shape[1] - rank, "energy": max(1 - left / total, 0.0)}
+    return _rounded(grown, given), report
+
+
+def _check(basis: Tensor | None, W: Tensor, energy: float, max_rank: float, rule: str) -> None:
+    if W.ndim != 2 or not torch.isfinite(W).all():
+        raise ValueError(f"W {tuple(W.shape)} is not finite, or not a matrix")
+    if rule not in ("total", "residual"):
+        raise ValueError(f"rule {rule!r} is neither 'total' nor 'residual'")
+    if not (0 < energy <= 1 and 0 < max_rank < 1):
+        raise ValueError(f"energy {energy} is not within (0, 1], or max_rank {max_rank} not within (0, 1)")
+    if basis is None:
+        return
+    if basis.ndim != 2 or basis.shape[0] != W.shape[0]:
+        raise ValueError(f"basis {tuple(basis.shape)} does not fit W {tuple(W.shape)}")
+    error = (basis.double().T @ basis.double() - torch.eye(basis.shape[1], dtype=torch.float64)).abs()
+    if basis.shape[1] and not error.max() <= 1e-4:
+        raise ValueError(
+            f"basis {tuple(basis.shape)} is not orthonormal: BᵀB differs from I by {float(error.max()):.1e}"
+        )
 
 
 def _orthonormal(columns: Tensor) -> Tensor:
-    """Gram-Schmidt, each column twice; columns that lose all but 1e-6 of their length are dropped."""
+    """Gram-Schmidt, each column twice; columns that lose all but `DROPPED` of their length are dropped."""
     kept = torch.zeros(columns.shape[0], 0, dtype=torch.float64)
     for column in columns.T:
         length = column.norm()
         for _ in range(2):
             column = column - kept @ (kept.T @ column)
-        if column.norm() > 1e-6 * length and length > 0:
+        if column.norm() > DROPPED * length and length > 0:
             kept = torch.cat([kept, (column / column.norm())[:, None]], 1)
     return kept
 
 
-def basis_loss(projections: dict[str, Tensor], bases: dict[str, Tensor]) -> Tensor:
-    """Mean over projections of ‖W − B Bᵀ W‖² / ‖W‖² (Eq 14).
+def _rounded(columns: Tensor, given: Tensor) -> Tensor:
+    """Orthonormal columns [q, r] in float32; the first ones are `given`.
 
-    Choices: relative, so that shrinking W does not lower it: the denominator carries no gradient. The printed
-      modulation α is 1 here and its size the loss' weight: learned jointly it has the trivial minimum 0, and with
-      that path cut nothing else teaches it.
+    Each entry is rounded up or down, large entries first, whichever keeps the column's products with itself and with
+    the columns before it closer to those of I. Rounding to nearest leaves 6e-8 at q = 16.
     """
-    terms = []
-    for name, B in bases.items():
-        W = projections[name]
-        terms.append(((W - B @ (B.T @ W)) ** 2).sum() / (W.detach() ** 2).sum().clamp_min(1e-20))
-    return torch.stack(terms).mean()
+    exact = columns.numpy()
+    out = np.zeros(exact.shape, np.float32)
+    out[:, : given.shape[1]] = given.numpy()
+    for j in range(given.shape[1], exact.shape[1]):
+        column = exact[:, j]
+        nearest = column.astype(np.float32)
+        beyond = np.nextafter(nearest, np.where(nearest < column, np.inf, -np.inf).astype(np.float32))
+        choices = np.stack([nearest, beyond]).astype(np.float64)
+        before = out[:, :j].astype(np.float64)
+        error = np.append(before.T @ column, column @ column - 1)
+        for i in np.argsort(-np.abs(column), kind="stable"):
+            moved = choices[:, i] - column[i]
+            change = np.append(moved[:, None] * before[i], (moved * (choices[:, i] + column[i]))[:, None], 1)
+            pick = int(((error + change[1]) ** 2).sum() < ((error + change[0]) ** 2).sum())
+            error = error + change[pick]
+            out[i, j] = choices[pick, i]
+    return torch.from_numpy(out)
+
+
+def regularizer(W: Tensor, basis: Tensor, alpha: Tensor | float = 1.0) -> Tensor:
+    """α ‖W − B Bᵀ W‖² / ‖W‖², in [0, α] (Eq 14); 0 for a basis without columns, and for W = 0.
+
+    Args: W [q, p]; basis [q, r] orthonormal; alpha: strength, ≥ 0.
+    Choices: relative, so that shrinking W does not lower it: the denominator carries no gradient, nor does α, whose
+      best value here would be 0. Scaled by max|W| first, so that 1e±25 neither overflows nor vanishes.
+    """
+    strength = alpha.detach() if isinstance(alpha, Tensor) else alpha
+    largest = W.detach().abs().amax() if W.numel() else W.new_tensor(0.0)
+    if basis.shape[1] == 0 or largest == 0:
+        return 0.0 * W.sum()
+    scaled = W / largest
+    return strength * ((scaled - basis @ (basis.T @ scaled)) ** 2).sum() / (scaled.detach() ** 2).sum()
+
+
+def basis_loss(
+    projections: dict[str, Tensor], bases: dict[str, Tensor], alphas: dict[str, Tensor] | None = None
+) -> Tensor:
+    """Mean over projections of `regularizer`, α = 1 where not given; 0 without bases (the first scene)."""
+    terms = [regularizer(projections[n], B, 1.0 if alphas is None else alphas[n]) for n, B in bases.items()]
+    return torch.stack(terms).mean() if terms else torch.tensor(0.0)
+
+
+class Modulation(nn.Module):
+    """Learned strength α > 0 of each projection's regulariser; starts at 1.
+
+    Choices: α = softplus, and `regularizer` stops its own gradient to α. What teaches α instead is `loss`: it rests at
+      α = 1 + cos(task gradient, regulariser gradient), so that earlier knowledge is held on to where that also serves
+      the new scene (up to 2) and let go where the two fight (towards 0).
+    """
+
+    def __init__(self, names: Iterable[str]):
+        super().__init__()
+        self.names = tuple(names)
+        self.raw = nn.Parameter(torch.full((len(self.names),), float(np.log(np.expm1(1.0)))))
+
+    def forward(self) -> dict[str, Tensor]:
+        """α by projection name, each a scalar with gradient to the module."""
+        return dict(zip(self.names, nn.functional.softplus(self.raw).unbind(), strict=True))
+
+    def loss(self, task: dict[str, Tensor], knowledge: dict[str, Tensor]) -> Tensor:
+        """½ mean (α − 1 − cos)², cos between gradients [q, p] of task loss and regulariser; 0 where one vanishes."""
+        alphas, terms = self(), []
+        for name in self.names:
+            a, b = (_direction(g[name].detach().double().flatten()) for g in (task, knowledge))
+            terms.append(0.5 * (alphas[name] - 1 - (a @ b).to(alphas[name].dtype)) ** 2)
+        return torch.stack(terms).mean() if terms else self.raw.sum()
+
+
+def _direction(vector: Tensor) -> Tensor:
+    scaled = vector / vector.abs().amax().clamp_min(1e-300) if vector.numel() else vector
+    return scaled / scaled.norm().clamp_min(1e-300)
