@@ -76,6 +76,15 @@ def photometric(render: Tensor, target: Tensor, mask: Tensor | None, weight_ssim
     return _Photometric.apply(render, target, weight, weight_ssim)
 
 
+def photometric_reference(render: Tensor, target: Tensor, mask: Tensor | None, weight_ssim: float) -> Tensor:
+    """As `photometric`, in plain torch and any float type: the oracle of the fused loss."""
+    counted = torch.ones_like(target[..., 0]) if mask is None else mask.to(target.dtype)
+    render = torch.where(counted[..., None] > 0, render, target)
+    weight = counted[..., None].expand_as(target) / (counted.sum() * target.shape[-1]).clamp_min(1)
+    distance = (weight * (render - target).abs()).sum()
+    return (1 - weight_ssim) * distance + weight_ssim * (weight * (1 - ssim_map(render, target))).sum()
+
+
 def feature_l1(render: Tensor, target: Tensor, mask: Tensor | None = None) -> Tensor:
     """Mean |difference| at the teacher's resolution.
 

@@ -1,5 +1,8 @@
 """The numba backend equals the plain-torch oracle, in value and gradient, and never depends on thread count."""
 
+import sys
+import types
+
 import numba
 import pytest
 import torch
@@ -139,3 +142,46 @@ def test_float64_is_refused_by_the_cpu_backend_and_taken_by_auto():
         rasterize(*arguments, viewmats.double(), K.double(), width, height, backend="cpu")
     render, _, _ = rasterize(*arguments, viewmats.double(), K.double(), width, height)
     assert render.dtype == torch.float64
+
+
+def test_a_gradient_to_a_camera_is_refused_not_dropped():
+    viewmats, K, width, height = camera()
+    with pytest.raises(ValueError, match="cameras no gradient"):
+        rasterize(*scene(channels=3), viewmats.requires_grad_(True), K, width, height, backend="cpu")
+
+
+def test_needle_has_the_gradient_of_float64():
+    arguments = [a[:1] for a in scene(channels=3)]
+    arguments[0] = torch.tensor([[0.05, 0.02, 1.5]])
+    arguments[2] = torch.tensor([[1e3, 1e-9, 1e-9]])
+    weights = torch.randn(1, 37, 53, 3, generator=torch.Generator().manual_seed(3))
+    found = gradients(arguments, torch.float32, "cpu", weights)[2]
+    exact = gradients(arguments, torch.float64, "reference", weights)[2]
+    for name, x, y in zip(NAMES, found, exact, strict=False):
+        error = (x.double() - y).abs().max() / y.abs().max()
+        assert error < 1e-3, (name, error)
+
+
+def test_cuda_backend_asks_gsplat_for_unpacked_absolute_gradients(monkeypatch):
+    asked = {}
+
+    def rasterization(*args, **options):
+        asked.update(options)
+        n = len(args[0])
+        sizes = {"means2d": (1, n, 2), "radii": (1, n, 2), "depths": (1, n), "conics": (1, n, 3)}
+        return torch.zeros(1), torch.zeros(1), {name: torch.zeros(size) for name, size in sizes.items()}
+
+    class OnGpu(torch.Tensor):
+        device = torch.device("cuda")
+
+    monkeypatch.setitem(sys.modules, "gsplat", types.SimpleNamespace(rasterization=rasterization))
+    arguments = scene(channels=3)
+    arguments[0] = arguments[0].as_subclass(OnGpu)
+    meta = rasterize(*arguments, *camera(), max_alpha=0.999)[2]
+    assert asked["packed"] is False and asked["absgrad"] is True and asked["sh_degree"] is None
+    assert {name: meta[name].ndim for name in meta} == {"means2d": 3, "conics": 3, "depths": 2, "radii": 2}
+
+
+def test_cuda_backend_refuses_tensors_on_the_cpu():
+    with pytest.raises(ValueError, match="on a GPU"):
+        rasterize(*scene(channels=3), *camera(), backend="cuda")

@@ -13,18 +13,21 @@ def rasterize(
 ) -> tuple[Tensor, Tensor, dict[str, Any]]:
     """Render Gaussians; arguments and results as `reference.rasterize`.
 
-    Args: backend: `cpu` (float32, numba), `reference` (plain torch, any float type), or `auto`: cpu for float32 on
-      the CPU, otherwise the reference.
+    Args: backend: `cpu` (float32, numba), `reference` (plain torch, any float type), `cuda` (gsplat), or `auto`:
+      cuda for tensors on a GPU, cpu for float32 on the CPU, otherwise the reference.
     Raises: ValueError on an unknown backend, or tensors that the chosen one does not take.
     """
     if backend == "auto":
-        backend = "cpu" if means.dtype == torch.float32 and means.device.type == "cpu" else "reference"
+        on_cpu = "cpu" if means.dtype == torch.float32 else "reference"
+        backend = {"cuda": "cuda", "cpu": on_cpu}.get(means.device.type, "reference")
     if backend == "cpu":
         from chebsplat.rasterize.cpu import rasterize as chosen
+    elif backend == "cuda":
+        from chebsplat.rasterize.cuda import rasterize as chosen
     elif backend == "reference":
         from chebsplat.rasterize.reference import rasterize as chosen
     else:
-        raise ValueError(f"backend {backend!r} is none of auto, cpu, reference")
+        raise ValueError(f"backend {backend!r} is none of auto, cpu, cuda, reference")
     return chosen(means, *args, **options)
 
 

@@ -14,20 +14,24 @@ NAMES = ("means", "quats", "scales", "opacities", "colors", "viewmats", "Ks")
 
 
 class _Project(torch.autograd.Function):
-    """means2d [N, 2] and covariances [N, 3] of one view; conics, depths, radii and whitening come without gradient."""
+    """means2d [N, 2] and covariances [N, 3] of one view; whitening, conics, depths and radii come without gradient.
+
+    What comes back for `covariances`, which stay between the two Functions, is not their gradient but the whitened
+    moments that `ellipses.project_adjoint` takes: they keep the precision that the gradient would lose.
+    """
 
     @staticmethod
     def forward(ctx: Any, means, quats, scales, camera):  # type: ignore[no-untyped-def, override]
         gaussians = [t.detach().contiguous().numpy() for t in (means, quats, scales)]
         found = [torch.from_numpy(a) for a in ellipses.project(*gaussians, *camera)]
         means2d, covariances, whitening, conics, depths, radii = found
-        ctx.gaussians, ctx.camera, ctx.radii = gaussians, camera[:4], radii.numpy()
+        ctx.gaussians, ctx.camera, ctx.radii = gaussians, (*camera[:4], camera[-1]), radii.numpy()
         ctx.mark_non_differentiable(whitening, conics, depths, radii)
         return means2d, covariances, whitening, conics, depths, radii
 
     @staticmethod
-    def backward(ctx: Any, grad_means2d, grad_covariances, *_):  # type: ignore[no-untyped-def, override]
-        slopes = [g.contiguous().numpy() for g in (grad_means2d, grad_covariances)]
+    def backward(ctx: Any, grad_means2d, moments, *_):  # type: ignore[no-untyped-def, override]
+        slopes = [g.contiguous().numpy() for g in (grad_means2d, moments)]
         found = ellipses.project_adjoint(*ctx.gaussians, *ctx.camera, ctx.radii, *slopes)
         return *(torch.from_numpy(a) for a in found), None
 
@@ -57,9 +61,9 @@ class _Composite(torch.autograd.Function):
         if not finite:
             raise ValueError("the gradient of the image is not finite")
         found = tiles.reduce(records, ctx.bins[3], ctx.arrays[1], ctx.arrays[2])
-        to_means2d, to_covariances, to_opacities, absolute, to_colors = (torch.from_numpy(a) for a in found)
+        to_means2d, moments, to_opacities, absolute, to_colors = (torch.from_numpy(a) for a in found)
         ctx.absgrad += absolute
-        return to_means2d, to_covariances, to_opacities, to_colors, None, None, None, None, None, None
+        return to_means2d, moments, to_opacities, to_colors, None, None, None, None, None, None
 
 
 def rasterize(

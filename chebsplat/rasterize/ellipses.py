@@ -67,6 +67,21 @@ def _jacobian(point, viewmat, K, width, height, out, jacobian):
     jacobian[1, 2] = -K[1, 1] / z * _clamped(out[1] / z, K[1, 2], K[1, 1], height)
 
 
+@inline
+def _ellipse(factor, eps2d):
+    """Covariance F Fᵀ + ε I: xx, xy, yy and the determinant, by Cauchy-Binet."""
+    a = b = c = 0.0
+    for k in range(3):
+        a += factor[0, k] * factor[0, k]
+        b += factor[0, k] * factor[1, k]
+        c += factor[1, k] * factor[1, k]
+    cross_0 = factor[0, 1] * factor[1, 2] - factor[0, 2] * factor[1, 1]
+    cross_1 = factor[0, 2] * factor[1, 0] - factor[0, 0] * factor[1, 2]
+    cross_2 = factor[0, 0] * factor[1, 1] - factor[0, 1] * factor[1, 0]
+    determinant = eps2d * eps2d + eps2d * (a + c) + cross_0 * cross_0 + cross_1 * cross_1 + cross_2 * cross_2
+    return a + eps2d, b, c + eps2d, determinant
+
+
 @kernel
 def project(means, quats, scales, viewmat, K, width, height, near_plane, far_plane, eps2d):
     """Ellipses of one view.
@@ -95,25 +110,17 @@ def project(means, quats, scales, viewmat, K, width, height, near_plane, far_pla
         _jacobian(means[i], viewmat, K, width, height, camera, jacobian)
         _matmul(jacobian, viewmat[:3, :3], screen)
         _matmul(screen, rotation, factor)
-        a = b = c = 0.0
         for k in range(3):
             factor[0, k] *= scales[i, k]
             factor[1, k] *= scales[i, k]
-            a += factor[0, k] * factor[0, k]
-            b += factor[0, k] * factor[1, k]
-            c += factor[1, k] * factor[1, k]
-        cross_0 = factor[0, 1] * factor[1, 2] - factor[0, 2] * factor[1, 1]
-        cross_1 = factor[0, 2] * factor[1, 0] - factor[0, 0] * factor[1, 2]
-        cross_2 = factor[0, 0] * factor[1, 1] - factor[0, 1] * factor[1, 0]
-        determinant = eps2d * eps2d + eps2d * (a + c) + cross_0 * cross_0 + cross_1 * cross_1 + cross_2 * cross_2
+        a, b, c, determinant = _ellipse(factor, eps2d)
         u, v = K[0, 0] * camera[0] / depth + K[0, 2], K[1, 1] * camera[1] / depth + K[1, 2]
-        biggest = 0.5 * (a + c) + eps2d + math.sqrt(0.25 * (a - c) * (a - c) + b * b)
+        biggest = 0.5 * (a + c) + math.sqrt(0.25 * (a - c) * (a - c) + b * b)
         if not (determinant > 0 and determinant < LARGEST * LARGEST and biggest < LARGEST):
             continue
         reach = min(math.ceil(3 * math.sqrt(biggest)), 2.0**30)
         if not (u + reach > 0 and u - reach < width and v + reach > 0 and v - reach < height):
             continue
-        a, c = a + eps2d, c + eps2d
         means2d[i, 0], means2d[i, 1], depths[i], radii[i] = u, v, depth, int(reach)
         covariances[i, 0], covariances[i, 1], covariances[i, 2] = a, b, c
         conics[i, 0], conics[i, 1], conics[i, 2] = c / determinant, -b / determinant, a / determinant
@@ -123,10 +130,12 @@ def project(means, quats, scales, viewmat, K, width, height, near_plane, far_pla
 
 
 @kernel
-def project_adjoint(means, quats, scales, viewmat, K, width, height, radii, grad_means2d, grad_covariances):
+def project_adjoint(means, quats, scales, viewmat, K, width, height, eps2d, radii, grad_means2d, moments):
     """Gradients [N, 3], [N, 4], [N, 3] to means, quats and scales; zero rows where culled.
 
-    Args: grad_means2d [N, 2]; grad_covariances [N, 3], xy being the sum over both off-diagonal entries.
+    Args: grad_means2d [N, 2]; moments [N, 3]: uu, uv, vv of Σ g (W d)(W d)ᵀ over a Gaussian's pixels.
+    The gradient to the factor F of Σ is 2 / (½ log₂e) Wᵀ M (W F): W F is bounded, while gradients to Σ itself would
+    have to cancel over the needle's length.
     """
     n = len(means)
     to_means, to_quats, to_scales = np.zeros((n, 3)), np.zeros((n, 4)), np.zeros((n, 3))
@@ -134,19 +143,26 @@ def project_adjoint(means, quats, scales, viewmat, K, width, height, radii, grad
         if radii[i] == 0:
             continue
         unit, camera = np.empty(4), np.empty(3)
-        rotation, jacobian, screen, axes = np.empty((3, 3)), np.empty((2, 3)), np.empty((2, 3)), np.empty((2, 3))
+        rotation, jacobian, screen = np.empty((3, 3)), np.empty((2, 3)), np.empty((2, 3))
+        axes, factor = np.empty((2, 3)), np.empty((2, 3))
         length = _rotation(quats[i], unit, rotation)
         _jacobian(means[i], viewmat, K, width, height, camera, jacobian)
         _matmul(jacobian, viewmat[:3, :3], screen)
         _matmul(screen, rotation, axes)
-        # Σ = A S² Aᵀ, A = P R, P = J V: down to A, to the scales, and on to R and P.
-        xx, xy, yy = 1.0 * grad_covariances[i, 0], 0.5 * grad_covariances[i, 1], 1.0 * grad_covariances[i, 2]
+        # F = A S, A = P R, P = J V: down to A, to the scales, and on to R and P.
+        for k in range(3):
+            factor[0, k], factor[1, k] = axes[0, k] * scales[i, k], axes[1, k] * scales[i, k]
+        _, b, c, determinant = _ellipse(factor, eps2d)
+        p, r = math.sqrt(HALF_LOG2E * c / determinant), math.sqrt(HALF_LOG2E / c)
+        q = -p * b / c
+        uu, uv, vv = 2 / HALF_LOG2E * moments[i, 0], 2 / HALF_LOG2E * moments[i, 1], 2 / HALF_LOG2E * moments[i, 2]
         by_axes, by_screen, by_rotation = np.empty((2, 3)), np.empty((2, 3)), np.empty((3, 3))
         for k in range(3):
             s = 1.0 * scales[i, k]
-            top, low = 2 * (xx * axes[0, k] + xy * axes[1, k]), 2 * (xy * axes[0, k] + yy * axes[1, k])
-            to_scales[i, k] = s * (top * axes[0, k] + low * axes[1, k])
-            by_axes[0, k], by_axes[1, k] = s * s * top, s * s * low
+            axis_u, axis_v = p * axes[0, k] + q * axes[1, k], r * axes[1, k]
+            top, low = s * (uu * axis_u + uv * axis_v), s * (uv * axis_u + vv * axis_v)
+            to_scales[i, k] = top * axis_u + low * axis_v
+            by_axes[0, k], by_axes[1, k] = s * p * top, s * (q * top + r * low)
         _matmul(by_axes, rotation.T, by_screen)
         _matmul(screen.T, by_axes, by_rotation)
         by_jacobian = np.empty((2, 3))

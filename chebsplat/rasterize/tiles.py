@@ -13,7 +13,6 @@ import numpy as np
 
 from chebsplat.jit import inline, kernel, prange
 from chebsplat.rasterize.binning import TILE
-from chebsplat.rasterize.ellipses import HALF_LOG2E
 from chebsplat.rasterize.lanes import (
     HALF,
     LANES,
@@ -147,13 +146,13 @@ def backward(
 
 @kernel
 def reduce(records, pair_starts, whitening, opacities):
-    """Sum each Gaussian's records, in the order of its pairs, and leave the whitened coordinates.
+    """Sum each Gaussian's records, in the order of its pairs.
 
-    Returns: gradients to means2d [N, 2], covariances [N, 3] (xy: both off-diagonal entries), opacities [N], the
-      absolute gradient to means2d [N, 2], and to colors [N, D].
+    Returns: gradients to means2d [N, 2]; moments [N, 3] for `ellipses.project_adjoint`; gradients to opacities [N],
+      the absolute gradient to means2d [N, 2], and to colors [N, D].
     """
     n, channels = len(pair_starts) - 1, records.shape[1] - N_GEOMETRY
-    to_means2d, to_covariances = np.zeros((n, 2), np.float32), np.zeros((n, 3), np.float32)
+    to_means2d, moments = np.zeros((n, 2), np.float32), np.zeros((n, 3), np.float32)
     to_opacities, absolute = np.zeros(n, np.float32), np.zeros((n, 2), np.float32)
     to_colors = np.zeros((n, channels), np.float32)
     for i in prange(n):
@@ -168,9 +167,7 @@ def reduce(records, pair_starts, whitening, opacities):
         p, q, r = 1.0 * whitening[i, 0], 1.0 * whitening[i, 1], 1.0 * whitening[i, 2]
         to_means2d[i, 0] = 2 * p * total[1]
         to_means2d[i, 1] = 2 * (q * total[1] + r * total[2])
-        to_covariances[i, 0] = p * p * total[3] / HALF_LOG2E
-        to_covariances[i, 1] = 2 * p * (q * total[3] + r * total[4]) / HALF_LOG2E
-        to_covariances[i, 2] = (q * q * total[3] + 2 * q * r * total[4] + r * r * total[5]) / HALF_LOG2E
+        moments[i, 0], moments[i, 1], moments[i, 2] = total[3], total[4], total[5]
         to_opacities[i] = total[0] / (math.log(2.0) * opacities[i])
         absolute[i, 0], absolute[i, 1] = total[6], total[7]
-    return to_means2d, to_covariances, to_opacities, absolute, to_colors
+    return to_means2d, moments, to_opacities, absolute, to_colors
