@@ -101,21 +101,25 @@ def accumulate(alphas, fronts, weights, cells, n, colors, i, sums):
 
 
 @lanes
-def by_channel(alphas, fronts, cells, first, n, colors, i, grads, by_alpha, slopes, weights, by_colors):
-    """slopes [n, lanes] = dL/d(weight) in one Gaussian's cells, and its dL/d(color) by lane into by_colors."""
-    for d in range(colors.shape[1]):
+def by_channel(alphas, fronts, cells, first, n, color, grads, tall_grads, by_alpha, slopes, weights, by_colors):
+    """slopes [n, lanes] = dL/d(weight) in one Gaussian's cells, and its dL/d(color) by lane into by_colors.
+
+    Args: grads [cells, D, lanes] and tall_grads [cells, lanes, D'] of the image, color [D'], where D' is D filled up
+      with zeros to a multiple of 8: a dot product that stores nothing needs no check for overlap.
+    """
+    for d in range(by_colors.shape[0]):
         for lane in range(weights.shape[0] & LANES):
             by_colors[d, lane] = ZERO
     for k in range(n):
         cell = cells[first + k] & LAST
+        for lane in range(LANES):
+            slope = by_alpha[cell, lane]
+            for d in range(color.shape[0] & -8):
+                slope += color[d] * tall_grads[cell, lane, d]
+            slopes[k, lane] = slope
         for lane in range(weights.shape[0] & LANES):
-            slopes[k, lane] = by_alpha[cell, lane]
             weights[lane] = alphas[first + k, lane] * fronts[first + k, lane]
-        for d in range(colors.shape[1]):
-            color = colors[i, d]
-            for lane in range(weights.shape[0] & LANES):
-                slopes[k, lane] += color * grads[cell, d, lane]
-        for d in range(colors.shape[1]):
+        for d in range(by_colors.shape[0]):
             for lane in range(weights.shape[0] & LANES):
                 by_colors[d, lane] += weights[lane] * grads[cell, d, lane]
 

@@ -105,13 +105,14 @@ def backward(
         top, left = (tile // columns) * TILE, (tile % columns) * TILE
         before, by_alpha = np.zeros((LANES, LANES), np.float32), np.zeros((LANES, LANES), np.float32)
         grads, check = np.zeros((LANES, channels, LANES), np.float32), ZERO
+        tall_grads = np.zeros((LANES, LANES, (channels + 7) // 8 * 8), np.float32)
         for y in range(min(TILE, height - top)):
             for x in range(min(TILE, width - left)):
                 cell, lane = 4 * (y >> 2) + (x >> 2), 4 * (y & 3) + (x & 3)
                 before[cell, lane], by_alpha[cell, lane] = ONE, grad_alpha[top + y, left + x]
                 check += ZERO * by_alpha[cell, lane]
                 for d in range(channels):
-                    grads[cell, d, lane] = grad[top + y, left + x, d]
+                    grads[cell, d, lane] = tall_grads[cell, lane, d] = grad[top + y, left + x, d]
                     check += ZERO * grads[cell, d, lane]
         finite[tile] = check == ZERO
         start, n_pairs = tile_starts[tile], tile_starts[tile + 1] - tile_starts[tile]
@@ -131,6 +132,7 @@ def backward(
             firsts[k + 1] = firsts[k] + n
         behind, slopes = np.zeros((LANES, LANES), np.float32), np.empty((LANES, LANES), np.float32)
         weights, by_colors = np.empty(LANES, np.float32), np.empty((channels, LANES), np.float32)
+        color = np.zeros((channels + 7) // 8 * 8, np.float32)
         for k in range(n_pairs - 1, -1, -1):
             i, first, n = gaussian[start + k], firsts[k], firsts[k + 1] - firsts[k]
             record = records[pair[start + k]]
@@ -138,7 +140,9 @@ def backward(
                 record[:] = ZERO
                 continue
             p, q, r, u, v = _place(means2d, whitening, i, left, top)
-            by_channel(alphas, fronts, cells, first, n, colors, i, grads, by_alpha, slopes, weights, by_colors)
+            for d in range(channels):
+                color[d] = colors[i, d]
+            by_channel(alphas, fronts, cells, first, n, color, grads, tall_grads, by_alpha, slopes, weights, by_colors)
             by_geometry(u, v, p, q, r, max_alpha, offsets, cells, first, n, alphas, fronts, slopes, behind, record)
             sum_lanes(by_colors, record)
     return records, finite.all()
