@@ -1,9 +1,14 @@
 """Pruning masks, densification and the optimizer's book-keeping."""
 
+import math
+
 import pytest
 import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
 
-from chebsplat import adapt
+from chebsplat import adapt, growth
+from chebsplat.rasterize.projection import rotation_matrices
 
 
 def raw(n=200, seed=0):
@@ -14,23 +19,56 @@ def raw(n=200, seed=0):
         "quats": torch.randn(n, 4, generator=g),
         "logit_opacities": torch.randn(n, generator=g),
         "sh0": torch.randn(n, 1, 3, generator=g),
+        "prune_logits": torch.randn(n, generator=g),
     }
 
 
-def test_mask_is_binary_forward_and_soft_backward():
-    logits = torch.linspace(-8, 8, 33, requires_grad=True)
+def seeded(seed=0):
+    return torch.Generator().manual_seed(seed)
+
+
+def grow(parameters, members, gradient, budget=50, threshold=1e-4, seed=0, **options):
+    return adapt.densify(parameters, members, gradient, threshold, budget, seeded(seed), **options)
+
+
+# masks
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+def test_mask_is_exactly_binary_forward_and_soft_backward(dtype):
+    logits = torch.linspace(-8, 8, 333, dtype=dtype, requires_grad=True)
     soft = adapt.soft_mask(logits, None)
     hard = adapt.hard_mask(soft)
-    assert set(hard.detach().round(decimals=5).tolist()) == {0.0, 1.0}
+    assert set(hard.detach().tolist()) == {0.0, 1.0}
+    assert torch.equal(hard.detach() == 1, soft.detach() > adapt.THRESHOLD)
     hard.sum().backward()
     assert torch.allclose(logits.grad, (soft * (1 - soft)).detach())
 
 
 def test_extreme_logits_keep_a_gradient_inside_the_clamp_and_stay_finite():
     logits = torch.tensor([-1e30, -9.9, 9.9, 1e30], requires_grad=True)
-    adapt.soft_mask(logits, logits.detach()).sum().backward()
+    soft = adapt.soft_mask(logits, logits.detach())
+    soft.sum().backward()
+    assert ((soft > 0) & (soft < 1)).all()
     assert torch.isfinite(logits.grad).all()
     assert (logits.grad[1:3] > 0).all()
+
+
+def test_either_gate_alone_can_remove_a_gaussian():
+    shut, neutral = torch.tensor([-5.0]), torch.tensor([5.0])
+    for pair in ((shut, neutral), (neutral, shut)):
+        assert adapt.hard_mask(adapt.soft_mask(*pair)).item() == 0
+    assert adapt.hard_mask(adapt.soft_mask(neutral, neutral)).item() == 1
+
+
+def test_semantic_gate_starts_open_and_alike_and_can_learn():
+    gate = adapt.SemanticGate(5)
+    features = torch.randn(40, 5, generator=seeded())
+    logits = gate(features)
+    assert (logits == 1).all()
+    adapt.soft_mask(torch.ones(40), logits).mean().backward()
+    assert gate.linear.bias.grad.abs() > 0
+    assert gate.linear.weight.grad.abs().max() > 0
 
 
 def test_a_masked_gaussian_has_no_opacity_and_no_size_but_keeps_its_parameters():
@@ -39,43 +77,205 @@ def test_a_masked_gaussian_has_no_opacity_and_no_size_but_keeps_its_parameters()
     assert opacities.tolist() == [0.5, 0.0]
 
 
+# densification by regions
+
+
 def test_region_gradient_is_the_mean_over_members_not_over_padding():
     gradient = torch.tensor([1.0, 3.0, 5.0])
     members = torch.tensor([[0, 1, -1], [2, -1, -1], [-1, -1, -1]])
     assert adapt.region_gradients(gradient, members).tolist() == [2.0, 5.0, 0.0]
+    assert adapt.region_gradients(torch.zeros(0), members[2:]).tolist() == [0.0]
 
 
-def test_two_gaussians_of_halved_opacity_composite_to_the_one():
-    logits = torch.linspace(-5, 5, 21, dtype=torch.float64)
-    half = adapt.halved_opacity(logits).sigmoid()
-    assert torch.allclose(1 - (1 - half) ** 2, logits.sigmoid())
+def test_a_gradient_that_is_nan_outside_a_region_does_not_reach_it():
+    found = adapt.region_gradients(torch.tensor([torch.nan, 2.0]), torch.tensor([[1, -1], [0, 1]]))
+    assert found[0] == 2
+    assert len(grow(raw(), torch.arange(16)[None], found[1:]).parents) == 0
 
 
-def test_densify_adds_only_inside_steep_regions_and_within_budget():
+@settings(deadline=None, derandomize=True, max_examples=40)
+@given(
+    n=st.integers(4, 300),
+    n_regions=st.integers(1, 6),
+    budget=st.integers(0, 40),
+    log_size=st.floats(-6, 6),
+    flat=st.booleans(),
+    bounds=st.tuples(st.floats(0.05, 1.0), st.floats(1.1, 4.0)),
+    seed=st.integers(0, 10**6),
+)
+def test_additions_keep_their_promises(n, n_regions, budget, log_size, flat, bounds, seed):
+    parameters = raw(n, seed)
+    parameters["means"] = parameters["means"] * 10.0**log_size
+    if flat:
+        parameters["means"][:, 2] = 0
+    members = torch.randint(-1, n, (n_regions, 12), generator=seeded(seed))
+    gradient = 1e-3 * torch.rand(n_regions, generator=seeded(seed + 1))
+    nearest, farthest = bounds
+    found = grow(parameters, members, gradient, budget, 2e-4, seed, nearest=nearest, farthest=farthest)
+    count = len(found.parents)
+    assert count <= budget
+    assert set(found.rows) == set(parameters)
+    assert all(len(v) == count and torch.isfinite(v).all() for v in found.rows.values())
+    assert set(found.changed) == {"logit_opacities", "log_scales"}
+    assert len(found.parents.unique()) == count
+    if not count:
+        return
+    new, old = found.rows["means"].double(), parameters["means"].double()
+    distance, _ = torch.cdist(new, old, compute_mode="donot_use_mm_for_euclid_dist").min(1)
+    assert torch.allclose(distance, (new - old[found.parents]).norm(dim=1), rtol=1e-3)
+    three = torch.cdist(old, old, compute_mode="donot_use_mm_for_euclid_dist").topk(4, largest=False).values[:, 1:]
+    spacing = three.mean(1)
+    assert (distance >= 0.99 * nearest * spacing.min()).all()
+    assert (distance <= 1.01 * farthest * spacing.max()).all()
+    inside = torch.zeros(count, dtype=torch.bool)
+    for region in range(n_regions):
+        ball = old[members[region][members[region] >= 0]]
+        if gradient[region] > 2e-4 and len(ball):
+            radius = (ball - ball.mean(0)).norm(dim=1).max()
+            inside |= (new - ball.mean(0)).norm(dim=1) <= radius * (1 + 1e-4)
+    assert inside.all()
+    for name in ("quats", "sh0", "prune_logits"):
+        assert torch.equal(found.rows[name], parameters[name][found.parents])
+    for name, values in found.changed.items():
+        assert torch.equal(values, found.rows[name])
+        assert (values <= parameters[name][found.parents] + 1e-5).all()
+
+
+def test_new_gaussians_keep_apart_from_each_other():
+    parameters = raw(400)
+    members = torch.arange(400).reshape(10, 40)
+    found = grow(parameters, members, torch.ones(10), 400, density=1.0)
+    new = found.rows["means"].double()
+    assert len(new) > 30
+    gaps = torch.cdist(new, new) + torch.eye(len(new))
+    three = torch.cdist(parameters["means"], parameters["means"]).topk(4, largest=False).values[:, 1:].mean(1)
+    spacing = three[members].median(1).values
+    assert gaps.min() >= 0.5 * 0.9 * spacing.min()
+
+
+def test_steeper_regions_come_first_where_the_budget_is_short():
+    parameters = raw(400)
+    halves = torch.arange(400).reshape(2, 200)
+    parameters["means"][200:] += 10
+    for steeper in (0, 1):
+        gradient = torch.full((2,), 2e-4)
+        gradient[steeper] = 1e-3
+        parents = grow(parameters, halves, gradient, 5).parents
+        assert len(parents) == 5
+        assert torch.isin(parents, halves[steeper]).all()
+
+
+def test_more_excess_gradient_brings_more_candidates():
+    parameters = raw(1000)
+    counts = [len(grow(parameters, torch.arange(1000)[None], torch.tensor([1e-4 * f])).parents) for f in (1.05, 2.0)]
+    assert counts[0] < counts[1]
+
+
+def test_densify_is_fixed_by_its_generator_and_leaves_its_input_alone():
     parameters = raw()
-    near_zero = parameters["means"].norm(dim=1).argsort()
-    members = torch.stack([near_zero[:16], near_zero[-16:]])
-    gradient = torch.tensor([1.0, 1e-6])
-    generator = torch.Generator().manual_seed(0)
-    additions = adapt.densify(parameters, members, gradient, 1e-4, 5, generator)
-    assert 0 < len(additions.parents) <= 5
-    centre = parameters["means"][members[0]].mean(0)
-    radius = (parameters["means"][members[0]] - centre).norm(dim=1).max()
-    assert ((additions.rows["means"] - centre).norm(dim=1) <= radius + 1e-5).all()
-    assert len(additions.parents.unique()) == len(additions.parents)
+    before = {name: value.clone() for name, value in parameters.items()}
+    members, gradient = torch.arange(200).reshape(5, 40), torch.ones(5)
+    a, b, c = (grow(parameters, members, gradient, seed=s) for s in (3, 3, 4))
+    assert torch.equal(a.rows["means"], b.rows["means"])
+    assert a.rows["means"].shape != c.rows["means"].shape or not torch.equal(a.rows["means"], c.rows["means"])
+    assert all(torch.equal(value, before[name]) for name, value in parameters.items())
 
 
-@pytest.mark.parametrize("gradient", [0.0, 1e-6])
-def test_densify_adds_nothing_where_nothing_is_steep(gradient):
-    members = torch.arange(16)[None]
-    found = adapt.densify(raw(), members, torch.tensor([gradient]), 1e-4, 5, torch.Generator().manual_seed(0))
+@pytest.mark.parametrize(
+    "case", ["flat gradient", "below threshold", "no budget", "no regions", "empty region", "one member", "coincident",
+             "three Gaussians", "none"]
+)  # fmt: skip
+def test_densify_adds_nothing_where_there_is_no_reason_or_no_room(case):
+    parameters, members, gradient, budget = raw(), torch.arange(16)[None], torch.ones(1), 50
+    if case == "flat gradient":
+        gradient = torch.zeros(1)
+    elif case == "below threshold":
+        gradient = torch.tensor([1e-6])
+    elif case == "no budget":
+        budget = 0
+    elif case == "no regions":
+        members, gradient = members[:0], gradient[:0]
+    elif case == "empty region":
+        members = torch.full((1, 16), -1)
+    elif case == "one member":
+        members = torch.tensor([[5, -1, -1]])
+    elif case == "coincident":
+        parameters["means"] = torch.zeros(200, 3)
+    elif case == "three Gaussians":
+        parameters, members = raw(3), torch.arange(3)[None]
+    elif case == "none":
+        parameters, members, gradient = raw(0), torch.zeros(0, 4, dtype=torch.int64), torch.zeros(0)
+    found = grow(parameters, members, gradient, budget)
     assert len(found.parents) == 0
+    assert all(value.shape == (0, *parameters[name].shape[1:]) for name, value in found.rows.items())
 
 
-def test_densify_survives_coincident_points():
-    parameters = raw() | {"means": torch.zeros(200, 3)}
-    found = adapt.densify(parameters, torch.arange(16)[None], torch.ones(1), 1e-4, 5, torch.Generator().manual_seed(0))
-    assert len(found.parents) == 0
+def test_gaussians_that_are_not_finite_neither_stop_growth_nor_have_offspring():
+    parameters = raw()
+    parameters["means"][::7] = torch.nan
+    parameters["means"][1] = torch.inf
+    found = grow(parameters, torch.arange(200).reshape(5, 40), torch.ones(5))
+    assert len(found.parents) > 5
+    assert torch.isfinite(parameters["means"][found.parents]).all()
+    assert torch.isfinite(found.rows["means"]).all()
+
+
+def test_bounds_out_of_order_are_refused():
+    for options in ({"threshold": 0.0}, {"nearest": 2.0}, {"nearest": 0.0}):
+        with pytest.raises(ValueError, match="do not hold"):
+            grow(raw(), torch.arange(16)[None], torch.ones(1), **options)
+
+
+# two that render like the one
+
+
+def test_opacity_at_the_old_centre_stays_whatever_the_offset():
+    logits = torch.linspace(-5, 5, 21, dtype=torch.float64)
+    quats = torch.randn(21, 4, generator=seeded(), dtype=torch.float64)
+    log_scales = torch.randn(21, 3, generator=seeded(1), dtype=torch.float64)
+    for size in (0.0, 0.5, 2.0, 1e6):
+        offsets = size * torch.randn(21, 3, generator=seeded(2), dtype=torch.float64)
+        shared = growth.shared_opacity(logits, log_scales, quats, offsets).sigmoid()
+        local = torch.einsum("nji,nj->ni", rotation_matrices(quats), offsets) / log_scales.exp()
+        falloff = torch.exp(-0.5 * (local**2).sum(1))
+        assert torch.allclose(1 - (1 - shared) * (1 - falloff * shared), logits.sigmoid(), atol=1e-6)
+    in_place = growth.shared_opacity(logits, log_scales, quats, 0 * offsets).sigmoid()
+    assert torch.allclose(in_place, 1 - (1 - logits.sigmoid()).sqrt())
+
+
+def test_scales_shrink_only_along_the_offset_and_keep_the_second_moment():
+    log_scales = torch.tensor([[0.0, 0.0, -2.0]], dtype=torch.float64)
+    quats = torch.tensor([[1.0, 0.0, 0.0, 0.0]], dtype=torch.float64)
+    shared = growth.shared_scales(log_scales, quats, torch.tensor([[1.0, 0.0, 0.0]], dtype=torch.float64)).exp()
+    assert shared[0, 0] ** 2 + 0.25 == pytest.approx(1.0)
+    assert shared[0, 1:].tolist() == pytest.approx([1.0, math.exp(-2)])
+
+
+@pytest.mark.parametrize("size", [0.0, 1e-30, 1e3, 1e18])
+def test_sharing_stays_finite_for_any_offset_scale_and_quaternion(size):
+    n = 8
+    quats = torch.randn(n, 4, generator=seeded())
+    quats[0] = 0
+    log_scales = torch.linspace(-80, 80, 3 * n).reshape(n, 3)
+    logits = torch.linspace(-100, 100, n)
+    offsets = size * torch.randn(n, 3, generator=seeded(1))
+    assert torch.isfinite(growth.shared_opacity(logits, log_scales, quats, offsets)).all()
+    scales = growth.shared_scales(log_scales, quats, offsets)
+    assert torch.isfinite(scales).all()
+    assert (log_scales - scales).max() <= math.log(growth.SHRINK) + 1e-4
+
+
+# the classic baseline
+
+
+def test_classic_candidates_are_steep_and_parted_by_size():
+    parameters = raw(10)
+    parameters["log_scales"][3] = 0.0
+    gradients = torch.tensor([0.0, 2, 3, 4, 0, 1, 0, 0, 0, 5])
+    parameters["means"][9] = torch.nan
+    clones, splits = adapt.classic_candidates(parameters, gradients, 0.5, 0.5)
+    assert clones.tolist() == [2, 1, 5]
+    assert splits.tolist() == [3]
 
 
 def test_clone_keeps_and_split_shrinks():
@@ -83,33 +283,111 @@ def test_clone_keeps_and_split_shrinks():
     parameters["log_scales"][0] = 0.0
     gradient = torch.zeros(200)
     gradient[:2] = 1.0
-    found = adapt.clone_or_split(parameters, gradient, 0.5, 0.5, 10, torch.Generator().manual_seed(0))
+    found = adapt.clone_or_split(parameters, gradient, 0.5, 0.5, 10, seeded())
     by_parent = {int(p): k for k, p in enumerate(found.parents)}
     assert set(by_parent) == {0, 1}
-    assert torch.equal(found.rows["means"][by_parent[1]], parameters["means"][1])
-    assert (found.rows["log_scales"][by_parent[0]] < 0).all()
+    for name, value in found.rows.items():
+        assert torch.equal(value[by_parent[1]], parameters[name][1])
+    assert torch.allclose(found.rows["log_scales"][by_parent[0]], torch.tensor(-math.log(1.6)))
+    assert not torch.equal(found.rows["means"][by_parent[0]], found.changed["means"][by_parent[0]])
 
 
-def stepped(parameters):
+def test_halves_of_splits_are_drawn_from_the_gaussian_that_is_split():
+    parameters = {name: value[:1].expand(20_000, *value.shape[1:]).clone() for name, value in raw().items()}
+    parameters["log_scales"][:] = torch.tensor([-1.0, -2.0, -3.0])
+    found = adapt.clone_or_split(parameters, torch.ones(20_000), 0.5, 0.01, 20_000, seeded())
+    frame = rotation_matrices(parameters["quats"][:1])[0]
+    for means in (found.rows["means"], found.changed["means"]):
+        local = (means - parameters["means"]) @ frame
+        assert torch.allclose(local.std(0), torch.tensor([-1.0, -2.0, -3.0]).exp(), rtol=0.03)  # 1/√(2N) = 0.5 %
+
+
+def test_classic_takes_the_steepest_within_budget():
+    gradient = torch.arange(200.0)
+    found = adapt.clone_or_split(raw(), gradient, 0.5, 0.06, 7, seeded())
+    assert sorted(found.parents.tolist()) == list(range(193, 200))
+    assert len(adapt.clone_or_split(raw(), gradient, 0.5, 0.06, 0, seeded()).parents) == 0
+
+
+# rows of parameters and optimizer
+
+
+def stepped(parameters, **options):
     for value in parameters.values():
         value.requires_grad_(True)
-    optimizer = torch.optim.Adam([{"params": [v], "lr": 0.01, "name": k} for k, v in parameters.items()])
-    sum((v**2).sum() for v in parameters.values()).backward()
+    groups = [{"params": [v], "lr": 0.01, "name": k} for k, v in parameters.items()]
+    module = torch.nn.Linear(10, 3)
+    groups.append({"params": list(module.parameters()), "lr": 0.01, "name": "modules"})
+    optimizer = torch.optim.Adam(groups, **options)
+    (sum((v**2).sum() for v in parameters.values()) + module(torch.ones(10)).sum()).backward()
     optimizer.step()
     return optimizer
 
 
-def test_pruning_keeps_the_moments_of_the_rows_that_stay():
+@pytest.mark.parametrize("options", [{}, {"amsgrad": True}, {"fused": True}])
+def test_pruning_keeps_the_moments_of_the_rows_that_stay(options):
     parameters = raw(10)
-    optimizer = stepped(parameters)
-    moment = optimizer.state[parameters["means"]]["exp_avg"].clone()
+    optimizer = stepped(parameters, **options)
+    before = {k: dict(optimizer.state[v]) for k, v in parameters.items()}
+    weight = optimizer.param_groups[-1]["params"][0]
     keep = torch.arange(10) % 2 == 0
     adapt.prune_optimizer(optimizer, parameters, keep)
-    assert len(parameters["means"]) == 5
-    assert torch.equal(optimizer.state[parameters["means"]]["exp_avg"], moment[keep])
-    assert optimizer.param_groups[0]["params"][0] is parameters["means"]
-    parameters["means"].sum().backward()
+    for index, (name, value) in enumerate(parameters.items()):
+        assert len(value) == 5
+        assert value.is_leaf
+        assert optimizer.param_groups[index]["params"][0] is value
+        for key, state in optimizer.state[value].items():
+            assert torch.equal(state, before[name][key] if state.ndim == 0 else before[name][key][keep])
+    assert optimizer.param_groups[-1]["params"][0] is weight
+    assert len(optimizer.state) == len(parameters) + 2
+    sum(v.sum() for v in parameters.values()).backward()
     optimizer.step()
+
+
+@pytest.mark.parametrize("options", [{}, {"amsgrad": True}])
+def test_extending_keeps_old_moments_and_starts_new_ones_at_zero(options):
+    parameters = raw(10)
+    optimizer = stepped(parameters, **options)
+    before = {k: dict(optimizer.state[v]) for k, v in parameters.items()}
+    rows = {k: v.detach()[:3] + 1 for k, v in parameters.items()}
+    adapt.extend_optimizer(optimizer, parameters, rows)
+    for name, value in parameters.items():
+        assert torch.equal(value[10:], rows[name])
+        for key, state in optimizer.state[value].items():
+            if state.ndim:
+                assert torch.equal(state[:10], before[name][key])
+                assert (state[10:] == 0).all()
+    sum(v.sum() for v in parameters.values()).backward()
+    optimizer.step()
+
+
+def test_rows_can_come_and_go_before_the_first_step_and_down_to_none():
+    parameters = raw(4)
+    for value in parameters.values():
+        value.requires_grad_(True)
+    optimizer = torch.optim.Adam([{"params": [v], "name": k} for k, v in parameters.items()])
+    adapt.extend_optimizer(optimizer, parameters, {k: v.detach()[:2] for k, v in parameters.items()})
+    adapt.prune_optimizer(optimizer, parameters, torch.zeros(6, dtype=torch.bool))
+    assert all(len(v) == 0 and v.requires_grad for v in parameters.values())
+
+
+def test_a_parameter_that_is_not_optimised_keeps_pace():
+    parameters = raw(6)
+    frozen = torch.arange(6)
+    optimizer = stepped(parameters)
+    parameters["ids"] = frozen
+    adapt.prune_optimizer(optimizer, parameters, torch.tensor([True, False, True, True, False, True]))
+    assert parameters["ids"].tolist() == [0, 2, 3, 5]
+    assert not parameters["ids"].requires_grad
+
+
+def test_selecting_what_was_appended_gives_it_back():
+    parameters, more = raw(5), raw(3, seed=1)
+    both = adapt.append(parameters, more)
+    first, last = adapt.select(both, torch.arange(8) < 5), adapt.select(both, torch.arange(5, 8))
+    assert all(torch.equal(first[k], parameters[k]) and torch.equal(last[k], more[k]) for k in parameters)
+    with pytest.raises(ValueError, match="do not fit"):
+        adapt.append(parameters, {"means": more["means"]})
 
 
 def test_added_rows_and_changed_parents_start_with_zero_moments():
@@ -117,12 +395,13 @@ def test_added_rows_and_changed_parents_start_with_zero_moments():
     optimizer = stepped(parameters)
     parents = torch.tensor([3, 7])
     rows = {k: v.detach()[parents].clone() for k, v in parameters.items()}
-    changed = {"logit_opacities": torch.tensor([-1.0, -2.0])}
+    changed = {"logit_opacities": torch.tensor([-1.0, -2.0]), "quats": rows["quats"].clone()}
     adapt.apply_additions(optimizer, parameters, adapt.Additions(parents, rows, changed))
     assert all(len(v) == 12 for v in parameters.values())
     assert parameters["logit_opacities"][parents].tolist() == [-1.0, -2.0]
     opacity = optimizer.state[parameters["logit_opacities"]]["exp_avg"]
     assert (opacity[[3, 7, 10, 11]] == 0).all()
-    means = optimizer.state[parameters["means"]]["exp_avg"]
-    assert (means[10:] == 0).all()
-    assert (means[3] != 0).any()
+    for untouched in ("means", "quats"):
+        moment = optimizer.state[parameters[untouched]]["exp_avg"]
+        assert (moment[10:] == 0).all()
+        assert (moment[3] != 0).any()
