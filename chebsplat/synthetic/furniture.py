@@ -129,12 +129,18 @@ def bin_(b: Builder, f: Frame, material: int) -> None:
     b.revolved("bin", material, f.moved(0, 0.16, 0), [(0.11, 0), (0.15, 0.36), (0.14, 0.36), (0.105, 0.03)])
 
 
-def plant(b: Builder, f: Frame, pot: int, green: int, rng: Generator, height: float = 0.9) -> None:
+def plant(
+    b: Builder, f: Frame, pot: int, green: int, rng: Generator, height: float = 0.9, behind: float = 0.19
+) -> None:
+    """Leaves spread to all sides, but grow steeply where only `behind` metres are left to the wall."""
     middle = f.moved(0, 0.22, 0)
     b.revolved("plant", pot, middle, [(0.11, 0), (0.16, 0.3), (0.14, 0.3), (0.13, 0.26)])
     for k in range(16):
-        root = middle.moved(0, 0, 0.25, 2 * np.pi * k * 0.382)
-        b.leaf("plant", green, root, height * rng.uniform(0.6, 1.0), rng.uniform(0.09, 0.14), rng.uniform(0.5, 1.0))
+        turn = 2 * np.pi * k * 0.382
+        length, width, bend = height * rng.uniform(0.6, 1.0), rng.uniform(0.09, 0.14), rng.uniform(0.5, 1.0)
+        free = (behind - 0.5 * width * abs(np.sin(turn))) / max(-np.cos(turn), 1e-6)
+        reach = min(0.55 * length, max(free, 0.05))
+        b.leaf("plant", green, middle.moved(0, 0, 0.25, turn), length, reach, width, bend)
 
 
 def rug(b: Builder, f: Frame, material: int, width: float, depth: float) -> None:

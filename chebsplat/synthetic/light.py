@@ -9,6 +9,11 @@ import numpy as np
 SAMPLES = ((-0.7, -0.6), (0.6, -0.7), (0.7, 0.6), (-0.6, 0.7))  # points of a panel that light is taken from
 
 
+def dot(a: np.ndarray, b: np.ndarray) -> np.ndarray:
+    """Row by row a · b, [N, 1]; several times faster on rows of three than a sum over the last axis."""
+    return np.einsum("ni,ni->n", a, b)[:, None]
+
+
 def shade(
     points: np.ndarray,
     normals: np.ndarray,
@@ -32,17 +37,15 @@ def shade(
     for centre, half in lights:
         for u, v in SAMPLES:
             offset = (centre + half * (u, v, 0) - start).astype(np.float32)
-            distance = np.linalg.norm(offset, axis=1, keepdims=True)
+            distance = np.sqrt(dot(offset, offset))
             direction = offset / distance
-            facing = np.maximum((normals * direction).sum(1, keepdims=True), 0)
+            facing = np.maximum(dot(normals, direction), 0)
             falloff = np.maximum(-direction[:, 2:] * -1, 0) / (0.6 + distance**2)
             lit = ~is_blocked(start, offset * np.float32(0.995))[:, None]
             diffuse += lit * facing * falloff
             middle = direction + to_eye
-            middle /= np.linalg.norm(middle, axis=1, keepdims=True).clip(1e-6)
-            highlight += (
-                lit * (facing > 0) * np.maximum((normals * middle).sum(1, keepdims=True), 0) ** shininess[:, None]
-            )
+            middle /= np.sqrt(dot(middle, middle)).clip(1e-6)
+            highlight += lit * (facing > 0) * np.maximum(dot(normals, middle), 0) ** shininess[:, None]
     n = len(lights) * len(SAMPLES)
     return albedo * (ambient + 5.2 / len(SAMPLES) * 0.5 * diffuse) + gloss[:, None] * highlight / n
 

@@ -103,10 +103,12 @@ class Builder:
         faces = np.concatenate([np.stack([a, a + 1, a + n], 1), np.stack([a + 1, a + n + 1, a + n], 1)])
         self.add(label, material, frame, np.concatenate([front, back]), np.concatenate([faces, faces[:, ::-1] + n * n]))
 
-    def leaf(self, label: str, material: int, frame: Frame, length: float, width: float, bend: float) -> None:
-        """A bent, pointed blade that grows from the local origin along y and up."""
+    def leaf(
+        self, label: str, material: int, frame: Frame, length: float, reach: float, width: float, bend: float
+    ) -> None:
+        """A bent, pointed blade that grows from the local origin up, and by `reach` (m) along y."""
         t = np.linspace(0, 1, 6)
-        spine = np.stack([np.zeros(6), length * t * np.cos(bend * t), length * t * (1 - 0.6 * bend * t)], 1)
+        spine = np.stack([np.zeros(6), reach * t * (1.5 - 0.5 * t), length * t * (1 - 0.6 * bend * t)], 1)
         half = np.stack([0.5 * width * np.sin(np.pi * np.clip(t, 0.04, 1)), np.zeros(6), np.zeros(6)], 1)
         vertices = np.concatenate([spine - half, spine + half])
         a = np.arange(5)

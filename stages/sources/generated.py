@@ -80,16 +80,16 @@ def trace(caster: RayCaster, K: np.ndarray, pose: np.ndarray, pixels: np.ndarray
 
 def shaded(room: Room, caster: RayCaster, pose: np.ndarray, rays: np.ndarray, hits: Hits) -> np.ndarray:
     """Linear light [N, 3] along rays; black where nothing is hit."""
-    from chebsplat.synthetic.light import shade
+    from chebsplat.synthetic.light import dot, shade
     from chebsplat.synthetic.textures import colors
 
     seen = hits.triangle >= 0
     triangle, rays, distance = hits.triangle[seen], rays[seen], hits.distance[seen]
     eye = (-pose[:3, :3].T @ pose[:3, 3]).astype(np.float32)
     points = eye + rays * distance[:, None]
-    to_eye = -rays / np.linalg.norm(rays, axis=1, keepdims=True)
+    to_eye = -rays / np.sqrt(dot(rays, rays))
     normals = hits.normals[seen]
-    normals = normals * np.where((normals * to_eye).sum(1, keepdims=True) < 0, np.float32(-1), np.float32(1))
+    normals = normals * np.where(dot(normals, to_eye) < 0, np.float32(-1), np.float32(1))
     part, material = room.soup.parts[triangle], room.soup.materials[triangle]
     local = np.einsum("nij,nj->ni", room.soup.rotations[part], points - room.soup.origins[part])
     albedo = colors(local, material, room.materials)
