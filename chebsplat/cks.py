@@ -42,7 +42,7 @@ def update(
                  printed rule, which always adds a vector).
       tolerance: κ below which the scene is no news and nothing is added (ε = 0.2).
       max_rank:  ceiling of r as a fraction of q, below 1: at r = q the regulariser would vanish for ever.
-    Returns: basis [q, r'] float32 with BᵀB = I to 3e-8 (dense columns of q ≥ 32; 6e-8 else); the given columns
+    Returns: basis [q, r'] float32 with BᵀB = I to 3e-8 (dense columns, q ≥ 32; one ulp else); the given columns
       come first, untouched where nothing is added. Report: `rank_before`, `rank_after`, `added`; `rho`, the relative
       residual before; `energy`, the fraction of ‖W‖² captured after.
     Raises:  ValueError on values that are not finite, shapes that disagree, a basis that is not orthonormal, or a

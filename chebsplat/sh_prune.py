@@ -27,19 +27,36 @@ def degrees(mask: Tensor) -> Tensor:
     return (mask > 0.5).sum(-1).to(torch.uint8)
 
 
+def ragged(sh0: Tensor, shN: Tensor, degree: Tensor) -> tuple[Tensor, list[Tensor]]:
+    """Gaussians sorted by degree, and the coefficients that each degree really has.
+
+    Args: sh0 [N, 1, 3]; shN [N, 15, 3]; degree u8 [N], 0 to 3.
+    Returns: order i64 [N], stable, lowest degree first; four tensors [N_l, (l + 1)², 3], which together hold the
+      Gaussians in that order.
+    Raises: ValueError on a degree beyond 3.
+    """
+    if (degree > 3).any():
+        raise ValueError(f"degree {int(degree.max())} is beyond 3")
+    order = torch.argsort(degree.long(), stable=True)
+    counts = torch.bincount(degree.long(), minlength=4).tolist()
+    whole = torch.cat([sh0, shN], 1)
+    return order, [whole[part, : (band + 1) ** 2] for band, part in enumerate(order.split(counts))]
+
+
 def soft_histogram(values: Tensor, valid: Tensor, n_bins: int, low: Tensor, high: Tensor) -> Tensor:
-    """Histogram whose mass is exactly 1, with gradients that stay finite.
+    """Histogram whose mass is exactly 1, with gradients that stay finite (Eq 13).
 
     Args:
-      values: [..., n]; valid bool [..., n]; low, high: [...] bounds, may coincide.
+      values: [..., n]; valid bool [..., n], values elsewhere may be anything; low, high: [...] bounds, may coincide.
     Returns: [..., n_bins]; zero where nothing is valid.
     Choices: differences of sigmoids at the interior edges, the end bins open; slope γ = 20/Δ with bin width
-      Δ ≥ 1e-6; divided by the count.
+      Δ ≥ 1e-6; divided by the count. Taken relative to `low`, so that bins narrower than its rounding stay apart.
     """
     width = ((high - low) / n_bins).clamp_min(1e-6)
-    edges = low[..., None] + width[..., None] * torch.arange(1, n_bins, dtype=values.dtype)
-    below = (20 / width[..., None, None] * (edges[..., None, :] - values[..., None])).sigmoid()
-    ends = torch.zeros_like(below[..., :1])
+    inside = torch.where(valid, values - low[..., None], 0.0) / width[..., None]
+    edges = torch.arange(1, n_bins, dtype=values.dtype, device=values.device)
+    below = (20 * (edges - inside[..., None])).sigmoid()
+    ends = torch.zeros_like(inside[..., None])
     mass = torch.diff(torch.cat([ends, below, ends + 1], -1), dim=-1)
     count = valid.sum(-1, keepdim=True).clamp_min(1)
     return (mass * valid[..., None]).sum(-2) / count
@@ -48,38 +65,62 @@ def soft_histogram(values: Tensor, valid: Tensor, n_bins: int, low: Tensor, high
 def band_colors(shN: Tensor, directions: Tensor) -> Tensor:
     """What each band adds to the colour seen along a direction.
 
-    Args: shN [N, 15, 3]; directions [Q, 3] unit. Returns: [Q, N, 3 bands, 3].
+    Args: shN [N, K, 3]; directions [..., N, 3] unit (or [..., 1, 3] for one that all Gaussians share).
+    Returns: [..., N, 3 bands, 3]; zero for bands that shN does not hold.
     """
-    values = basis(directions, 3)[:, 1:]
-    parts = [torch.einsum("qk,nkc->qnc", values[:, a:b], shN[:, a:b]) for a, b in BANDS]
-    return torch.stack(parts, 2)
+    values = basis(directions, 3)[..., 1:]
+    values = values.expand(*values.shape[:-2], len(shN), -1)
+    parts = [torch.einsum("...nk,nkc->...nc", values[..., a:b], shN[:, a:b]) for a, b in BANDS if b <= shN.shape[1]]
+    parts += [values.new_zeros(*values.shape[:-1], 3)] * (len(BANDS) - len(parts))
+    return torch.stack(parts, -2)
 
 
+def guidance_directions() -> Tensor:
+    """Unit directions [10, 3]: one of each opposite pair of a dodecahedron's corners.
+
+    No function of one band up to 3 vanishes at all of them (most of those of bands 2 and 3 do on the axes), and an
+    opposite direction would only flip the sign.
+    """
+    g = (1 + 5**0.5) / 2
+    corners: list[tuple[float, float, float]] = [(1, 1, 1), (1, 1, -1), (1, -1, 1), (1, -1, -1)]
+    corners += [(0, g, 1 / g), (0, g, -1 / g), (1 / g, 0, g), (-1 / g, 0, g), (g, 1 / g, 0), (g, -1 / g, 0)]
+    return torch.tensor(corners) / 3**0.5
+
+
+@torch.no_grad()
 def region_guidance(shN: Tensor, members: Tensor, n: int, n_bins: int = 8) -> Tensor:
     """Weight in (0, 1] of each band's penalty, [n, 3]; small where a region's colours need the band (Eq 13).
 
-    Args: shN [n, 15, 3]; members i64 [M, k], -1 where padded.
-    Choices: need is how far the soft histogram of the band's colours over the region, seen from the six axis
-      directions, lies from all mass in the bin of no contribution: total variation t; the weight is 1 − t, at least
-      0.05. The range is that of the region's strongest band, and at least 1/255. Gaussians in several regions take
-      the mean, those in none 1. A guide of the penalty, not a path for gradients.
+    Args: shN [n, K, 3]; members i64 [M, k], -1 where padded; n_bins: odd numbers give a bin of no contribution, so
+      one more is taken if it is even.
+    Choices: need is how far the soft histogram of the band's colours over the region's Gaussians, seen from ten
+      directions, lies from that without the band (all mass in the middle bin): total variation t. The weight is
+      1 − t, at least 0.05, and no more than that of the bands above, which a band's mask takes along. A colour counts
+      by the channel it changes most, so that opposite changes of two channels do not cancel. The range is that of the
+      region's strongest band, but the middle bin reaches at least half a grey level (1/510) either way: pixels blend
+      colours, so less is never seen. Gaussians in several regions take the mean, those in none 1. A guide of the
+      penalty, not a path for gradients.
     """
-    weight, times = torch.zeros(n, 3), torch.zeros(n, 1)
     if len(members) == 0 or n == 0:
         return torch.ones(n, 3)
-    axes = torch.eye(3)
-    colors = band_colors(shN, torch.cat([axes, -axes])).mean(-1).permute(1, 2, 0)  # [n, 3, 6]
-    index, present = members.clamp_min(0), members >= 0
-    inside = colors[index].permute(0, 2, 1, 3).flatten(2)  # [M, 3, k * 6]
-    valid = present[:, None, :, None].expand(-1, 3, -1, 6).flatten(2)
-    reach = (inside.abs() * valid).amax((1, 2)).clamp_min(0.5 / 255)[:, None].expand(-1, 3)
-    empty = torch.zeros(*inside.shape[:2], 1)
-    found = soft_histogram(inside, valid, n_bins + 1, -reach, reach)
-    none = soft_histogram(empty, torch.ones_like(empty, dtype=torch.bool), n_bins + 1, -reach, reach)
-    per_region = (1 - 0.5 * (found - none).abs().sum(-1)).clamp(0.05, 1)
-    flat, rows = index[present], per_region[:, None].expand(-1, members.shape[1], -1)[present]
-    weight.index_add_(0, flat, rows)
-    times.index_add_(0, flat, torch.ones(len(flat), 1))
+    n_bins += 1 - n_bins % 2
+    colors = band_colors(shN, guidance_directions()[:, None].to(shN))  # [Q, n, 3 bands, 3]
+    strongest = colors.abs().argmax(-1, keepdim=True)
+    changes = colors.gather(-1, strongest)[..., 0].permute(1, 2, 0)  # [n, 3 bands, Q]
+    present = members >= 0
+    index = members.clamp_min(0)
+    weight, times = torch.zeros(n, 3), torch.zeros(n, 1)
+    for rows in torch.arange(len(members)).split(128):
+        inside = changes[index[rows]].permute(0, 2, 1, 3).flatten(2)  # [M, 3 bands, k * Q]
+        valid = present[rows][:, None, :, None].expand(-1, 3, -1, changes.shape[-1]).flatten(2)
+        reach = (inside.abs() * valid).amax((1, 2)).clamp_min(n_bins * 0.5 / 255)[:, None].expand(-1, 3)
+        found = soft_histogram(inside, valid, n_bins, -reach, reach)
+        empty = torch.zeros_like(found[..., :1])
+        without = soft_histogram(empty, torch.ones_like(empty, dtype=torch.bool), n_bins, -reach, reach)
+        spared = (1 - 0.5 * (found - without).abs().sum(-1)).clamp(0.05, 1)
+        spared = spared.flip(-1).cummin(-1).values.flip(-1)
+        weight.index_add_(0, index[rows][present[rows]], spared[:, None].expand(*index[rows].shape, 3)[present[rows]])
+    times.index_add_(0, index[present], torch.ones(int(present.sum()), 1))
     return torch.where(times > 0, weight / times.clamp_min(1), torch.ones_like(weight))
 
 

@@ -2,16 +2,40 @@
 
 import pytest
 import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
 
 from chebsplat import sh_prune
+from chebsplat.sh import basis, eval_sh
 
 
-def test_masks_are_nested_and_degree_is_the_highest_band_kept():
-    logits = torch.randn(500, 3, generator=torch.Generator().manual_seed(0)) * 6
-    mask = sh_prune.band_mask(logits)
-    assert (mask.diff(dim=1) <= 1e-6).all()
-    assert torch.equal(sh_prune.degrees(mask).float(), (mask > 0.5).sum(1).float())
+def normal(*shape, seed=0):
+    return torch.randn(*shape, generator=torch.Generator().manual_seed(seed))
+
+
+# masks
+
+
+def test_masks_are_binary_nested_and_degree_is_the_highest_band_kept():
+    mask = sh_prune.band_mask(normal(500, 3) * 6)
+    assert set(mask.unique().tolist()) == {0.0, 1.0}
+    assert (mask.diff(dim=1) <= 0).all()
+    assert torch.equal(sh_prune.degrees(mask).float(), mask.sum(1))
+    assert sh_prune.degrees(mask).dtype == torch.uint8
     assert len(sh_prune.degrees(mask).unique()) == 4
+
+
+def test_a_higher_band_teaches_the_lower_bands_that_carry_it():
+    logits = torch.zeros(1, 3, requires_grad=True)
+    sh_prune.band_mask(logits)[0, 2].backward()
+    assert torch.allclose(logits.grad, torch.full((1, 3), 0.5**4))
+
+
+@pytest.mark.parametrize("size", [0.0, 9.9, 1e30])
+def test_mask_gradients_are_finite_at_any_logit(size):
+    logits = torch.tensor([[-size, size, -size]], requires_grad=True)
+    sh_prune.sh_loss(sh_prune.band_mask(logits)).backward()
+    assert torch.isfinite(logits.grad).all()
 
 
 def test_masked_bands_vanish_and_band_zero_is_untouched():
@@ -19,42 +43,166 @@ def test_masked_bands_vanish_and_band_zero_is_untouched():
     out = sh_prune.masked_sh(shN, torch.tensor([[1.0, 0.0, 0.0]]))
     assert out[0, :3].eq(1).all()
     assert out[0, 3:].eq(0).all()
-    assert sh_prune.masked_sh(shN[:, :3], torch.tensor([[1.0, 0.0, 0.0]])).shape == (1, 3, 3)
+    for held in (0, 3, 8):
+        assert sh_prune.masked_sh(shN[:, :held], torch.tensor([[1.0, 0.0, 0.0]])).shape == (1, held, 3)
 
 
-@pytest.mark.parametrize("case", ["spread", "constant", "two far apart"])
-def test_histogram_has_mass_one_and_finite_gradients(case):
-    values = {
-        "spread": torch.linspace(-1, 1, 30),
-        "constant": torch.full((30,), 0.3),
-        "two far apart": torch.tensor([-1e6, 1e6]),
-    }[case].requires_grad_(True)
-    valid = torch.ones(len(values), dtype=torch.bool)
-    found = sh_prune.soft_histogram(values, valid, 8, values.detach().min(), values.detach().max())
-    assert abs(found.sum().item() - 1) < 1e-5
+@pytest.mark.parametrize("degree", [0, 1, 2, 3])
+def test_ragged_coefficients_render_like_masked_ones(degree):
+    n = 60
+    sh0, shN, kept = normal(n, 1, 3), normal(n, 15, 3, seed=1), torch.arange(n).remainder(degree + 1).to(torch.uint8)
+    order, buckets = sh_prune.ragged(sh0, shN, kept)
+    assert [b.shape[1] for b in buckets] == [1, 4, 9, 16]
+    assert sum(len(b) for b in buckets) == n
+    mask = (torch.arange(1, 4) <= kept[:, None]).float()
+    directions = normal(n, 3, seed=2)
+    whole = eval_sh(sh0, sh_prune.masked_sh(shN, mask), directions, 3)[order]
+    start = 0
+    for band, bucket in enumerate(buckets):
+        rows = order[start : start + len(bucket)]
+        assert (kept[rows] == band).all()
+        assert (rows.diff() > 0).all()  # stable
+        assert torch.allclose(eval_sh(bucket[:, :1], bucket[:, 1:], directions[rows], band),
+                              whole[start : start + len(bucket)], atol=1e-5)  # fmt: skip
+        start += len(bucket)
+
+
+def test_ragged_of_nothing_and_of_a_degree_that_does_not_exist():
+    order, buckets = sh_prune.ragged(torch.zeros(0, 1, 3), torch.zeros(0, 15, 3), torch.zeros(0, dtype=torch.uint8))
+    assert len(order) == 0
+    assert [len(b) for b in buckets] == [0, 0, 0, 0]
+    with pytest.raises(ValueError, match="degree 4"):
+        sh_prune.ragged(torch.zeros(1, 1, 3), torch.zeros(1, 15, 3), torch.full((1,), 4, dtype=torch.uint8))
+
+
+# histograms
+
+
+@settings(deadline=None, derandomize=True, max_examples=60)
+@given(
+    n=st.integers(0, 40),
+    n_bins=st.integers(2, 20),
+    log_size=st.integers(-30, 30),
+    offset=st.sampled_from([0.0, 1.0, -1e3, 1e6]),
+    seed=st.integers(0, 10**6),
+)
+def test_histogram_has_mass_one_no_negative_bin_and_finite_gradients(n, n_bins, log_size, offset, seed):
+    values = (normal(n, seed=seed) * 10.0**log_size + offset).requires_grad_(True)
+    valid = torch.ones(n, dtype=torch.bool)
+    low, high = (values.detach().aminmax()) if n else (torch.tensor(0.0), torch.tensor(1.0))
+    found = sh_prune.soft_histogram(values, valid, n_bins, low, high)
+    assert found.shape == (n_bins,)
+    assert abs(found.sum().item() - (n > 0)) < 1e-5
+    assert (found >= 0).all()
     (found**2).sum().backward()
     assert torch.isfinite(values.grad).all()
 
 
-def test_histogram_of_nothing_is_zero():
-    nothing = torch.zeros(3, dtype=torch.bool)
-    found = sh_prune.soft_histogram(torch.zeros(3), nothing, 4, torch.tensor(0.0), torch.tensor(1.0))
-    assert (found == 0).all()
+@pytest.mark.parametrize("case", ["constant", "constant far off", "one", "two far apart", "outside the bounds"])
+def test_histogram_of_an_extreme_has_mass_one_and_finite_gradients(case):
+    values = {
+        "constant": torch.full((30,), 0.3),
+        "constant far off": torch.full((30,), 1e6),
+        "one": torch.tensor([0.5]),
+        "two far apart": torch.tensor([-1e6, 1e6]),
+        "outside the bounds": torch.tensor([-9.0, 9.0, 1e30]),
+    }[case].requires_grad_(True)
+    low, high = values.detach().aminmax()
+    if case == "outside the bounds":
+        low, high = torch.tensor(0.0), torch.tensor(1.0)
+    bounds = [b.clone().requires_grad_(True) for b in (low, high)]
+    found = sh_prune.soft_histogram(values, torch.ones(len(values), dtype=torch.bool), 8, *bounds)
+    assert abs(found.sum().item() - 1) < 1e-6
+    if "constant" in case or case == "one":
+        assert found[0].item() == pytest.approx(1.0)
+    (found**2).sum().backward()
+    assert all(torch.isfinite(x.grad).all() for x in (values, *bounds))
 
 
-def test_guidance_spares_the_bands_that_colour_a_region():
+def test_histogram_of_well_placed_values_is_the_plain_one():
+    values = torch.tensor([0.05, 0.15, 0.15, 0.35, 0.95])
+    found = sh_prune.soft_histogram(values, torch.ones(5, dtype=torch.bool), 10, torch.tensor(0.0), torch.tensor(1.0))
+    plain = torch.histc(values, 10, 0, 1) / 5
+    assert torch.allclose(found, plain, atol=1e-4)  # half a bin from an edge: sigmoid(-10) = 5e-5
+
+
+def test_a_histogram_can_be_taught():
+    values = torch.tensor([0.19, 0.5], requires_grad=True)
+    valid = torch.ones(2, dtype=torch.bool)
+    sh_prune.soft_histogram(values, valid, 5, torch.tensor(0.0), torch.tensor(1.0))[1].backward()
+    assert values.grad[0] > 0
+
+
+def test_what_is_not_valid_leaves_no_trace_even_if_it_is_nan():
+    values = torch.tensor([[0.1, 0.9, torch.nan], [torch.inf, torch.nan, 0.5], [torch.nan] * 3], requires_grad=True)
+    valid = torch.tensor([[True, True, False], [False, False, True], [False] * 3])
+    found = sh_prune.soft_histogram(values, valid, 4, torch.zeros(3), torch.ones(3))
+    alone = sh_prune.soft_histogram(torch.tensor([0.1, 0.9]), valid[0, :2], 4, torch.tensor(0.0), torch.tensor(1.0))
+    assert torch.equal(found[0], alone)
+    assert found.sum(1).tolist() == pytest.approx([1, 1, 0], abs=1e-6)
+    (found**2).sum().backward()
+    assert torch.isfinite(values.grad).all()
+
+
+# guidance
+
+
+def test_band_colours_add_up_to_the_view_dependent_colour():
+    shN, directions = normal(20, 15, 3), torch.nn.functional.normalize(normal(20, 3, seed=1), dim=-1)
+    whole = torch.einsum("nk,nkc->nc", basis(directions, 3)[:, 1:], shN)
+    assert torch.allclose(sh_prune.band_colors(shN, directions).sum(1), whole, atol=1e-5)
+    shared = sh_prune.band_colors(shN, directions[:4, None])
+    assert shared.shape == (4, 20, 3, 3)
+    assert torch.allclose(shared[2], sh_prune.band_colors(shN, directions[2].expand(20, 3)), atol=1e-6)
+    assert (sh_prune.band_colors(shN[:, :3], directions)[:, 1:] == 0).all()
+
+
+def test_no_function_of_a_band_is_invisible_to_the_guidance():
+    directions = sh_prune.guidance_directions()
+    assert torch.allclose(directions.norm(dim=1), torch.ones(10))
+    values = basis(directions, 3)[:, 1:]
+    assert all(torch.linalg.svdvals(values[:, a:b]).min() > 0.4 for a, b in sh_prune.BANDS)
+
+
+@pytest.mark.parametrize("column", range(15))
+def test_guidance_spares_a_band_whichever_coefficient_colours_the_region(column):
     shN = torch.zeros(40, 15, 3)
-    shN[:, :3] = torch.randn(40, 3, 1, generator=torch.Generator().manual_seed(0))
+    shN[:, column] = normal(40, 3)
+    band = next(i for i, (a, b) in enumerate(sh_prune.BANDS) if a <= column < b)
     weight = sh_prune.region_guidance(shN, torch.arange(40).reshape(2, 20), 40)
-    assert (weight[:, 0] < 0.6).all()
-    assert (weight[:, 1:] > 0.95).all()
+    assert (weight[:, : band + 1] < 0.8).all()
+    assert (weight[:, band + 1 :] > 0.95).all()
+
+
+def test_opposite_changes_of_two_channels_do_not_cancel():
+    shN = torch.zeros(20, 15, 3)
+    shN[:, :3, 0] = normal(20, 3)
+    shN[:, :3, 1] = -shN[:, :3, 0]
+    assert (sh_prune.region_guidance(shN, torch.arange(20)[None], 20)[:, 0] < 0.7).all()
+
+
+def test_colours_that_no_screen_shows_are_not_spared():
+    invisible = normal(20, 15, 3) * 1e-4
+    assert (sh_prune.region_guidance(invisible, torch.arange(20)[None], 20) > 0.99).all()
+    assert (sh_prune.region_guidance(invisible * 1e4, torch.arange(20)[None], 20)[:, 0] < 0.5).all()
+
+
+@settings(deadline=None, derandomize=True, max_examples=25)
+@given(log_size=st.integers(-30, 30), held=st.sampled_from([0, 3, 8, 15]), seed=st.integers(0, 10**6))
+def test_guidance_lies_within_bounds_and_never_presses_a_band_below_one_that_is_needed(log_size, held, seed):
+    members = torch.randint(-1, 30, (4, 8), generator=torch.Generator().manual_seed(seed))
+    weight = sh_prune.region_guidance(normal(30, held, 3, seed=seed) * 10.0**log_size, members, 30)
+    assert ((weight >= 0.05 - 1e-6) & (weight <= 1)).all()
+    assert (weight.diff(dim=1) >= -1e-6).all()
 
 
 def test_guidance_is_one_outside_regions_and_without_regions():
     shN = torch.ones(5, 15, 3)
-    weight = sh_prune.region_guidance(shN, torch.tensor([[0, 1, -1]]), 5)
+    weight = sh_prune.region_guidance(shN, torch.tensor([[0, 1, -1], [-1, -1, -1]]), 5)
+    assert (weight[:2, 0] < 1).all()
     assert (weight[2:] == 1).all()
     assert (sh_prune.region_guidance(shN, torch.zeros(0, 3, dtype=torch.int64), 5) == 1).all()
+    assert sh_prune.region_guidance(shN[:0], torch.zeros(0, 3, dtype=torch.int64), 0).shape == (0, 3)
 
 
 def test_loss_weights_bands_by_their_number_of_coefficients():
@@ -63,3 +211,9 @@ def test_loss_weights_bands_by_their_number_of_coefficients():
     sh_prune.sh_loss(mask).backward()
     assert torch.allclose(mask.grad * 3, torch.tensor([3.0, 5.0, 7.0]).expand(3, 3))
     assert sh_prune.sh_loss(torch.zeros(0, 3)).item() == 0
+
+
+def test_guidance_scales_the_loss_and_learns_nothing_from_it():
+    logits, guide = torch.zeros(4, 3, requires_grad=True), torch.full((4, 3), 0.5)
+    halved, full = sh_prune.sh_loss(sh_prune.band_mask(logits), guide), sh_prune.sh_loss(sh_prune.band_mask(logits))
+    assert halved.item() == pytest.approx(full.item() / 2)
