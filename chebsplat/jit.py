@@ -12,7 +12,15 @@ import numba
 
 log = logging.getLogger("chebsplat")
 
-_SOURCES = ("rasterize/binning.py", "rasterize/ellipses.py", "rasterize/lanes.py", "rasterize/tiles.py", "ssim.py")
+_SOURCES = (
+    "jit.py",
+    "rasterize/binning.py",
+    "rasterize/ellipses.py",
+    "rasterize/cells.py",
+    "rasterize/simd.py",
+    "rasterize/tiles.py",
+    "ssim.py",
+)
 
 
 def _cache_folder() -> Path:
@@ -34,7 +42,7 @@ settings.THREADING_LAYER_PRIORITY = ["omp", "workqueue", "tbb"]
 # No fast-math beyond reassociation and contraction: NaN and infinity keep their meaning.
 kernel: Any = numba.njit(cache=True, parallel=True, error_model="numpy", fastmath={"reassoc", "contract", "nsz"})
 inline: Any = numba.njit(cache=True, error_model="numpy", fastmath={"reassoc", "contract", "nsz"}, inline="always")
-# Short loops, compiled by themselves: inside a large kernel the vectoriser gives up on them.
-lanes: Any = numba.njit(cache=True, error_model="numpy", fastmath={"reassoc", "contract", "nsz"})
+# Explicit vectors: reassociation would undo the rounding by x + 1.5·2²³ − 1.5·2²³.
+lanes: Any = numba.njit(cache=True, error_model="numpy", fastmath={"contract"})
 serial: Any = numba.njit(cache=True, error_model="numpy")
 prange = numba.prange

@@ -48,19 +48,19 @@ class _Composite(torch.autograd.Function):
             t.detach().contiguous().numpy() for t in (means2d, covariances, opacities, colors, whitening, depths, radii)
         )
         bins = binning.bin_gaussians(centers, spreads, z, reach, strengths, channels, *size)
+        splats = tiles.pack(bins.order, centers, whitened, strengths, channels)
         limit = np.float32(max_alpha)
-        render, transmittance = tiles.forward(centers, whitened, strengths, channels, *bins[:2], *size, limit)
-        ctx.arrays, ctx.bins, ctx.absgrad = (centers, whitened, strengths, channels), bins, absgrad
-        ctx.size, ctx.limit = size, limit
+        found = tiles.forward(splats, bins.tile_starts, bins.rank, channels.shape[1], *size, limit)
+        render, transmittance, *seen = found
+        ctx.arrays, ctx.absgrad = (len(centers), splats, *bins, *seen, limit), absgrad
         return torch.from_numpy(render), 1 - torch.from_numpy(transmittance)
 
     @staticmethod
     def backward(ctx: Any, grad_render, grad_alpha):  # type: ignore[no-untyped-def, override]
         slopes = [g.contiguous().numpy() for g in (grad_render, grad_alpha)]
-        records, finite = tiles.backward(*ctx.arrays, *ctx.bins[:3], *ctx.size, ctx.limit, *slopes)
+        *found, finite = tiles.backward(*ctx.arrays, *slopes, True)
         if not finite:
             raise ValueError("the gradient of the image is not finite")
-        found = tiles.reduce(records, ctx.bins[3], ctx.arrays[1], ctx.arrays[2])
         to_means2d, moments, to_opacities, absolute, to_colors = (torch.from_numpy(a) for a in found)
         ctx.absgrad += absolute
         return to_means2d, moments, to_opacities, to_colors, None, None, None, None, None, None
