@@ -28,6 +28,7 @@ def rasterize(
     far_plane: float = 1e10,
     eps2d: float = 0.3,
     max_alpha: float = 0.99,
+    rasterize_mode: str = "classic",
     backgrounds: Tensor | None = None,
 ) -> tuple[Tensor, Tensor, dict[str, Any]]:
     """As `reference.rasterize`, of float32 tensors on a GPU; `means2d.absgrad` [C, N, 2] is there after backward.
@@ -45,7 +46,7 @@ def rasterize(
     renders, alphas, found = rasterization(
         means, quats, scales, opacities, colors, viewmats, Ks, width, height,
         near_plane=near_plane, far_plane=far_plane, eps2d=eps2d, sh_degree=None, packed=False,
-        backgrounds=backgrounds, absgrad=True,
+        backgrounds=backgrounds, absgrad=True, rasterize_mode=rasterize_mode,
     )  # fmt: skip
     return renders, alphas, named(found)
 
