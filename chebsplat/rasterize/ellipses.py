@@ -74,7 +74,7 @@ def _cross(a, b, out):
 
 @inline
 def _ellipse(factor, eps2d, cross):
-    """Covariance F Fᵀ + ε I: xx, xy, yy and the determinant, by Cauchy-Binet; fills the cross product of F's rows, and returns its length last."""
+    """F Fᵀ + ε I: xx, xy, yy, the determinant by Cauchy-Binet, and |f × g| of F's rows; f × g goes into `cross`."""
     a = b = c = 0.0
     for k in range(3):
         a += factor[0, k] * factor[0, k]
