@@ -106,14 +106,9 @@ def project(
     reach = (EXTENT * largest.sqrt()).ceil().clamp_max(2**30)
     u, v = means2d.detach().unbind(-1)
     visible = visible & (u + reach > 0) & (u - reach < width) & (v + reach > 0) & (v - reach < height)
-    floats = (means2d, covariances, conics, whitening)
-    return Projected(
-        *(torch.where(visible[:, None], value, torch.zeros_like(value)) for value in floats),
-        torch.where(visible, compensations, zero),
-        torch.where(visible, z, zero),
-        torch.where(visible, reach, zero).int(),
-        visible,
-    )
+    rows = [torch.where(visible[:, None], t, torch.zeros_like(t)) for t in (means2d, covariances, conics, whitening)]
+    numbers = [torch.where(visible, t, torch.zeros_like(t)) for t in (compensations, z, reach)]
+    return Projected(rows[0], rows[1], rows[2], rows[3], numbers[0], numbers[1], numbers[2].int(), visible)
 
 
 def _ellipses(factor: Tensor, eps2d: float) -> tuple[Tensor, ...]:
