@@ -44,6 +44,7 @@ class _Composite(torch.autograd.Function):
     def forward(  # type: ignore[override]
         ctx: Any, means2d: Tensor, covariances: Tensor, opacities: Tensor, colors: Tensor,
         whitening: Tensor, depths: Tensor, radii: Tensor, absgrad: Tensor, size: tuple[int, int], max_alpha: float,
+        view: int,
     ) -> tuple[Tensor, Tensor]:  # fmt: skip
         centers, spreads, strengths, channels, whitened, z, reach = (
             t.detach().contiguous().numpy() for t in (means2d, covariances, opacities, colors, whitening, depths, radii)
@@ -52,7 +53,7 @@ class _Composite(torch.autograd.Function):
         limit = np.float32(max_alpha)
         render, transmittance = tiles.forward(centers, whitened, strengths, channels, *bins[:2], *size, limit)
         ctx.arrays, ctx.bins, ctx.absgrad = (centers, whitened, strengths, channels), bins, absgrad
-        ctx.size, ctx.limit = size, limit
+        ctx.size, ctx.limit, ctx.view = size, limit, view
         return torch.from_numpy(render), 1 - torch.from_numpy(transmittance)
 
     @staticmethod
@@ -60,11 +61,11 @@ class _Composite(torch.autograd.Function):
         slopes = [g.contiguous().numpy() for g in (grad_render, grad_alpha)]
         records, finite = tiles.backward(*ctx.arrays, *ctx.bins[:3], *ctx.size, ctx.limit, *slopes)
         if not finite:
-            raise ValueError("the gradient of the image is not finite")
+            raise ValueError(f"the gradient of the image of view {ctx.view} is not finite")
         found = tiles.reduce(records, ctx.bins[3], ctx.arrays[1], ctx.arrays[2])
         to_means2d, moments, to_opacities, absolute, to_colors = (torch.from_numpy(a) for a in found)
         ctx.absgrad += absolute
-        return to_means2d, moments, to_opacities, to_colors, None, None, None, None, None, None
+        return to_means2d, moments, to_opacities, to_colors, *[None] * 7
 
 
 def rasterize(
@@ -112,7 +113,7 @@ def rasterize(
         _Composite.apply(
             means2d[c], covariances[c], compensated(opacities, compensations[c]) if antialiased else opacities,
             colors if colors.ndim == 2 else colors[c],
-            whitening[c], depths[c], radii[c], absgrad[c], (width, height), max_alpha,
+            whitening[c], depths[c], radii[c], absgrad[c], (width, height), max_alpha, c,
         )
         for c in range(len(cameras))
     ]  # fmt: skip

@@ -8,6 +8,7 @@ the image. Tiles with about as many Gaussians go together, filled up with ones t
 from __future__ import annotations
 
 import math
+from functools import partial
 from typing import Any
 
 import torch
@@ -56,7 +57,7 @@ def rasterize(
         that a Gaussian smaller than a pixel fades as it shrinks; `classic` does not.
     Returns: renders [C, H, W, D], alphas [C, H, W, 1], and meta: `means2d` [C, N, 2] (retains its gradient),
       `conics` [C, N, 3], `depths` [C, N], `radii` [C, N].
-    Raises: ValueError on an unknown mode.
+    Raises: ValueError on an unknown mode or, in backward, on a gradient of the image that is not finite.
     Choices: gsplat's constants, so that every backend renders a scene alike.
     """
     antialiased = is_antialiased(rasterize_mode)
@@ -72,6 +73,8 @@ def rasterize(
         render, alpha = _composite(means2d[c], view, strengths, channels, width, height, max_alpha)
         if backgrounds is not None:
             render = render + (1 - alpha) * backgrounds[c]
+        if render.requires_grad:
+            render.register_hook(partial(_refuse_broken, c))
         renders.append(render)
         alphas.append(alpha)
     meta = {
@@ -81,6 +84,11 @@ def rasterize(
         "radii": torch.stack([view.radii for view in views]),
     }
     return torch.stack(renders), torch.stack(alphas), meta
+
+
+def _refuse_broken(view: int, gradient: Tensor | None) -> None:
+    if gradient is not None and not torch.isfinite(gradient).all():
+        raise ValueError(f"the gradient of the image of view {view} is not finite")
 
 
 def _composite(
