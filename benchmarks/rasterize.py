@@ -65,12 +65,13 @@ def measure_stages(width: int, height: int, n: int, channels: int, repeats: int)
     camera, size, ceiling = (np.eye(4), K, width, height), (width, height), np.float32(0.99)
     gaussians, by_channel = (means, quats, scales), (opacities, colors)
     rng = np.random.default_rng(0)
+    no_slope = np.zeros(n, np.float32)
     grad = rng.random((height, width, channels), np.float32), rng.random((height, width), np.float32)
 
     def project() -> tuple[np.ndarray, ...]:
         return ellipses.project(*gaussians, *camera, 0.01, 1e10, 0.3)
 
-    means2d, covariances, whitening, _, depths, radii = project()
+    means2d, covariances, whitening, _, depths, radii, _ = project()
 
     def bins() -> tuple[np.ndarray, ...]:
         return binning.bin_gaussians(means2d, covariances, depths, radii, *by_channel, *size)
@@ -87,7 +88,7 @@ def measure_stages(width: int, height: int, n: int, channels: int, repeats: int)
 
     def reduce() -> object:
         to_means2d, moments, *_ = tiles.reduce(records, pairs[3], whitening, opacities)
-        return ellipses.project_adjoint(*gaussians, *camera, 0.3, radii, to_means2d, moments)
+        return ellipses.project_adjoint(*gaussians, *camera, 0.3, radii, to_means2d, moments, no_slope)
 
     stages = {"project": project, "bin": bins, "tiles": forward, "tiles, adjoint": backward, "reduce, project": reduce}
     return {f"stage: {name}": median_ms(stage, repeats) for name, stage in stages.items()}

@@ -15,7 +15,7 @@ from chebsplat.jit import inline, kernel, prange
 
 HALF_LOG2E = 0.5 * math.log2(math.e)
 LN2 = math.log(2.0)
-LARGEST = 1e30  # of any result, so that float32 can hold it and its square root's square
+LARGEST, EXTENT = 1e30, 3.33  # as `projection`'s, which numba's cache could not follow
 
 
 @inline
@@ -68,18 +68,22 @@ def _jacobian(point, viewmat, K, width, height, out, jacobian):
 
 
 @inline
-def _ellipse(factor, eps2d):
-    """Covariance F Fᵀ + ε I: xx, xy, yy and the determinant, by Cauchy-Binet."""
+def _cross(a, b, out):
+    out[0], out[1], out[2] = a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]
+
+
+@inline
+def _ellipse(factor, eps2d, cross):
+    """F Fᵀ + ε I: xx, xy, yy, the determinant by Cauchy-Binet, and |f × g| of F's rows; f × g goes into `cross`."""
     a = b = c = 0.0
     for k in range(3):
         a += factor[0, k] * factor[0, k]
         b += factor[0, k] * factor[1, k]
         c += factor[1, k] * factor[1, k]
-    cross_0 = factor[0, 1] * factor[1, 2] - factor[0, 2] * factor[1, 1]
-    cross_1 = factor[0, 2] * factor[1, 0] - factor[0, 0] * factor[1, 2]
-    cross_2 = factor[0, 0] * factor[1, 1] - factor[0, 1] * factor[1, 0]
-    determinant = eps2d * eps2d + eps2d * (a + c) + cross_0 * cross_0 + cross_1 * cross_1 + cross_2 * cross_2
-    return a + eps2d, b, c + eps2d, determinant
+    _cross(factor[0], factor[1], cross)
+    area = cross[0] * cross[0] + cross[1] * cross[1] + cross[2] * cross[2]
+    determinant = eps2d * eps2d + eps2d * (a + c) + area
+    return a + eps2d, b, c + eps2d, determinant, math.sqrt(area)
 
 
 @kernel
@@ -88,12 +92,13 @@ def project(means, quats, scales, viewmat, K, width, height, near_plane, far_pla
 
     Args: means, scales [N, 3], quats [N, 4] float32; viewmat [4, 4], K [3, 3] float64.
     Returns: float32 means2d [N, 2], covariances [N, 3] (xx, xy, yy; ε included), whitening [N, 3] (p, q, r),
-      conics [N, 3], depths [N]; radii [N] i32. Rows of culled Gaussians are zero; a visible one's radius is not.
+      conics [N, 3], depths [N]; radii [N] i32; compensations [N] f32, √(det Σ / det(Σ + ε I)). Rows of culled
+      Gaussians are zero; a visible one's radius is not.
     """
     n = len(means)
     means2d, covariances = np.zeros((n, 2), np.float32), np.zeros((n, 3), np.float32)
     whitening, conics = np.zeros((n, 3), np.float32), np.zeros((n, 3), np.float32)
-    depths, radii = np.zeros(n, np.float32), np.zeros(n, np.int32)
+    depths, radii, compensations = np.zeros(n, np.float32), np.zeros(n, np.int32), np.zeros(n, np.float32)
     for i in prange(n):
         depth = viewmat[2, 3]
         for k in range(3):
@@ -104,7 +109,7 @@ def project(means, quats, scales, viewmat, K, width, height, near_plane, far_pla
         sums = 1.0 * quats[i, 0] + quats[i, 1] + quats[i, 2] + quats[i, 3]
         if not (largest > 1e-12 and math.isfinite(largest) and math.isfinite(sums - sums)):
             continue
-        unit, camera = np.empty(4), np.empty(3)
+        unit, camera, cross = np.empty(4), np.empty(3), np.empty(3)
         rotation, jacobian, screen, factor = np.empty((3, 3)), np.empty((2, 3)), np.empty((2, 3)), np.empty((2, 3))
         _rotation(quats[i], unit, rotation)
         _jacobian(means[i], viewmat, K, width, height, camera, jacobian)
@@ -113,36 +118,41 @@ def project(means, quats, scales, viewmat, K, width, height, near_plane, far_pla
         for k in range(3):
             factor[0, k] *= scales[i, k]
             factor[1, k] *= scales[i, k]
-        a, b, c, determinant = _ellipse(factor, eps2d)
+        a, b, c, determinant, area = _ellipse(factor, eps2d, cross)
         u, v = K[0, 0] * camera[0] / depth + K[0, 2], K[1, 1] * camera[1] / depth + K[1, 2]
         biggest = 0.5 * (a + c) + math.sqrt(0.25 * (a - c) * (a - c) + b * b)
         if not (determinant > 0 and determinant < LARGEST * LARGEST and biggest < LARGEST):
             continue
-        reach = min(math.ceil(3 * math.sqrt(biggest)), 2.0**30)
+        reach = min(math.ceil(EXTENT * math.sqrt(biggest)), 2.0**30)
         if not (u + reach > 0 and u - reach < width and v + reach > 0 and v - reach < height):
             continue
         means2d[i, 0], means2d[i, 1], depths[i], radii[i] = u, v, depth, int(reach)
         covariances[i, 0], covariances[i, 1], covariances[i, 2] = a, b, c
         conics[i, 0], conics[i, 1], conics[i, 2] = c / determinant, -b / determinant, a / determinant
+        compensations[i] = area / math.sqrt(determinant)
         p = math.sqrt(HALF_LOG2E * c / determinant)
         whitening[i, 0], whitening[i, 1], whitening[i, 2] = p, -p * b / c, math.sqrt(HALF_LOG2E / c)
-    return means2d, covariances, whitening, conics, depths, radii
+    return means2d, covariances, whitening, conics, depths, radii, compensations
 
 
 @kernel
-def project_adjoint(means, quats, scales, viewmat, K, width, height, eps2d, radii, grad_means2d, moments):
+def project_adjoint(
+    means, quats, scales, viewmat, K, width, height, eps2d, radii, grad_means2d, moments, grad_compensations
+):
     """Gradients [N, 3], [N, 4], [N, 3] to means, quats and scales; zero rows where culled.
 
-    Args: grad_means2d [N, 2]; moments [N, 3]: uu, uv, vv of Σ g (W d)(W d)ᵀ over a Gaussian's pixels.
+    Args: grad_means2d [N, 2]; moments [N, 3]: uu, uv, vv of Σ g (W d)(W d)ᵀ over a Gaussian's pixels;
+      grad_compensations [N].
     The gradient to the factor F of Σ is 2 / (½ log₂e) Wᵀ M (W F): W F is bounded, while gradients to Σ itself would
-    have to cancel over the needle's length.
+    have to cancel over the needle's length. The compensation is |f × g| / √det of F's rows f and g; its gradient is
+    taken at the unit normal f × g / |f × g|, which stays bounded as the ellipse flattens.
     """
     n = len(means)
     to_means, to_quats, to_scales = np.zeros((n, 3)), np.zeros((n, 4)), np.zeros((n, 3))
     for i in prange(n):
         if radii[i] == 0:
             continue
-        unit, camera = np.empty(4), np.empty(3)
+        unit, camera, normal, across = np.empty(4), np.empty(3), np.empty(3), np.empty((2, 3))
         rotation, jacobian, screen = np.empty((3, 3)), np.empty((2, 3)), np.empty((2, 3))
         axes, factor = np.empty((2, 3)), np.empty((2, 3))
         length = _rotation(quats[i], unit, rotation)
@@ -152,7 +162,7 @@ def project_adjoint(means, quats, scales, viewmat, K, width, height, eps2d, radi
         # F = A S, A = P R, P = J V: down to A, to the scales, and on to R and P.
         for k in range(3):
             factor[0, k], factor[1, k] = axes[0, k] * scales[i, k], axes[1, k] * scales[i, k]
-        _, b, c, determinant = _ellipse(factor, eps2d)
+        a, b, c, determinant, area = _ellipse(factor, eps2d, normal)
         p, r = math.sqrt(HALF_LOG2E * c / determinant), math.sqrt(HALF_LOG2E / c)
         q = -p * b / c
         uu, uv, vv = 2 / HALF_LOG2E * moments[i, 0], 2 / HALF_LOG2E * moments[i, 1], 2 / HALF_LOG2E * moments[i, 2]
@@ -163,6 +173,19 @@ def project_adjoint(means, quats, scales, viewmat, K, width, height, eps2d, radi
             top, low = s * (uu * axis_u + uv * axis_v), s * (uv * axis_u + vv * axis_v)
             to_scales[i, k] = top * axis_u + low * axis_v
             by_axes[0, k], by_axes[1, k] = s * p * top, s * (q * top + r * low)
+        if grad_compensations[i] != 0 and area > 0:
+            weight = grad_compensations[i] / (determinant * math.sqrt(determinant))
+            for k in range(3):
+                normal[k] /= area
+            _cross(factor[1], normal, across[0])
+            _cross(normal, factor[0], across[1])
+            spread = eps2d * (a + c - eps2d)  # det − |f × g|²; a and c have ε inside
+            for k in range(3):
+                top = weight * (spread * across[0, k] - eps2d * area * factor[0, k])
+                low = weight * (spread * across[1, k] - eps2d * area * factor[1, k])
+                to_scales[i, k] += top * axes[0, k] + low * axes[1, k]
+                by_axes[0, k] += top * scales[i, k]
+                by_axes[1, k] += low * scales[i, k]
         _matmul(by_axes, rotation.T, by_screen)
         _matmul(screen.T, by_axes, by_rotation)
         by_jacobian = np.empty((2, 3))
