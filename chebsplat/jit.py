@@ -12,20 +12,11 @@ import numba
 
 log = logging.getLogger("chebsplat")
 
-_SOURCES = (
-    "jit.py",
-    "rasterize/binning.py",
-    "rasterize/ellipses.py",
-    "rasterize/cells.py",
-    "rasterize/simd.py",
-    "rasterize/tiles.py",
-    "ssim.py",
-)
-
 
 def _cache_folder() -> Path:
     root = Path(__file__).parent
-    text = b"".join((root / name).read_bytes() for name in _SOURCES)
+    sources = [path.read_bytes() for path in sorted(root.rglob("*.py"))]
+    text = b"".join(source for source in sources if b"numba" in source or b"chebsplat.jit" in source)
     base = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache")
     return base / "chebsplat" / f"numba-{hashlib.sha256(text).hexdigest()[:16]}"
 

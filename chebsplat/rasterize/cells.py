@@ -13,8 +13,19 @@ import math
 import numpy as np
 
 from chebsplat.jit import inline, lanes
-from chebsplat.rasterize.simd import bits, fma, fnma, load, magnitude, multiply, splat, store, total, where
-from chebsplat.rasterize.simd import scale_by_power
+from chebsplat.rasterize.simd import (
+    bits,
+    fma,
+    fnma,
+    load,
+    magnitude,
+    multiply,
+    scale_by_power,
+    splat,
+    store,
+    total,
+    where,
+)
 
 LANES = 16
 SHAPE = 8  # floats of a row of shapes, and of a splat before its channels
@@ -26,8 +37,8 @@ REACH = np.float32(math.log2(255) + 1e-3)  # beyond the ellipse α = 1/255, with
 LN2, FAINT, NEVER = np.float32(math.log(2)), np.float32(-20), np.float32(np.inf)
 ZERO, ONE, TWO, SHIFT = np.float32(0), np.float32(1), np.float32(2), np.float32(1.5 * 2**23)
 # Offsets of the lanes from their cell's middle, and of the cells from their tile's.
-LANE_X, LANE_Y = (np.float32(v) for v in np.meshgrid(np.arange(4) - 1.5, np.arange(4) - 1.5))
-LANE_X, LANE_Y = LANE_X.ravel(), LANE_Y.ravel()
+LANE_X = (np.arange(LANES) % 4 - 1.5).astype(np.float32)
+LANE_Y = (np.arange(LANES) // 4 - 1.5).astype(np.float32)
 CELL_X, CELL_Y = 4 * LANE_X, 4 * LANE_Y
 _x, _y = CELL_X[:, None] + LANE_X, CELL_Y[:, None] + LANE_Y
 MOMENTS = np.stack([_x**0, _x, _y, _x**2, _x * _y, _y**2, 0 * _x, 0 * _x], -1)  # [cells, lanes, SHAPE]

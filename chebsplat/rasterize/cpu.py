@@ -43,8 +43,8 @@ class _Composite(torch.autograd.Function):
     @staticmethod
     def forward(  # type: ignore[override]
         ctx: Any, means2d: Tensor, covariances: Tensor, opacities: Tensor, colors: Tensor,
-        whitening: Tensor, depths: Tensor, radii: Tensor, absgrad: Tensor | None, size: tuple[int, int], max_alpha: float,
-        view: int,
+        whitening: Tensor, depths: Tensor, radii: Tensor, absgrad: Tensor | None, size: tuple[int, int],
+        max_alpha: float, view: int,
     ) -> tuple[Tensor, Tensor]:  # fmt: skip
         centers, spreads, strengths, channels, whitened, z, reach = (
             t.detach().contiguous().numpy() for t in (means2d, covariances, opacities, colors, whitening, depths, radii)
@@ -111,14 +111,15 @@ def rasterize(
     means2d, covariances, whitening, conics, depths, radii, compensations = found
     if means2d.requires_grad:
         means2d.retain_grad()
+    absolute = torch.zeros(means2d.shape if absgrad else (0,))
     if absgrad:
-        means2d.absgrad = torch.zeros(means2d.shape)  # type: ignore[attr-defined]
+        means2d.absgrad = absolute  # type: ignore[attr-defined]
     composed = [
         _Composite.apply(
             means2d[c], covariances[c], compensated(opacities, compensations[c]) if antialiased else opacities,
             colors if colors.ndim == 2 else colors[c],
             whitening[c], depths[c], radii[c],
-            means2d.absgrad[c] if absgrad else None, (width, height), max_alpha, c,
+            absolute[c] if absgrad else None, (width, height), max_alpha, c,
         )
         for c in range(len(cameras))
     ]  # fmt: skip

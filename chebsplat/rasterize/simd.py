@@ -11,10 +11,12 @@ import operator
 from typing import Any
 
 from llvmlite import ir
+from numba import extending
 from numba.core import cgutils, types
 from numba.core.typing import signature
-from numba.extending import intrinsic, models, overload, register_model
+from numba.extending import models, overload, register_model
 
+intrinsic: Any = extending.intrinsic  # its own type takes the typing context for an argument of the call
 _FLOAT, _INT = ir.FloatType(), ir.IntType(32)
 
 
@@ -68,7 +70,7 @@ def load(_typing, array, index):  # type: ignore[no-untyped-def]
     """array.flat[index : index + 16]."""
 
     def build(context, builder, sig, args):  # type: ignore[no-untyped-def]
-        return builder.load(_data(context, builder, sig.args[0], *args, WIDE), align=4)
+        return builder.load(_data(context, builder, sig.args[0], args[0], args[1], WIDE), align=4)
 
     return signature(F16, array, types.intp), build
 
@@ -78,7 +80,7 @@ def store(_typing, array, index, value):  # type: ignore[no-untyped-def]
     """array.flat[index : index + 16] = value."""
 
     def build(context, builder, sig, args):  # type: ignore[no-untyped-def]
-        builder.store(args[2], _data(context, builder, sig.args[0], *args[:2], WIDE), align=4)
+        builder.store(args[2], _data(context, builder, sig.args[0], args[0], args[1], WIDE), align=4)
         return context.get_dummy_value()
 
     return signature(types.none, array, types.intp, F16), build
@@ -90,7 +92,7 @@ def prefetch(_typing, array, index):  # type: ignore[no-untyped-def]
 
     def build(context, builder, sig, args):  # type: ignore[no-untyped-def]
         byte = ir.IntType(8).as_pointer()
-        place = builder.bitcast(_data(context, builder, sig.args[0], *args, _FLOAT), byte)
+        place = builder.bitcast(_data(context, builder, sig.args[0], args[0], args[1], _FLOAT), byte)
         kind = ir.FunctionType(ir.VoidType(), [byte, _INT, _INT, _INT])
         function = cgutils.get_or_insert_function(builder.module, kind, "llvm.prefetch.p0")
         builder.call(function, [place, _INT(0), _INT(3), _INT(1)])
@@ -220,10 +222,10 @@ def to_lanes(_typing, out, out_at, a, a_at, a_step):  # type: ignore[no-untyped-
             parts.append(builder.load(_data(context, builder, sig.args[2], a, at, four), align=4))
         while len(parts) > 4:
             n = 2 * parts[0].type.count
-            parts = [_interleave(builder, *parts[i : i + 2], list(range(n))) for i in range(0, len(parts), 2)]
+            parts = [_interleave(builder, parts[i], parts[i + 1], list(range(n))) for i in range(0, len(parts), 2)]
         for c in (0, 2):
             order = [4 * lane + k for k in (c, c + 1) for lane in range(8)]
-            low, high = _interleave(builder, *parts[:2], order), _interleave(builder, *parts[2:], order)
+            low, high = _interleave(builder, parts[0], parts[1], order), _interleave(builder, parts[2], parts[3], order)
             for k in range(2):
                 both = _interleave(builder, low, high, [8 * k + i + j for j in (0, 16) for i in range(8)])
                 at = builder.add(out_at, out_at.type(16 * (c + k)))
@@ -246,7 +248,7 @@ def from_lanes(_typing, out, out_at, out_step, a, a_at):  # type: ignore[no-unty
             rows.append(builder.load(_data(context, builder, sig.args[3], a, at, WIDE), align=4))
         for half in (0, 8):  # lanes half .. half + 7, as (lane, c mod 2)
             order = [half + lane + k for lane in range(8) for k in (0, 16)]
-            even, odd = _interleave(builder, *rows[:2], order), _interleave(builder, *rows[2:], order)
+            even, odd = _interleave(builder, rows[0], rows[1], order), _interleave(builder, rows[2], rows[3], order)
             for lane in range(8):
                 four_channels = [2 * lane, 2 * lane + 1, 16 + 2 * lane, 17 + 2 * lane]
                 at = builder.add(out_at, builder.mul(out_step, out_step.type(half + lane)))

@@ -78,10 +78,10 @@ def _begin(states, width, height):
 
 @serial
 def _is_done(states, cell):
+    n_open = 0
     for lane in range(LANES):
-        if states[cell, 1, lane] != NEVER:
-            return False
-    return True
+        n_open += states[cell, 1, lane] != NEVER
+    return n_open == 0
 
 
 @serial
