@@ -8,6 +8,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from chebsplat.rasterize import reference
 from chebsplat.rasterize.projection import is_antialiased
 
 log = logging.getLogger("chebsplat")
@@ -55,6 +56,8 @@ def rasterize(
             "or move the tensors to the CPU, or pass backend='reference'"
         ) from error
     _report_ceiling(max_alpha)
+    if len(means) == 0:
+        return _nothing(means, colors, viewmats, Ks, width, height, backgrounds)
     gaussians = _without_broken(means, quats, scales, opacities, colors)
     renders, alphas, found = rasterization(
         *gaussians, viewmats, Ks, width, height,
@@ -63,6 +66,16 @@ def rasterize(
         channel_chunk=max(CHUNK, colors.shape[-1]),
     )  # fmt: skip
     return renders, alphas, named(found)
+
+
+def _nothing(
+    means: Tensor, colors: Tensor, viewmats: Tensor, Ks: Tensor, width: int, height: int, backgrounds: Tensor | None
+) -> tuple[Tensor, Tensor, dict[str, Any]]:
+    """The background: gsplat is not asked to sort an empty scene."""
+    empty = (means, means.new_zeros(0, 4), means, means.new_zeros(0), colors)
+    found = reference.rasterize(*empty, viewmats, Ks, width, height, backgrounds=backgrounds)
+    found[2]["means2d"].absgrad = torch.zeros_like(found[2]["means2d"])
+    return found
 
 
 def _without_broken(
