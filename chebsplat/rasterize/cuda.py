@@ -56,8 +56,11 @@ def rasterize(
             "or move the tensors to the CPU, or pass backend='reference'"
         ) from error
     _report_ceiling(max_alpha)
-    if len(means) == 0:
-        return _nothing(means, colors, viewmats, Ks, width, height, backgrounds)
+    if len(means) == 0:  # the background: gsplat is not asked to sort an empty scene
+        empty = (means, quats, scales, opacities, colors, viewmats, Ks, width, height)
+        renders, alphas, meta = reference.rasterize(*empty, backgrounds=backgrounds)
+        meta["means2d"].absgrad = torch.zeros_like(meta["means2d"])
+        return renders, alphas, meta
     gaussians = _without_broken(means, quats, scales, opacities, colors)
     renders, alphas, found = rasterization(
         *gaussians, viewmats, Ks, width, height,
@@ -66,16 +69,6 @@ def rasterize(
         channel_chunk=max(CHUNK, colors.shape[-1]),
     )  # fmt: skip
     return renders, alphas, named(found)
-
-
-def _nothing(
-    means: Tensor, colors: Tensor, viewmats: Tensor, Ks: Tensor, width: int, height: int, backgrounds: Tensor | None
-) -> tuple[Tensor, Tensor, dict[str, Any]]:
-    """The background: gsplat is not asked to sort an empty scene."""
-    empty = (means, means.new_zeros(0, 4), means, means.new_zeros(0), colors)
-    found = reference.rasterize(*empty, viewmats, Ks, width, height, backgrounds=backgrounds)
-    found[2]["means2d"].absgrad = torch.zeros_like(found[2]["means2d"])
-    return found
 
 
 def _without_broken(
