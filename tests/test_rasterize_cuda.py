@@ -7,6 +7,7 @@ import pytest
 import torch
 from raster import NAMES, camera, gradients, scene, undecided
 from test_rasterize import tiny_case
+from test_rasterize_exact import EXTREMES
 
 from chebsplat.rasterize import rasterize
 
@@ -126,3 +127,33 @@ def test_reference_image_of_four_gaussians_is_as_on_the_cpu():
     both = [torch.cat([render, alpha], -1)[0].cpu() for render, alpha, _ in (found, expected)]
     assert (both[0] - both[1]).abs().max() < 1e-4
     assert (both[0] - image).abs().max() < 1e-4
+
+
+@pytest.mark.gpu
+@pytest.mark.parametrize("mode", ["classic", "antialiased"])
+@pytest.mark.parametrize("name", EXTREMES)
+def test_extreme_input_renders_as_on_the_cpu(name, mode):
+    options = {"rasterize_mode": mode, "max_alpha": CEILING}
+    arguments = scene(channels=3)
+    arguments[0][3] = torch.tensor([0.05, 0.02, 1.5])
+    EXTREMES[name][0](arguments)
+    weights = torch.ones(1, 37, 53, 3)
+    weights[undecided(arguments, 53, 37, **options)] = 0
+    decided = (weights != 0).all(-1)
+    a = gradients(arguments, torch.float32, "cpu", weights, **options)
+    b = gradients(arguments, torch.float32, "cuda", weights, device="cuda", **options)
+    for x, y in zip(a[:2], b[:2], strict=True):
+        assert (x - y.cpu())[decided].abs().max() < 1e-3  # float32 covariances: needles lose digits
+    assert all(torch.isfinite(g).all() for g in b[2])
+
+
+@pytest.mark.gpu
+@pytest.mark.parametrize("n", [0, 5])
+def test_nothing_in_view_is_the_background(n):
+    arguments = [a[:n] for a in scene(channels=3)]
+    arguments[0][:, 2] = -1
+    backgrounds = torch.tensor([[0.1, 0.2, 0.3]], device="cuda")
+    weights, options = torch.ones(1, 37, 53, 3), {"device": "cuda", "max_alpha": CEILING, "backgrounds": backgrounds}
+    image, alpha, grads, meta = gradients(arguments, torch.float32, "cuda", weights, **options)
+    assert (image == backgrounds).all() and (alpha == 0).all()
+    assert all((g == 0).all() for g in [*grads, meta["means2d"].absgrad])

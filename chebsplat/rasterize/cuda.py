@@ -8,6 +8,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from chebsplat.rasterize import reference
 from chebsplat.rasterize.projection import is_antialiased
 
 log = logging.getLogger("chebsplat")
@@ -56,6 +57,11 @@ def rasterize(
             "or move the tensors to the CPU, or pass backend='reference'"
         ) from error
     _report_ceiling(max_alpha)
+    if len(means) == 0:  # the background: gsplat is not asked to sort an empty scene
+        empty = (means, quats, scales, opacities, colors, viewmats, Ks, width, height)
+        renders, alphas, meta = reference.rasterize(*empty, backgrounds=backgrounds)
+        meta["means2d"].absgrad = torch.zeros_like(meta["means2d"])
+        return renders, alphas, meta
     gaussians = _without_broken(means, quats, scales, opacities, colors)
     renders, alphas, found = rasterization(
         *gaussians, viewmats, Ks, width, height,

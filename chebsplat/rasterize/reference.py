@@ -1,4 +1,4 @@
-"""The oracle: plain torch, any float type, gradients by autograd; tile by tile, each tile a few matrix products.
+"""The oracle: plain torch, any float type, tile by tile, each tile a few matrix products.
 
 Within a tile, at an offset (x, y) from its middle, ln α of a Gaussian is a quadratic in x and y: six coefficients. So
 one matrix product gives ln α of all its pixels and Gaussians, and a second one, of compositing weights and colours,
@@ -170,10 +170,34 @@ def _batches(by_count: Tensor, counts: Tensor) -> list[Tensor]:
     return [*groups, by_count[start:]]
 
 
+class _Weights(torch.autograd.Function):
+    """Compositing weights α_i Π_{j<i} (1 − α_j) of depth-sorted Gaussians, the last dimension, of ln α.
+
+    Its adjoint is α_i T_i ∂w_i − α_i / (1 − α_i) Σ_{j>i} w_j ∂w_j: half the passes that autograd would make. Tests hold
+    it to autograd.
+    """
+
+    @staticmethod
+    def forward(ctx: Any, log_alphas: Tensor, max_alpha: float) -> Tensor:  # type: ignore[override]
+        alphas = log_alphas.exp().clamp_max_(max_alpha)
+        alphas.masked_fill_(alphas < ALPHA_MIN, 0)
+        after = torch.cumprod(1 - alphas, -1)
+        weights = alphas.clone()
+        weights[..., 1:] *= after[..., :-1]
+        weights.masked_fill_(after <= T_MIN, 0)
+        ctx.save_for_backward(alphas, weights)
+        ctx.max_alpha = max_alpha
+        return weights
+
+    @staticmethod
+    @torch.autograd.function.once_differentiable
+    def backward(ctx: Any, grad: Tensor) -> tuple[Tensor, None]:
+        alphas, weights = ctx.saved_tensors
+        gain = grad * weights
+        behind = gain.flip(-1).cumsum_(-1).flip(-1).sub_(gain)
+        found = gain.addcmul_(behind, alphas / (1 - alphas), value=-1)
+        return found.masked_fill_(alphas >= ctx.max_alpha, 0), None
+
+
 def _weights(log_alphas: Tensor, max_alpha: float) -> Tensor:
-    """Compositing weights α_i Π_{j<i} (1 − α_j) of depth-sorted Gaussians, the last dimension."""
-    alphas = log_alphas.exp().clamp_max(max_alpha)
-    alphas = alphas.masked_fill(alphas < ALPHA_MIN, 0)
-    after = torch.cumprod(1 - alphas, -1)
-    before = torch.cat([torch.ones_like(after[..., :1]), after[..., :-1]], -1)
-    return (alphas * before).masked_fill(after <= T_MIN, 0)
+    return _Weights.apply(log_alphas, max_alpha)
