@@ -22,14 +22,26 @@ def table(path):
         return list(csv.DictReader(handle))
 
 
-@pytest.mark.parametrize("only", ["needles 1e6", "coincident and round", "n = 3"])
+@pytest.mark.parametrize(
+    "only",
+    [
+        "needles 1e6",
+        "coincident and round",
+        "n = 3",
+        "fusion: ",
+        "a residual of 1e-06",
+        "histogram, constant",
+        "zero quat",
+    ],
+)
 def test_cases_pass_and_are_written_down(suite, tmp_path, capsys, only):
     module, _ = suite
     assert module.main(["--only", only, "--csv", str(tmp_path / "s.csv")]) == 0
     rows = table(tmp_path / "s.csv")
     assert rows
     assert all(row["passed"] == "True" and float(row["error"]) <= float(row["tolerance"]) for row in rows)
-    assert only in capsys.readouterr().out
+    assert all(only in f"{row['module']}: {row['case']}" for row in rows)
+    assert f"{len(rows)} cases, 0 failed" in capsys.readouterr().out
 
 
 def off(case):
@@ -65,7 +77,7 @@ def test_a_wrong_descriptor_fails(suite, tmp_path, monkeypatch):
 
     correct = descriptor.describe_regions
     monkeypatch.setattr(descriptor, "describe_regions", lambda *a, **k: correct(*a, **k) * (1 + 1e-5))
-    assert module.main(["--only", "needles 1e6", "--csv", str(tmp_path / "s.csv")]) == 1
+    assert module.main(["--only", "descriptor: needles 1e6", "--csv", str(tmp_path / "s.csv")]) == 1
 
 
 def test_an_unknown_case_is_a_usage_error(suite, tmp_path):

@@ -15,7 +15,7 @@ import chebsplat  # isort: skip  # before torch: a busy machine punishes OpenMP 
 import numpy as np
 import torch
 
-from benchmarks.stability import descriptor  # noqa: F401  # importing a module registers its cases
+from benchmarks.stability import descriptor, fusion, knowledge, pruning, rasterizer  # noqa: F401  # registers cases
 from benchmarks.stability.case import CASES, Row, run
 
 MEDIAN = 5e-7  # of the descriptor's float32 errors, in a whole run
@@ -51,7 +51,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 
 def line(row: Row) -> str:
-    what = f"{row.module:<11} {row.case:<44} {row.condition:<26} {row.naive:<28}"
+    what = f"{row.module:<11} {row.case:<44} {row.condition:<24} {row.naive:<31}"
     return f"{what} {row.error:8.1e} <= {row.tolerance:7.1e}  {'pass' if row.passed else 'FAIL'}  {row.note}".rstrip()
 
 
