@@ -50,6 +50,15 @@ def test_classifiers_learn_what_is_there_and_nothing_else(shapes, kind):
     assert accuracy(fit(kind, noise[::2], labels[::2], rng), noise[1::2], labels[1::2]) < 60
 
 
+def test_a_column_that_is_constant_in_training_says_nothing(shapes):
+    rng = np.random.default_rng(0)
+    constant, rounding = 0.1 + 1e-16 * rng.normal(size=60), 1e-17 * rng.normal(size=60)
+    x = np.column_stack([rng.normal(size=(60, 2)), constant, rounding])
+    standard = shapes.classifiers.standardizer(x)
+    assert (standard(x + 5)[:, 2:] == 0).all()
+    np.testing.assert_allclose(standard(x)[:, :2].std(0), 1)
+
+
 @pytest.mark.parametrize("pooling", ["mean and deviation", "quartiles"])
 def test_features_ignore_pose_place_size_and_order(shapes, pooling):
     rng = np.random.default_rng(3)

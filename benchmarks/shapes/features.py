@@ -42,14 +42,15 @@ def ours(regions: Regions, **options: float) -> np.ndarray:
 
 
 def printed(regions: Regions, n_eigs: int = 16, n_angles: int = 4, max_degree: int = 8) -> np.ndarray:
-    """Eqs 1-6 in the printed style: K eigenvectors of unit length, hard cut, rotations about the world's z axis.
+    """Eqs 1-6 in the printed style: K eigenvectors, hard cut, rotations about the world's z axis.
 
-    Kinder than print: float64, a region of unit size, and a symmetric eigensolver, so that nothing raises.
+    Kinder than print: float64, a region of unit size, a symmetric eigensolver, so that nothing raises, and squares of
+    eigenvectors times n, so that a region of fewer Gaussians has features of the same size.
     """
     means, scales, R = (torch.from_numpy(v) for v in canonical(regions)[:3])
     n, eye = means.shape[1], torch.eye(3, dtype=torch.float64)
     metric = torch.linalg.inv(eye + 30.0 * R @ (scales[..., None] ** 2 * R.mT))
-    columns = []
+    columns, n_eigs = [], min(n_eigs, n)
     for angle in 2 * np.pi * np.arange(n_angles) / n_angles:
         cos, sin = np.cos(angle), np.sin(angle)
         turned = means @ torch.tensor([[cos, -sin, 0], [sin, cos, 0], [0, 0, 1]])
@@ -59,7 +60,7 @@ def printed(regions: Regions, n_eigs: int = 16, n_angles: int = 4, max_degree: i
         root = weights.sum(2).clamp_min(1e-300).rsqrt()
         values, vectors = torch.linalg.eigh(torch.eye(n) - root[:, :, None] * weights * root[:, None])
         values, vectors = values[:, :n_eigs], root[:, :, None] * vectors[:, :, :n_eigs]
-        squares = vectors**2 / (vectors**2).sum(1, keepdim=True)
+        squares = n * vectors**2 / (vectors**2).sum(1, keepdim=True)
         x = (2 * values / values[:, -1:].clamp_min(1e-12) - 1).clamp(-1, 1)
         columns += [((d * x.arccos()).cos()[:, None] * squares).sum(2) for d in range(max_degree + 1)]
     return torch.stack(columns, -1).numpy()
