@@ -15,7 +15,14 @@ import chebsplat  # isort: skip  # before torch: a busy machine punishes OpenMP 
 import numpy as np
 import torch
 
-from benchmarks.stability import descriptor, fusion, knowledge, pruning, rasterizer  # noqa: F401  # registers cases
+from benchmarks.stability import (  # noqa: F401  # importing a module registers its cases
+    descriptor,
+    fusion,
+    knowledge,
+    pruning,
+    rasterizer,
+    regions,
+)
 from benchmarks.stability.case import CASES, Row, run
 
 MEDIAN = 5e-7  # of the descriptor's float32 errors, in a whole run

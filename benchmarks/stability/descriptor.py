@@ -261,6 +261,13 @@ def one_broken(bad: float, field: str) -> Outcome:
     return Outcome("1 of 16 Gaussians", as_printed(broken), error, TOLERANCE)
 
 
+@case("every Gaussian NaN")
+def all_broken() -> Outcome:
+    region = cloud()
+    broken = region._replace(means=region.means * np.nan)
+    return Outcome("16 of 16 Gaussians", as_printed(broken), relative(ours(broken), np.zeros((16, 4, 7))), 0.0)
+
+
 # gradients
 
 FLAT: dict[str, Callable[[], Region]] = {
