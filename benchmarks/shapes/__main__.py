@@ -38,6 +38,7 @@ KINDS = ("linear", "knn")
 BARS = [  # linear classifier: ours over what, where, by how many points
     ("isotropic", "as trained", 30),
     ("isotropic", "mixed", 30),
+    ("isotropic", "noise .10", 30),
     ("no rotations", "as trained", 12),
     ("no rotations", "mixed", 12),
     ("no rotations", "noise .10", 12),
