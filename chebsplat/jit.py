@@ -12,7 +12,16 @@ import numba
 
 log = logging.getLogger("chebsplat")
 
-_SOURCES = ("rasterize/binning.py", "rasterize/ellipses.py", "rasterize/lanes.py", "rasterize/tiles.py", "ssim.py")
+_SOURCES = (
+    "rasterize/binning.py",
+    "rasterize/ellipses.py",
+    "rasterize/lanes.py",
+    "rasterize/tiles.py",
+    "ssim.py",
+    "simd.py",
+    "region_frame.py",
+    "descriptor_kernel.py",
+)
 
 
 def _cache_folder() -> Path:

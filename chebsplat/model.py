@@ -10,7 +10,7 @@ import torch
 from torch import Tensor, nn
 
 from chebsplat import adapt, sh_prune
-from chebsplat.descriptor import describe_members
+from chebsplat.descriptor import describe_members, n_degrees
 from chebsplat.encoder import RegionEncoder
 from chebsplat.fusion import Gate, propagate, propagation_weights
 from chebsplat.rasterize import rasterize
@@ -57,7 +57,8 @@ class Shape(nn.Module):
     def __init__(self, n_channels: int, describe: dict[str, Any], train: dict[str, Any]):
         super().__init__()
         self.describe, self.train_settings = describe, train
-        self.n_described = describe["n_angles"] * (describe["max_degree"] - 1) if train["albo"] else 0
+        per_angle = n_degrees(describe["spectrum"], describe["max_degree"])
+        self.n_described = describe["n_angles"] * per_angle if train["albo"] else 0
         n_context = n_channels if train["context"] == "features" else 0
         n_layers = train["n_layers"] if train["encoder"] == "transformer" else 0
         self.encoder = RegionEncoder(
@@ -84,9 +85,10 @@ class Shape(nn.Module):
         elif descriptors is not None:
             self.descriptors = descriptors.flatten(2)
         else:
-            chosen = {k: settings[k] for k in ("n_angles", "max_degree", "anisotropy", "bandwidth")}
+            names = ("n_angles", "max_degree", "anisotropy", "bandwidth", "spectrum", "n_eigs")
+            chosen = {k: settings[k] for k in names}
             described = describe_members(means, raw["quats"].detach(), scales, self.members, **chosen)
-            self.descriptors = described.flatten(2)
+            self.descriptors = described.values.flatten(2)
         where = means[self.centers]
         offsets = means[self.members.clamp_min(0)] - where[:, None]
         self.positions = offsets / max(regions.radius, 1e-12)

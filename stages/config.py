@@ -71,6 +71,8 @@ class DescribeSection(_Section):
     max_degree: int = Field(8, ge=2)  # D
     anisotropy: float = Field(30.0, ge=0)
     bandwidth: float = Field(0.7, gt=0)
+    spectrum: Literal["full", "taper", "hard"] = "full"  # hard: the paper's
+    n_eigs: int = Field(16, ge=1)  # K, of taper and hard
     region_size: int = Field(32, ge=4, le=64)  # Gaussians in a region, at most
     n_regions: int = Field(768, ge=1)
     seed: int = 0
