@@ -168,7 +168,8 @@ def describe_members(
     chunk: int = 2048,
 ) -> Described:
     """Descriptors of Gaussians [N] gathered by `members` i64 [M, n], -1 where padded; `chunk` bounds memory."""
-    sizes = {"n_angles": n_angles, "max_degree": max_degree, "anisotropy": anisotropy, "bandwidth": bandwidth}
+    sizes: dict[str, Any] = {"n_angles": n_angles, "max_degree": max_degree}
+    sizes |= {"anisotropy": anisotropy, "bandwidth": bandwidth}
     values = [torch.zeros(0, members.shape[1], n_angles, n_degrees(spectrum, max_degree))]
     counts = np.zeros(3, np.int64)
     for part in members.split(chunk if spectrum == "full" else min(chunk, 256)):

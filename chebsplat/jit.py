@@ -12,16 +12,9 @@ import numba
 
 log = logging.getLogger("chebsplat")
 
-_SOURCES = (
-    "rasterize/binning.py",
-    "rasterize/ellipses.py",
-    "rasterize/lanes.py",
-    "rasterize/tiles.py",
-    "ssim.py",
-    "simd.py",
-    "region_frame.py",
-    "descriptor_kernel.py",
-)
+_RASTERIZER = ("binning.py", "ellipses.py", "lanes.py", "tiles.py")
+_SOURCES = (*(f"rasterize/{name}" for name in _RASTERIZER), "ssim.py", "simd.py", "region_frame.py", "albo_kernel.py",
+            "descriptor_kernel.py")  # fmt: skip
 
 
 def _cache_folder() -> Path:

@@ -14,6 +14,7 @@ from llvmlite import ir
 from numba.core import cgutils, types
 from numba.extending import intrinsic, models, register_model
 
+instruction: Any = intrinsic
 N_LANES = 16
 _FLOATS = ir.VectorType(ir.FloatType(), N_LANES)
 _INTS = ir.VectorType(ir.IntType(32), N_LANES)
@@ -56,7 +57,7 @@ def _call(builder: Any, name: str, *values: Any) -> Any:
     return builder.call(function, values)
 
 
-@intrinsic
+@instruction
 def load(typing: Any, array: Any, index: Any) -> Any:
     """array[index : index + 16]."""
 
@@ -67,7 +68,7 @@ def load(typing: Any, array: Any, index: Any) -> Any:
     return f32x16(array, types.intp), emit
 
 
-@intrinsic
+@instruction
 def store(typing: Any, array: Any, index: Any, vector: Any) -> Any:
     """array[index : index + 16] = vector."""
 
@@ -79,7 +80,7 @@ def store(typing: Any, array: Any, index: Any, vector: Any) -> Any:
     return types.void(array, types.intp, f32x16), emit
 
 
-@intrinsic
+@instruction
 def spread(typing: Any, array: Any, index: Any) -> Any:
     """array[index] in every lane."""
 
@@ -89,7 +90,7 @@ def spread(typing: Any, array: Any, index: Any) -> Any:
     return f32x16(array, types.intp), emit
 
 
-@intrinsic
+@instruction
 def fill(typing: Any, value: Any) -> Any:
     """A float32 in every lane."""
 
@@ -99,7 +100,7 @@ def fill(typing: Any, value: Any) -> Any:
     return f32x16(types.float32), emit
 
 
-@intrinsic
+@instruction
 def add(typing: Any, a: Any, b: Any) -> Any:
     def emit(context: Any, builder: Any, signature: Any, args: Any) -> Any:
         return builder.fadd(*args)
@@ -107,7 +108,7 @@ def add(typing: Any, a: Any, b: Any) -> Any:
     return f32x16(f32x16, f32x16), emit
 
 
-@intrinsic
+@instruction
 def sub(typing: Any, a: Any, b: Any) -> Any:
     def emit(context: Any, builder: Any, signature: Any, args: Any) -> Any:
         return builder.fsub(*args)
@@ -115,7 +116,7 @@ def sub(typing: Any, a: Any, b: Any) -> Any:
     return f32x16(f32x16, f32x16), emit
 
 
-@intrinsic
+@instruction
 def mul(typing: Any, a: Any, b: Any) -> Any:
     def emit(context: Any, builder: Any, signature: Any, args: Any) -> Any:
         return builder.fmul(*args)
@@ -123,7 +124,7 @@ def mul(typing: Any, a: Any, b: Any) -> Any:
     return f32x16(f32x16, f32x16), emit
 
 
-@intrinsic
+@instruction
 def fma(typing: Any, a: Any, b: Any, c: Any) -> Any:
     """a b + c, rounded once where the machine can."""
 
@@ -133,7 +134,7 @@ def fma(typing: Any, a: Any, b: Any, c: Any) -> Any:
     return f32x16(f32x16, f32x16, f32x16), emit
 
 
-@intrinsic
+@instruction
 def exp2(typing: Any, x: Any) -> Any:
     """2^x to 1e-7 for x <= 100; 2^-120 below x = -120."""
 
@@ -150,7 +151,7 @@ def exp2(typing: Any, x: Any) -> Any:
     return f32x16(f32x16), emit
 
 
-@intrinsic
+@instruction
 def total(typing: Any, vector: Any) -> Any:
     """Sum of the lanes, halves first."""
 
@@ -164,7 +165,7 @@ def total(typing: Any, vector: Any) -> Any:
     return types.float32(f32x16), emit
 
 
-@intrinsic
+@instruction
 def transpose(typing: Any, array: Any, source: Any, target: Any, stride: Any) -> Any:
     """Copy the transpose of the 16×16 block that begins at `source` to the one at `target`; rows are `stride` apart."""
 
