@@ -110,6 +110,7 @@ class TrainSection(_Section):
     prune_from: float = Field(0.4, ge=0, le=1)
     sh_freeze: float = Field(0.8, ge=0, le=1)
     refresh_every: int = Field(200, ge=1)  # steps between refreshes of regions and descriptors
+    refresh_tolerance: float = Field(0.0, ge=0)  # change, in radii, that leaves a region's descriptors as they are
     report_every: int = Field(100, ge=1)  # steps between rows of the trace
     # rates
     lr_means: float = 1.6e-4

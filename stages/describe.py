@@ -27,7 +27,9 @@ def run(job: Job) -> None:
     raw = initial_gaussians(points.means, points.colors, points.covariances)
     regions = build_regions(points.means, settings.n_regions, settings.region_size, settings.seed)
     parameters = settings.model_dump(exclude={"n_regions", "region_size", "seed"})
-    described = describe_members(*activated(raw)[:3], torch.as_tensor(regions.members), **parameters)
+    # Centred in float64, and only then float32: far from the origin the fractions would be lost.
+    means = torch.as_tensor(points.means - points.means.mean(0), dtype=torch.float32)
+    described = describe_members(means, *activated(raw)[1:3], torch.as_tensor(regions.members), **parameters)
     values = described.values.numpy()
     if not np.isfinite(values).all():
         bad = int(np.sum(~np.isfinite(values).all((1, 2, 3))))
@@ -41,7 +43,8 @@ def run(job: Job) -> None:
         where = f"{described.n_clustered} of {described.n_cuts} cuts fell into a cluster of eigenvalues"
         log.warning("%s: values there depend on round-off; describe.spectrum = 'taper' does not cut", where)
     job.facts |= {"n_regions": len(values), "radius": regions.radius, "n_values": int(np.prod(values.shape[2:]))}
-    record = Descriptors(regions.centers, regions.members, values, settings.model_dump(mode="json"))
+    facts = settings.model_dump(mode="json") | {"radius": regions.radius, "share": regions.share}
+    record = Descriptors(regions.centers, regions.members, values, facts)
     write_descriptors(job.out, record)
 
 
