@@ -1,5 +1,7 @@
 """Regions cover the scene in farthest-point order, and change only where the scene does."""
 
+import itertools
+
 import numpy as np
 import pytest
 
@@ -14,7 +16,7 @@ def test_centres_are_in_farthest_point_order():
     points = cloud(500)
     picked, reach = farthest_points(points, 60, 7)
     distance = np.full(500, np.inf)
-    for before, after in zip(picked[:-1], picked[1:], strict=True):
+    for before, after in itertools.pairwise(picked):
         distance = np.minimum(distance, np.linalg.norm(points - points[before], axis=1))
         assert distance[after] >= distance.max() * (1 - 1e-6)  # float32 inside
     distance = np.minimum(distance, np.linalg.norm(points - points[picked[-1]], axis=1))
