@@ -34,15 +34,15 @@ def cut_spectrum(S: Tensor, mask: Tensor, n_eigs: int, max_degree: int, *, hard:
     Returns: values, zero where padded.
     Choices: `hard` keeps the K smallest and all of the last one's eigenspace, w = 1, x = 2 λ / λ_max − 1 with λ_max
       the largest kept one. Otherwise w = 1 − smoothstep(2 λ / λ_c − 1) and x = 2 min(λ / λ_c, 1) − 1 with
-      λ_c = λ_(K+1): no cluster is ever split. Neither λ_max nor λ_c goes below `SMALLEST`. Eigenpairs by numpy: the
-      batched eigh of torch slows down with threads.
+      λ_c = λ_(K+1), the last of all if K >= n: no cluster is ever split. Neither λ_max nor λ_c goes below
+      `SMALLEST`. Eigenpairs on one thread: libraries slow down severalfold when they share such small matrices out.
     """
     m, n = mask.shape
     count = mask.sum(1).numpy()
     laplacian = torch.eye(n, dtype=torch.float64) - S.detach()
     # Padding goes behind the spectrum, which ends at 2.
     laplacian = laplacian + torch.diag_embed(torch.where(mask, 0.0, 3.0).double())
-    values, vectors = np.linalg.eigh(laplacian.numpy())
+    values, vectors = _eigenpairs(laplacian)
     values = np.clip(values, 0.0, None)
     place, rows = np.arange(n), np.arange(m)
     wanted = np.minimum(n_eigs, count)
@@ -69,3 +69,13 @@ def cut_spectrum(S: Tensor, mask: Tensor, n_eigs: int, max_degree: int, *, hard:
     polynomials = np.cos(np.arange(max_degree + 1) * np.arccos(np.clip(x, -1.0, 1.0))[..., None])
     out = count[:, None, None] * ((vectors**2) @ (weights[..., None] * polynomials))
     return Cut(torch.from_numpy(np.where(mask.numpy()[..., None], out, 0.0)), n_cuts, n_clustered)
+
+
+def _eigenpairs(matrices: Tensor) -> tuple[np.ndarray, np.ndarray]:
+    threads = torch.get_num_threads()
+    torch.set_num_threads(1)
+    try:
+        values, vectors = torch.linalg.eigh(matrices)
+    finally:
+        torch.set_num_threads(threads)
+    return values.numpy(), vectors.numpy()
