@@ -10,7 +10,7 @@ CHOICE := $(if $(scene),--scene '$(scene)') $(if $(sequence),--sequence '$(seque
 
 # `make scene=office0` needs no target: naming a scene or a sequence means running it.
 .DEFAULT_GOAL := $(if $(scene)$(sequence),run,help)
-.PHONY: help run plan verify clean-stale setup test test-all lint lock
+.PHONY: help run plan verify clean-stale setup test test-all bench-descriptor lint lock
 
 run: $(READY)  ## make scene=NAME|FOLDER [stage=] [set=a.b=c,...] [ablation=] [cores=]; or sequence=NAME
 	@$(CHEBSPLAT) run $(CHOICE) $(if $(stage),--stage '$(stage)') $(if $(cores),--cores '$(cores)')
@@ -38,6 +38,9 @@ test: $(READY)  ## the tests, in parallel, without the slow ones
 
 test-all: $(READY)  ## all tests, the slow ones too
 	@$(PY) -m pytest -q -n auto --dist loadgroup -m "not gpu" $(args)
+
+bench-descriptor: $(READY)  ## routes to the descriptor: error over time, bars, growth; into build/bench/
+	@$(PY) benchmarks/descriptor.py $(args)
 
 lint: $(READY)  ## ruff (lint, format) and mypy
 	@$(PY) -m ruff check . && $(PY) -m ruff format --check .

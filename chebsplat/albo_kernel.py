@@ -1,7 +1,11 @@
-"""The symmetric operator −S of a region in float32 (Eqs 2-3): the fast twin of `albo.similarity`.
+"""The symmetric operator u uᵀ − S of a region in float32 (Eqs 2-3): the fast twin of `albo.similarity`.
+
+S u = u for u_i = sqrt(A_i / Σ A). Without that pair the spectrum of a well connected region keeps off ±1, where T_d
+multiplies rounding errors by d² rather than by d.
 
 Matrices are [n, n] stored flat, where n is the member count filled up to a multiple of 16. All are symmetric: what
-fills one fills the blocks on and above the diagonal and mirrors them.
+fills one fills the blocks on and above the diagonal and mirrors them. Sums are carried out as written: no function here
+may be compiled with reassociation.
 """
 
 from __future__ import annotations
@@ -10,16 +14,16 @@ import math
 
 import numpy as np
 
-from chebsplat.jit import lanes, serial
+from chebsplat.jit import serial
 from chebsplat.simd import add, exp2, fill, fma, load, mul, spread, store, sub, transpose
 
 # Below this degree or bandwidth exponents are large enough for float32 to lose digits: the operator is then built in
 # float64 and in logarithms.
 LEAST_DEGREE, LEAST_BANDWIDTH = np.float32(1e-3), 0.05
-ZERO, ONE = np.float32(0), np.float32(1)
+ZERO = np.float32(0)
 
 
-@lanes
+@serial
 def mirror(a, n):
     """Copy the blocks above the diagonal to their places below."""
     for i in range(0, n, 16):
@@ -27,7 +31,7 @@ def mirror(a, n):
             transpose(a, i * n + j, j * n + i, n)
 
 
-@lanes
+@serial
 def weights(points, factors, count, n, scale, out):
     """w_ij = 2^(scale (|Y_i Δ|² + |Y_j Δ|²)) into out [n, n], 0 on the diagonal and where padded.
 
@@ -64,27 +68,36 @@ def weights(points, factors, count, n, scale, out):
     mirror(out, n)
 
 
-@lanes
+@serial
 def column_sums(a, count, n, out):
+    """Sums of columns into out [n], what they lost to rounding into out [n:]: the true sum is their difference."""
     for j in range(0, n, 16):
-        sums = fill(ZERO)
+        sums, lost = fill(ZERO), fill(ZERO)
         for i in range(count):
-            sums = add(sums, load(a, i * n + j))
+            term = sub(load(a, i * n + j), lost)
+            larger = add(sums, term)
+            lost = sub(sub(larger, sums), term)
+            sums = larger
         store(out, j, sums)
-
-
-@lanes
-def normalise(a, roots, count, n):
-    """a_ij <- -a_ij roots_i roots_j."""
-    for i in range(count):
-        root = fill(-roots[i])
-        for j in range(0, n, 16):
-            store(a, i * n + j, mul(mul(load(a, i * n + j), load(roots, j)), root))
+        store(out, n + j, lost)
 
 
 @serial
-def operator(points, metrics, count, n, scale, split, degrees, out):
-    """−S into out [n, n] unless a degree is too small for float32. Returns: the least degree."""
+def normalise(a, roots, u, count, n):
+    """a_ij <- u_i u_j − a_ij roots_i roots_j, of roots in two float32 each, [n] and [n:], rounded once or nearly so."""
+    for i in range(count):
+        root, rest, lead = fill(-roots[i]), fill(-roots[n + i]), fill(u[i])
+        for j in range(0, n, 16):
+            other, w = load(roots, j), load(a, i * n + j)
+            product = mul(root, other)
+            lost = fma(root, other, sub(fill(ZERO), product))
+            lost = fma(root, load(roots, n + j), fma(rest, other, lost))
+            store(a, i * n + j, fma(w, product, fma(lead, load(u, j), mul(w, lost))))
+
+
+@serial
+def operator(points, metrics, count, n, scale, split, degrees, u, out):
+    """u uᵀ − S into out [n, n], and u [n], unless a degree is too small for float32. Returns: the least degree."""
     split[:] = ZERO
     for i in range(count):
         for k in range(3):
@@ -97,16 +110,23 @@ def operator(points, metrics, count, n, scale, split, degrees, out):
     for i in range(1, count):
         least = min(least, degrees[i])
     if least >= LEAST_DEGREE:
+        total = 0.0
+        for i in range(count):
+            total += float(degrees[i]) - float(degrees[n + i])
         for i in range(n):
-            degrees[i] = ONE / np.sqrt(degrees[i]) if i < count else ZERO
-        normalise(out, degrees, count, n)
+            degree = float(degrees[i]) - float(degrees[n + i]) if i < count else 1.0
+            root = 1.0 / math.sqrt(degree) if i < count else 0.0
+            degrees[i], degrees[n + i] = np.float32(root), np.float32(root - np.float32(root))
+            u[i] = np.float32(math.sqrt(degree / total)) if i < count else ZERO
+        normalise(out, degrees, u, count, n)
     return least
 
 
 @serial
-def exact_operator(points, factors, count, n, bandwidth, out):
+def exact_operator(points, factors, count, n, bandwidth, u, out):
     """−S in float64 and logarithms, rounded once: right where every weight of a member underflows.
 
+    Here u = 0: a region like this falls apart into parts that each have a pair at −1, and zeros are exact.
     Args: points [n, 3], factors [n, 3, 3].
     """
     lengths, logs = np.empty((count, count)), np.empty(count)
@@ -129,7 +149,7 @@ def exact_operator(points, factors, count, n, bandwidth, out):
         for j in range(count):
             total += math.exp(lengths[i, j] - top)
         logs[i] = 0.5 * (top + math.log(total))
-    out[: n * n] = ZERO
+    out[: n * n], u[:n] = ZERO, ZERO
     for i in range(count):
         for j in range(count):
             if i != j:

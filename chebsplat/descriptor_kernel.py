@@ -9,7 +9,7 @@ import math
 import numpy as np
 
 from chebsplat.albo_kernel import LEAST_BANDWIDTH, LEAST_DEGREE, exact_operator, mirror, operator
-from chebsplat.jit import kernel, lanes, prange, serial
+from chebsplat.jit import kernel, prange, serial
 from chebsplat.region_frame import canonical, metric, tangent_axis, turn_back
 from chebsplat.simd import fill, fma, load, mul, spread, store, sub
 
@@ -18,7 +18,7 @@ FINEST = np.float32(-0.5 / LEAST_BANDWIDTH**2 / math.log(2.0))
 ZERO, HALF, ONE, TWO = np.float32(0), np.float32(0.5), np.float32(1), np.float32(2)
 
 
-@lanes
+@serial
 def next_term(x, term, before, at_zero, count, n, out):
     """out = 2 x term + 2 T_m(0) x − before: the recurrence of E_m = T_m − T_m(0) I."""
     twice, shift = fill(TWO), fill(TWO * at_zero)
@@ -39,7 +39,7 @@ def next_term(x, term, before, at_zero, count, n, out):
     mirror(out, n)
 
 
-@lanes
+@serial
 def row_products(a, b, count, n, out, start):
     """Diagonal of a b into out[start:]; columns are summed, which for symmetric matrices are the rows."""
     for j in range(0, n, 16):
@@ -50,8 +50,11 @@ def row_products(a, b, count, n, out, start):
 
 
 @serial
-def diagonals(terms, max_degree, count, n, out):
-    """n ([T_d(−S)]_ii − T_d(0)) of degrees 2...max_degree into out [D - 1, n], from terms[1] = −S."""
+def diagonals(terms, u, max_degree, count, n, out):
+    """n ([T_d(−S)]_ii − T_d(0)) of degrees 2...max_degree into out [D - 1, n], from terms[1] = u uᵀ − S.
+
+    T_d(−S) = T_d(u uᵀ − S) + (T_d(−1) − T_d(0)) u uᵀ, because S u = u; u may be zero.
+    """
     for m in range(1, (max_degree + 1) // 2):
         at_zero = ZERO if m % 2 else (ONE if m % 4 == 0 else -ONE)
         next_term(terms[1], terms[m], terms[m - 1], at_zero, count, n, terms[m + 1])
@@ -62,10 +65,12 @@ def diagonals(terms, max_degree, count, n, out):
         row_products(terms[m], terms[k], count, n, out, start)
         m_zero = ZERO if m % 2 else (ONE if m % 4 == 0 else -ONE)
         k_zero = ZERO if k % 2 else (ONE if k % 4 == 0 else -ONE)
+        sign = -ONE if degree % 2 else ONE
+        lead = sign - (ZERO if degree % 2 else (ONE if degree % 4 == 0 else -ONE))
         for i in range(count):
             at = i * n + i
-            rows = out[start + i] + m_zero * terms[k, at] + k_zero * terms[m, at]
-            out[start + i] = TWO * np.float32(count) * rows
+            value = TWO * (out[start + i] + m_zero * terms[k, at] + k_zero * terms[m, at]) - terms[k - m, at]
+            out[start + i] = np.float32(count) * (value + lead * u[i] * u[i])
 
 
 @serial
@@ -104,7 +109,11 @@ def describe_block(first, last, means, scales, rotmats, mask, anisotropy, bandwi
     points, turned, sizes = np.empty((size, 3)), np.empty((size, 3)), np.empty((size, 3))
     frames, factors = np.empty((size, 3, 3)), np.empty((size, 3, 3))
     split, metrics = np.empty(6 * widest, np.float32), np.empty(9 * widest, np.float32)
-    degrees, values = np.empty(widest, np.float32), np.empty((n_angles, (max_degree - 1) * widest), np.float32)
+    u, degrees, values = (
+        np.empty(widest, np.float32),
+        np.empty(2 * widest, np.float32),
+        np.empty((n_angles, (max_degree - 1) * widest), np.float32),
+    )
     terms = np.empty(((max_degree + 1) // 2 + 1, widest * widest), np.float32)
     for r in range(first, last):
         count = canonical(means[r], scales[r], rotmats[r], mask[r], index, points, sizes, frames)
@@ -122,11 +131,11 @@ def describe_block(first, last, means, scales, rotmats, mask, anisotropy, bandwi
             terms[0, i] = ZERO
         for j in range(n_angles if certainty > 0.0 else 1):
             turn_back(points, count, axis, 2.0 * math.pi * j / n_angles, turned)
-            least = operator(turned, metrics, count, n, scale, split, degrees, terms[1]) if scale > FINEST else ZERO
+            least = operator(turned, metrics, count, n, scale, split, degrees, u, terms[1]) if scale > FINEST else ZERO
             if least < LEAST_DEGREE:
-                exact_operator(turned, factors, count, n, bandwidth, terms[1])
+                exact_operator(turned, factors, count, n, bandwidth, u, terms[1])
                 exact[r] = True
-            diagonals(terms, max_degree, count, n, values[j])
+            diagonals(terms, u, max_degree, count, n, values[j])
         pair_angles(values, certainty, index, count, n, out[r])
 
 

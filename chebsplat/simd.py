@@ -21,6 +21,7 @@ _INTS = ir.VectorType(ir.IntType(32), N_LANES)
 # 2^f on [-½, ½] to 2e-8, by Chebyshev interpolation
 _nodes = 0.5 * np.cos((np.arange(7) + 0.5) * np.pi / 7)
 _EXP2 = np.polynomial.polynomial.polyfit(_nodes, 2.0**_nodes, 6)
+_EXP2[0] = 1.0  # 2^0 is 1
 
 
 class _Vector(types.Type):
