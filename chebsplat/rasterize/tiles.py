@@ -14,8 +14,8 @@ import numpy as np
 from chebsplat.jit import inline, kernel, prange, serial
 from chebsplat.rasterize import cells
 from chebsplat.rasterize.binning import TILE, band_start
+from chebsplat.rasterize.blocks import from_lanes, prefetch, to_lanes
 from chebsplat.rasterize.cells import BLOCK, LANES, N_GEOMETRY, NEVER, ONE, SHAPE, SLACK, T_MIN, ZERO
-from chebsplat.rasterize.simd import from_lanes, prefetch, to_lanes
 
 CHUNK = 128  # Gaussians of a tile between two looks at whether it is done
 
