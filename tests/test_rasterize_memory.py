@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 
 FILE = Path(__file__).parents[1] / "benchmarks/raster_memory.py"
-SMALL = pytest.mark.xfail(reason="two pairs a Gaussian: splats and gradients, 8 (11 + D) bytes each, outweigh the pairs")
+SMALL = pytest.mark.xfail(reason="two pairs a Gaussian: its splat and gradients, 8 (11 + D) bytes, outweigh them")
 
 
 @pytest.fixture(scope="module")
