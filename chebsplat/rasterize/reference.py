@@ -13,12 +13,13 @@ from typing import Any
 
 import torch
 from torch import Tensor
+from torch.nn.functional import hardshrink
 
 from chebsplat.rasterize.projection import Projected, compensated, is_antialiased, project
 
 ALPHA_MIN = 1 / 255  # fainter contributions are skipped
 T_MIN = 1e-4  # compositing stops before transmittance falls to this
-TILE = 16
+TILE = 8  # pixels; larger ones waste more products than they save look-ups
 BATCH = 1 << 19  # pixels times Gaussians at a time, for the cache's sake
 UNSEEN = -1e4  # ln α of a filler
 
@@ -100,7 +101,7 @@ def _composite(
     index = index[torch.argsort(view.depths[index], stable=True)]
     columns, rows = math.ceil(width / TILE), math.ceil(height / TILE)
     table = torch.cat([means2d, view.whitening, opacities[:, None], channels], 1)[index]
-    owner, tile = _pairs(table[:, :6].detach(), view.covariances[index].detach(), columns, rows, width, height)
+    owner, tile = _pairs(table[:, :6].detach(), view.covariances[index].detach(), columns, rows, width, height, TILE)
     pairs = table.index_select(0, owner)
     middles = torch.stack([tile % columns, tile // columns], -1) * TILE + TILE / 2
     quadratics = _quadratics(pairs[:, :2] - middles, pairs[:, 2:5], pairs[:, 5].log())
@@ -125,7 +126,7 @@ def _composite(
 
 
 def _pairs(
-    table: Tensor, covariances: Tensor, columns: int, rows: int, width: int, height: int
+    table: Tensor, covariances: Tensor, columns: int, rows: int, width: int, height: int, side: int
 ) -> tuple[Tensor, Tensor]:
     """Which of M Gaussians may reach 1/255 in which tile: indices [P] of both, tile by tile and in order within.
 
@@ -134,17 +135,17 @@ def _pairs(
     u, v, p, q, r, opacities = table.unbind(-1)
     limit = (255 * opacities).log().clamp_min(0) + 1e-3  # a little more than enough
     reach_x, reach_y = (2 * limit * covariances[:, 0]).sqrt(), (2 * limit * covariances[:, 2]).sqrt()
-    first_x, last_x = (((u + sign * reach_x).clamp(0, width - 1) // TILE).long() for sign in (-1, 1))
-    first_y, last_y = (((v + sign * reach_y).clamp(0, height - 1) // TILE).long() for sign in (-1, 1))
+    first_x, last_x = (((u + sign * reach_x).clamp(0, width - 1) // side).long() for sign in (-1, 1))
+    first_y, last_y = (((v + sign * reach_y).clamp(0, height - 1) // side).long() for sign in (-1, 1))
     across = last_x - first_x + 1
     counts = across * (last_y - first_y + 1)
     owner = torch.repeat_interleave(torch.arange(len(counts), device=u.device), counts)
     nth = torch.arange(len(owner), device=u.device) - (counts.cumsum(0) - counts)[owner]
     x, y = first_x[owner] + nth % across[owner], first_y[owner] + nth // across[owner]
     # the ellipse against the parallelogram that a tile is in whitened coordinates
-    dx, dy, p, q, r = x * TILE + TILE / 2 - u[owner], y * TILE + TILE / 2 - v[owner], p[owner], q[owner], r[owner]
-    far_u = ((p * dx + q * dy).abs() - TILE / 2 * (p + q.abs())).clamp_min(0)
-    far_v = ((r * dy).abs() - TILE / 2 * r).clamp_min(0)
+    dx, dy, p, q, r = x * side + side / 2 - u[owner], y * side + side / 2 - v[owner], p[owner], q[owner], r[owner]
+    far_u = ((p * dx + q * dy).abs() - side / 2 * (p + q.abs())).clamp_min(0)
+    far_v = ((r * dy).abs() - side / 2 * r).clamp_min(0)
     near = far_u * far_u + far_v * far_v <= limit[owner]
     owner, tile = owner[near], (y * columns + x)[near]
     tile, order = torch.sort(tile, stable=True)
@@ -179,12 +180,11 @@ class _Weights(torch.autograd.Function):
 
     @staticmethod
     def forward(ctx: Any, log_alphas: Tensor, max_alpha: float) -> Tensor:  # type: ignore[override]
-        alphas = log_alphas.exp().clamp_max_(max_alpha)
-        alphas.masked_fill_(alphas < ALPHA_MIN, 0)
+        alphas = hardshrink(log_alphas.exp().clamp_max_(max_alpha), math.nextafter(ALPHA_MIN, 0))
         after = torch.cumprod(1 - alphas, -1)
         weights = alphas.clone()
         weights[..., 1:] *= after[..., :-1]
-        weights.masked_fill_(after <= T_MIN, 0)
+        weights *= hardshrink(after, T_MIN).sign_()  # a mask of numbers: torch vectorises no mask of truths
         ctx.save_for_backward(alphas, weights)
         ctx.max_alpha = max_alpha
         return weights
@@ -196,7 +196,7 @@ class _Weights(torch.autograd.Function):
         gain = grad * weights
         behind = gain.flip(-1).cumsum_(-1).flip(-1).sub_(gain)
         found = gain.addcmul_(behind, alphas / (1 - alphas), value=-1)
-        return found.masked_fill_(alphas >= ctx.max_alpha, 0), None
+        return found.mul_((ctx.max_alpha - alphas).sign_()), None
 
 
 def _weights(log_alphas: Tensor, max_alpha: float) -> Tensor:
