@@ -119,6 +119,25 @@ def test_absolute_gradient_is_the_sum_over_pixels(mode):
     assert (meta["means2d"].absgrad - expected).abs().max() <= GRADIENT * expected.max()
 
 
+@pytest.mark.parametrize("backend", ["reference", "cpu"])
+def test_a_gaussian_outside_reaches_in_as_far_as_it_shows(backend):
+    # its mean is 3.1 to 3.3 σ beyond the middle of the last pixels, and a wider image of the same camera cannot cull it
+    K = torch.tensor([[[160.0, 0, 200], [0, 160, 10], [0, 0, 1]]])
+    arguments = [torch.tensor([[0.0, 0, 2]]), torch.tensor([[1.0, 0, 0, 0]]), torch.full((1, 3), 0.1)]
+    arguments += [torch.tensor([0.99]), torch.ones(1, 1)]
+    for reach in (3.1, 3.2, 3.3):
+        slope = 1.5
+        for _ in range(50):
+            sigma = (64 * (1 + slope**2) + 0.3) ** 0.5
+            slope = (399.5 + reach * sigma - 200) / 160
+        arguments[0][0, 0] = 2 * slope
+        narrow, wide = (
+            rasterize(*arguments, torch.eye(4)[None], K, width, 20, backend=backend)[0] for width in (400, 600)
+        )
+        assert narrow.max() > 1 / 255
+        torch.testing.assert_close(narrow, wide[:, :, :400], rtol=1e-4, atol=1e-6)
+
+
 # Extreme inputs: Gaussian 3 is spoiled; `culled` says that it must then be as if it were not there.
 
 
