@@ -12,12 +12,11 @@ import numba
 
 log = logging.getLogger("chebsplat")
 
-_SOURCES = ("rasterize/binning.py", "rasterize/ellipses.py", "rasterize/lanes.py", "rasterize/tiles.py", "ssim.py")
-
 
 def _cache_folder() -> Path:
     root = Path(__file__).parent
-    text = b"".join((root / name).read_bytes() for name in _SOURCES)
+    sources = [path.read_bytes() for path in sorted(root.rglob("*.py"))]
+    text = b"".join(source for source in sources if b"numba" in source or b"chebsplat.jit" in source)
     base = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache")
     return base / "chebsplat" / f"numba-{hashlib.sha256(text).hexdigest()[:16]}"
 
@@ -34,7 +33,7 @@ settings.THREADING_LAYER_PRIORITY = ["omp", "workqueue", "tbb"]
 # No fast-math beyond reassociation and contraction: NaN and infinity keep their meaning.
 kernel: Any = numba.njit(cache=True, parallel=True, error_model="numpy", fastmath={"reassoc", "contract", "nsz"})
 inline: Any = numba.njit(cache=True, error_model="numpy", fastmath={"reassoc", "contract", "nsz"}, inline="always")
-# Short loops, compiled by themselves: inside a large kernel the vectoriser gives up on them.
-lanes: Any = numba.njit(cache=True, error_model="numpy", fastmath={"reassoc", "contract", "nsz"})
+# Explicit vectors: reassociation would undo the rounding by x + 1.5·2²³ − 1.5·2²³.
+lanes: Any = numba.njit(cache=True, error_model="numpy", fastmath={"contract"})
 serial: Any = numba.njit(cache=True, error_model="numpy")
 prange = numba.prange

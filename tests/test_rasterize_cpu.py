@@ -16,7 +16,7 @@ def test_any_number_of_threads_gives_the_same_bits(channels, n, mode):
     try:
         for threads in (1, 2, min(4, before)):
             numba.set_num_threads(threads)
-            options = {"backend": "cpu", "rasterize_mode": mode}
+            options = {"backend": "cpu", "rasterize_mode": mode, "absgrad": True}
             render, alpha, grads, meta = gradients(scene(n, channels), torch.float32, weights=weights, **options)
             results.append([render, alpha, *grads, meta["means2d"].absgrad])
     finally:

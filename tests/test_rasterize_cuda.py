@@ -39,7 +39,7 @@ def render(arguments, **options):
 
 
 def test_gsplat_is_asked_for_unpacked_absolute_gradients(asked):
-    meta = render(scene(channels=3), rasterize_mode="antialiased")[2]
+    meta = render(scene(channels=3), rasterize_mode="antialiased", absgrad=True)[2]
     wanted = {
         "packed": False,
         "absgrad": True,
@@ -98,11 +98,11 @@ def test_tensors_on_the_cpu_are_refused():
 @pytest.mark.parametrize("channels", [1, 3, 19, 32, 35])
 @pytest.mark.parametrize("background", [False, True], ids=["black", "background"])
 def test_random_scenes_are_as_on_the_cpu(channels, mode, background):
-    options = {"rasterize_mode": mode, "max_alpha": CEILING}
+    options = {"rasterize_mode": mode, "max_alpha": CEILING, "absgrad": True}
     arguments = scene(channels=channels)
     backgrounds = torch.full((2, channels), 0.7) if background else None
     weights = torch.randn(2, 37, 53, channels, generator=torch.Generator().manual_seed(1))
-    weights[undecided(arguments, 53, 37, 2, **options)] = 0
+    weights[undecided(arguments, 53, 37, 2, rasterize_mode=mode, max_alpha=CEILING)] = 0
     a = gradients(arguments, torch.float32, "cpu", weights, backgrounds=backgrounds, **options)
     on_gpu = backgrounds.cuda() if background else None
     b = gradients(arguments, torch.float32, "cuda", weights, device="cuda", backgrounds=on_gpu, **options)

@@ -38,33 +38,35 @@ class _Project(torch.autograd.Function):
 
 
 class _Composite(torch.autograd.Function):
-    """Render [H, W, D] and alpha [H, W] of one view; backward also adds to `absgrad` [N, 2], in place."""
+    """Render [H, W, D] and alpha [H, W] of one view; backward also adds to `absgrad` [N, 2] if given, in place."""
 
     @staticmethod
     def forward(  # type: ignore[override]
         ctx: Any, means2d: Tensor, covariances: Tensor, opacities: Tensor, colors: Tensor,
-        whitening: Tensor, depths: Tensor, radii: Tensor, absgrad: Tensor, size: tuple[int, int], max_alpha: float,
-        view: int,
+        whitening: Tensor, depths: Tensor, radii: Tensor, absgrad: Tensor | None, size: tuple[int, int],
+        max_alpha: float, view: int,
     ) -> tuple[Tensor, Tensor]:  # fmt: skip
         centers, spreads, strengths, channels, whitened, z, reach = (
             t.detach().contiguous().numpy() for t in (means2d, covariances, opacities, colors, whitening, depths, radii)
         )
         bins = binning.bin_gaussians(centers, spreads, z, reach, strengths, channels, *size)
+        splats = tiles.pack(bins.order, centers, whitened, strengths, channels)
         limit = np.float32(max_alpha)
-        render, transmittance = tiles.forward(centers, whitened, strengths, channels, *bins[:2], *size, limit)
-        ctx.arrays, ctx.bins, ctx.absgrad = (centers, whitened, strengths, channels), bins, absgrad
-        ctx.size, ctx.limit, ctx.view = size, limit, view
+        found = tiles.forward(splats, bins.tile_starts, bins.rank, channels.shape[1], *size, limit)
+        render, transmittance, *seen = found
+        ctx.arrays, ctx.absgrad = (len(centers), splats, *bins, *seen, limit), absgrad
+        ctx.view = view
         return torch.from_numpy(render), 1 - torch.from_numpy(transmittance)
 
     @staticmethod
     def backward(ctx: Any, grad_render, grad_alpha):  # type: ignore[no-untyped-def, override]
         slopes = [g.contiguous().numpy() for g in (grad_render, grad_alpha)]
-        records, finite = tiles.backward(*ctx.arrays, *ctx.bins[:3], *ctx.size, ctx.limit, *slopes)
+        *found, finite = tiles.backward(*ctx.arrays, *slopes, ctx.absgrad is not None)
         if not finite:
             raise ValueError(f"the gradient of the image of view {ctx.view} is not finite")
-        found = tiles.reduce(records, ctx.bins[3], ctx.arrays[1], ctx.arrays[2])
         to_means2d, moments, to_opacities, absolute, to_colors = (torch.from_numpy(a) for a in found)
-        ctx.absgrad += absolute
+        if ctx.absgrad is not None:
+            ctx.absgrad += absolute
         return to_means2d, moments, to_opacities, to_colors, *[None] * 7
 
 
@@ -85,10 +87,12 @@ def rasterize(
     max_alpha: float = 0.99,
     rasterize_mode: str = "classic",
     backgrounds: Tensor | None = None,
+    absgrad: bool = False,
 ) -> tuple[Tensor, Tensor, dict[str, Any]]:
     """As `reference.rasterize`, in float32, and fast.
 
-    meta's `means2d` carries `absgrad` [C, N, 2]: after backward, the sum over pixels of the absolute gradient.
+    Args: absgrad: whether meta's `means2d` carries `absgrad` [C, N, 2], after backward the sum over pixels of the
+      absolute gradient.
 
     Raises: ValueError unless all inputs are float32 on the CPU, if a gradient to a camera is asked for, or, in
       backward, on a gradient of the image that is not finite.
@@ -105,15 +109,17 @@ def rasterize(
     views = [_Project.apply(means, quats, scales, camera) for camera in cameras]
     found = (_stack(parts) for parts in zip(*views, strict=True))
     means2d, covariances, whitening, conics, depths, radii, compensations = found
-    absgrad = torch.zeros(means2d.shape)
     if means2d.requires_grad:
         means2d.retain_grad()
-    means2d.absgrad = absgrad  # type: ignore[attr-defined]
+    absolute = torch.zeros(means2d.shape if absgrad else (0,))
+    if absgrad:
+        means2d.absgrad = absolute  # type: ignore[attr-defined]
     composed = [
         _Composite.apply(
             means2d[c], covariances[c], compensated(opacities, compensations[c]) if antialiased else opacities,
             colors if colors.ndim == 2 else colors[c],
-            whitening[c], depths[c], radii[c], absgrad[c], (width, height), max_alpha, c,
+            whitening[c], depths[c], radii[c],
+            absolute[c] if absgrad else None, (width, height), max_alpha, c,
         )
         for c in range(len(cameras))
     ]  # fmt: skip

@@ -34,8 +34,9 @@ def rasterize(
     max_alpha: float = 0.99,
     rasterize_mode: str = "classic",
     backgrounds: Tensor | None = None,
+    absgrad: bool = False,
 ) -> tuple[Tensor, Tensor, dict[str, Any]]:
-    """As `reference.rasterize`, of float32 tensors on a GPU; `means2d.absgrad` [C, N, 2] is there after backward.
+    """As `cpu.rasterize`, of float32 tensors on a GPU.
 
     Raises: ValueError unless the Gaussians are float32 on a GPU, or beyond 512 channels; ImportError, with the remedy,
       without gsplat.
@@ -65,7 +66,7 @@ def rasterize(
     renders, alphas, found = rasterization(
         *gaussians, viewmats, Ks, width, height,
         near_plane=near_plane, far_plane=far_plane, eps2d=eps2d, sh_degree=None, packed=False, render_mode="RGB",
-        backgrounds=backgrounds, absgrad=True, rasterize_mode=rasterize_mode,
+        backgrounds=backgrounds, absgrad=absgrad, rasterize_mode=rasterize_mode,
         channel_chunk=max(CHUNK, colors.shape[-1]),
     )  # fmt: skip
     return renders, alphas, named(found)
