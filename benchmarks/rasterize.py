@@ -83,26 +83,32 @@ def stages() -> dict[str, Callable[[], object]]:
     grad = rng.random((height, width, CHANNELS), np.float32), rng.random((height, width), np.float32)
     means2d, covariances, whitening, _, depths, radii, _ = ellipses.project(*gaussians, *view, 0.01, 1e10, 0.3)
 
-    def bins() -> tuple[np.ndarray, ...]:
+    def bins() -> binning.Bins:
         return binning.bin_gaussians(means2d, covariances, depths, radii, *by_channel, width, height)
 
-    pairs = bins()
+    found = bins()
 
-    def backward() -> tuple[np.ndarray, bool]:
-        return tiles.backward(means2d, whitening, *by_channel, *pairs[:3], width, height, ceiling, *grad)
+    def pack() -> np.ndarray:
+        return tiles.pack(found.order, means2d, whitening, *by_channel)
 
-    records, _ = backward()
+    splats = pack()
 
-    def reduce() -> object:
-        to_means2d, moments, *_ = tiles.reduce(records, pairs[3], whitening, opacities)
-        return ellipses.project_adjoint(*gaussians, *view, 0.3, radii, to_means2d, moments, no_slope)
+    def forward() -> tuple[np.ndarray, ...]:
+        return tiles.forward(splats, found.tile_starts, found.rank, CHANNELS, width, height, ceiling)
 
+    _, _, *seen = forward()
+
+    def backward() -> tuple[Any, ...]:
+        return tiles.backward(N, splats, *found, *seen, ceiling, *grad, False)
+
+    to_means2d, moments, *_ = backward()
     return {
         "project": lambda: ellipses.project(*gaussians, *view, 0.01, 1e10, 0.3),
         "bin": bins,
-        "forward": lambda: tiles.forward(means2d, whitening, *by_channel, *pairs[:2], width, height, ceiling),
+        "pack": pack,
+        "forward": forward,
         "backward": backward,
-        "reduce and project back": reduce,
+        "project back": lambda: ellipses.project_adjoint(*gaussians, *view, 0.3, radii, to_means2d, moments, no_slope),
     }
 
 
@@ -113,8 +119,8 @@ def loss() -> Callable[[], None]:
 
     def run() -> None:
         image.grad = None
-        features = feature_l1(image[..., 3:], target[..., 3:])
-        (photometric(image[..., :3], target[..., :3], None, 0.2) + features).backward()
+        (color, features), (wanted_color, wanted) = (v.split([3, CHANNELS - 3], -1) for v in (image, target))
+        (photometric(color, wanted_color, None, 0.2) + feature_l1(features, wanted)).backward()
 
     return run
 

@@ -41,6 +41,7 @@ def rasterize(
     max_alpha: float = 0.99,
     rasterize_mode: str = "classic",
     backgrounds: Tensor | None = None,
+    absgrad: bool = False,
 ) -> tuple[Tensor, Tensor, dict[str, Any]]:
     """Render Gaussians front to back into C views, D channels at once; differentiable by autograd.
 
@@ -56,6 +57,8 @@ def rasterize(
       max_alpha:   ceiling of one Gaussian's alpha; its gradient above is zero.
       rasterize_mode: `antialiased` multiplies opacities by √(det Σ / det(Σ + eps2d I)), Σ the projected covariance, so
         that a Gaussian smaller than a pixel fades as it shrinks; `classic` does not.
+      absgrad:     whether meta's `means2d` carries `absgrad` [C, N, 2], after backward the sum over pixels of the
+        absolute gradient.
     Returns: renders [C, H, W, D], alphas [C, H, W, 1], and meta: `means2d` [C, N, 2] (retains its gradient),
       `conics` [C, N, 3], `depths` [C, N], `radii` [C, N].
     Raises: ValueError on an unknown mode or, in backward, on a gradient of the image that is not finite.
@@ -67,11 +70,15 @@ def rasterize(
     means2d = torch.stack([view.means2d for view in views])
     if means2d.requires_grad:
         means2d.retain_grad()
+    absolute = torch.zeros_like(means2d) if absgrad else None
+    if absgrad:
+        means2d.absgrad = absolute  # type: ignore[attr-defined]
     renders, alphas = [], []
     for c, view in enumerate(views):
         strengths = compensated(opacities, view.compensations) if antialiased else opacities
         channels = colors if colors.ndim == 2 else colors[c]
-        render, alpha = _composite(means2d[c], view, strengths, channels, width, height, max_alpha)
+        sums = None if absolute is None else absolute[c]
+        render, alpha = _composite(means2d[c], view, strengths, channels, width, height, max_alpha, sums)
         if backgrounds is not None:
             render = render + (1 - alpha) * backgrounds[c]
         if render.requires_grad:
@@ -93,9 +100,10 @@ def _refuse_broken(view: int, gradient: Tensor | None) -> None:
 
 
 def _composite(
-    means2d: Tensor, view: Projected, opacities: Tensor, channels: Tensor, width: int, height: int, max_alpha: float
-) -> tuple[Tensor, Tensor]:
-    """Render [H, W, D] and alpha [H, W, 1] of one view."""
+    means2d: Tensor, view: Projected, opacities: Tensor, channels: Tensor, width: int, height: int, max_alpha: float,
+    absolute: Tensor | None,
+) -> tuple[Tensor, Tensor]:  # fmt: skip
+    """Render [H, W, D] and alpha [H, W, 1] of one view; backward also adds to `absolute` [N, 2] if given, in place."""
     shown = view.visible & (opacities >= ALPHA_MIN) & torch.isfinite(opacities) & torch.isfinite(channels).all(-1)
     index = shown.nonzero()[:, 0]
     index = index[torch.argsort(view.depths[index], stable=True)]
@@ -104,7 +112,8 @@ def _composite(
     owner, tile = _pairs(table[:, :6].detach(), view.covariances[index].detach(), columns, rows, width, height, TILE)
     pairs = table.index_select(0, owner)
     middles = torch.stack([tile % columns, tile // columns], -1) * TILE + TILE / 2
-    quadratics = _quadratics(pairs[:, :2] - middles, pairs[:, 2:5], pairs[:, 5].log())
+    offsets, whitening = pairs[:, :2] - middles, pairs[:, 2:5]
+    quadratics = _quadratics(offsets, whitening, pairs[:, 5].log())
     filler = quadratics.new_tensor([[UNSEEN, 0, 0, 0, 0, 0]])
     quadratics, colors = torch.cat([quadratics, filler]), torch.cat([pairs[:, 6:], torch.zeros_like(channels[:1])])
     counts = torch.bincount(tile, minlength=columns * rows)
@@ -118,11 +127,28 @@ def _composite(
         most = int(counts[tiles[-1]])
         slots = torch.arange(most, device=tiles.device)
         members = torch.where(slots < counts[tiles, None], starts[tiles, None] + slots, len(tile))  # [T, most]
-        weights = _weights(basis @ quadratics[members].mT, max_alpha)
+        log_alphas = basis @ quadratics[members].mT
+        if absolute is not None and log_alphas.requires_grad:
+            real = members < len(tile)
+            at_pair = members.clamp_max(max(len(tile) - 1, 0))
+            shapes = torch.cat([offsets, whitening], 1).detach()[at_pair]
+            who = torch.where(real, index[owner][at_pair], -1)
+            log_alphas.register_hook(partial(_add_absolute, absolute, shapes, who, x, y))
+        weights = _weights(log_alphas, max_alpha)
         images.append(torch.cat([weights @ colors[members], weights.sum(-1, keepdim=True)], -1))
     image = torch.cat(images)[torch.argsort(by_count)].reshape(rows, columns, TILE, TILE, -1)
     image = image.transpose(1, 2).reshape(rows * TILE, columns * TILE, -1)[:height, :width]
     return image[..., :-1], image[..., -1:]
+
+
+def _add_absolute(absolute: Tensor, shapes: Tensor, who: Tensor, x: Tensor, y: Tensor, gradient: Tensor) -> None:
+    """Add Σ |∂L/∂mean| over pixels; gradient [T, TILE², M] to ln α, shapes [T, M, 5] of Gaussians who [T, M] or −1."""
+    mean_x, mean_y, p, q, r = (t[:, None] for t in shapes.unbind(-1))
+    dx, dy = x[:, None] - mean_x, y[:, None] - mean_y
+    u = p * dx + q * dy
+    along_x, along_y = 2 * p * u, 2 * (q * u + r * r * dy)
+    sums = torch.stack([(gradient * t).abs().sum(1) for t in (along_x, along_y)], -1)
+    absolute.index_add_(0, who[who >= 0], sums[who >= 0])
 
 
 def _pairs(
