@@ -10,8 +10,7 @@ from raster import NAMES, brute_force, camera, gradients, scene, undecided
 
 from chebsplat.rasterize import rasterize
 
-IMAGE = 1e-6  # root mean square, of values in [0, 1]
-IMAGE_AT_WORST = 4e-6  # a mean at 50 pixels is rounded to 2e-6 of a pixel, and ln α is as steep as 2 a pixel
+IMAGE = 1.2e-6  # at worst, of values in [0, 1]; over 1e-6 only under a pixel: a mean at 50 is rounded by 2e-6
 GRADIENT = 1e-4  # relative, of each tensor's norm and of its largest entry
 ORACLE = 1e-10
 
@@ -25,11 +24,10 @@ def one_torch_thread():
     torch.set_num_threads(before)
 
 
-def assert_agree(found, exact, decided, image, worst, gradient):
+def assert_agree(found, exact, decided, image, gradient):
     for x, y in zip(found[:2], exact[:2], strict=True):
         error = (x.double() - y)[decided]
-        assert error.numel() == 0 or error.square().mean().sqrt() <= image
-        assert error.numel() == 0 or error.abs().max() <= worst
+        assert error.numel() == 0 or error.abs().max() <= image
     for name, x, y in zip((*NAMES, "means2d"), found[2], exact[2], strict=True):
         assert torch.isfinite(x).all(), name
         error = x.double() - y
@@ -51,10 +49,10 @@ def check(arguments, width=53, height=37, views=1, backend="cpu", **options):
     weights, decided = loss_weights(arguments, width, height, views, **options)
     exact = brute_force(arguments, weights, **options)
     oracle = gradients(arguments, torch.float64, "reference", weights, **options)
-    assert_agree(oracle, exact, decided, ORACLE, ORACLE, ORACLE)
+    assert_agree(oracle, exact, decided, ORACLE, ORACLE)
     if backend != "reference":
         found = gradients(arguments, torch.float32, backend, weights, **options)
-        assert_agree(found, oracle, decided, IMAGE, IMAGE_AT_WORST, GRADIENT)
+        assert_agree(found, oracle, decided, IMAGE, GRADIENT)
         return found
     return oracle
 
@@ -80,7 +78,7 @@ def test_several_views_and_backgrounds_are_exact():
     background = torch.tensor([[0.1, 0.2, 0.3, 0.4], [0.9, 0.8, 0.7, 0.6]])
     found = gradients(arguments, torch.float32, "cpu", weights, backgrounds=background)
     oracle = gradients(arguments, torch.float64, "reference", weights, backgrounds=background.double())
-    assert_agree(found, oracle, decided, IMAGE, IMAGE_AT_WORST, GRADIENT)
+    assert_agree(found, oracle, decided, IMAGE, GRADIENT)
 
 
 @pytest.mark.parametrize("backend", ["reference", "cpu"])
