@@ -15,15 +15,17 @@ from chebsplat.jit import inline, kernel, prange
 
 HALF_LOG2E = 0.5 * math.log2(math.e)
 LN2 = math.log(2.0)
+PARTS = 64  # of the Gaussians: each has scratch of its own
 LARGEST, EXTENT = 1e30, 3.33  # as `projection`'s, which numba's cache could not follow
 
 
 @inline
-def _matmul(a, b, out):
-    for i in range(out.shape[0]):
-        for j in range(out.shape[1]):
+def _matmul(a, b, out, rows, inner, columns):
+    """The sizes, as literals, let the compiler unroll."""
+    for i in range(rows):
+        for j in range(columns):
             total = 0.0
-            for k in range(a.shape[1]):
+            for k in range(inner):
                 total += a[i, k] * b[k, j]
             out[i, j] = total
 
@@ -99,39 +101,41 @@ def project(means, quats, scales, viewmat, K, width, height, near_plane, far_pla
     means2d, covariances = np.zeros((n, 2), np.float32), np.zeros((n, 3), np.float32)
     whitening, conics = np.zeros((n, 3), np.float32), np.zeros((n, 3), np.float32)
     depths, radii, compensations = np.zeros(n, np.float32), np.zeros(n, np.int32), np.zeros(n, np.float32)
-    for i in prange(n):
-        depth = viewmat[2, 3]
-        for k in range(3):
-            depth += viewmat[2, k] * means[i, k]
-        if not (depth > near_plane and depth < far_plane):
-            continue
-        largest = max(max(abs(quats[i, 0]), abs(quats[i, 1])), max(abs(quats[i, 2]), abs(quats[i, 3])))
-        sums = 1.0 * quats[i, 0] + quats[i, 1] + quats[i, 2] + quats[i, 3]
-        if not (largest > 1e-12 and math.isfinite(largest) and math.isfinite(sums - sums)):
-            continue
+    turn = np.ascontiguousarray(viewmat[:3, :3])
+    for part in prange(PARTS):
         unit, camera, cross = np.empty(4), np.empty(3), np.empty(3)
         rotation, jacobian, screen, factor = np.empty((3, 3)), np.empty((2, 3)), np.empty((2, 3)), np.empty((2, 3))
-        _rotation(quats[i], unit, rotation)
-        _jacobian(means[i], viewmat, K, width, height, camera, jacobian)
-        _matmul(jacobian, viewmat[:3, :3], screen)
-        _matmul(screen, rotation, factor)
-        for k in range(3):
-            factor[0, k] *= scales[i, k]
-            factor[1, k] *= scales[i, k]
-        a, b, c, determinant, area = _ellipse(factor, eps2d, cross)
-        u, v = K[0, 0] * camera[0] / depth + K[0, 2], K[1, 1] * camera[1] / depth + K[1, 2]
-        biggest = 0.5 * (a + c) + math.sqrt(0.25 * (a - c) * (a - c) + b * b)
-        if not (determinant > 0 and determinant < LARGEST * LARGEST and biggest < LARGEST):
-            continue
-        reach = min(math.ceil(EXTENT * math.sqrt(biggest)), 2.0**30)
-        if not (u + reach > 0 and u - reach < width and v + reach > 0 and v - reach < height):
-            continue
-        means2d[i, 0], means2d[i, 1], depths[i], radii[i] = u, v, depth, int(reach)
-        covariances[i, 0], covariances[i, 1], covariances[i, 2] = a, b, c
-        conics[i, 0], conics[i, 1], conics[i, 2] = c / determinant, -b / determinant, a / determinant
-        compensations[i] = area / math.sqrt(determinant)
-        p = math.sqrt(HALF_LOG2E * c / determinant)
-        whitening[i, 0], whitening[i, 1], whitening[i, 2] = p, -p * b / c, math.sqrt(HALF_LOG2E / c)
+        for i in range(part * n // PARTS, (part + 1) * n // PARTS):
+            depth = viewmat[2, 3]
+            for k in range(3):
+                depth += viewmat[2, k] * means[i, k]
+            if not (depth > near_plane and depth < far_plane):
+                continue
+            largest = max(max(abs(quats[i, 0]), abs(quats[i, 1])), max(abs(quats[i, 2]), abs(quats[i, 3])))
+            sums = 1.0 * quats[i, 0] + quats[i, 1] + quats[i, 2] + quats[i, 3]
+            if not (largest > 1e-12 and math.isfinite(largest) and math.isfinite(sums - sums)):
+                continue
+            _rotation(quats[i], unit, rotation)
+            _jacobian(means[i], viewmat, K, width, height, camera, jacobian)
+            _matmul(jacobian, turn, screen, 2, 3, 3)
+            _matmul(screen, rotation, factor, 2, 3, 3)
+            for k in range(3):
+                factor[0, k] *= scales[i, k]
+                factor[1, k] *= scales[i, k]
+            a, b, c, determinant, area = _ellipse(factor, eps2d, cross)
+            u, v = K[0, 0] * camera[0] / depth + K[0, 2], K[1, 1] * camera[1] / depth + K[1, 2]
+            biggest = 0.5 * (a + c) + math.sqrt(0.25 * (a - c) * (a - c) + b * b)
+            if not (determinant > 0 and determinant < LARGEST * LARGEST and biggest < LARGEST):
+                continue
+            reach = min(math.ceil(EXTENT * math.sqrt(biggest)), 2.0**30)
+            if not (u + reach > 0 and u - reach < width and v + reach > 0 and v - reach < height):
+                continue
+            means2d[i, 0], means2d[i, 1], depths[i], radii[i] = u, v, depth, int(reach)
+            covariances[i, 0], covariances[i, 1], covariances[i, 2] = a, b, c
+            conics[i, 0], conics[i, 1], conics[i, 2] = c / determinant, -b / determinant, a / determinant
+            compensations[i] = area / math.sqrt(determinant)
+            p = math.sqrt(HALF_LOG2E * c / determinant)
+            whitening[i, 0], whitening[i, 1], whitening[i, 2] = p, -p * b / c, math.sqrt(HALF_LOG2E / c)
     return means2d, covariances, whitening, conics, depths, radii, compensations
 
 
@@ -148,64 +152,70 @@ def project_adjoint(
     taken at the unit normal f × g / |f × g|, which stays bounded as the ellipse flattens.
     """
     n = len(means)
-    to_means, to_quats, to_scales = np.zeros((n, 3)), np.zeros((n, 4)), np.zeros((n, 3))
-    for i in prange(n):
-        if radii[i] == 0:
-            continue
+    to_means, to_scales = np.zeros((n, 3), np.float32), np.zeros((n, 3), np.float32)
+    to_quats = np.zeros((n, 4), np.float32)
+    turn = np.ascontiguousarray(viewmat[:3, :3])
+    for part in prange(PARTS):
         unit, camera, normal, across = np.empty(4), np.empty(3), np.empty(3), np.empty((2, 3))
         rotation, jacobian, screen = np.empty((3, 3)), np.empty((2, 3)), np.empty((2, 3))
         axes, factor = np.empty((2, 3)), np.empty((2, 3))
-        length = _rotation(quats[i], unit, rotation)
-        _jacobian(means[i], viewmat, K, width, height, camera, jacobian)
-        _matmul(jacobian, viewmat[:3, :3], screen)
-        _matmul(screen, rotation, axes)
-        # F = A S, A = P R, P = J V: down to A, to the scales, and on to R and P.
-        for k in range(3):
-            factor[0, k], factor[1, k] = axes[0, k] * scales[i, k], axes[1, k] * scales[i, k]
-        a, b, c, determinant, area = _ellipse(factor, eps2d, normal)
-        p, r = math.sqrt(HALF_LOG2E * c / determinant), math.sqrt(HALF_LOG2E / c)
-        q = -p * b / c
-        uu, uv, vv = 2 / HALF_LOG2E * moments[i, 0], 2 / HALF_LOG2E * moments[i, 1], 2 / HALF_LOG2E * moments[i, 2]
         by_axes, by_screen, by_rotation = np.empty((2, 3)), np.empty((2, 3)), np.empty((3, 3))
-        for k in range(3):
-            s = 1.0 * scales[i, k]
-            axis_u, axis_v = p * axes[0, k] + q * axes[1, k], r * axes[1, k]
-            top, low = s * (uu * axis_u + uv * axis_v), s * (uv * axis_u + vv * axis_v)
-            to_scales[i, k] = top * axis_u + low * axis_v
-            by_axes[0, k], by_axes[1, k] = s * p * top, s * (q * top + r * low)
-        if grad_compensations[i] != 0 and area > 0:
-            weight = grad_compensations[i] / (determinant * math.sqrt(determinant))
+        by_jacobian, by_scales, by_quat = np.empty((2, 3)), np.empty(3), np.empty(4)
+        for i in range(part * n // PARTS, (part + 1) * n // PARTS):
+            if radii[i] == 0:
+                continue
+            length = _rotation(quats[i], unit, rotation)
+            _jacobian(means[i], viewmat, K, width, height, camera, jacobian)
+            _matmul(jacobian, turn, screen, 2, 3, 3)
+            _matmul(screen, rotation, axes, 2, 3, 3)
+            # F = A S, A = P R, P = J V: down to A, to the scales, and on to R and P.
             for k in range(3):
-                normal[k] /= area
-            _cross(factor[1], normal, across[0])
-            _cross(normal, factor[0], across[1])
-            spread = eps2d * (a + c - eps2d)  # det − |f × g|²; a and c have ε inside
+                factor[0, k], factor[1, k] = axes[0, k] * scales[i, k], axes[1, k] * scales[i, k]
+            a, b, c, determinant, area = _ellipse(factor, eps2d, normal)
+            p, r = math.sqrt(HALF_LOG2E * c / determinant), math.sqrt(HALF_LOG2E / c)
+            q = -p * b / c
+            uu, uv, vv = 2 / HALF_LOG2E * moments[i, 0], 2 / HALF_LOG2E * moments[i, 1], 2 / HALF_LOG2E * moments[i, 2]
             for k in range(3):
-                top = weight * (spread * across[0, k] - eps2d * area * factor[0, k])
-                low = weight * (spread * across[1, k] - eps2d * area * factor[1, k])
-                to_scales[i, k] += top * axes[0, k] + low * axes[1, k]
-                by_axes[0, k] += top * scales[i, k]
-                by_axes[1, k] += low * scales[i, k]
-        _matmul(by_axes, rotation.T, by_screen)
-        _matmul(screen.T, by_axes, by_rotation)
-        by_jacobian = np.empty((2, 3))
-        _matmul(by_screen, viewmat[:3, :3].T, by_jacobian)
-        x, y, z, fx, fy = camera[0], camera[1], camera[2], K[0, 0], K[1, 1]
-        slope_x, slope_y = _clamped(x / z, K[0, 2], fx, width), _clamped(y / z, K[1, 2], fy, height)
-        by_x, by_y = fx / z * grad_means2d[i, 0], fy / z * grad_means2d[i, 1]
-        by_z = -(by_x * x + by_y * y) / z
-        by_z += (-fx * by_jacobian[0, 0] - fy * by_jacobian[1, 1]) / (z * z)
-        by_z += (fx * slope_x * by_jacobian[0, 2] + fy * slope_y * by_jacobian[1, 2]) / (z * z)
-        if slope_x == x / z:
-            by_x -= fx / (z * z) * by_jacobian[0, 2]
-            by_z += fx * slope_x / (z * z) * by_jacobian[0, 2]
-        if slope_y == y / z:
-            by_y -= fy / (z * z) * by_jacobian[1, 2]
-            by_z += fy * slope_y / (z * z) * by_jacobian[1, 2]
-        for k in range(3):
-            to_means[i, k] = viewmat[0, k] * by_x + viewmat[1, k] * by_y + viewmat[2, k] * by_z
-        _rotation_adjoint(unit, length, by_rotation, to_quats[i])
-    return to_means.astype(np.float32), to_quats.astype(np.float32), to_scales.astype(np.float32)
+                s = 1.0 * scales[i, k]
+                axis_u, axis_v = p * axes[0, k] + q * axes[1, k], r * axes[1, k]
+                top, low = s * (uu * axis_u + uv * axis_v), s * (uv * axis_u + vv * axis_v)
+                by_scales[k] = top * axis_u + low * axis_v
+                by_axes[0, k], by_axes[1, k] = s * p * top, s * (q * top + r * low)
+            if grad_compensations[i] != 0 and area > 0:
+                weight = grad_compensations[i] / (determinant * math.sqrt(determinant))
+                for k in range(3):
+                    normal[k] /= area
+                _cross(factor[1], normal, across[0])
+                _cross(normal, factor[0], across[1])
+                spread = eps2d * (a + c - eps2d)  # det − |f × g|²; a and c have ε inside
+                for k in range(3):
+                    top = weight * (spread * across[0, k] - eps2d * area * factor[0, k])
+                    low = weight * (spread * across[1, k] - eps2d * area * factor[1, k])
+                    by_scales[k] += top * axes[0, k] + low * axes[1, k]
+                    by_axes[0, k] += top * scales[i, k]
+                    by_axes[1, k] += low * scales[i, k]
+            _matmul(by_axes, rotation.T, by_screen, 2, 3, 3)
+            _matmul(screen.T, by_axes, by_rotation, 3, 2, 3)
+            _matmul(by_screen, turn.T, by_jacobian, 2, 3, 3)
+            x, y, z, fx, fy = camera[0], camera[1], camera[2], K[0, 0], K[1, 1]
+            slope_x, slope_y = _clamped(x / z, K[0, 2], fx, width), _clamped(y / z, K[1, 2], fy, height)
+            by_x, by_y = fx / z * grad_means2d[i, 0], fy / z * grad_means2d[i, 1]
+            by_z = -(by_x * x + by_y * y) / z
+            by_z += (-fx * by_jacobian[0, 0] - fy * by_jacobian[1, 1]) / (z * z)
+            by_z += (fx * slope_x * by_jacobian[0, 2] + fy * slope_y * by_jacobian[1, 2]) / (z * z)
+            if slope_x == x / z:
+                by_x -= fx / (z * z) * by_jacobian[0, 2]
+                by_z += fx * slope_x / (z * z) * by_jacobian[0, 2]
+            if slope_y == y / z:
+                by_y -= fy / (z * z) * by_jacobian[1, 2]
+                by_z += fy * slope_y / (z * z) * by_jacobian[1, 2]
+            for k in range(3):
+                to_means[i, k] = viewmat[0, k] * by_x + viewmat[1, k] * by_y + viewmat[2, k] * by_z
+                to_scales[i, k] = by_scales[k]
+            _rotation_adjoint(unit, length, by_rotation, by_quat)
+            for k in range(4):
+                to_quats[i, k] = by_quat[k]
+    return to_means, to_quats, to_scales
 
 
 @inline
