@@ -34,13 +34,14 @@ def _matmul(a, b, out, rows, inner, columns):
 def _rotation(quat, unit, out):
     """Fill the unit quaternion [4] and its matrix [3, 3]; returns the length of `quat`."""
     largest = max(max(abs(quat[0]), abs(quat[1])), max(abs(quat[2]), abs(quat[3])))
-    total = 0.0
+    total, shrink = 0.0, 1.0 / largest
     for k in range(4):
-        unit[k] = quat[k] / largest
+        unit[k] = quat[k] * shrink
         total += unit[k] * unit[k]
     root = math.sqrt(total)
+    shrink = 1.0 / root
     for k in range(4):
-        unit[k] /= root
+        unit[k] *= shrink
     w, x, y, z = unit[0], unit[1], unit[2], unit[3]
     out[0, 0], out[0, 1], out[0, 2] = 1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)
     out[1, 0], out[1, 1], out[1, 2] = 2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)
@@ -62,11 +63,11 @@ def _jacobian(point, viewmat, K, width, height, out, jacobian):
         out[i] = viewmat[i, 3]
         for k in range(3):
             out[i] += viewmat[i, k] * point[k]
-    z = out[2]
-    jacobian[0, 0], jacobian[0, 1] = K[0, 0] / z, 0.0
-    jacobian[1, 0], jacobian[1, 1] = 0.0, K[1, 1] / z
-    jacobian[0, 2] = -K[0, 0] / z * _clamped(out[0] / z, K[0, 2], K[0, 0], width)
-    jacobian[1, 2] = -K[1, 1] / z * _clamped(out[1] / z, K[1, 2], K[1, 1], height)
+    near = 1.0 / out[2]
+    jacobian[0, 0], jacobian[0, 1] = K[0, 0] * near, 0.0
+    jacobian[1, 0], jacobian[1, 1] = 0.0, K[1, 1] * near
+    jacobian[0, 2] = -K[0, 0] * near * _clamped(out[0] * near, K[0, 2], K[0, 0], width)
+    jacobian[1, 2] = -K[1, 1] * near * _clamped(out[1] * near, K[1, 2], K[1, 1], height)
 
 
 @inline
@@ -123,7 +124,7 @@ def project(means, quats, scales, viewmat, K, width, height, near_plane, far_pla
                 factor[0, k] *= scales[i, k]
                 factor[1, k] *= scales[i, k]
             a, b, c, determinant, area = _ellipse(factor, eps2d, cross)
-            u, v = K[0, 0] * camera[0] / depth + K[0, 2], K[1, 1] * camera[1] / depth + K[1, 2]
+            u, v = jacobian[0, 0] * camera[0] + K[0, 2], jacobian[1, 1] * camera[1] + K[1, 2]
             biggest = 0.5 * (a + c) + math.sqrt(0.25 * (a - c) * (a - c) + b * b)
             if not (determinant > 0 and determinant < LARGEST * LARGEST and biggest < LARGEST):
                 continue
@@ -132,10 +133,11 @@ def project(means, quats, scales, viewmat, K, width, height, near_plane, far_pla
                 continue
             means2d[i, 0], means2d[i, 1], depths[i], radii[i] = u, v, depth, int(reach)
             covariances[i, 0], covariances[i, 1], covariances[i, 2] = a, b, c
-            conics[i, 0], conics[i, 1], conics[i, 2] = c / determinant, -b / determinant, a / determinant
-            compensations[i] = area / math.sqrt(determinant)
-            p = math.sqrt(HALF_LOG2E * c / determinant)
-            whitening[i, 0], whitening[i, 1], whitening[i, 2] = p, -p * b / c, math.sqrt(HALF_LOG2E / c)
+            over = 1.0 / determinant
+            conics[i, 0], conics[i, 1], conics[i, 2] = c * over, -b * over, a * over
+            compensations[i] = area * math.sqrt(over)
+            p, under = math.sqrt(HALF_LOG2E * c * over), 1.0 / c
+            whitening[i, 0], whitening[i, 1], whitening[i, 2] = p, -p * b * under, math.sqrt(HALF_LOG2E * under)
     return means2d, covariances, whitening, conics, depths, radii, compensations
 
 
@@ -172,8 +174,9 @@ def project_adjoint(
             for k in range(3):
                 factor[0, k], factor[1, k] = axes[0, k] * scales[i, k], axes[1, k] * scales[i, k]
             a, b, c, determinant, area = _ellipse(factor, eps2d, normal)
-            p, r = math.sqrt(HALF_LOG2E * c / determinant), math.sqrt(HALF_LOG2E / c)
-            q = -p * b / c
+            under = 1.0 / c
+            p, r = math.sqrt(HALF_LOG2E * c / determinant), math.sqrt(HALF_LOG2E * under)
+            q = -p * b * under
             uu, uv, vv = 2 / HALF_LOG2E * moments[i, 0], 2 / HALF_LOG2E * moments[i, 1], 2 / HALF_LOG2E * moments[i, 2]
             for k in range(3):
                 s = 1.0 * scales[i, k]
@@ -197,18 +200,19 @@ def project_adjoint(
             _matmul(by_axes, rotation.T, by_screen, 2, 3, 3)
             _matmul(screen.T, by_axes, by_rotation, 3, 2, 3)
             _matmul(by_screen, turn.T, by_jacobian, 2, 3, 3)
-            x, y, z, fx, fy = camera[0], camera[1], camera[2], K[0, 0], K[1, 1]
-            slope_x, slope_y = _clamped(x / z, K[0, 2], fx, width), _clamped(y / z, K[1, 2], fy, height)
-            by_x, by_y = fx / z * grad_means2d[i, 0], fy / z * grad_means2d[i, 1]
-            by_z = -(by_x * x + by_y * y) / z
-            by_z += (-fx * by_jacobian[0, 0] - fy * by_jacobian[1, 1]) / (z * z)
-            by_z += (fx * slope_x * by_jacobian[0, 2] + fy * slope_y * by_jacobian[1, 2]) / (z * z)
-            if slope_x == x / z:
-                by_x -= fx / (z * z) * by_jacobian[0, 2]
-                by_z += fx * slope_x / (z * z) * by_jacobian[0, 2]
-            if slope_y == y / z:
-                by_y -= fy / (z * z) * by_jacobian[1, 2]
-                by_z += fy * slope_y / (z * z) * by_jacobian[1, 2]
+            x, y, near, fx, fy = camera[0], camera[1], 1.0 / camera[2], K[0, 0], K[1, 1]
+            slope_x, slope_y = _clamped(x * near, K[0, 2], fx, width), _clamped(y * near, K[1, 2], fy, height)
+            by_x, by_y = fx * near * grad_means2d[i, 0], fy * near * grad_means2d[i, 1]
+            by_z = -(by_x * x + by_y * y) * near
+            steep_x, steep_y = fx * near * near, fy * near * near
+            by_z += steep_x * (slope_x * by_jacobian[0, 2] - by_jacobian[0, 0])
+            by_z += steep_y * (slope_y * by_jacobian[1, 2] - by_jacobian[1, 1])
+            if slope_x == x * near:
+                by_x -= steep_x * by_jacobian[0, 2]
+                by_z += steep_x * slope_x * by_jacobian[0, 2]
+            if slope_y == y * near:
+                by_y -= steep_y * by_jacobian[1, 2]
+                by_z += steep_y * slope_y * by_jacobian[1, 2]
             for k in range(3):
                 to_means[i, k] = viewmat[0, k] * by_x + viewmat[1, k] * by_y + viewmat[2, k] * by_z
                 to_scales[i, k] = by_scales[k]
@@ -228,5 +232,6 @@ def _rotation_adjoint(unit, length, by, out):
     out[2] = 2 * (w * skew_y + x * (by[0, 1] + by[1, 0]) + z * (by[1, 2] + by[2, 1]) - 2 * y * (by[0, 0] + by[2, 2]))
     out[3] = 2 * (w * skew_z + x * (by[0, 2] + by[2, 0]) + y * (by[1, 2] + by[2, 1]) - 2 * z * (by[0, 0] + by[1, 1]))
     along = out[0] * w + out[1] * x + out[2] * y + out[3] * z
+    shrink = 1.0 / length
     for k in range(4):
-        out[k] = (out[k] - along * unit[k]) / length
+        out[k] = (out[k] - along * unit[k]) * shrink
