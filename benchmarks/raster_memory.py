@@ -45,8 +45,8 @@ def count_pairs(arguments: list[torch.Tensor], width: int, height: int) -> int:
     view = project(means, quats, scales, viewmats[0], Ks[0], width, height, 0.01, 1e10, 0.3)
     shown = view.visible & (opacities >= reference.ALPHA_MIN)
     table = torch.cat([view.means2d, view.whitening, opacities[:, None]], 1)[shown]
-    columns, rows = -(-width // reference.TILE), -(-height // reference.TILE)
-    return len(reference._pairs(table, view.covariances[shown], columns, rows, width, height)[0])
+    columns, rows = -(-width // 16), -(-height // 16)
+    return len(reference._pairs(table, view.covariances[shown], columns, rows, width, height, 16)[0])
 
 
 def resident(which: str) -> int:

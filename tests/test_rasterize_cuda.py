@@ -153,7 +153,8 @@ def test_nothing_in_view_is_the_background(n):
     arguments = [a[:n] for a in scene(channels=3)]
     arguments[0][:, 2] = -1
     backgrounds = torch.tensor([[0.1, 0.2, 0.3]], device="cuda")
-    weights, options = torch.ones(1, 37, 53, 3), {"device": "cuda", "max_alpha": CEILING, "backgrounds": backgrounds}
+    weights = torch.ones(1, 37, 53, 3)
+    options = {"device": "cuda", "max_alpha": CEILING, "backgrounds": backgrounds, "absgrad": True}
     image, alpha, grads, meta = gradients(arguments, torch.float32, "cuda", weights, **options)
     assert (image == backgrounds).all() and (alpha == 0).all()
     assert all((g == 0).all() for g in [*grads, meta["means2d"].absgrad])

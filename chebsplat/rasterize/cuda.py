@@ -59,9 +59,7 @@ def rasterize(
     _report_ceiling(max_alpha)
     if len(means) == 0:  # the background: gsplat is not asked to sort an empty scene
         empty = (means, quats, scales, opacities, colors, viewmats, Ks, width, height)
-        renders, alphas, meta = reference.rasterize(*empty, backgrounds=backgrounds)
-        meta["means2d"].absgrad = torch.zeros_like(meta["means2d"])
-        return renders, alphas, meta
+        return reference.rasterize(*empty, backgrounds=backgrounds, absgrad=absgrad)
     gaussians = _without_broken(means, quats, scales, opacities, colors)
     renders, alphas, found = rasterization(
         *gaussians, viewmats, Ks, width, height,

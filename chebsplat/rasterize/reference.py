@@ -13,12 +13,13 @@ from typing import Any
 
 import torch
 from torch import Tensor
+from torch.nn.functional import hardshrink
 
 from chebsplat.rasterize.projection import Projected, compensated, is_antialiased, project
 
 ALPHA_MIN = 1 / 255  # fainter contributions are skipped
 T_MIN = 1e-4  # compositing stops before transmittance falls to this
-TILE = 16
+TILE = 8  # pixels; larger ones waste more products than they save look-ups
 BATCH = 1 << 19  # pixels times Gaussians at a time, for the cache's sake
 UNSEEN = -1e4  # ln α of a filler
 
@@ -40,6 +41,7 @@ def rasterize(
     max_alpha: float = 0.99,
     rasterize_mode: str = "classic",
     backgrounds: Tensor | None = None,
+    absgrad: bool = False,
 ) -> tuple[Tensor, Tensor, dict[str, Any]]:
     """Render Gaussians front to back into C views, D channels at once; differentiable by autograd.
 
@@ -55,6 +57,8 @@ def rasterize(
       max_alpha:   ceiling of one Gaussian's alpha; its gradient above is zero.
       rasterize_mode: `antialiased` multiplies opacities by √(det Σ / det(Σ + eps2d I)), Σ the projected covariance, so
         that a Gaussian smaller than a pixel fades as it shrinks; `classic` does not.
+      absgrad:     whether meta's `means2d` carries `absgrad` [C, N, 2], after backward the sum over pixels of the
+        absolute gradient.
     Returns: renders [C, H, W, D], alphas [C, H, W, 1], and meta: `means2d` [C, N, 2] (retains its gradient),
       `conics` [C, N, 3], `depths` [C, N], `radii` [C, N].
     Raises: ValueError on an unknown mode or, in backward, on a gradient of the image that is not finite.
@@ -66,11 +70,15 @@ def rasterize(
     means2d = torch.stack([view.means2d for view in views])
     if means2d.requires_grad:
         means2d.retain_grad()
+    absolute = torch.zeros_like(means2d) if absgrad else None
+    if absgrad:
+        means2d.absgrad = absolute  # type: ignore[attr-defined]
     renders, alphas = [], []
     for c, view in enumerate(views):
         strengths = compensated(opacities, view.compensations) if antialiased else opacities
         channels = colors if colors.ndim == 2 else colors[c]
-        render, alpha = _composite(means2d[c], view, strengths, channels, width, height, max_alpha)
+        sums = None if absolute is None else absolute[c]
+        render, alpha = _composite(means2d[c], view, strengths, channels, width, height, max_alpha, sums)
         if backgrounds is not None:
             render = render + (1 - alpha) * backgrounds[c]
         if render.requires_grad:
@@ -92,18 +100,20 @@ def _refuse_broken(view: int, gradient: Tensor | None) -> None:
 
 
 def _composite(
-    means2d: Tensor, view: Projected, opacities: Tensor, channels: Tensor, width: int, height: int, max_alpha: float
-) -> tuple[Tensor, Tensor]:
-    """Render [H, W, D] and alpha [H, W, 1] of one view."""
+    means2d: Tensor, view: Projected, opacities: Tensor, channels: Tensor, width: int, height: int, max_alpha: float,
+    absolute: Tensor | None,
+) -> tuple[Tensor, Tensor]:  # fmt: skip
+    """Render [H, W, D] and alpha [H, W, 1] of one view; backward also adds to `absolute` [N, 2] if given, in place."""
     shown = view.visible & (opacities >= ALPHA_MIN) & torch.isfinite(opacities) & torch.isfinite(channels).all(-1)
     index = shown.nonzero()[:, 0]
     index = index[torch.argsort(view.depths[index], stable=True)]
     columns, rows = math.ceil(width / TILE), math.ceil(height / TILE)
     table = torch.cat([means2d, view.whitening, opacities[:, None], channels], 1)[index]
-    owner, tile = _pairs(table[:, :6].detach(), view.covariances[index].detach(), columns, rows, width, height)
+    owner, tile = _pairs(table[:, :6].detach(), view.covariances[index].detach(), columns, rows, width, height, TILE)
     pairs = table.index_select(0, owner)
     middles = torch.stack([tile % columns, tile // columns], -1) * TILE + TILE / 2
-    quadratics = _quadratics(pairs[:, :2] - middles, pairs[:, 2:5], pairs[:, 5].log())
+    offsets, whitening = pairs[:, :2] - middles, pairs[:, 2:5]
+    quadratics = _quadratics(offsets, whitening, pairs[:, 5].log())
     filler = quadratics.new_tensor([[UNSEEN, 0, 0, 0, 0, 0]])
     quadratics, colors = torch.cat([quadratics, filler]), torch.cat([pairs[:, 6:], torch.zeros_like(channels[:1])])
     counts = torch.bincount(tile, minlength=columns * rows)
@@ -117,15 +127,32 @@ def _composite(
         most = int(counts[tiles[-1]])
         slots = torch.arange(most, device=tiles.device)
         members = torch.where(slots < counts[tiles, None], starts[tiles, None] + slots, len(tile))  # [T, most]
-        weights = _weights(basis @ quadratics[members].mT, max_alpha)
+        log_alphas = basis @ quadratics[members].mT
+        if absolute is not None and log_alphas.requires_grad:
+            real = members < len(tile)
+            at_pair = members.clamp_max(max(len(tile) - 1, 0))
+            shapes = torch.cat([offsets, whitening], 1).detach()[at_pair]
+            who = torch.where(real, index[owner][at_pair], -1)
+            log_alphas.register_hook(partial(_add_absolute, absolute, shapes, who, x, y))
+        weights = _weights(log_alphas, max_alpha)
         images.append(torch.cat([weights @ colors[members], weights.sum(-1, keepdim=True)], -1))
     image = torch.cat(images)[torch.argsort(by_count)].reshape(rows, columns, TILE, TILE, -1)
     image = image.transpose(1, 2).reshape(rows * TILE, columns * TILE, -1)[:height, :width]
     return image[..., :-1], image[..., -1:]
 
 
+def _add_absolute(absolute: Tensor, shapes: Tensor, who: Tensor, x: Tensor, y: Tensor, gradient: Tensor) -> None:
+    """Add Σ |∂L/∂mean| over pixels; gradient [T, TILE², M] to ln α, shapes [T, M, 5] of Gaussians who [T, M] or −1."""
+    mean_x, mean_y, p, q, r = (t[:, None] for t in shapes.unbind(-1))
+    dx, dy = x[:, None] - mean_x, y[:, None] - mean_y
+    u = p * dx + q * dy
+    along_x, along_y = 2 * p * u, 2 * (q * u + r * r * dy)
+    sums = torch.stack([(gradient * t).abs().sum(1) for t in (along_x, along_y)], -1)
+    absolute.index_add_(0, who[who >= 0], sums[who >= 0])
+
+
 def _pairs(
-    table: Tensor, covariances: Tensor, columns: int, rows: int, width: int, height: int
+    table: Tensor, covariances: Tensor, columns: int, rows: int, width: int, height: int, side: int
 ) -> tuple[Tensor, Tensor]:
     """Which of M Gaussians may reach 1/255 in which tile: indices [P] of both, tile by tile and in order within.
 
@@ -134,17 +161,17 @@ def _pairs(
     u, v, p, q, r, opacities = table.unbind(-1)
     limit = (255 * opacities).log().clamp_min(0) + 1e-3  # a little more than enough
     reach_x, reach_y = (2 * limit * covariances[:, 0]).sqrt(), (2 * limit * covariances[:, 2]).sqrt()
-    first_x, last_x = (((u + sign * reach_x).clamp(0, width - 1) // TILE).long() for sign in (-1, 1))
-    first_y, last_y = (((v + sign * reach_y).clamp(0, height - 1) // TILE).long() for sign in (-1, 1))
+    first_x, last_x = (((u + sign * reach_x).clamp(0, width - 1) // side).long() for sign in (-1, 1))
+    first_y, last_y = (((v + sign * reach_y).clamp(0, height - 1) // side).long() for sign in (-1, 1))
     across = last_x - first_x + 1
     counts = across * (last_y - first_y + 1)
     owner = torch.repeat_interleave(torch.arange(len(counts), device=u.device), counts)
     nth = torch.arange(len(owner), device=u.device) - (counts.cumsum(0) - counts)[owner]
     x, y = first_x[owner] + nth % across[owner], first_y[owner] + nth // across[owner]
     # the ellipse against the parallelogram that a tile is in whitened coordinates
-    dx, dy, p, q, r = x * TILE + TILE / 2 - u[owner], y * TILE + TILE / 2 - v[owner], p[owner], q[owner], r[owner]
-    far_u = ((p * dx + q * dy).abs() - TILE / 2 * (p + q.abs())).clamp_min(0)
-    far_v = ((r * dy).abs() - TILE / 2 * r).clamp_min(0)
+    dx, dy, p, q, r = x * side + side / 2 - u[owner], y * side + side / 2 - v[owner], p[owner], q[owner], r[owner]
+    far_u = ((p * dx + q * dy).abs() - side / 2 * (p + q.abs())).clamp_min(0)
+    far_v = ((r * dy).abs() - side / 2 * r).clamp_min(0)
     near = far_u * far_u + far_v * far_v <= limit[owner]
     owner, tile = owner[near], (y * columns + x)[near]
     tile, order = torch.sort(tile, stable=True)
@@ -179,12 +206,11 @@ class _Weights(torch.autograd.Function):
 
     @staticmethod
     def forward(ctx: Any, log_alphas: Tensor, max_alpha: float) -> Tensor:  # type: ignore[override]
-        alphas = log_alphas.exp().clamp_max_(max_alpha)
-        alphas.masked_fill_(alphas < ALPHA_MIN, 0)
+        alphas = hardshrink(log_alphas.exp().clamp_max_(max_alpha), math.nextafter(ALPHA_MIN, 0))
         after = torch.cumprod(1 - alphas, -1)
         weights = alphas.clone()
         weights[..., 1:] *= after[..., :-1]
-        weights.masked_fill_(after <= T_MIN, 0)
+        weights *= hardshrink(after, T_MIN).sign_()  # a mask of numbers: torch vectorises no mask of truths
         ctx.save_for_backward(alphas, weights)
         ctx.max_alpha = max_alpha
         return weights
@@ -196,7 +222,7 @@ class _Weights(torch.autograd.Function):
         gain = grad * weights
         behind = gain.flip(-1).cumsum_(-1).flip(-1).sub_(gain)
         found = gain.addcmul_(behind, alphas / (1 - alphas), value=-1)
-        return found.masked_fill_(alphas >= ctx.max_alpha, 0), None
+        return found.mul_((ctx.max_alpha - alphas).sign_()), None
 
 
 def _weights(log_alphas: Tensor, max_alpha: float) -> Tensor:
