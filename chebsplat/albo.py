@@ -39,8 +39,8 @@ def canonicalize(means: Tensor, scales: Tensor, rotmats: Tensor, mask: Tensor) -
     extent = torch.where(extent > 0, extent, 1.0)
     means = torch.where(keep, means / extent, 0.0)
     means = torch.where(keep, means - means.sum(1, keepdim=True) / count, 0.0)
-    radius = ((means * means).sum((1, 2), keepdim=True) / count).sqrt()
-    radius = torch.where(radius > 0, radius, 1.0)
+    square = (means * means).sum((1, 2), keepdim=True) / count
+    radius = torch.where(square > 0, square, 1.0).sqrt()  # the root of 0 has no gradient
     scales = torch.where(keep, scales.double() / extent / radius, 0.0)
     rotmats = torch.where(keep[..., None], rotmats.double(), torch.eye(3, dtype=torch.float64))
     return Region(means / radius, scales, rotmats, mask)
@@ -62,10 +62,12 @@ def metric_factors(region: Region, anisotropy: float) -> Tensor:
     return root[..., None] * region.rotmats.transpose(-1, -2)
 
 
+@torch.no_grad()
 def tangent_axis(region: Region) -> tuple[Tensor, Tensor]:
     """The axis of least variance of the region's Gaussian mixture, and how well it is defined.
 
     Returns: axis [M, 3], of arbitrary sign; certainty [M], a smoothstep of the gap of the two smallest variances.
+      Neither has a gradient: that of an eigenvector does not exist where eigenvalues meet.
     """
     widest = region.scales.amax((1, 2), keepdim=True).clamp_min(1.0)
     spread = region.rotmats * (region.scales / widest)[..., None, :]
@@ -109,7 +111,10 @@ def similarity(region: Region, factors: Tensor, rotmats: Tensor, bandwidth: floa
     log_weights = -0.5 * (lengths + lengths.transpose(1, 2)) / bandwidth**2
     n = region.mask.shape[1]
     pair = region.mask[:, :, None] & region.mask[:, None] & ~torch.eye(n, dtype=torch.bool)
-    log_degrees = torch.where(pair, log_weights, -torch.inf).logsumexp(-1)
-    log_degrees = torch.where(torch.isfinite(log_degrees), log_degrees, 0.0)
+    log_weights = torch.where(pair, log_weights, 0.0)
+    top = torch.where(pair, log_weights, -torch.inf).amax(-1).detach()
+    top = torch.where(torch.isfinite(top), top, 0.0)
+    degrees = torch.where(pair, (log_weights - top[..., None]).clamp_max(0).exp(), 0.0).sum(-1)
+    log_degrees = top + torch.where(degrees > 0, degrees, 1.0).log()
     exponent = log_weights - 0.5 * (log_degrees[:, :, None] + log_degrees[:, None])
-    return torch.where(pair, torch.where(pair, exponent, 0.0).exp(), 0.0)
+    return torch.where(pair, exponent.clamp_max(0).exp(), 0.0)

@@ -1,12 +1,36 @@
-"""Chebyshev descriptors of regions of Gaussians over the whole spectrum, without eigenvectors (Eqs 4-6)."""
+"""Chebyshev descriptors of regions of Gaussians (Eqs 4-6): the torch route, differentiable and of any precision, and
+the compiled one that stages and training use.
+"""
 
 from __future__ import annotations
 
+from typing import Any, Literal, NamedTuple
+
+import numpy as np
 import torch
 from torch import Tensor
 
 from chebsplat.albo import canonicalize, metric_factors, rotations_about, similarity, tangent_axis
 from chebsplat.rasterize.projection import rotation_matrices
+from chebsplat.spectra import cut_spectrum
+
+Spectrum = Literal["full", "taper", "hard"]
+
+
+class Described(NamedTuple):
+    """values f32 [M, n, J, P]; of the n_cuts cuts of the spectrum (region and angle), n_clustered fell into a cluster
+    of eigenvalues; n_exact regions took the float64 operator. All counts are 0 where they do not apply.
+    """
+
+    values: Tensor
+    n_cuts: int = 0
+    n_clustered: int = 0
+    n_exact: int = 0
+
+
+def n_degrees(spectrum: Spectrum, max_degree: int) -> int:
+    """P, values of one angle: degrees 2...D of the full spectrum, whose first two vanish, and 0...D of a cut one."""
+    return max_degree - 1 if spectrum == "full" else max_degree + 1
 
 
 def chebyshev_diagonals(S: Tensor, max_degree: int) -> Tensor:
@@ -32,7 +56,7 @@ def chebyshev_diagonals(S: Tensor, max_degree: int) -> Tensor:
     return torch.stack(columns, -1)
 
 
-def describe_regions(
+def describe_reference(
     means: Tensor,
     scales: Tensor,
     rotmats: Tensor,
@@ -42,29 +66,35 @@ def describe_regions(
     max_degree: int = 8,
     anisotropy: float = 30.0,
     bandwidth: float = 0.7,
-    dtype: torch.dtype = torch.float32,
-) -> Tensor:
-    """Descriptor of every Gaussian of every region.
+    spectrum: Spectrum = "full",
+    n_eigs: int = 16,
+    dtype: torch.dtype = torch.float64,
+) -> Described:
+    """Descriptor of every Gaussian of every region, in torch: the oracle, and differentiable with the full spectrum.
 
-    Args: as `albo.canonicalize`; `dtype` is that of the operator and recurrence, canonicalisation is float64.
-    Returns: [M, n, J, D - 1], zero where padded; g^d(i) = n ([T_d(−S)]_ii − T_d(0)), the printed formula with K = n
-      and λ_max = 2; degrees 0 and 1 are identically zero and left out.
+    Args: as `albo.canonicalize`; `dtype` is that of the recurrence, all before it is float64; `n_eigs` is K of a cut
+      spectrum (see `spectra`).
+    Returns: values [M, n, J, P], zero where padded and in regions of fewer than two Gaussians, which have no edge;
+      g^d(i) = n ([T_d(−S)]_ii − T_d(0)), the printed formula with K = n and λ_max = 2; degrees 0 and 1 are
+      identically zero and left out.
     Raises: ValueError on sizes or parameters that make no sense.
     Choices: angles j and J − j are replaced by half their sum and half their absolute difference, so that the sign of
-    the axis does not matter; angles j > 0 fade to angle 0 where the axis is ill-defined.
+    the axis does not matter; angles j > 0 fade to angle 0 where the axis is ill-defined; the axis has no gradient.
     """
-    if n_angles < 1 or max_degree < 2 or bandwidth <= 0 or anisotropy < 0:
-        raise ValueError("n_angles >= 1, max_degree >= 2, bandwidth > 0 and anisotropy >= 0 are needed")
-    if means.shape != scales.shape or rotmats.shape != (*means.shape, 3) or mask.shape != means.shape[:2]:
-        raise ValueError(f"shapes disagree: {means.shape}, {scales.shape}, {rotmats.shape}, {mask.shape}")
+    _check(means, scales, rotmats, mask, n_angles, max_degree, anisotropy, bandwidth, n_eigs)
     region = canonicalize(means, scales, rotmats, mask)
     factors = metric_factors(region, anisotropy)
     axis, certainty = tangent_axis(region)
     count = region.mask.sum(1)[:, None, None]
-    angles = []
+    angles, n_cuts, n_clustered = [], 0, 0
     for rotation in rotations_about(axis, n_angles):
-        S = similarity(region, factors, rotation, bandwidth).to(dtype)
-        angles.append(chebyshev_diagonals(S, max_degree) * count)
+        S = similarity(region, factors, rotation, bandwidth)
+        if spectrum == "full":
+            angles.append(chebyshev_diagonals(S.to(dtype), max_degree) * count)
+        else:
+            cut = cut_spectrum(S, region.mask, n_eigs, max_degree, hard=spectrum == "hard")
+            angles.append(cut.values.to(dtype))
+            n_cuts, n_clustered = n_cuts + cut.n_cuts, n_clustered + cut.n_clustered
     certainty = certainty.to(dtype)[:, None, None]
     paired = [angles[0]]
     for j in range(1, n_angles):
@@ -73,9 +103,56 @@ def describe_regions(
             paired.append(angles[0] + certainty * (0.5 * (low + high) - angles[0]))
         else:
             paired.append(certainty * 0.5 * (low - high).abs())
-    return torch.where(region.mask[..., None, None], torch.stack(paired, 2), 0.0)
+    keep = region.mask[..., None, None] & (count[..., None] > 1)
+    return Described(torch.where(keep, torch.stack(paired, 2), 0.0), n_cuts, n_clustered)
 
 
+def describe_compiled(
+    means: Tensor,
+    scales: Tensor,
+    rotmats: Tensor,
+    mask: Tensor,
+    *,
+    n_angles: int = 4,
+    max_degree: int = 8,
+    anisotropy: float = 30.0,
+    bandwidth: float = 0.7,
+) -> Described:
+    """`describe_reference` of the full spectrum, compiled: float64 up to the operator, then float32.
+
+    The same bits for any number of threads. Padding costs nothing.
+    """
+    from chebsplat.descriptor_kernel import describe
+
+    _check(means, scales, rotmats, mask, n_angles, max_degree, anisotropy, bandwidth)
+    out = np.zeros((*mask.shape, n_angles, max_degree - 1), np.float32)
+    exact = np.zeros(len(mask), np.bool_)
+    parts = [v.detach().double().contiguous().numpy() for v in (means, scales, rotmats)]
+    describe(*parts, mask.contiguous().numpy(), float(anisotropy), float(bandwidth), out, exact)
+    return Described(torch.from_numpy(out), n_exact=int(exact.sum()))
+
+
+def describe_regions(
+    means: Tensor,
+    scales: Tensor,
+    rotmats: Tensor,
+    mask: Tensor,
+    *,
+    spectrum: Spectrum = "full",
+    n_eigs: int = 16,
+    dtype: torch.dtype = torch.float32,
+    **parameters: Any,
+) -> Tensor:
+    """Descriptors [M, n, J, P] by the fastest route: compiled for the full spectrum in float32 without a gradient,
+    else `describe_reference`, which documents the arguments.
+    """
+    given = (means, scales, rotmats, mask)
+    if spectrum == "full" and dtype == torch.float32 and not any(v.requires_grad for v in given):
+        return describe_compiled(*given, **parameters).values
+    return describe_reference(*given, spectrum=spectrum, n_eigs=n_eigs, dtype=dtype, **parameters).values
+
+
+@torch.no_grad()
 def describe_members(
     means: Tensor,
     quats: Tensor,
@@ -86,25 +163,40 @@ def describe_members(
     max_degree: int,
     anisotropy: float,
     bandwidth: float,
-    chunk: int = 512,
-) -> Tensor:
-    """`describe_regions` of Gaussians [N] gathered by `members` i64 [M, n], -1 where padded; `chunk` bounds memory.
-
-    Returns: [M, n, J, D - 1] float32.
-    """
-    parts = [torch.zeros(0, members.shape[1], n_angles, max_degree - 1)]
-    for part in members.split(chunk):
+    spectrum: Spectrum = "full",
+    n_eigs: int = 16,
+    chunk: int = 2048,
+) -> Described:
+    """Descriptors of Gaussians [N] gathered by `members` i64 [M, n], -1 where padded; `chunk` bounds memory."""
+    sizes: dict[str, Any] = {"n_angles": n_angles, "max_degree": max_degree}
+    sizes |= {"anisotropy": anisotropy, "bandwidth": bandwidth}
+    values = [torch.zeros(0, members.shape[1], n_angles, n_degrees(spectrum, max_degree))]
+    counts = np.zeros(3, np.int64)
+    for part in members.split(chunk if spectrum == "full" else min(chunk, 256)):
         index = part.clamp_min(0)
-        parts.append(
-            describe_regions(
-                means[index],
-                scales[index],
-                rotation_matrices(quats[index].reshape(-1, 4)).reshape(*index.shape, 3, 3),
-                part >= 0,
-                n_angles=n_angles,
-                max_degree=max_degree,
-                anisotropy=anisotropy,
-                bandwidth=bandwidth,
-            )
-        )
-    return torch.cat(parts)
+        rotmats = rotation_matrices(quats[index].reshape(-1, 4)).reshape(*index.shape, 3, 3)
+        given = (means[index], scales[index], rotmats, part >= 0)
+        if spectrum == "full":
+            found = describe_compiled(*given, **sizes)
+        else:
+            found = describe_reference(*given, **sizes, spectrum=spectrum, n_eigs=n_eigs)
+        values.append(found.values.float())
+        counts += found[1:]
+    return Described(torch.cat(values), *(int(count) for count in counts))
+
+
+def _check(
+    means: Tensor,
+    scales: Tensor,
+    rotmats: Tensor,
+    mask: Tensor,
+    n_angles: int,
+    max_degree: int,
+    anisotropy: float,
+    bandwidth: float,
+    n_eigs: int = 1,
+) -> None:
+    if n_angles < 1 or max_degree < 2 or n_eigs < 1 or not bandwidth > 0 or not anisotropy >= 0:
+        raise ValueError("n_angles >= 1, max_degree >= 2, n_eigs >= 1, bandwidth > 0 and anisotropy >= 0 are needed")
+    if means.shape != scales.shape or rotmats.shape != (*means.shape, 3) or mask.shape != means.shape[:2]:
+        raise ValueError(f"shapes disagree: {means.shape}, {scales.shape}, {rotmats.shape}, {mask.shape}")

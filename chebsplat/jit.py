@@ -24,7 +24,7 @@ def _cache_folder() -> Path:
 # A folder that the user has chosen is left alone.
 FOLDER = Path(os.environ.get("NUMBA_CACHE_DIR") or _cache_folder())
 if not FOLDER.exists():
-    log.info("compiling kernels, about 35 s, once")
+    log.info("compiling kernels, about 60 s, once")
 settings: Any = numba.config
 settings.CACHE_DIR = str(FOLDER)
 # open3d brings a TBB that numba refuses with a warning: OpenMP comes first.

@@ -10,11 +10,12 @@ import torch
 from torch import Tensor, nn
 
 from chebsplat import adapt, sh_prune
-from chebsplat.descriptor import describe_members
+from chebsplat.descriptor import n_degrees
 from chebsplat.encoder import RegionEncoder
 from chebsplat.fusion import Gate, propagate, propagation_weights
 from chebsplat.rasterize import rasterize
 from chebsplat.rasterize.projection import rotation_matrices
+from chebsplat.refresh import Descriptors, Names
 from chebsplat.regions import Regions, build_regions, covering
 from chebsplat.sh_kernels import colors_in_view
 from chebsplat.views import View, in_frustum
@@ -57,7 +58,8 @@ class Shape(nn.Module):
     def __init__(self, n_channels: int, describe: dict[str, Any], train: dict[str, Any]):
         super().__init__()
         self.describe, self.train_settings = describe, train
-        self.n_described = describe["n_angles"] * (describe["max_degree"] - 1) if train["albo"] else 0
+        per_angle = n_degrees(describe["spectrum"], describe["max_degree"])
+        self.n_described = describe["n_angles"] * per_angle if train["albo"] else 0
         n_context = n_channels if train["context"] == "features" else 0
         n_layers = train["n_layers"] if train["encoder"] == "transformer" else 0
         self.encoder = RegionEncoder(
@@ -65,28 +67,48 @@ class Shape(nn.Module):
         )
         self.gate = Gate(n_channels)
         self.regions: Regions | None = None
+        names = ("n_angles", "max_degree", "anisotropy", "bandwidth", "spectrum", "n_eigs")
+        self.described = Descriptors({k: describe[k] for k in names}, train["refresh_tolerance"])
+        self.names = Names()
+
+    def keep(self, rows: Tensor) -> None:
+        """Gaussians were removed, all but `rows` [N] bool; those that are added go behind the others unannounced."""
+        kept = rows.numpy()
+        self.names.keep(kept)
+        if self.regions is not None:
+            centers = self.regions.centers
+            self.described.keep(rows[torch.as_tensor(centers)])
+            self.regions = self.regions._replace(centers=(np.cumsum(kept) - 1)[centers[kept[centers]]])
 
     @torch.no_grad()
     def refresh(
-        self, raw: dict[str, Tensor], regions: Regions | None = None, descriptors: Tensor | None = None
+        self,
+        raw: dict[str, Tensor],
+        regions: Regions | None = None,
+        descriptors: Tensor | None = None,
+        *,
+        anew: bool = False,
     ) -> None:
-        """Regions of the Gaussians as they are now; `regions` and `descriptors` spare their computation."""
+        """Regions of the Gaussians as they are now; `regions` and `descriptors` spare their computation.
+
+        Centres stay where they still cover the scene, unless `anew`; then the result owes nothing to earlier calls.
+        """
         means, settings = raw["means"].detach(), self.describe
+        if anew:
+            self.regions, self.names = None, Names()
+            self.described.forget()
         if regions is None:
             sizes = (settings["n_regions"], settings["region_size"], settings["seed"])
-            regions = build_regions(means.double().numpy(), *sizes)
+            regions = build_regions(means.double().numpy(), *sizes, ids=self.names.of(len(means)), earlier=self.regions)
         self.regions = regions
         self.members = torch.as_tensor(regions.members)
         self.centers = torch.as_tensor(regions.centers)
         scales = raw["log_scales"].detach().exp()
         if not self.n_described:
             self.descriptors = torch.zeros(*self.members.shape, 0)
-        elif descriptors is not None:
-            self.descriptors = descriptors.flatten(2)
         else:
-            chosen = {k: settings[k] for k in ("n_angles", "max_degree", "anisotropy", "bandwidth")}
-            described = describe_members(means, raw["quats"].detach(), scales, self.members, **chosen)
-            self.descriptors = described.flatten(2)
+            shapes = raw["quats"].detach(), raw["log_scales"].detach()
+            self.descriptors = self.described.update(means, *shapes, self.members, regions.radius, descriptors)
         where = means[self.centers]
         offsets = means[self.members.clamp_min(0)] - where[:, None]
         self.positions = offsets / max(regions.radius, 1e-12)
@@ -216,5 +238,5 @@ class SceneModel:
         """Fused features [N, C] of all Gaussians, every region encoded; None without an encoder."""
         if self.shape is None:
             return None
-        self.shape.refresh(self.raw)
+        self.shape.refresh(self.raw, anew=True)
         return self.shape.fuse(self.raw["features"], torch.arange(len(self)))[0].numpy()

@@ -6,29 +6,44 @@ from typing import NamedTuple
 
 import numpy as np
 
+SAMPLE = 65536  # points that stand for all where only a density is wanted
+
 
 class Regions(NamedTuple):
-    """centers i64 [M] are indices of points; members i64 [M, n], -1 where padded, the centre first.
-    radius: scene units; no member is farther from its centre, and it is at least the centres' covering radius.
+    """centers i64 [M] are indices of points, in farthest-point order; members i64 [M, n], -1 where padded, the centre
+    first. radius: scene units; no member is farther from its centre, and it is at least the centres' covering
+    radius. share: the part of all points that members were taken from.
     """
 
     centers: np.ndarray
     members: np.ndarray
     radius: float
+    share: float = 1.0
 
 
-def build_regions(means: np.ndarray, n_regions: int, region_size: int, seed: int = 0) -> Regions:
+def build_regions(
+    means: np.ndarray,
+    n_regions: int,
+    region_size: int,
+    seed: int = 0,
+    *,
+    ids: np.ndarray | None = None,
+    earlier: Regions | None = None,
+) -> Regions:
     """Cover points with regions (METHOD: sampling).
 
     Args:
-      means:       [N, 3] scene units.
-      n_regions:   how many, at most N; region_size: how many members, at most.
+      means:       [N, 3] scene units; float64 where the scene is far from the origin.
+      n_regions:   how many, at most; region_size: how many members, at most.
       seed:        of the first centre and of the thinning.
-    Returns: regions; zero of them for N = 0.
+      ids:         i64 [N], what a point is called while others come and go; its index otherwise.
+      earlier:     regions whose centres, radius and share are kept if they still fit (their members are not read).
+    Returns: regions; zero of them for N = 0, fewer than n_regions where points coincide.
     Raises:  ValueError on sizes below 1 or non-finite means.
     Choices: centres by farthest-point sampling; the radius is 1.5 times the covering radius, so that regions
       overlap. Neighbours come from a thinned set of about `region_size` points a ball, else a region of the nearest
-      ones would shrink to a speck inside a dense ball; the centre itself is always a member.
+      ones would shrink to a speck inside a dense ball; the centre itself is always a member. A point is thinned away
+      by a hash of its id, so that a point that comes, goes or moves changes the regions around it and no others.
     """
     if n_regions < 1 or region_size < 1:
         raise ValueError("n_regions and region_size must be at least 1")
@@ -37,23 +52,41 @@ def build_regions(means: np.ndarray, n_regions: int, region_size: int, seed: int
     n = len(means)
     if n == 0:
         return Regions(np.zeros(0, np.int64), np.zeros((0, region_size), np.int64), 0.0)
-    from scipy.spatial import cKDTree
+    keys = _uniform(np.arange(n) if ids is None else ids, seed)
+    held = None if earlier is None else _hold(means, earlier, min(n_regions, n))
+    if held is None:
+        start = int(np.random.default_rng(seed).integers(n))
+        centers, reach = farthest_points(means, min(n_regions, n), start)
+        radius = 1.5 * reach or 1.0
+        share = _share(means, centers, radius, region_size, keys)
+    else:
+        centers, radius, share = held
+    return Regions(centers, _neighbourhoods(means, centers, radius, share, region_size, keys), radius, share)
 
-    rng = np.random.default_rng(seed)
-    centers = _farthest_points(means, min(n_regions, n), int(rng.integers(n)))
-    where = means[centers]
-    reach, _ = cKDTree(where).query(means, workers=-1)
-    radius = 1.5 * float(reach.max()) or 1.0
-    ball = np.array([len(x) for x in cKDTree(means).query_ball_point(where[:64], radius, workers=-1)])
-    share = min(1.0, region_size / max(float(np.median(ball)), 1.0))
-    thinned = np.sort(rng.permutation(n)[: max(int(np.ceil(share * n)), min(n, region_size))])
-    k = min(region_size, len(thinned))
-    distance, index = cKDTree(means[thinned]).query(where, k, distance_upper_bound=radius * (1 + 1e-9), workers=-1)
-    distance, index = distance.reshape(len(where), k), index.reshape(len(where), k)
-    found = np.where(np.isfinite(distance), thinned[np.minimum(index, len(thinned) - 1)], -1)
-    members = np.full((len(where), region_size), -1, np.int64)
-    members[:, :k] = found
-    return Regions(centers, _centre_first(members, centers), radius)
+
+def farthest_points(means: np.ndarray, count: int, start: int) -> tuple[np.ndarray, float]:
+    """Indices [M] of points, each the farthest from those before it, and their covering radius.
+
+    Choices: M < count where only coincident points are left. Exact in float32 around the centroid. `start` is an
+    index in the library's own order of the points: it seeds the first pick without naming it.
+    """
+    import fpsample
+
+    n = len(means)
+    if n == 1:
+        return np.zeros(1, np.int64), 0.0
+    points = means - means.mean(0, dtype=np.float64)
+    extent = float(np.abs(points).max())
+    points = np.ascontiguousarray(points / (extent or 1.0), np.float32)
+    height = int(np.clip(np.log2(n) - 4, 1, 9))
+    asked = min(count + 1, n)  # one more: its distance is the covering radius
+    picked = np.asarray(fpsample.bucket_fps_kdline_sampling(points, asked, height, start), np.int64)
+    _, first = np.unique(points[picked], axis=0, return_index=True)
+    picked = picked[np.sort(first)]
+    centers = picked[:count]
+    if len(picked) == len(centers):
+        return centers, 0.0
+    return centers, float(np.linalg.norm(means[centers] - means[picked[count]], axis=1).min())
 
 
 def covering(points: np.ndarray, centers: np.ndarray, radius: float, n_covers: int) -> np.ndarray:
@@ -67,15 +100,58 @@ def covering(points: np.ndarray, centers: np.ndarray, radius: float, n_covers: i
     return np.where(np.isfinite(distance), index, -1)
 
 
-def _farthest_points(means: np.ndarray, count: int, start: int) -> np.ndarray:
-    import fpsample
+def _hold(means: np.ndarray, earlier: Regions, count: int) -> tuple[np.ndarray, float, float] | None:
+    """Earlier centres, the few that are missing filled in where points are farthest; None if they no longer fit."""
+    missing = count - len(earlier.centers)
+    if not 0 <= missing <= count // 8:
+        return None
+    centers = list(earlier.centers)
+    reach = _tree(means[earlier.centers]).query(means, workers=-1)[0]
+    for _ in range(missing):
+        centers.append(int(reach.argmax()))
+        reach = np.minimum(reach, np.linalg.norm(means - means[centers[-1]], axis=1))
+    farthest = float(reach.max())
+    if not earlier.radius / 3 <= farthest <= earlier.radius:  # sampled, it is radius / 1.5
+        return None
+    return np.array(centers, np.int64), earlier.radius, earlier.share
 
-    points = np.ascontiguousarray(means - means.mean(0), np.float32)
-    if count == len(means):
-        return np.arange(count)
-    height = int(np.clip(np.log2(max(len(points), 2)) - 4, 1, 9))
-    picked = fpsample.bucket_fps_kdline_sampling(points, count, height, start)
-    return np.unique(np.asarray(picked, np.int64))
+
+def _share(means: np.ndarray, centers: np.ndarray, radius: float, region_size: int, keys: np.ndarray) -> float:
+    """The part of the points that leaves the median ball `region_size` of them."""
+    n = len(means)
+    sample = means if n <= SAMPLE else means[np.argpartition(keys, SAMPLE)[:SAMPLE]]
+    counts = _tree(sample).query_ball_point(means[centers[:64]], radius, workers=-1, return_length=True)
+    ball = float(np.median(counts)) * n / len(sample)
+    return min(1.0, max(region_size / max(ball, 1.0), min(n, region_size) / n))
+
+
+def _neighbourhoods(
+    means: np.ndarray, centers: np.ndarray, radius: float, share: float, region_size: int, keys: np.ndarray
+) -> np.ndarray:
+    """members i64 [M, region_size]: the centre, then the nearest of the thinned points within the radius."""
+    thinned = np.flatnonzero(keys < share)
+    where = means[centers]
+    k = min(region_size, max(len(thinned), 1))
+    members = np.full((len(where), region_size), -1, np.int64)
+    if len(thinned):
+        distance, index = _tree(means[thinned]).query(where, k, distance_upper_bound=radius * (1 + 1e-9), workers=-1)
+        distance, index = distance.reshape(len(where), k), index.reshape(len(where), k)
+        members[:, :k] = np.where(np.isfinite(distance), thinned[np.minimum(index, len(thinned) - 1)], -1)
+    return _centre_first(members, centers)
+
+
+def _tree(points: np.ndarray):  # type: ignore[no-untyped-def]
+    from scipy.spatial import cKDTree
+
+    return cKDTree(points, balanced_tree=False, compact_nodes=False)
+
+
+def _uniform(ids: np.ndarray, seed: int) -> np.ndarray:
+    """A number in [0, 1) for each id and seed, by a mixing of bits in which every one reaches every other."""
+    x = np.asarray(ids, np.uint64) + np.uint64(1 + (seed << 32) % 2**63)
+    for shift, factor in ((30, 0xBF58476D1CE4E5B9), (27, 0x94D049BB133111EB)):
+        x = (x ^ (x >> np.uint64(shift))) * np.uint64(factor)
+    return (x ^ (x >> np.uint64(31))).astype(np.float64) / 2.0**64
 
 
 def _centre_first(members: np.ndarray, centers: np.ndarray) -> np.ndarray:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import time
 from collections.abc import Iterator
 from typing import Any
 
@@ -56,6 +57,7 @@ class Trainer:
         self.order_generator = np.random.default_rng(settings["seed"])
         self.generator = torch.Generator().manual_seed(settings["seed"])
         self.n_added = self.n_removed = 0
+        self.refresh_seconds = 0.0  # of the steps alone
         self._clear_gradients()
         total = settings["steps"]
         first, last = round(settings["densify_from"] * total), round(settings["densify_until"] * total)
@@ -84,6 +86,7 @@ class Trainer:
     def steps(self) -> Iterator[tuple[int, dict[str, float]]]:
         """Train; yields (step, figures) after each step."""
         total, n_views = self.settings["steps"], len(self.views.names)
+        self.refresh_seconds = 0.0
         order: list[int] = []
         for step in range(1, total + 1):
             order = order or self.order_generator.permutation(n_views).tolist()
@@ -108,6 +111,7 @@ class Trainer:
 
     def refresh(self, regions: Regions | None = None, descriptors: Tensor | None = None) -> None:
         """Regions, descriptors and band guidance of the Gaussians as they are now."""
+        began = time.perf_counter()
         shape, settings = self.model.shape, self.settings
         if shape is not None:
             shape.refresh(self.model.raw, regions, descriptors)
@@ -119,6 +123,7 @@ class Trainer:
         self.members = torch.as_tensor(regions.members)
         if settings["sh_prune"] and settings["sh_guided"] and settings["sh_degree"] > 0:
             self.guidance = sh_prune.region_guidance(self.model.raw["shN"].detach(), self.members, len(self.model))
+        self.refresh_seconds += time.perf_counter() - began
 
     def _step(self, step: int, index: int) -> dict[str, float]:
         settings = self.settings
@@ -202,6 +207,8 @@ class Trainer:
             keep[strength.topk(min(settings["min_gaussians"], len(strength))).indices] = True
         self.n_removed += int((~keep).sum())
         adapt.prune_optimizer(self.optimizer, raw, keep)
+        if self.model.shape is not None:
+            self.model.shape.keep(keep)
 
     @torch.no_grad()
     def _freeze_bands(self) -> None:

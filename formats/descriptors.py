@@ -18,7 +18,8 @@ SCHEMA = "chebsplat.descriptors/1"
 @dataclass
 class Descriptors:
     """centers: i64 [M] indices of the points that regions are centred on. members: i64 [M, n], -1 where padded.
-    values: f32 [M, n, J, D-1], zero where padded. settings: the parameters they were computed with.
+    values: f32 [M, n, J, P], zero where padded; P = D - 1 degrees of the full spectrum (settings["spectrum"]), D + 1
+    of a cut one. settings: the parameters they were computed with, and the regions' radius and share.
     """
 
     centers: np.ndarray

@@ -71,6 +71,8 @@ class DescribeSection(_Section):
     max_degree: int = Field(8, ge=2)  # D
     anisotropy: float = Field(30.0, ge=0)
     bandwidth: float = Field(0.7, gt=0)
+    spectrum: Literal["full", "taper", "hard"] = "full"  # hard: the paper's
+    n_eigs: int = Field(16, ge=1)  # K, of taper and hard
     region_size: int = Field(32, ge=4, le=64)  # Gaussians in a region, at most
     n_regions: int = Field(768, ge=1)
     seed: int = 0
@@ -108,6 +110,7 @@ class TrainSection(_Section):
     prune_from: float = Field(0.4, ge=0, le=1)
     sh_freeze: float = Field(0.8, ge=0, le=1)
     refresh_every: int = Field(200, ge=1)  # steps between refreshes of regions and descriptors
+    refresh_tolerance: float = Field(0.0, ge=0)  # change, in radii, that leaves a region's descriptors as they are
     report_every: int = Field(100, ge=1)  # steps between rows of the trace
     # rates
     lr_means: float = 1.6e-4

@@ -2,8 +2,12 @@
 
 from __future__ import annotations
 
+import logging
+
 from chebsplat.errors import DataFailure
 from chebsplat.stages.command import Job, command
+
+log = logging.getLogger("chebsplat")
 
 
 def run(job: Job) -> None:
@@ -22,15 +26,25 @@ def run(job: Job) -> None:
         raise DataFailure("the points artifact holds no points; nothing can be described")
     raw = initial_gaussians(points.means, points.colors, points.covariances)
     regions = build_regions(points.means, settings.n_regions, settings.region_size, settings.seed)
-    sizes = settings.model_dump(include={"n_angles", "max_degree", "anisotropy", "bandwidth"})
-    values = describe_members(*activated(raw)[:3], torch.as_tensor(regions.members), **sizes).numpy()
+    parameters = settings.model_dump(exclude={"n_regions", "region_size", "seed"})
+    # Centred in float64, and only then float32: far from the origin the fractions would be lost.
+    means = torch.as_tensor(points.means - points.means.mean(0), dtype=torch.float32)
+    described = describe_members(means, *activated(raw)[1:3], torch.as_tensor(regions.members), **parameters)
+    values = described.values.numpy()
     if not np.isfinite(values).all():
         bad = int(np.sum(~np.isfinite(values).all((1, 2, 3))))
         raise DataFailure(f"{bad} of {len(values)} regions have non-finite descriptors")
     if settings.n_angles == 1:
         job.left_out("rotations", "describe.n_angles is 1")
+    job.facts |= {"spectrum": settings.spectrum, "n_in_float64": described.n_exact}
+    if settings.spectrum == "hard":
+        job.facts |= {"n_cuts": described.n_cuts, "n_cuts_in_clusters": described.n_clustered}
+    if described.n_clustered:
+        where = f"{described.n_clustered} of {described.n_cuts} cuts fell into a cluster of eigenvalues"
+        log.warning("%s: values there depend on round-off; describe.spectrum = 'taper' does not cut", where)
     job.facts |= {"n_regions": len(values), "radius": regions.radius, "n_values": int(np.prod(values.shape[2:]))}
-    record = Descriptors(regions.centers, regions.members, values, settings.model_dump(mode="json"))
+    facts = settings.model_dump(mode="json") | {"radius": regions.radius, "share": regions.share}
+    record = Descriptors(regions.centers, regions.members, values, facts)
     write_descriptors(job.out, record)
 
 

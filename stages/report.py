@@ -75,6 +75,10 @@ def run(job: Job) -> None:
     )
     (job.out / "report.html").write_text(text)
     job.facts |= {"page": "report.html", "psnr": figures["image"]["psnr"]}
+    if "descriptors" in manifests:
+        known = manifests["descriptors"].facts
+        names = ("spectrum", "n_cuts", "n_cuts_in_clusters", "n_in_float64")
+        job.facts["descriptors"] = {name: known[name] for name in names if name in known}
 
 
 def absent_stages(job: Job, gaussians: Gaussians) -> dict[str, str]:

@@ -59,6 +59,10 @@ def run(job: Job) -> None:
         encoder = model.shape.encoder
         notes["encoder"] = {"n_inputs": encoder.n_inputs, "n_channels": encoder.n_channels} | encoder.settings
     job.facts |= {"n_gaussians": left, "seconds_per_step": trace[-1]["seconds"] / train["steps"]}
+    job.facts["refresh_share"] = trainer.refresh_seconds / trace[-1]["seconds"]
+    if model.shape is not None and model.shape.described.n_regions:
+        described = model.shape.described
+        job.facts["described_anew"] = described.n_described / described.n_regions
     write_gaussians(job.out, Gaussians(parameters, cameras, modules, optimizer_state(trainer), trace, notes))
 
 
@@ -140,7 +144,6 @@ def knowledge(job: Job, model: Any, train: dict[str, Any]) -> dict[str, Any]:
 
 def first_regions(job: Job, trainer: Trainer, n_points: int) -> None:
     """Start from the describe stage's regions where there are any."""
-    import numpy as np
     import torch
 
     from chebsplat.formats.descriptors import read_descriptors
@@ -152,14 +155,8 @@ def first_regions(job: Job, trainer: Trainer, n_points: int) -> None:
     found = read_descriptors(job.inputs["descriptors"])
     if found.members.max(initial=-1) >= n_points:
         raise InputError(f"{job.inputs['descriptors']} describes other points; run the describe stage on these points")
-    means = trainer.model.raw["means"].detach().numpy()
-    offsets = means[np.maximum(found.members, 0)] - means[found.centers][:, None]
-    from scipy.spatial import cKDTree
-
-    reach, _ = cKDTree(means[found.centers]).query(means)
-    spread = np.linalg.norm(offsets, axis=-1)[found.members >= 0].max(initial=0.0)
-    radius = float(max(1.5 * reach.max(), spread))
-    trainer.refresh(Regions(found.centers, found.members, radius), torch.from_numpy(found.values))
+    radius, share = found.settings["radius"], found.settings["share"]
+    trainer.refresh(Regions(found.centers, found.members, radius, share), torch.from_numpy(found.values))
 
 
 def follow(job: Job, trainer: Trainer, train: dict[str, Any]) -> list[dict[str, float]]:

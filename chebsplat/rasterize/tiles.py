@@ -14,8 +14,8 @@ import numpy as np
 from chebsplat.jit import inline, kernel, prange, serial
 from chebsplat.rasterize import cells
 from chebsplat.rasterize.binning import TILE, band_start
+from chebsplat.rasterize.blocks import from_lanes, prefetch, to_lanes
 from chebsplat.rasterize.cells import BLOCK, LANES, N_GEOMETRY, NEVER, ONE, SHAPE, SLACK, T_MIN, ZERO
-from chebsplat.rasterize.simd import from_lanes, prefetch, to_lanes
 
 CHUNK = 128  # Gaussians of a tile between two looks at whether it is done
 
@@ -157,7 +157,7 @@ def _backward_tile(
     depth = channels + 1  # alpha is a channel in which every Gaussian is 1
     states = np.empty((LANES, 2, LANES), np.float32)
     _begin(states, width - left, height - top)
-    tall_grads, check = np.zeros((LANES, LANES, padded(depth)), np.float32), ZERO
+    tall_grads, check = np.empty((LANES, LANES, padded(depth)), np.float32), ZERO
     grads = np.empty((LANES, padded(depth), LANES), np.float32)
     for cell in range(LANES):
         for lane in range(LANES):
@@ -168,6 +168,9 @@ def _backward_tile(
                     check += ZERO * grad[y, x, d]
                 tall_grads[cell, lane, channels] = grad_alpha[y, x]
                 check += ZERO * grad_alpha[y, x]
+                tall_grads[cell, lane, depth:] = ZERO
+            else:
+                tall_grads[cell, lane] = ZERO
         for c in range(0, padded(depth), 4):
             at = LANES * padded(depth) * cell
             to_lanes(grads, at + LANES * c, tall_grads, at + c, padded(depth))
