@@ -41,15 +41,16 @@ def threads(n: int) -> None:
 
 
 def take_turns(variants: dict[str, tuple[int, Callable[[], object]]], rounds: int) -> Timed:
-    """Fastest of `rounds` by name, after one round that does not count; variants are (threads, action)."""
+    """Fastest of `rounds` by name; variants are (threads, action). Each turn begins with a run that does not count:
+    it fills the caches, and starts as many threads."""
     best = dict.fromkeys(variants, np.inf)
-    for k in range(rounds + 1):
+    for _ in range(rounds):
         for name, (n, action) in variants.items():
             threads(n)
+            action()
             began = time.perf_counter()
             action()
-            if k > 0:
-                best[name] = min(best[name], 1e3 * (time.perf_counter() - began))
+            best[name] = min(best[name], 1e3 * (time.perf_counter() - began))
     return best
 
 
