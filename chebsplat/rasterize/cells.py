@@ -166,10 +166,13 @@ def unwind(alphas, weights, out, count, max_alpha):
 
 
 @lanes
-def record_colors(weights, tall_grads, count, cell, places, records):
-    """records[places[m], N_GEOMETRY:] += Σ_lanes weights[m] tall_grads[cell]: [cells, 16, channels]."""
-    channels, step, row = records.shape[1] - N_GEOMETRY, records.shape[1], tall_grads.shape[2]
-    at = LANES * cell * row
+def record_colors(weights, tall_grads, channels, count, cell, places, records):
+    """records[places[m], N_GEOMETRY:] += Σ_lanes weights[m] tall_grads: by cell, 16 rows of D `channels` and a margin.
+
+    The records have a multiple of four columns; what the last ones take up beyond D is never read.
+    """
+    row, at, step = channels, cell * (LANES * channels + LANES), records.shape[1]
+    channels = step - N_GEOMETRY
     for m in range(0, count, BLOCK):
         c = 0
         while c + 16 <= channels:
@@ -221,3 +224,24 @@ def record_absolute(g, count, cell, shapes, rows, places, records):
         slope = load(g, LANES * m) * splat(TWO)
         records[places[m], 6] += total(magnitude(slope * splat(p) * u))
         records[places[m], 7] += total(magnitude(slope * fma(splat(q), u, splat(r) * v)))
+
+
+@lanes
+def copy(a, a_at, n, b, b_at):
+    """b[b_at : b_at + n] = a[a_at : a_at + n] of flat arrays."""
+    k = 0
+    while k + LANES <= n:
+        store(b, b_at + k, load(a, a_at + k))
+        k += LANES
+    while k < n:
+        b[b_at + k] = a[a_at + k]
+        k += 1
+
+
+@lanes
+def is_finite(a, at, n):
+    """Whether all of a.flat[at : at + n] is finite; n a multiple of 16."""
+    sums = splat(ZERO)
+    for k in range(0, n, LANES):
+        sums = fma(load(a, at + k), splat(ZERO), sums)
+    return total(sums) == ZERO

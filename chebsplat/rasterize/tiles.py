@@ -85,9 +85,9 @@ def _is_done(states, cell):
 
 
 @serial
-def _forward_tile(splats, ranks, start, stop, left, top, max_alpha, masks, render, transmittance):
-    """One tile of `forward`. Returns how many of its pairs were looked at."""
-    height, width, channels = render.shape
+def _forward_tile(splats, ranks, start, stop, left, top, channels, max_alpha, masks, render, transmittance):
+    """One tile of `forward`, into the flat render. Returns how many of its pairs were looked at."""
+    height, width = transmittance.shape
     states, depth = np.empty((LANES, 2, LANES), np.float32), padded(channels)
     _begin(states, width - left, height - top)
     sums = np.zeros((LANES, depth, LANES), np.float32)
@@ -111,16 +111,16 @@ def _forward_tile(splats, ranks, start, stop, left, top, max_alpha, masks, rende
             if _is_done(states, cell):
                 done |= 1 << cell
         first += n
-    pixels = np.empty((LANES, depth), np.float32)
+    pixels = np.empty(LANES * channels + LANES, np.float32)
     for cell in range(LANES):
-        for c in range(0, depth, 4):
-            from_lanes(pixels, c, depth, sums, LANES * (cell * depth + c))
-        for lane in range(LANES):
-            x, y = left + 4 * (cell & 3) + (lane & 3), top + 4 * (cell >> 2) + (lane >> 2)
-            if x < width and y < height:
-                transmittance[y, x] = states[cell, 0, lane]
-                for d in range(channels):
-                    render[y, x, d] = pixels[lane, d]
+        for c in range(depth - 4, -1, -4):  # what the last four spill into the next pixel, the first four mend
+            from_lanes(pixels, c, channels, sums, LANES * (cell * depth + c))
+        for row in range(4):
+            x, y = left + 4 * (cell & 3), top + 4 * (cell >> 2) + row
+            if y < height and x < width:
+                n = min(4, width - x)
+                transmittance[y, x : x + n] = states[cell, 0, 4 * row : 4 * row + n]
+                cells.copy(pixels, 4 * row * channels, n * channels, render, (y * width + x) * channels)
     return first - start
 
 
@@ -132,7 +132,7 @@ def forward(splats, tile_starts, ranks, channels, width, height, max_alpha):
       the pairs that were looked at before all pixels were done: for `backward`.
     """
     columns, n_tiles = (width + TILE - 1) // TILE, len(tile_starts) - 1
-    render = np.empty((height, width, channels), np.float32)
+    render = np.empty(height * width * channels, np.float32)
     transmittance = np.empty((height, width), np.float32)
     masks, used = np.empty(len(ranks), np.uint16), np.zeros(n_tiles, np.int64)
     for j in prange(16 * ((n_tiles + 15) // 16)):
@@ -140,40 +140,41 @@ def forward(splats, tile_starts, ranks, channels, width, height, max_alpha):
         if tile < n_tiles:
             used[tile] = _forward_tile(
                 splats, ranks, tile_starts[tile], tile_starts[tile + 1], (tile % columns) * TILE,
-                (tile // columns) * TILE, max_alpha, masks, render, transmittance,
+                (tile // columns) * TILE, channels, max_alpha, masks, render, transmittance,
             )  # fmt: skip
-    return render, transmittance, masks, used
+    return render.reshape((height, width, channels)), transmittance, masks, used
 
 
 @serial
 def _backward_tile(
-    splats, ranks, pair, masks, start, n, left, top, max_alpha, grad, grad_alpha, absolute, base, spare, records
-):
+    splats, ranks, pair, masks, start, n, left, top, channels, max_alpha, grad, grad_alpha, absolute, base, spare,
+    records,
+):  # fmt: skip
     """One tile of `backward`: adds to the records of its pairs. Returns whether the gradient is finite.
 
     `base` is the first pair's number, `spare` a row of records that takes what fills up a block.
     """
-    height, width, channels = grad.shape
+    height, width = grad_alpha.shape
     depth = channels + 1  # alpha is a channel in which every Gaussian is 1
     states = np.empty((LANES, 2, LANES), np.float32)
     _begin(states, width - left, height - top)
-    tall_grads, check = np.empty((LANES, LANES, padded(depth)), np.float32), ZERO
-    grads = np.empty((LANES, padded(depth), LANES), np.float32)
+    row, finite = LANES * channels + LANES, True  # of tall_grads: a cell's pixels, and a margin
+    tall_grads, grads = np.empty(LANES * row, np.float32), np.empty((LANES, padded(channels) + 4, LANES), np.float32)
     for cell in range(LANES):
+        x, at = left + 4 * (cell & 3), cell * row
+        for y in range(top + 4 * (cell >> 2), top + 4 * (cell >> 2) + 4):
+            inside = max(min(4, width - x), 0) * channels if y < height else 0
+            cells.copy(grad, (y * width + x) * channels, inside, tall_grads, at)
+            tall_grads[at + inside : at + 4 * channels] = ZERO
+            at += 4 * channels
+        tall_grads[at : (cell + 1) * row] = ZERO
+        for c in range(0, channels, 4):
+            to_lanes(grads, LANES * (grads.shape[1] * cell + c), tall_grads, cell * row + c, channels)
         for lane in range(LANES):
             x, y = left + 4 * (cell & 3) + (lane & 3), top + 4 * (cell >> 2) + (lane >> 2)
-            if x < width and y < height:
-                for d in range(channels):
-                    tall_grads[cell, lane, d] = grad[y, x, d]
-                    check += ZERO * grad[y, x, d]
-                tall_grads[cell, lane, channels] = grad_alpha[y, x]
-                check += ZERO * grad_alpha[y, x]
-                tall_grads[cell, lane, depth:] = ZERO
-            else:
-                tall_grads[cell, lane] = ZERO
-        for c in range(0, padded(depth), 4):
-            at = LANES * padded(depth) * cell
-            to_lanes(grads, at + LANES * c, tall_grads, at + c, padded(depth))
+            grads[cell, channels, lane] = grad_alpha[y, x] if y < height and x < width else ZERO
+        finite &= cells.is_finite(tall_grads, cell * row, row)
+        finite &= cells.is_finite(grads, LANES * (grads.shape[1] * cell + channels), LANES)
     room = (n + AHEAD + BLOCK) // BLOCK * BLOCK
     shapes, chosen = np.empty((n, SHAPE), np.float32), np.zeros((room + SLACK, padded(depth)), np.float32)
     alphas, weights = np.empty((room, LANES), np.float32), np.empty((room, LANES), np.float32)
@@ -192,13 +193,13 @@ def _backward_tile(
         cells.gather(splats, ranks, start, rows, count, chosen)
         cells.slopes(chosen, grads, count, cell, depth, g)
         cells.unwind(alphas, weights, g, count, max_alpha)
-        cells.record_colors(weights, tall_grads, count, cell, places, records)
+        cells.record_colors(weights, tall_grads, channels, count, cell, places, records)
         cells.record_geometry(g, count, cell, places, records)
         if absolute:
             cells.record_absolute(g, count, cell, shapes, rows, places, records)
     for k in range(n):
         cells.whiten(records, pair[start + k] - base, shapes, k)
-    return check == ZERO
+    return finite
 
 
 @serial
@@ -226,6 +227,7 @@ def backward(
       the absolute gradient to means2d [n or 0, 2], to colors [n, D]; whether the image's gradient is finite.
     """
     height, width, channels = grad.shape
+    flat = grad.reshape(-1)
     columns, rows = (width + TILE - 1) // TILE, (height + TILE - 1) // TILE
     finite, bands, shown = np.ones(len(tile_starts) - 1, np.bool_), len(pair_starts), len(order)
     room = 0
@@ -245,7 +247,7 @@ def backward(
                     records[pair[k] - base] = ZERO
                 finite[tile] = _backward_tile(
                     splats, ranks, pair, masks, tile_starts[tile], used[tile], (tile % columns) * TILE,
-                    (tile // columns) * TILE, max_alpha, grad, grad_alpha, absolute, base,
+                    (tile // columns) * TILE, channels, max_alpha, flat, grad_alpha, absolute, base,
                     n_pairs + tile - first_tile, records,
                 )  # fmt: skip
         for m in prange(shown):
