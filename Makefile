@@ -10,7 +10,7 @@ CHOICE := $(if $(scene),--scene '$(scene)') $(if $(sequence),--sequence '$(seque
 
 # `make scene=office0` needs no target: naming a scene or a sequence means running it.
 .DEFAULT_GOAL := $(if $(scene)$(sequence),run,help)
-.PHONY: help run plan verify clean-stale setup test test-all bench-descriptor bench-refresh lint lock
+.PHONY: help run plan verify clean-stale setup test test-all stability bench-raster bench-train bench-descriptor bench-refresh bench-shapes lint lock
 
 run: $(READY)  ## make scene=NAME|FOLDER [stage=] [set=a.b=c,...] [ablation=] [cores=]; or sequence=NAME
 	@$(CHEBSPLAT) run $(CHOICE) $(if $(stage),--stage '$(stage)') $(if $(cores),--cores '$(cores)')
@@ -38,6 +38,19 @@ test: $(READY)  ## the tests, in parallel, without the slow ones
 
 test-all: $(READY)  ## all tests, the slow ones too
 	@$(PY) -m pytest -q -n auto --dist loadgroup -m "not gpu" $(args)
+
+bench-raster: $(READY)  ## the rasterizer against its bars, in build/bench/: table, CSV, figure (4 minutes, quiet machine)
+	@$(PY) benchmarks/rasterize.py $(args)
+
+bench-train: $(READY)  ## office0 without the shape branch: seconds of 3000 steps, PSNR against the reference backend
+	@$(CHEBSPLAT) run --scene office0 --stage teacher
+	@$(PY) benchmarks/training.py --work work/office0 $(args)
+
+stability: $(READY)  ## every extreme case, naive and ours; build/bench/stability.csv; fails if one does (args=--only X)
+	@$(PY) -m benchmarks.stability $(args)
+
+bench-shapes: $(READY)  ## which shapes a classifier tells apart, ours beside FPFH and others; build/bench/shapes.csv, .png
+	@$(PY) -m benchmarks.shapes $(args)
 
 bench-descriptor: $(READY)  ## routes to the descriptor: error over time, bars, growth; into build/bench/
 	@$(PY) benchmarks/descriptor.py $(args)

@@ -15,7 +15,7 @@ import math
 import numpy as np
 
 from chebsplat.jit import serial
-from chebsplat.simd import add, exp2, fill, fma, load, mul, spread, store, sub, transpose
+from chebsplat.simd import exp2, fma, load, splat, spread, store, transpose
 
 # Below this degree or bandwidth exponents are large enough for float32 to lose digits: the operator is then built in
 # float64 and in logarithms.
@@ -37,7 +37,7 @@ def weights(points, factors, count, n, scale, out):
 
     Args: points [6, n], coordinates in two float32 each, so that differences keep every digit; factors [9, n].
     """
-    factor = fill(scale)
+    factor = splat(scale)
     for j in range(0, n, 16):
         xj, yj, zj = load(points, j), load(points, n + j), load(points, 2 * n + j)
         uj, vj, wj = load(points, 3 * n + j), load(points, 4 * n + j), load(points, 5 * n + j)
@@ -45,22 +45,22 @@ def weights(points, factors, count, n, scale, out):
         m3, m4, m5 = load(factors, 3 * n + j), load(factors, 4 * n + j), load(factors, 5 * n + j)
         m6, m7, m8 = load(factors, 6 * n + j), load(factors, 7 * n + j), load(factors, 8 * n + j)
         for i in range(min(j + 16, count)):
-            x = add(sub(xj, spread(points, i)), sub(uj, spread(points, 3 * n + i)))
-            y = add(sub(yj, spread(points, n + i)), sub(vj, spread(points, 4 * n + i)))
-            z = add(sub(zj, spread(points, 2 * n + i)), sub(wj, spread(points, 5 * n + i)))
-            a, b, c = mul(m0, x), mul(m3, x), mul(m6, x)
+            x = (xj - spread(points, i)) + (uj - spread(points, 3 * n + i))
+            y = (yj - spread(points, n + i)) + (vj - spread(points, 4 * n + i))
+            z = (zj - spread(points, 2 * n + i)) + (wj - spread(points, 5 * n + i))
+            a, b, c = m0 * x, m3 * x, m6 * x
             a, b, c = fma(m1, y, a), fma(m4, y, b), fma(m7, y, c)
             a, b, c = fma(m2, z, a), fma(m5, z, b), fma(m8, z, c)
-            of_j = fma(a, a, fma(b, b, mul(c, c)))
-            a, b, c = mul(spread(factors, i), x), mul(spread(factors, 3 * n + i), x), mul(spread(factors, 6 * n + i), x)
+            of_j = fma(a, a, fma(b, b, c * c))
+            a, b, c = spread(factors, i) * x, spread(factors, 3 * n + i) * x, spread(factors, 6 * n + i) * x
             a, b = fma(spread(factors, n + i), y, a), fma(spread(factors, 4 * n + i), y, b)
             c = fma(spread(factors, 7 * n + i), y, c)
             a, b = fma(spread(factors, 2 * n + i), z, a), fma(spread(factors, 5 * n + i), z, b)
             c = fma(spread(factors, 8 * n + i), z, c)
-            of_i = fma(a, a, fma(b, b, mul(c, c)))
-            store(out, i * n + j, exp2(mul(factor, add(of_i, of_j))))
+            of_i = fma(a, a, fma(b, b, c * c))
+            store(out, i * n + j, exp2(factor * (of_i + of_j)))
         for i in range(count, j + 16):
-            store(out, i * n + j, fill(ZERO))
+            store(out, i * n + j, splat(ZERO))
     for i in range(count):
         out[i * n + i] = ZERO
         for j in range(count, n):
@@ -72,11 +72,11 @@ def weights(points, factors, count, n, scale, out):
 def column_sums(a, count, n, out):
     """Sums of columns into out [n], what they lost to rounding into out [n:]: the true sum is their difference."""
     for j in range(0, n, 16):
-        sums, lost = fill(ZERO), fill(ZERO)
+        sums, lost = splat(ZERO), splat(ZERO)
         for i in range(count):
-            term = sub(load(a, i * n + j), lost)
-            larger = add(sums, term)
-            lost = sub(sub(larger, sums), term)
+            term = load(a, i * n + j) - lost
+            larger = sums + term
+            lost = (larger - sums) - term
             sums = larger
         store(out, j, sums)
         store(out, n + j, lost)
@@ -86,13 +86,13 @@ def column_sums(a, count, n, out):
 def normalise(a, roots, u, count, n):
     """a_ij <- u_i u_j − a_ij roots_i roots_j, of roots in two float32 each, [n] and [n:], rounded once or nearly so."""
     for i in range(count):
-        root, rest, lead = fill(-roots[i]), fill(-roots[n + i]), fill(u[i])
+        root, rest, lead = splat(-roots[i]), splat(-roots[n + i]), splat(u[i])
         for j in range(0, n, 16):
             other, w = load(roots, j), load(a, i * n + j)
-            product = mul(root, other)
-            lost = fma(root, other, sub(fill(ZERO), product))
+            product = root * other
+            lost = fma(root, other, splat(ZERO) - product)
             lost = fma(root, load(roots, n + j), fma(rest, other, lost))
-            store(a, i * n + j, fma(w, product, fma(lead, load(u, j), mul(w, lost))))
+            store(a, i * n + j, fma(w, product, fma(lead, load(u, j), w * lost)))
 
 
 @serial

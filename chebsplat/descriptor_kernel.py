@@ -11,7 +11,7 @@ import numpy as np
 from chebsplat.albo_kernel import LEAST_BANDWIDTH, LEAST_DEGREE, exact_operator, mirror, operator
 from chebsplat.jit import kernel, prange, serial
 from chebsplat.region_frame import canonical, metric, tangent_axis, turn_back
-from chebsplat.simd import fill, fma, load, mul, spread, store, sub
+from chebsplat.simd import fma, load, splat, spread, store
 
 BLOCK = 8  # regions that share scratch memory
 FINEST = np.float32(-0.5 / LEAST_BANDWIDTH**2 / math.log(2.0))
@@ -21,10 +21,10 @@ ZERO, HALF, ONE, TWO = np.float32(0), np.float32(0.5), np.float32(1), np.float32
 @serial
 def next_term(x, term, before, at_zero, count, n, out):
     """out = 2 x term + 2 T_m(0) x − before: the recurrence of E_m = T_m − T_m(0) I."""
-    twice, shift = fill(TWO), fill(TWO * at_zero)
+    twice, shift = splat(TWO), splat(TWO * at_zero)
     for j in range(0, n, 16):
         for i in range(0, j + 16, 8):
-            a = b = c = d = e = f = g = h = fill(ZERO)
+            a = b = c = d = e = f = g = h = splat(ZERO)
             for k in range(count):
                 row, s = load(term, k * n + j), k * n + i
                 a, b = fma(spread(x, s), row, a), fma(spread(x, s + 1), row, b)
@@ -33,7 +33,7 @@ def next_term(x, term, before, at_zero, count, n, out):
                 g, h = fma(spread(x, s + 6), row, g), fma(spread(x, s + 7), row, h)
             s = i * n + j
             for value in (a, b, c, d, e, f, g, h):
-                rest = sub(mul(shift, load(x, s)), load(before, s))
+                rest = (shift * load(x, s)) - load(before, s)
                 store(out, s, fma(twice, value, rest))
                 s += n
     mirror(out, n)
@@ -43,7 +43,7 @@ def next_term(x, term, before, at_zero, count, n, out):
 def row_products(a, b, count, n, out, start):
     """Diagonal of a b into out[start:]; columns are summed, which for symmetric matrices are the rows."""
     for j in range(0, n, 16):
-        sums = fill(ZERO)
+        sums = splat(ZERO)
         for i in range(count):
             sums = fma(load(a, i * n + j), load(b, i * n + j), sums)
         store(out, start + j, sums)

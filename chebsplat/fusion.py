@@ -26,14 +26,16 @@ def propagation_weights(
       radius:  of the regions, scene units, > 0.
     Returns: [N, k], rows sum to 1, or to 0 for a point that nothing covers.
     Choices: logits −|S⁻¹RᵀΔ|²/temperature with s² + (inflation · radius)² for s², since the centre's own
-      deviations give one region all the weight, or NaN; softmax over the regions that cover the point.
+      deviations give one region all the weight, or NaN; softmax over the regions that cover the point;
+      lengths in radii, so that no unit over- or underflows.
     """
     index = cover.clamp_min(0)
-    local = torch.einsum("nkji,nkj->nki", rotmats[index], means[:, None] - centers[index])
-    variances = scales[index] ** 2 + (inflation * radius) ** 2
+    local = torch.einsum("nkji,nkj->nki", rotmats[index], (means[:, None] - centers[index]) / radius)
+    variances = (scales[index] / radius) ** 2 + inflation**2
     logits = -(local**2 / variances).sum(-1) / temperature
     present = cover >= 0
-    weights = logits.masked_fill(~present, -1e9).softmax(-1)
+    absent = ~present & present.any(-1, keepdim=True)  # a point that nothing covers keeps finite logits
+    weights = logits.masked_fill(absent, -torch.inf).softmax(-1)
     return torch.where(present, weights, torch.zeros_like(weights))
 
 

@@ -85,16 +85,43 @@ def photometric_reference(render: Tensor, target: Tensor, mask: Tensor | None, w
     return (1 - weight_ssim) * distance + weight_ssim * (weight * (1 - ssim_map(render, target))).sum()
 
 
+class _FeatureL1(torch.autograd.Function):
+    """The fused loss: its gradient is computed with its value."""
+
+    @staticmethod
+    def forward(ctx: Any, render: Tensor, target: Tensor, share: Tensor) -> Tensor:  # type: ignore[override]
+        from chebsplat.pooling import feature_l1
+
+        values, gradient = feature_l1(*(t.detach().contiguous().numpy() for t in (render, target, share)))
+        ctx.save_for_backward(torch.from_numpy(gradient))
+        return render.new_tensor(values.sum())
+
+    @staticmethod
+    def backward(ctx: Any, grad: Tensor):  # type: ignore[no-untyped-def, override]
+        (gradient,) = ctx.saved_tensors
+        return grad * gradient, None, None
+
+
+def _cell_shares(mask: Tensor | None, size: tuple[int, int], kind: torch.dtype) -> Tensor:
+    """What each cell of the target counts, [h, w], summing to 1 (or 0): the share of its pixels that count."""
+    if mask is None:
+        return torch.full(size, 1 / (size[0] * size[1]), dtype=kind)
+    share = torch.nn.functional.adaptive_avg_pool2d(mask[None].to(kind), size)[0]
+    return share / share.sum().clamp_min(1e-6)
+
+
 def feature_l1(render: Tensor, target: Tensor, mask: Tensor | None = None) -> Tensor:
     """Mean |difference| at the teacher's resolution.
 
-    Args: render [H, W, C]; target [h, w, C], h ≤ H; mask [H, W] bool, true where a pixel counts.
+    Args: render [H, W, C]; target [h, w, C], h ≤ H; mask [H, W] bool, true where a pixel counts. float32.
     Choices: the render is averaged over each cell of the target; a cell counts by the share of its pixels that do.
     """
+    share = _cell_shares(mask, (target.shape[0], target.shape[1]), render.dtype)
+    return _FeatureL1.apply(render, target.to(render.dtype), share)
+
+
+def feature_l1_reference(render: Tensor, target: Tensor, mask: Tensor | None = None) -> Tensor:
+    """As `feature_l1`, in plain torch and any float type: the oracle of the fused loss."""
     size = (target.shape[0], target.shape[1])
     pooled = torch.nn.functional.adaptive_avg_pool2d(render.permute(2, 0, 1), size).permute(1, 2, 0)
-    difference = (pooled - target.to(render.dtype)).abs().mean(-1)
-    if mask is None:
-        return difference.mean()
-    share = torch.nn.functional.adaptive_avg_pool2d(mask[None].to(render.dtype), size)[0]
-    return (difference * share).sum() / share.sum().clamp_min(1e-6)
+    return ((pooled - target).abs().mean(-1) * _cell_shares(mask, size, render.dtype)).sum()

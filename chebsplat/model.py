@@ -17,7 +17,7 @@ from chebsplat.rasterize import rasterize
 from chebsplat.rasterize.projection import rotation_matrices
 from chebsplat.refresh import Descriptors, Names
 from chebsplat.regions import Regions, build_regions, covering
-from chebsplat.sh import eval_sh, n_coefficients
+from chebsplat.sh_kernels import colors_in_view
 from chebsplat.views import View, in_frustum
 
 
@@ -220,18 +220,17 @@ class SceneModel:
         if masked and (soft := self.soft_mask(index, features)) is not None:
             aside["mask"] = soft
             scales, opacities = adapt.apply_mask(adapt.hard_mask(soft), scales, opacities)
-        shN = take(raw["shN"], index)[:, : n_coefficients(degree) - 1]
-        if masked and degree > 0 and (bands := self.sh_mask(index)) is not None:
+        bands = self.sh_mask(index) if masked and degree > 0 else None
+        if bands is not None:
             aside["bands"] = bands
-            shN = sh_prune.masked_sh(shN, bands)
         eye = -view.viewmat[:3, :3].T @ view.viewmat[:3, 3]
-        colors = eval_sh(take(raw["sh0"], index), shN, means.detach() - eye, degree)
+        colors = colors_in_view(raw["sh0"], raw["shN"], bands, index, raw["means"], eye, degree)
         channels = colors if features is None else torch.cat([colors, features], -1)
         render, alpha, meta = rasterize(
             means, quats, scales, opacities, channels, view.viewmat[None], view.K[None], view.width, view.height
         )
-        rendered = Rendered(render[0, ..., :3], alpha[0], render[0, ..., 3:] if features is not None else None,
-                            meta, index)  # fmt: skip
+        parts = render[0].split([3, channels.shape[1] - 3], -1)  # one gradient, where two slices would make two
+        rendered = Rendered(parts[0], alpha[0], parts[1] if features is not None else None, meta, index)
         return rendered, aside
 
     @torch.no_grad()

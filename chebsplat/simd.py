@@ -1,196 +1,253 @@
-"""Sixteen float32 at once, for kernels whose speed cannot be left to the compiler's vectoriser.
+"""Vectors of 16 float32 as values inside numba kernels.
 
-`f32x16` is a numba type; the functions here are instructions on it and on flat float32 arrays. An array argument is
-contiguous, an index counts its elements and is not checked. LLVM splits a vector where the machine's are shorter, so
-the results do not depend on the width; only a machine without fused multiply-add rounds differently.
+numba's loops vectorise only when LLVM proves that nothing aliases; these say it. LLVM splits a vector wider than the
+machine's registers, so the same source runs on AVX-512 (one register), AVX2 (two), SSE and NEON (four); only a machine
+without fused multiply-add rounds differently. An array argument is contiguous float32, its index counts elements and
+is not checked: the callers lay out every buffer that they pass.
 """
 
 from __future__ import annotations
 
+import operator
 from typing import Any
 
 import numpy as np
 from llvmlite import ir
+from numba import extending
 from numba.core import cgutils, types
-from numba.extending import intrinsic, models, register_model
+from numba.core.typing import signature
+from numba.extending import models, overload, register_model
 
-instruction: Any = intrinsic
-N_LANES = 16
-_FLOATS = ir.VectorType(ir.FloatType(), N_LANES)
-_INTS = ir.VectorType(ir.IntType(32), N_LANES)
+intrinsic: Any = extending.intrinsic  # its own type takes the typing context for an argument of the call
+FLOAT, INT = ir.FloatType(), ir.IntType(32)
+
+
+class Vector(types.Type):
+    """`width` float32 values; or, with `kind` 1, as many truth values."""
+
+    def __init__(self, width: int, kind: str = "float32"):
+        self.width, self.kind = width, kind
+        super().__init__(f"simd.{kind}x{width}")
+
+
+@register_model(Vector)
+class _VectorModel(models.PrimitiveModel):  # type: ignore[misc]
+    def __init__(self, manager: Any, vector: Vector):
+        element = FLOAT if vector.kind == "float32" else ir.IntType(1)
+        super().__init__(manager, vector, ir.VectorType(element, vector.width))
+
+
+F16, M16 = Vector(16), Vector(16, "bool")
+WIDE = ir.VectorType(FLOAT, 16)
 # 2^f on [-½, ½] to 2e-8, by Chebyshev interpolation
 _nodes = 0.5 * np.cos((np.arange(7) + 0.5) * np.pi / 7)
 _EXP2 = np.polynomial.polynomial.polyfit(_nodes, 2.0**_nodes, 6)
 _EXP2[0] = 1.0  # 2^0 is 1
 
 
-class _Vector(types.Type):
-    def __init__(self) -> None:
-        super().__init__(name="f32x16")
+def address(context: Any, builder: Any, kind: Any, value: Any, index: Any, to: ir.Type) -> Any:
+    """Pointer to element `index` of an array, as a pointer to type `to`."""
+    data = context.make_array(kind)(context, builder, value).data
+    return builder.bitcast(builder.gep(data, [index]), to.as_pointer())
 
 
-f32x16 = _Vector()
+def broadcast(builder: Any, scalar: Any, width: int = 16) -> Any:
+    vector = ir.VectorType(FLOAT, width)
+    one = builder.insert_element(ir.Constant(vector, ir.Undefined), scalar, ir.Constant(INT, 0))
+    zeros = ir.Constant(ir.VectorType(INT, width), [0] * width)
+    return builder.shuffle_vector(one, ir.Constant(vector, ir.Undefined), zeros)
 
 
-@register_model(_Vector)
-class _Model(models.PrimitiveModel):
-    def __init__(self, dmm: Any, fe_type: Any) -> None:
-        super().__init__(dmm, fe_type, _FLOATS)
+def multiply_add(builder: Any, a: Any, b: Any, c: Any) -> Any:
+    """a b + c, fused where the machine can."""
+    name = f"llvm.fmuladd.v{a.type.count}f32"
+    function = cgutils.get_or_insert_function(builder.module, ir.FunctionType(a.type, [a.type] * 3), name)
+    return builder.call(function, [a, b, c])
 
 
-def _constant(value: float) -> ir.Constant:
-    return ir.Constant(_FLOATS, [float(np.float32(value))] * N_LANES)
-
-
-def _address(context: Any, builder: Any, array_type: Any, array: Any, index: Any) -> Any:
-    data = context.make_array(array_type)(context, builder, array).data
-    return builder.gep(data, [index])
-
-
-def _spread(builder: Any, scalar: Any) -> Any:
-    first = builder.insert_element(ir.Constant(_FLOATS, ir.Undefined), scalar, ir.Constant(ir.IntType(32), 0))
-    return builder.shuffle_vector(first, ir.Constant(_FLOATS, ir.Undefined), ir.Constant(_INTS, [0] * N_LANES))
+def shuffle(builder: Any, a: Any, b: Any, order: list[int]) -> Any:
+    """Elements of a and b, numbered through, in this order."""
+    return builder.shuffle_vector(a, b, ir.Constant(ir.VectorType(INT, len(order)), order))
 
 
 def _call(builder: Any, name: str, *values: Any) -> Any:
-    kind = ir.FunctionType(_FLOATS, [_FLOATS] * len(values))
-    function = cgutils.get_or_insert_function(builder.module, kind, f"llvm.{name}.v{N_LANES}f32")
-    return builder.call(function, values)
+    kind = ir.FunctionType(WIDE, [WIDE] * len(values))
+    return builder.call(cgutils.get_or_insert_function(builder.module, kind, f"llvm.{name}.v16f32"), values)
 
 
-@instruction
-def load(typing: Any, array: Any, index: Any) -> Any:
-    """array[index : index + 16]."""
-
-    def emit(context: Any, builder: Any, signature: Any, args: Any) -> Any:
-        address = _address(context, builder, signature.args[0], *args)
-        return builder.load(builder.bitcast(address, _FLOATS.as_pointer()), align=4)
-
-    return f32x16(array, types.intp), emit
+def _constant(value: float) -> ir.Constant:
+    return ir.Constant(WIDE, [float(np.float32(value))] * 16)
 
 
-@instruction
-def store(typing: Any, array: Any, index: Any, vector: Any) -> Any:
-    """array[index : index + 16] = vector."""
+@intrinsic
+def splat(_typing, scalar):  # type: ignore[no-untyped-def]
+    """All lanes equal to `scalar`."""
+    return signature(F16, types.float32), lambda context, builder, sig, args: broadcast(builder, args[0])
 
-    def emit(context: Any, builder: Any, signature: Any, args: Any) -> Any:
-        address = _address(context, builder, signature.args[0], *args[:2])
-        builder.store(args[2], builder.bitcast(address, _FLOATS.as_pointer()), align=4)
+
+@intrinsic
+def load(_typing, array, index):  # type: ignore[no-untyped-def]
+    """array.flat[index : index + 16]."""
+
+    def build(context, builder, sig, args):  # type: ignore[no-untyped-def]
+        return builder.load(address(context, builder, sig.args[0], args[0], args[1], WIDE), align=4)
+
+    return signature(F16, array, types.intp), build
+
+
+@intrinsic
+def store(_typing, array, index, value):  # type: ignore[no-untyped-def]
+    """array.flat[index : index + 16] = value."""
+
+    def build(context, builder, sig, args):  # type: ignore[no-untyped-def]
+        builder.store(args[2], address(context, builder, sig.args[0], args[0], args[1], WIDE), align=4)
         return context.get_dummy_value()
 
-    return types.void(array, types.intp, f32x16), emit
+    return signature(types.none, array, types.intp, F16), build
 
 
-@instruction
-def spread(typing: Any, array: Any, index: Any) -> Any:
-    """array[index] in every lane."""
-
-    def emit(context: Any, builder: Any, signature: Any, args: Any) -> Any:
-        return _spread(builder, builder.load(_address(context, builder, signature.args[0], *args)))
-
-    return f32x16(array, types.intp), emit
+@intrinsic
+def fma(_typing, a, b, c):  # type: ignore[no-untyped-def]
+    """a b + c."""
+    return signature(F16, F16, F16, F16), lambda context, builder, sig, args: multiply_add(builder, *args)
 
 
-@instruction
-def fill(typing: Any, value: Any) -> Any:
-    """A float32 in every lane."""
+@intrinsic
+def fnma(_typing, a, b, c):  # type: ignore[no-untyped-def]
+    """c − a b."""
 
-    def emit(context: Any, builder: Any, signature: Any, args: Any) -> Any:
-        return _spread(builder, args[0])
+    def build(context, builder, sig, args):  # type: ignore[no-untyped-def]
+        return multiply_add(builder, builder.fneg(args[0]), *args[1:])
 
-    return f32x16(types.float32), emit
-
-
-@instruction
-def add(typing: Any, a: Any, b: Any) -> Any:
-    def emit(context: Any, builder: Any, signature: Any, args: Any) -> Any:
-        return builder.fadd(*args)
-
-    return f32x16(f32x16, f32x16), emit
+    return signature(F16, F16, F16, F16), build
 
 
-@instruction
-def sub(typing: Any, a: Any, b: Any) -> Any:
-    def emit(context: Any, builder: Any, signature: Any, args: Any) -> Any:
-        return builder.fsub(*args)
+@intrinsic
+def magnitude(_typing, value):  # type: ignore[no-untyped-def]
+    """|value|."""
 
-    return f32x16(f32x16, f32x16), emit
-
-
-@instruction
-def mul(typing: Any, a: Any, b: Any) -> Any:
-    def emit(context: Any, builder: Any, signature: Any, args: Any) -> Any:
-        return builder.fmul(*args)
-
-    return f32x16(f32x16, f32x16), emit
+    return signature(F16, F16), lambda context, builder, sig, args: _call(builder, "fabs", args[0])
 
 
-@instruction
-def fma(typing: Any, a: Any, b: Any, c: Any) -> Any:
-    """a b + c, rounded once where the machine can."""
+def _binary(name: str) -> Any:
+    @intrinsic
+    def apply(_typing, a, b):  # type: ignore[no-untyped-def]
+        return signature(F16, F16, F16), lambda context, builder, sig, args: getattr(builder, name)(*args)
 
-    def emit(context: Any, builder: Any, signature: Any, args: Any) -> Any:
-        return _call(builder, "fmuladd", *args)
-
-    return f32x16(f32x16, f32x16, f32x16), emit
+    return apply
 
 
-@instruction
-def exp2(typing: Any, x: Any) -> Any:
+def _compare(symbol: str) -> Any:
+    @intrinsic
+    def apply(_typing, a, b):  # type: ignore[no-untyped-def]
+        return signature(M16, F16, F16), lambda context, builder, sig, args: builder.fcmp_ordered(symbol, *args)
+
+    return apply
+
+
+def _operate(function: Any, apply: Any) -> None:
+    @overload(function, inline="always")
+    def implement(a, b):  # type: ignore[no-untyped-def]
+        if a == F16 and b == F16:
+            return lambda a, b: apply(a, b)
+        return None
+
+
+for _function, _name in ((operator.add, "fadd"), (operator.sub, "fsub"), (operator.mul, "fmul")):
+    _operate(_function, _binary(_name))
+for _function, _symbol in ((operator.lt, "<"), (operator.le, "<="), (operator.gt, ">"), (operator.ge, ">=")):
+    _operate(_function, _compare(_symbol))
+
+
+@intrinsic
+def where(_typing, mask, a, b):  # type: ignore[no-untyped-def]
+    """a where the mask holds, else b."""
+    return signature(F16, M16, F16, F16), lambda context, builder, sig, args: builder.select(*args)
+
+
+@intrinsic
+def bits(_typing, mask):  # type: ignore[no-untyped-def]
+    """The mask as an integer, lane 0 in the lowest bit."""
+
+    def build(context, builder, sig, args):  # type: ignore[no-untyped-def]
+        return builder.zext(builder.bitcast(args[0], ir.IntType(16)), ir.IntType(32))
+
+    return signature(types.int32, M16), build
+
+
+@intrinsic
+def scale_by_power(_typing, value, shifted):  # type: ignore[no-untyped-def]
+    """value · 2^k, where `shifted` is k + 1.5·2²³, which holds k in its low bits; no over- or underflow."""
+
+    def build(context, builder, sig, args):  # type: ignore[no-untyped-def]
+        whole = ir.VectorType(INT, 16)
+        power = builder.shl(builder.bitcast(args[1], whole), ir.Constant(whole, [23] * 16))
+        return builder.bitcast(builder.add(builder.bitcast(args[0], whole), power), WIDE)
+
+    return signature(F16, F16, F16), build
+
+
+@intrinsic
+def total(_typing, value):  # type: ignore[no-untyped-def]
+    """Sum of the lanes, as a tree."""
+
+    def build(context, builder, sig, args):  # type: ignore[no-untyped-def]
+        name = "llvm.vector.reduce.fadd.v16f32"
+        kind = ir.FunctionType(FLOAT, [FLOAT, WIDE])
+        function = cgutils.get_or_insert_function(builder.module, kind, name)
+        return builder.call(function, [ir.Constant(FLOAT, 0.0), args[0]], fastmath=["reassoc"])
+
+    return signature(types.float32, F16), build
+
+
+@intrinsic
+def spread(_typing, array, index):  # type: ignore[no-untyped-def]
+    """array.flat[index] in every lane."""
+
+    def build(context, builder, sig, args):  # type: ignore[no-untyped-def]
+        return broadcast(builder, builder.load(address(context, builder, sig.args[0], args[0], args[1], FLOAT)))
+
+    return signature(F16, array, types.intp), build
+
+
+@intrinsic
+def exp2(_typing, x):  # type: ignore[no-untyped-def]
     """2^x to 1e-7 for x <= 100; 2^-120 below x = -120."""
 
-    def emit(context: Any, builder: Any, signature: Any, args: Any) -> Any:
+    def build(context, builder, sig, args):  # type: ignore[no-untyped-def]
+        whole_numbers = ir.VectorType(INT, 16)
         x = _call(builder, "maxnum", args[0], _constant(-120.0))
         whole = _call(builder, "nearbyint", x)
-        f = builder.fsub(x, whole)
-        value = _constant(_EXP2[-1])
+        f, value = builder.fsub(x, whole), _constant(_EXP2[-1])
         for coefficient in _EXP2[-2::-1]:
-            value = _call(builder, "fmuladd", value, f, _constant(coefficient))
-        power = builder.shl(builder.fptosi(whole, _INTS), ir.Constant(_INTS, [23] * N_LANES))
-        return builder.bitcast(builder.add(builder.bitcast(value, _INTS), power), _FLOATS)
+            value = multiply_add(builder, value, f, _constant(coefficient))
+        power = builder.shl(builder.fptosi(whole, whole_numbers), ir.Constant(whole_numbers, [23] * 16))
+        return builder.bitcast(builder.add(builder.bitcast(value, whole_numbers), power), WIDE)
 
-    return f32x16(f32x16), emit
-
-
-@instruction
-def total(typing: Any, vector: Any) -> Any:
-    """Sum of the lanes, halves first."""
-
-    def emit(context: Any, builder: Any, signature: Any, args: Any) -> Any:
-        value = args[0]
-        for half in (8, 4, 2, 1):
-            moved = ir.Constant(_INTS, [(lane + half) % N_LANES for lane in range(N_LANES)])
-            value = builder.fadd(value, builder.shuffle_vector(value, value, moved))
-        return builder.extract_element(value, ir.Constant(ir.IntType(32), 0))
-
-    return types.float32(f32x16), emit
+    return signature(F16, F16), build
 
 
-@instruction
-def transpose(typing: Any, array: Any, source: Any, target: Any, stride: Any) -> Any:
+@intrinsic
+def transpose(_typing, array, source, target, stride):  # type: ignore[no-untyped-def]
     """Copy the transpose of the 16×16 block that begins at `source` to the one at `target`; rows are `stride` apart."""
 
-    def emit(context: Any, builder: Any, signature: Any, args: Any) -> Any:
+    def build(context, builder, sig, args):  # type: ignore[no-untyped-def]
         array, source, target, stride = args
-        rows = []
-        for row in range(N_LANES):
-            index = builder.add(source, builder.mul(stride, ir.Constant(stride.type, row)))
-            address = _address(context, builder, signature.args[0], array, index)
-            rows.append(builder.load(builder.bitcast(address, _FLOATS.as_pointer()), align=4))
+        places = [builder.mul(stride, stride.type(row)) for row in range(16)]
+        at = [address(context, builder, sig.args[0], array, builder.add(source, place), WIDE) for place in places]
+        rows = [builder.load(place, align=4) for place in at]
         for step in (8, 4, 2, 1):  # swap the off-diagonal quarters of ever smaller blocks
-            low = [k if k & step == 0 else k - step + N_LANES for k in range(N_LANES)]
-            high = [k + step if k & step == 0 else k + N_LANES for k in range(N_LANES)]
+            low = [k if k & step == 0 else k - step + 16 for k in range(16)]
+            high = [k + step if k & step == 0 else k + 16 for k in range(16)]
             swapped = list(rows)
-            for row in range(N_LANES):
+            for row in range(16):
                 if row & step == 0:
                     pair = rows[row], rows[row + step]
-                    swapped[row] = builder.shuffle_vector(*pair, ir.Constant(_INTS, low))
-                    swapped[row + step] = builder.shuffle_vector(*pair, ir.Constant(_INTS, high))
+                    swapped[row], swapped[row + step] = shuffle(builder, *pair, low), shuffle(builder, *pair, high)
             rows = swapped
-        for row in range(N_LANES):
-            index = builder.add(target, builder.mul(stride, ir.Constant(stride.type, row)))
-            address = _address(context, builder, signature.args[0], array, index)
-            builder.store(rows[row], builder.bitcast(address, _FLOATS.as_pointer()), align=4)
+        for place, row in zip(places, rows, strict=True):
+            to = address(context, builder, sig.args[0], array, builder.add(target, place), WIDE)
+            builder.store(row, to, align=4)
         return context.get_dummy_value()
 
-    return types.void(array, types.intp, types.intp, types.intp), emit
+    return signature(types.none, array, types.intp, types.intp, types.intp), build

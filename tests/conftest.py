@@ -1,6 +1,6 @@
 """Toy artifacts of every stage, made once by the real commands; tests that use them share one worker."""
 
-import chebsplat  # noqa: F401  # isort: skip  # before torch: idle OpenMP threads that spin slow all tests tenfold
+import chebsplat  # noqa: F401  # isort: skip  # before torch: OpenMP threads that spin slow parallel tests down
 import pytest
 from shared import INPUTS, run_stage
 

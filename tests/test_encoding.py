@@ -154,3 +154,19 @@ def test_noise_free_features_decode_to_their_labels():
     found, confidence = decode(features, codes)
     assert np.array_equal(found, labels)
     assert (confidence > 0.9).all()
+
+
+@pytest.mark.parametrize("unit", [1e-22, 1.0, 1e22])
+@pytest.mark.parametrize("temperature", [1e-9, 1.0])
+def test_propagation_weights_do_not_depend_on_units_and_stay_finite(unit, temperature):
+    g = torch.Generator().manual_seed(0)
+    means = (torch.rand(20, 3, generator=g) * unit).requires_grad_(True)
+    cover = torch.tensor([[0, 1, -1], [2, -1, -1], [-1, -1, -1], [0, 2, 1]]).repeat(5, 1)
+    rotmats, scales = torch.eye(3).expand(3, 3, 3), torch.full((3, 3), 0.1 * unit)
+    weights = propagation_weights(
+        means, cover, means.detach()[:3], rotmats, scales, 0.5 * unit, temperature=temperature
+    )
+    covered = (cover >= 0).any(1)
+    torch.testing.assert_close(weights.sum(1), covered.float())
+    (weights * torch.rand(weights.shape, generator=g)).sum().backward()
+    assert torch.isfinite(means.grad).all()

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 import torch
 
-from chebsplat.losses import feature_l1, photometric, photometric_reference, ssim
+from chebsplat.losses import feature_l1, feature_l1_reference, photometric, photometric_reference, ssim
 
 
 def images(height=40, width=52, seed=0):
@@ -67,3 +67,17 @@ def test_feature_distance_is_zero_for_the_pooled_render_and_ignores_masked_pixel
     mask[:4, :4] = False
     pooled[0, 0] = 100
     assert feature_l1(render, pooled, mask).item() < 1e-6
+
+
+@pytest.mark.parametrize(("size", "cells"), [((24, 32), (6, 8)), ((25, 30), (6, 7)), ((9, 11), (9, 11))])
+@pytest.mark.parametrize("masked", [False, True])
+def test_fused_feature_distance_equals_the_oracle(size, cells, masked):
+    g = torch.Generator().manual_seed(0)
+    render, target = torch.rand(*size, 5, generator=g), torch.rand(*cells, 5, generator=g)
+    mask = torch.rand(size, generator=g) > 0.4 if masked else None
+    a, b = render.clone().requires_grad_(True), render.double().requires_grad_(True)
+    value, exact = feature_l1(a, target, mask), feature_l1_reference(b, target.double(), mask)
+    (3 * value).backward()
+    (3 * exact).backward()
+    assert abs(value.item() - exact.item()) < 1e-6
+    torch.testing.assert_close(a.grad.double(), b.grad, rtol=1e-5, atol=1e-9)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from importlib import import_module
 from typing import Any
 
 import torch
@@ -20,15 +21,9 @@ def rasterize(
     if backend == "auto":
         on_cpu = "cpu" if means.dtype == torch.float32 else "reference"
         backend = {"cuda": "cuda", "cpu": on_cpu}.get(means.device.type, "reference")
-    if backend == "cpu":
-        from chebsplat.rasterize.cpu import rasterize as chosen
-    elif backend == "cuda":
-        from chebsplat.rasterize.cuda import rasterize as chosen
-    elif backend == "reference":
-        from chebsplat.rasterize.reference import rasterize as chosen
-    else:
+    if backend not in ("cpu", "cuda", "reference"):
         raise ValueError(f"backend {backend!r} is none of auto, cpu, cuda, reference")
-    return chosen(means, *args, **options)
+    return import_module(f"chebsplat.rasterize.{backend}").rasterize(means, *args, **options)
 
 
 __all__ = ["rasterize"]

@@ -1,91 +1,170 @@
 """Which Gaussians touch which tiles, front to back.
 
-A Gaussian touches a tile through one *pair*. Pairs are numbered Gaussian by Gaussian, so that the gradient records a
-Gaussian collects lie together and are summed in a fixed order: no atomics, the same bits for any number of threads.
+A Gaussian touches a tile through one *pair*. Pairs are numbered by band of tile rows, then Gaussian by Gaussian: the
+gradient records that a Gaussian collects in a band lie together and are summed in a fixed order. No atomics, the same
+bits for any number of threads, and records for one band at a time. Work is dealt out in PARTS, whatever the threads.
 """
 
 from __future__ import annotations
 
 import math
+from typing import NamedTuple
 
 import numpy as np
 
-from chebsplat.jit import serial
+from chebsplat.jit import inline, kernel, prange, serial
 
 TILE = 16
+BANDS = 4  # at most; of tile rows
+PARTS, SORT_PARTS = 16, 4  # a sort's parts each count all digits
 ALPHA_MIN = 1 / 255
 DIGIT = 11  # bits of a sorting pass: three passes for 32
 
 
+class Bins(NamedTuple):
+    """order i32 [V]: the Gaussians that touch a tile, front to back; their place in it is their *rank*.
+    tile_starts i64 [tiles + 1] and, in tile order and front to back within, rank and pair, i32 [P];
+    pair_starts i32 [bands, V + 1] by rank.
+    """
+
+    order: np.ndarray
+    tile_starts: np.ndarray
+    rank: np.ndarray
+    pair: np.ndarray
+    pair_starts: np.ndarray
+
+
+@inline
+def _share(part, n):
+    """First index of a part of n."""
+    return part * n // PARTS
+
+
 @serial
-def _by_depth(depths, shown):
-    """Indices of the shown Gaussians by ascending depth, ties by index: a radix sort of positive float32."""
-    index = np.flatnonzero(shown).astype(np.int32)
-    n = len(index)
-    keys = depths[index].view(np.uint32)
-    other_index, other_keys = np.empty(n, np.int32), np.empty(n, np.uint32)
+def band_start(band, rows):
+    """First tile row of a band."""
+    return band * rows // min(BANDS, rows)
+
+
+@inline
+def _box(means2d, covariances, opacities, i, width, height, boxes):
+    """Fill the half-open box of tiles that α ≥ 1/255 may touch, x then y."""
+    limit = 2.0 * math.log(255.0 * opacities[i]) + 1e-3  # the cells' own test is exact
+    reach_x, reach_y = math.sqrt(limit * covariances[i, 0]), math.sqrt(limit * covariances[i, 2])
+    # a pixel's centre is at +0.5
+    x0, x1 = max(means2d[i, 0] - reach_x - 0.5, 0.0), min(means2d[i, 0] + reach_x + 0.5, float(width))
+    y0, y1 = max(means2d[i, 1] - reach_y - 0.5, 0.0), min(means2d[i, 1] + reach_y + 0.5, float(height))
+    if x0 < x1 and y0 < y1:
+        boxes[i, 0], boxes[i, 1] = int(x0) // TILE, (math.ceil(x1) + TILE - 1) // TILE
+        boxes[i, 2], boxes[i, 3] = int(y0) // TILE, (math.ceil(y1) + TILE - 1) // TILE
+
+
+@inline
+def _usable(radii, opacities, colors, i):
+    """Projected, bright enough, and finite in opacity and in every channel."""
+    check = np.float32(0)
+    for d in range(colors.shape[1]):
+        check += colors[i, d] * np.float32(0)
+    return radii[i] != 0 and opacities[i] >= np.float32(ALPHA_MIN) and math.isfinite(opacities[i]) and check == 0
+
+
+@kernel
+def _sort(index, keys):
+    """`index` by ascending key, ties as they come: a radix sort, stable, in parts."""
+    n, size = len(index), 1 << DIGIT
+    other_index, other_keys = np.empty_like(index), np.empty_like(keys)
+    starts = np.empty((SORT_PARTS, size), np.int32)
+    mask = np.uint32(size - 1)
     for k in range(3):
-        shift, starts = np.uint32(k * DIGIT), np.zeros((1 << DIGIT) + 1, np.int64)
-        mask = np.uint32((1 << DIGIT) - 1)
-        for m in range(n):
-            starts[((keys[m] >> shift) & mask) + 1] += 1
-        starts = np.cumsum(starts)
-        for m in range(n):
-            digit = (keys[m] >> shift) & mask
-            where = starts[digit]
-            other_index[where], other_keys[where] = index[m], keys[m]
-            starts[digit] = where + 1
+        shift = np.uint32(k * DIGIT)
+        for part in prange(SORT_PARTS):
+            starts[part] = 0
+            for m in range(part * n // SORT_PARTS, (part + 1) * n // SORT_PARTS):
+                starts[part, (keys[m] >> shift) & mask] += 1
+        total = 0
+        for digit in range(size):
+            for part in range(SORT_PARTS):
+                count = starts[part, digit]
+                starts[part, digit] = total
+                total += count
+        for part in prange(SORT_PARTS):
+            for m in range(part * n // SORT_PARTS, (part + 1) * n // SORT_PARTS):
+                digit = (keys[m] >> shift) & mask
+                where = starts[part, digit]
+                other_index[where], other_keys[where] = index[m], keys[m]
+                starts[part, digit] = where + 1
         index, other_index = other_index, index
         keys, other_keys = other_keys, keys
     return index
 
 
-@serial
-def bin_gaussians(means2d, covariances, depths, radii, opacities, colors, width, height):
-    """Pairs of Gaussians and tiles.
+@kernel
+def _boxes(means2d, covariances, radii, opacities, colors, width, height):
+    """Boxes of tiles i32 [N, 4], all 0 for a Gaussian that touches none."""
+    boxes = np.zeros((len(means2d), 4), np.int32)
+    for i in prange(len(means2d)):
+        if _usable(radii, opacities, colors, i):
+            _box(means2d, covariances, opacities, i, width, height, boxes)
+    return boxes
 
-    Args: of one view, as `ellipses.project` gives them; opacities [N]; colors [N, D].
-    Returns: tile_starts i64 [tiles + 1] and, in tile order and front to back within, gaussian i32 [P] and pair
-      i32 [P]; pair_starts i64 [N + 1] by Gaussian.
+
+@kernel
+def _deal(order, boxes, columns, rows):
+    """tile_starts, rank, pair and pair_starts: every Gaussian, in this order, to its tiles."""
+    n, tiles, bands = len(order), columns * rows, min(BANDS, rows)
+    cursors, tile_starts = np.zeros((PARTS, tiles), np.int32), np.zeros(tiles + 1, np.int64)
+    pair_starts, firsts = np.zeros((bands, n + 1), np.int32), np.empty(bands + 1, np.int64)
+    for band in range(bands + 1):
+        firsts[band] = band_start(band, rows)
+    for part in prange(PARTS):
+        for m in range(_share(part, n), _share(part + 1, n)):
+            x0, x1, y0, y1 = boxes[order[m], 0], boxes[order[m], 1], boxes[order[m], 2], boxes[order[m], 3]
+            for band in range(bands):
+                pair_starts[band, m + 1] = max(min(firsts[band + 1], y1) - max(firsts[band], y0), 0) * (x1 - x0)
+            for y in range(y0, y1):
+                for x in range(x0, x1):
+                    cursors[part, y * columns + x] += 1
+    total = np.int32(0)
+    for band in range(bands):
+        pair_starts[band, 0] = total
+        for m in range(n):
+            total += pair_starts[band, m + 1]
+            pair_starts[band, m + 1] = total
+    total = np.int32(0)
+    for tile in range(tiles):
+        for part in range(PARTS):
+            count = cursors[part, tile]
+            cursors[part, tile] = total
+            total += count
+        tile_starts[tile + 1] = total
+    rank, pair = np.empty(total, np.int32), np.empty(total, np.int32)
+    for part in prange(PARTS):
+        for m in range(_share(part, n), _share(part + 1, n)):
+            x0, x1, y0, y1 = boxes[order[m], 0], boxes[order[m], 1], boxes[order[m], 2], boxes[order[m], 3]
+            band = 0
+            for y in range(y0, y1):
+                while firsts[band + 1] <= y:
+                    band += 1
+                k = pair_starts[band, m] + (y - max(firsts[band], y0)) * (x1 - x0)
+                for x in range(x0, x1):
+                    where = cursors[part, y * columns + x]
+                    rank[where], pair[where] = m, k
+                    cursors[part, y * columns + x] = where + 1
+                    k += 1
+    return tile_starts, rank, pair, pair_starts
+
+
+def bin_gaussians(
+    means2d: np.ndarray, covariances: np.ndarray, depths: np.ndarray, radii: np.ndarray, opacities: np.ndarray,
+    colors: np.ndarray, width: int, height: int,
+) -> Bins:  # fmt: skip
+    """Pairs of Gaussians and tiles of one view.
+
+    Args: as `ellipses.project` gives them; opacities [N]; colors [N, D].
     Choices: the box of the ellipse α ≥ 1/255; a Gaussian that is fainter, or not finite in opacity or in any
-      channel, touches nothing.
+      channel, touches nothing. Ties in depth go by index.
     """
-    columns, rows = (width + TILE - 1) // TILE, (height + TILE - 1) // TILE
-    n = len(means2d)
-    shown, boxes = np.zeros(n, np.bool_), np.zeros((n, 4), np.int32)
-    counts, tile_starts = np.zeros(n + 1, np.int64), np.zeros(columns * rows + 1, np.int64)
-    for i in range(n):
-        opacity, finite = opacities[i], np.float32(0)
-        if radii[i] == 0 or not (opacity >= np.float32(ALPHA_MIN) and math.isfinite(opacity)):
-            continue
-        for d in range(colors.shape[1]):
-            finite += colors[i, d] * np.float32(0)
-        if finite != 0:
-            continue
-        limit = 2.0 * math.log(255.0 * opacity) + 1e-3  # the tiles' own test is exact
-        reach_x, reach_y = math.sqrt(limit * covariances[i, 0]), math.sqrt(limit * covariances[i, 2])
-        # a pixel's centre is at +0.5
-        x0, x1 = max(means2d[i, 0] - reach_x - 0.5, 0.0), min(means2d[i, 0] + reach_x + 0.5, float(width))
-        y0, y1 = max(means2d[i, 1] - reach_y - 0.5, 0.0), min(means2d[i, 1] + reach_y + 0.5, float(height))
-        if not (x0 < x1 and y0 < y1):
-            continue
-        shown[i] = True
-        boxes[i, 0], boxes[i, 1] = int(x0) // TILE, (math.ceil(x1) + TILE - 1) // TILE
-        boxes[i, 2], boxes[i, 3] = int(y0) // TILE, (math.ceil(y1) + TILE - 1) // TILE
-        counts[i + 1] = (boxes[i, 1] - boxes[i, 0]) * (boxes[i, 3] - boxes[i, 2])
-        for ty in range(boxes[i, 2], boxes[i, 3]):
-            for tx in range(boxes[i, 0], boxes[i, 1]):
-                tile_starts[ty * columns + tx + 1] += 1
-    pair_starts, tile_starts = np.cumsum(counts), np.cumsum(tile_starts)
-    total = tile_starts[-1]
-    gaussian, pair = np.empty(total, np.int32), np.empty(total, np.int32)
-    cursor = tile_starts[:-1].copy()
-    for i in _by_depth(depths, shown):
-        k = pair_starts[i]
-        for ty in range(boxes[i, 2], boxes[i, 3]):
-            for tx in range(boxes[i, 0], boxes[i, 1]):
-                where = cursor[ty * columns + tx]
-                gaussian[where], pair[where] = i, k
-                cursor[ty * columns + tx] = where + 1
-                k += 1
-    return tile_starts, gaussian, pair, pair_starts
+    boxes = _boxes(means2d, covariances, radii, opacities, colors, width, height)
+    shown = np.flatnonzero(boxes[:, 1]).astype(np.int32)
+    order = _sort(shown, depths[shown].view(np.uint32))
+    return Bins(order, *_deal(order, boxes, (width + TILE - 1) // TILE, (height + TILE - 1) // TILE))

@@ -9,12 +9,13 @@ import torch
 from torch import Tensor
 
 from chebsplat.rasterize import binning, ellipses, tiles
+from chebsplat.rasterize.projection import compensated, is_antialiased
 
 NAMES = ("means", "quats", "scales", "opacities", "colors", "viewmats", "Ks")
 
 
 class _Project(torch.autograd.Function):
-    """means2d [N, 2] and covariances [N, 3] of one view; whitening, conics, depths and radii come without gradient.
+    """means2d [N, 2], covariances [N, 3] and compensations [N] of one view; the rest comes without gradient.
 
     What comes back for `covariances`, which stay between the two Functions, is not their gradient but the whitened
     moments that `ellipses.project_adjoint` takes: they keep the precision that the gradient would lose.
@@ -24,46 +25,49 @@ class _Project(torch.autograd.Function):
     def forward(ctx: Any, means, quats, scales, camera):  # type: ignore[no-untyped-def, override]
         gaussians = [t.detach().contiguous().numpy() for t in (means, quats, scales)]
         found = [torch.from_numpy(a) for a in ellipses.project(*gaussians, *camera)]
-        means2d, covariances, whitening, conics, depths, radii = found
+        means2d, covariances, whitening, conics, depths, radii, compensations = found
         ctx.gaussians, ctx.camera, ctx.radii = gaussians, (*camera[:4], camera[-1]), radii.numpy()
         ctx.mark_non_differentiable(whitening, conics, depths, radii)
-        return means2d, covariances, whitening, conics, depths, radii
+        return means2d, covariances, whitening, conics, depths, radii, compensations
 
     @staticmethod
-    def backward(ctx: Any, grad_means2d, moments, *_):  # type: ignore[no-untyped-def, override]
-        slopes = [g.contiguous().numpy() for g in (grad_means2d, moments)]
+    def backward(ctx: Any, grad_means2d, moments, *others):  # type: ignore[no-untyped-def, override]
+        slopes = [g.contiguous().numpy() for g in (grad_means2d, moments, others[-1])]
         found = ellipses.project_adjoint(*ctx.gaussians, *ctx.camera, ctx.radii, *slopes)
         return *(torch.from_numpy(a) for a in found), None
 
 
 class _Composite(torch.autograd.Function):
-    """Render [H, W, D] and alpha [H, W] of one view; backward also adds to `absgrad` [N, 2], in place."""
+    """Render [H, W, D] and alpha [H, W] of one view; backward also adds to `absgrad` [N, 2] if given, in place."""
 
     @staticmethod
     def forward(  # type: ignore[override]
         ctx: Any, means2d: Tensor, covariances: Tensor, opacities: Tensor, colors: Tensor,
-        whitening: Tensor, depths: Tensor, radii: Tensor, absgrad: Tensor, size: tuple[int, int], max_alpha: float,
+        whitening: Tensor, depths: Tensor, radii: Tensor, absgrad: Tensor | None, size: tuple[int, int],
+        max_alpha: float, view: int,
     ) -> tuple[Tensor, Tensor]:  # fmt: skip
         centers, spreads, strengths, channels, whitened, z, reach = (
             t.detach().contiguous().numpy() for t in (means2d, covariances, opacities, colors, whitening, depths, radii)
         )
         bins = binning.bin_gaussians(centers, spreads, z, reach, strengths, channels, *size)
+        splats = tiles.pack(bins.order, centers, whitened, strengths, channels)
         limit = np.float32(max_alpha)
-        render, transmittance = tiles.forward(centers, whitened, strengths, channels, *bins[:2], *size, limit)
-        ctx.arrays, ctx.bins, ctx.absgrad = (centers, whitened, strengths, channels), bins, absgrad
-        ctx.size, ctx.limit = size, limit
+        found = tiles.forward(splats, bins.tile_starts, bins.rank, channels.shape[1], *size, limit)
+        render, transmittance, *seen = found
+        ctx.arrays, ctx.absgrad = (len(centers), splats, *bins, *seen, limit), absgrad
+        ctx.view = view
         return torch.from_numpy(render), 1 - torch.from_numpy(transmittance)
 
     @staticmethod
     def backward(ctx: Any, grad_render, grad_alpha):  # type: ignore[no-untyped-def, override]
         slopes = [g.contiguous().numpy() for g in (grad_render, grad_alpha)]
-        records, finite = tiles.backward(*ctx.arrays, *ctx.bins[:3], *ctx.size, ctx.limit, *slopes)
+        *found, finite = tiles.backward(*ctx.arrays, *slopes, ctx.absgrad is not None)
         if not finite:
-            raise ValueError("the gradient of the image is not finite")
-        found = tiles.reduce(records, ctx.bins[3], ctx.arrays[1], ctx.arrays[2])
+            raise ValueError(f"the gradient of the image of view {ctx.view} is not finite")
         to_means2d, moments, to_opacities, absolute, to_colors = (torch.from_numpy(a) for a in found)
-        ctx.absgrad += absolute
-        return to_means2d, moments, to_opacities, to_colors, None, None, None, None, None, None
+        if ctx.absgrad is not None:
+            ctx.absgrad += absolute
+        return to_means2d, moments, to_opacities, to_colors, *[None] * 7
 
 
 def rasterize(
@@ -81,11 +85,14 @@ def rasterize(
     far_plane: float = 1e10,
     eps2d: float = 0.3,
     max_alpha: float = 0.99,
+    rasterize_mode: str = "classic",
     backgrounds: Tensor | None = None,
+    absgrad: bool = False,
 ) -> tuple[Tensor, Tensor, dict[str, Any]]:
     """As `reference.rasterize`, in float32, and fast.
 
-    meta's `means2d` carries `absgrad` [C, N, 2]: after backward, the sum over pixels of the absolute gradient.
+    Args: absgrad: whether meta's `means2d` carries `absgrad` [C, N, 2], after backward the sum over pixels of the
+      absolute gradient.
 
     Raises: ValueError unless all inputs are float32 on the CPU, if a gradient to a camera is asked for, or, in
       backward, on a gradient of the image that is not finite.
@@ -96,18 +103,23 @@ def rasterize(
             raise ValueError(f"{name} is {tensor.dtype} on {tensor.device}; the cpu backend takes float32 on the CPU")
     if viewmats.requires_grad or Ks.requires_grad:
         raise ValueError("the cpu backend gives cameras no gradient: use the reference")
+    antialiased = is_antialiased(rasterize_mode)
     cameras = [(*(t.detach().double().contiguous().numpy() for t in pair), width, height, near_plane, far_plane, eps2d)
                for pair in zip(viewmats, Ks, strict=True)]  # fmt: skip
     views = [_Project.apply(means, quats, scales, camera) for camera in cameras]
-    means2d, covariances, whitening, conics, depths, radii = (_stack(parts) for parts in zip(*views, strict=True))
-    absgrad = torch.zeros(means2d.shape)
+    found = (_stack(parts) for parts in zip(*views, strict=True))
+    means2d, covariances, whitening, conics, depths, radii, compensations = found
     if means2d.requires_grad:
         means2d.retain_grad()
-    means2d.absgrad = absgrad  # type: ignore[attr-defined]
+    absolute = torch.zeros(means2d.shape if absgrad else (0,))
+    if absgrad:
+        means2d.absgrad = absolute  # type: ignore[attr-defined]
     composed = [
         _Composite.apply(
-            means2d[c], covariances[c], opacities, colors if colors.ndim == 2 else colors[c],
-            whitening[c], depths[c], radii[c], absgrad[c], (width, height), max_alpha,
+            means2d[c], covariances[c], compensated(opacities, compensations[c]) if antialiased else opacities,
+            colors if colors.ndim == 2 else colors[c],
+            whitening[c], depths[c], radii[c],
+            absolute[c] if absgrad else None, (width, height), max_alpha, c,
         )
         for c in range(len(cameras))
     ]  # fmt: skip

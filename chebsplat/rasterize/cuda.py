@@ -8,9 +8,13 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from chebsplat.rasterize import reference
+from chebsplat.rasterize.projection import is_antialiased
+
 log = logging.getLogger("chebsplat")
 
 MAX_ALPHA = 0.999  # built into gsplat's kernels
+CHUNK, MOST = 32, 512  # channels at a time by default, and the most that its kernels are made for
 
 
 def rasterize(
@@ -28,26 +32,61 @@ def rasterize(
     far_plane: float = 1e10,
     eps2d: float = 0.3,
     max_alpha: float = 0.99,
+    rasterize_mode: str = "classic",
     backgrounds: Tensor | None = None,
+    absgrad: bool = False,
 ) -> tuple[Tensor, Tensor, dict[str, Any]]:
-    """As `reference.rasterize`, of float32 tensors on a GPU; `means2d.absgrad` [C, N, 2] is there after backward.
+    """As `cpu.rasterize`, of float32 tensors on a GPU.
 
-    Raises: ValueError unless the Gaussians are float32 on a GPU; ImportError, with the remedy, without gsplat.
-    Choices: gsplat fixes the ceiling of alpha at 0.999; another `max_alpha` is reported once and has no effect.
+    Raises: ValueError unless the Gaussians are float32 on a GPU, or beyond 512 channels; ImportError, with the remedy,
+      without gsplat.
+    Choices: gsplat fixes the ceiling of alpha at 0.999; another `max_alpha` is reported once and has no effect. All
+      channels go at once: of gsplat's chunks only one would leave its absolute gradient. A broken Gaussian is replaced
+      by one that nobody sees, because gsplat would draw a NaN opaque.
     """
+    is_antialiased(rasterize_mode)
     if means.dtype != torch.float32 or means.device.type != "cuda":
         raise ValueError(f"means is {means.dtype} on {means.device}; the cuda backend takes float32 on a GPU")
+    if colors.shape[-1] > MOST:
+        raise ValueError(f"{colors.shape[-1]} channels; the cuda backend takes at most {MOST} channels")
     try:
         from gsplat import rasterization
     except ImportError as error:
-        raise ImportError("the cuda backend needs gsplat: pip install 'chebsplat[cuda]'") from error
+        raise ImportError(
+            "torch sees a GPU, but gsplat, which renders on it, cannot be imported: pip install 'chebsplat[cuda]'; "
+            "or move the tensors to the CPU, or pass backend='reference'"
+        ) from error
     _report_ceiling(max_alpha)
+    if len(means) == 0:  # the background: gsplat is not asked to sort an empty scene
+        empty = (means, quats, scales, opacities, colors, viewmats, Ks, width, height)
+        return reference.rasterize(*empty, backgrounds=backgrounds, absgrad=absgrad)
+    gaussians = _without_broken(means, quats, scales, opacities, colors)
     renders, alphas, found = rasterization(
-        means, quats, scales, opacities, colors, viewmats, Ks, width, height,
-        near_plane=near_plane, far_plane=far_plane, eps2d=eps2d, sh_degree=None, packed=False,
-        backgrounds=backgrounds, absgrad=True,
+        *gaussians, viewmats, Ks, width, height,
+        near_plane=near_plane, far_plane=far_plane, eps2d=eps2d, sh_degree=None, packed=False, render_mode="RGB",
+        backgrounds=backgrounds, absgrad=absgrad, rasterize_mode=rasterize_mode,
+        channel_chunk=max(CHUNK, colors.shape[-1]),
     )  # fmt: skip
     return renders, alphas, named(found)
+
+
+def _without_broken(
+    means: Tensor, quats: Tensor, scales: Tensor, opacities: Tensor, colors: Tensor
+) -> tuple[Tensor, ...]:
+    """Gaussians with harmless values and opacity 0 where one is not finite or has no rotation; quaternions scaled."""
+    longest = quats.detach().abs().amax(-1)
+    finite_colors = torch.isfinite(colors).all(-1)
+    whole = torch.isfinite(opacities) & torch.isfinite(longest) & (longest > 1e-12)
+    whole &= torch.isfinite(means).all(-1) & torch.isfinite(scales).all(-1)
+    whole &= finite_colors if colors.ndim == 2 else finite_colors.all(0)
+    rows = whole[:, None]
+    return (
+        torch.where(rows, means, 0),
+        torch.where(rows, quats / torch.where(whole, longest, 1)[:, None], 1),
+        torch.where(rows, scales, 1),
+        torch.where(whole, opacities, 0),
+        torch.where(rows, colors, 0),
+    )
 
 
 def named(found: dict[str, Any]) -> dict[str, Any]:

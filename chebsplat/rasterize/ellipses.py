@@ -15,15 +15,17 @@ from chebsplat.jit import inline, kernel, prange
 
 HALF_LOG2E = 0.5 * math.log2(math.e)
 LN2 = math.log(2.0)
-LARGEST = 1e30  # of any result, so that float32 can hold it and its square root's square
+PARTS = 64  # of the Gaussians: each has scratch of its own
+LARGEST, EXTENT = 1e30, 3.33  # as `projection`'s, which numba's cache could not follow
 
 
 @inline
-def _matmul(a, b, out):
-    for i in range(out.shape[0]):
-        for j in range(out.shape[1]):
+def _matmul(a, b, out, rows, inner, columns):
+    """The sizes, as literals, let the compiler unroll."""
+    for i in range(rows):
+        for j in range(columns):
             total = 0.0
-            for k in range(a.shape[1]):
+            for k in range(inner):
                 total += a[i, k] * b[k, j]
             out[i, j] = total
 
@@ -32,13 +34,14 @@ def _matmul(a, b, out):
 def _rotation(quat, unit, out):
     """Fill the unit quaternion [4] and its matrix [3, 3]; returns the length of `quat`."""
     largest = max(max(abs(quat[0]), abs(quat[1])), max(abs(quat[2]), abs(quat[3])))
-    total = 0.0
+    total, shrink = 0.0, 1.0 / largest
     for k in range(4):
-        unit[k] = quat[k] / largest
+        unit[k] = quat[k] * shrink
         total += unit[k] * unit[k]
     root = math.sqrt(total)
+    shrink = 1.0 / root
     for k in range(4):
-        unit[k] /= root
+        unit[k] *= shrink
     w, x, y, z = unit[0], unit[1], unit[2], unit[3]
     out[0, 0], out[0, 1], out[0, 2] = 1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)
     out[1, 0], out[1, 1], out[1, 2] = 2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)
@@ -60,26 +63,30 @@ def _jacobian(point, viewmat, K, width, height, out, jacobian):
         out[i] = viewmat[i, 3]
         for k in range(3):
             out[i] += viewmat[i, k] * point[k]
-    z = out[2]
-    jacobian[0, 0], jacobian[0, 1] = K[0, 0] / z, 0.0
-    jacobian[1, 0], jacobian[1, 1] = 0.0, K[1, 1] / z
-    jacobian[0, 2] = -K[0, 0] / z * _clamped(out[0] / z, K[0, 2], K[0, 0], width)
-    jacobian[1, 2] = -K[1, 1] / z * _clamped(out[1] / z, K[1, 2], K[1, 1], height)
+    near = 1.0 / out[2]
+    jacobian[0, 0], jacobian[0, 1] = K[0, 0] * near, 0.0
+    jacobian[1, 0], jacobian[1, 1] = 0.0, K[1, 1] * near
+    jacobian[0, 2] = -K[0, 0] * near * _clamped(out[0] * near, K[0, 2], K[0, 0], width)
+    jacobian[1, 2] = -K[1, 1] * near * _clamped(out[1] * near, K[1, 2], K[1, 1], height)
 
 
 @inline
-def _ellipse(factor, eps2d):
-    """Covariance F Fᵀ + ε I: xx, xy, yy and the determinant, by Cauchy-Binet."""
+def _cross(a, b, out):
+    out[0], out[1], out[2] = a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]
+
+
+@inline
+def _ellipse(factor, eps2d, cross):
+    """F Fᵀ + ε I: xx, xy, yy, the determinant by Cauchy-Binet, and |f × g| of F's rows; f × g goes into `cross`."""
     a = b = c = 0.0
     for k in range(3):
         a += factor[0, k] * factor[0, k]
         b += factor[0, k] * factor[1, k]
         c += factor[1, k] * factor[1, k]
-    cross_0 = factor[0, 1] * factor[1, 2] - factor[0, 2] * factor[1, 1]
-    cross_1 = factor[0, 2] * factor[1, 0] - factor[0, 0] * factor[1, 2]
-    cross_2 = factor[0, 0] * factor[1, 1] - factor[0, 1] * factor[1, 0]
-    determinant = eps2d * eps2d + eps2d * (a + c) + cross_0 * cross_0 + cross_1 * cross_1 + cross_2 * cross_2
-    return a + eps2d, b, c + eps2d, determinant
+    _cross(factor[0], factor[1], cross)
+    area = cross[0] * cross[0] + cross[1] * cross[1] + cross[2] * cross[2]
+    determinant = eps2d * eps2d + eps2d * (a + c) + area
+    return a + eps2d, b, c + eps2d, determinant, math.sqrt(area)
 
 
 @kernel
@@ -88,101 +95,131 @@ def project(means, quats, scales, viewmat, K, width, height, near_plane, far_pla
 
     Args: means, scales [N, 3], quats [N, 4] float32; viewmat [4, 4], K [3, 3] float64.
     Returns: float32 means2d [N, 2], covariances [N, 3] (xx, xy, yy; ε included), whitening [N, 3] (p, q, r),
-      conics [N, 3], depths [N]; radii [N] i32. Rows of culled Gaussians are zero; a visible one's radius is not.
+      conics [N, 3], depths [N]; radii [N] i32; compensations [N] f32, √(det Σ / det(Σ + ε I)). Rows of culled
+      Gaussians are zero; a visible one's radius is not.
     """
     n = len(means)
     means2d, covariances = np.zeros((n, 2), np.float32), np.zeros((n, 3), np.float32)
     whitening, conics = np.zeros((n, 3), np.float32), np.zeros((n, 3), np.float32)
-    depths, radii = np.zeros(n, np.float32), np.zeros(n, np.int32)
-    for i in prange(n):
-        depth = viewmat[2, 3]
-        for k in range(3):
-            depth += viewmat[2, k] * means[i, k]
-        if not (depth > near_plane and depth < far_plane):
-            continue
-        largest = max(max(abs(quats[i, 0]), abs(quats[i, 1])), max(abs(quats[i, 2]), abs(quats[i, 3])))
-        sums = 1.0 * quats[i, 0] + quats[i, 1] + quats[i, 2] + quats[i, 3]
-        if not (largest > 1e-12 and math.isfinite(largest) and math.isfinite(sums - sums)):
-            continue
-        unit, camera = np.empty(4), np.empty(3)
+    depths, radii, compensations = np.zeros(n, np.float32), np.zeros(n, np.int32), np.zeros(n, np.float32)
+    turn = np.ascontiguousarray(viewmat[:3, :3])
+    for part in prange(PARTS):
+        unit, camera, cross = np.empty(4), np.empty(3), np.empty(3)
         rotation, jacobian, screen, factor = np.empty((3, 3)), np.empty((2, 3)), np.empty((2, 3)), np.empty((2, 3))
-        _rotation(quats[i], unit, rotation)
-        _jacobian(means[i], viewmat, K, width, height, camera, jacobian)
-        _matmul(jacobian, viewmat[:3, :3], screen)
-        _matmul(screen, rotation, factor)
-        for k in range(3):
-            factor[0, k] *= scales[i, k]
-            factor[1, k] *= scales[i, k]
-        a, b, c, determinant = _ellipse(factor, eps2d)
-        u, v = K[0, 0] * camera[0] / depth + K[0, 2], K[1, 1] * camera[1] / depth + K[1, 2]
-        biggest = 0.5 * (a + c) + math.sqrt(0.25 * (a - c) * (a - c) + b * b)
-        if not (determinant > 0 and determinant < LARGEST * LARGEST and biggest < LARGEST):
-            continue
-        reach = min(math.ceil(3 * math.sqrt(biggest)), 2.0**30)
-        if not (u + reach > 0 and u - reach < width and v + reach > 0 and v - reach < height):
-            continue
-        means2d[i, 0], means2d[i, 1], depths[i], radii[i] = u, v, depth, int(reach)
-        covariances[i, 0], covariances[i, 1], covariances[i, 2] = a, b, c
-        conics[i, 0], conics[i, 1], conics[i, 2] = c / determinant, -b / determinant, a / determinant
-        p = math.sqrt(HALF_LOG2E * c / determinant)
-        whitening[i, 0], whitening[i, 1], whitening[i, 2] = p, -p * b / c, math.sqrt(HALF_LOG2E / c)
-    return means2d, covariances, whitening, conics, depths, radii
+        for i in range(part * n // PARTS, (part + 1) * n // PARTS):
+            depth = viewmat[2, 3]
+            for k in range(3):
+                depth += viewmat[2, k] * means[i, k]
+            if not (depth > near_plane and depth < far_plane):
+                continue
+            largest = max(max(abs(quats[i, 0]), abs(quats[i, 1])), max(abs(quats[i, 2]), abs(quats[i, 3])))
+            sums = 1.0 * quats[i, 0] + quats[i, 1] + quats[i, 2] + quats[i, 3]
+            if not (largest > 1e-12 and math.isfinite(largest) and math.isfinite(sums - sums)):
+                continue
+            _rotation(quats[i], unit, rotation)
+            _jacobian(means[i], viewmat, K, width, height, camera, jacobian)
+            _matmul(jacobian, turn, screen, 2, 3, 3)
+            _matmul(screen, rotation, factor, 2, 3, 3)
+            for k in range(3):
+                factor[0, k] *= scales[i, k]
+                factor[1, k] *= scales[i, k]
+            a, b, c, determinant, area = _ellipse(factor, eps2d, cross)
+            u, v = jacobian[0, 0] * camera[0] + K[0, 2], jacobian[1, 1] * camera[1] + K[1, 2]
+            biggest = 0.5 * (a + c) + math.sqrt(0.25 * (a - c) * (a - c) + b * b)
+            if not (determinant > 0 and determinant < LARGEST * LARGEST and biggest < LARGEST):
+                continue
+            reach = min(math.ceil(EXTENT * math.sqrt(biggest)), 2.0**30)
+            if not (u + reach > 0 and u - reach < width and v + reach > 0 and v - reach < height):
+                continue
+            means2d[i, 0], means2d[i, 1], depths[i], radii[i] = u, v, depth, int(reach)
+            covariances[i, 0], covariances[i, 1], covariances[i, 2] = a, b, c
+            over = 1.0 / determinant
+            conics[i, 0], conics[i, 1], conics[i, 2] = c * over, -b * over, a * over
+            compensations[i] = area * math.sqrt(over)
+            p, under = math.sqrt(HALF_LOG2E * c * over), 1.0 / c
+            whitening[i, 0], whitening[i, 1], whitening[i, 2] = p, -p * b * under, math.sqrt(HALF_LOG2E * under)
+    return means2d, covariances, whitening, conics, depths, radii, compensations
 
 
 @kernel
-def project_adjoint(means, quats, scales, viewmat, K, width, height, eps2d, radii, grad_means2d, moments):
+def project_adjoint(
+    means, quats, scales, viewmat, K, width, height, eps2d, radii, grad_means2d, moments, grad_compensations
+):
     """Gradients [N, 3], [N, 4], [N, 3] to means, quats and scales; zero rows where culled.
 
-    Args: grad_means2d [N, 2]; moments [N, 3]: uu, uv, vv of Σ g (W d)(W d)ᵀ over a Gaussian's pixels.
+    Args: grad_means2d [N, 2]; moments [N, 3]: uu, uv, vv of Σ g (W d)(W d)ᵀ over a Gaussian's pixels;
+      grad_compensations [N].
     The gradient to the factor F of Σ is 2 / (½ log₂e) Wᵀ M (W F): W F is bounded, while gradients to Σ itself would
-    have to cancel over the needle's length.
+    have to cancel over the needle's length. The compensation is |f × g| / √det of F's rows f and g; its gradient is
+    taken at the unit normal f × g / |f × g|, which stays bounded as the ellipse flattens.
     """
     n = len(means)
-    to_means, to_quats, to_scales = np.zeros((n, 3)), np.zeros((n, 4)), np.zeros((n, 3))
-    for i in prange(n):
-        if radii[i] == 0:
-            continue
-        unit, camera = np.empty(4), np.empty(3)
+    to_means, to_scales = np.zeros((n, 3), np.float32), np.zeros((n, 3), np.float32)
+    to_quats = np.zeros((n, 4), np.float32)
+    turn = np.ascontiguousarray(viewmat[:3, :3])
+    for part in prange(PARTS):
+        unit, camera, normal, across = np.empty(4), np.empty(3), np.empty(3), np.empty((2, 3))
         rotation, jacobian, screen = np.empty((3, 3)), np.empty((2, 3)), np.empty((2, 3))
         axes, factor = np.empty((2, 3)), np.empty((2, 3))
-        length = _rotation(quats[i], unit, rotation)
-        _jacobian(means[i], viewmat, K, width, height, camera, jacobian)
-        _matmul(jacobian, viewmat[:3, :3], screen)
-        _matmul(screen, rotation, axes)
-        # F = A S, A = P R, P = J V: down to A, to the scales, and on to R and P.
-        for k in range(3):
-            factor[0, k], factor[1, k] = axes[0, k] * scales[i, k], axes[1, k] * scales[i, k]
-        _, b, c, determinant = _ellipse(factor, eps2d)
-        p, r = math.sqrt(HALF_LOG2E * c / determinant), math.sqrt(HALF_LOG2E / c)
-        q = -p * b / c
-        uu, uv, vv = 2 / HALF_LOG2E * moments[i, 0], 2 / HALF_LOG2E * moments[i, 1], 2 / HALF_LOG2E * moments[i, 2]
         by_axes, by_screen, by_rotation = np.empty((2, 3)), np.empty((2, 3)), np.empty((3, 3))
-        for k in range(3):
-            s = 1.0 * scales[i, k]
-            axis_u, axis_v = p * axes[0, k] + q * axes[1, k], r * axes[1, k]
-            top, low = s * (uu * axis_u + uv * axis_v), s * (uv * axis_u + vv * axis_v)
-            to_scales[i, k] = top * axis_u + low * axis_v
-            by_axes[0, k], by_axes[1, k] = s * p * top, s * (q * top + r * low)
-        _matmul(by_axes, rotation.T, by_screen)
-        _matmul(screen.T, by_axes, by_rotation)
-        by_jacobian = np.empty((2, 3))
-        _matmul(by_screen, viewmat[:3, :3].T, by_jacobian)
-        x, y, z, fx, fy = camera[0], camera[1], camera[2], K[0, 0], K[1, 1]
-        slope_x, slope_y = _clamped(x / z, K[0, 2], fx, width), _clamped(y / z, K[1, 2], fy, height)
-        by_x, by_y = fx / z * grad_means2d[i, 0], fy / z * grad_means2d[i, 1]
-        by_z = -(by_x * x + by_y * y) / z
-        by_z += (-fx * by_jacobian[0, 0] - fy * by_jacobian[1, 1]) / (z * z)
-        by_z += (fx * slope_x * by_jacobian[0, 2] + fy * slope_y * by_jacobian[1, 2]) / (z * z)
-        if slope_x == x / z:
-            by_x -= fx / (z * z) * by_jacobian[0, 2]
-            by_z += fx * slope_x / (z * z) * by_jacobian[0, 2]
-        if slope_y == y / z:
-            by_y -= fy / (z * z) * by_jacobian[1, 2]
-            by_z += fy * slope_y / (z * z) * by_jacobian[1, 2]
-        for k in range(3):
-            to_means[i, k] = viewmat[0, k] * by_x + viewmat[1, k] * by_y + viewmat[2, k] * by_z
-        _rotation_adjoint(unit, length, by_rotation, to_quats[i])
-    return to_means.astype(np.float32), to_quats.astype(np.float32), to_scales.astype(np.float32)
+        by_jacobian, by_scales, by_quat = np.empty((2, 3)), np.empty(3), np.empty(4)
+        for i in range(part * n // PARTS, (part + 1) * n // PARTS):
+            if radii[i] == 0:
+                continue
+            length = _rotation(quats[i], unit, rotation)
+            _jacobian(means[i], viewmat, K, width, height, camera, jacobian)
+            _matmul(jacobian, turn, screen, 2, 3, 3)
+            _matmul(screen, rotation, axes, 2, 3, 3)
+            # F = A S, A = P R, P = J V: down to A, to the scales, and on to R and P.
+            for k in range(3):
+                factor[0, k], factor[1, k] = axes[0, k] * scales[i, k], axes[1, k] * scales[i, k]
+            a, b, c, determinant, area = _ellipse(factor, eps2d, normal)
+            under = 1.0 / c
+            p, r = math.sqrt(HALF_LOG2E * c / determinant), math.sqrt(HALF_LOG2E * under)
+            q = -p * b * under
+            uu, uv, vv = 2 / HALF_LOG2E * moments[i, 0], 2 / HALF_LOG2E * moments[i, 1], 2 / HALF_LOG2E * moments[i, 2]
+            for k in range(3):
+                s = 1.0 * scales[i, k]
+                axis_u, axis_v = p * axes[0, k] + q * axes[1, k], r * axes[1, k]
+                top, low = s * (uu * axis_u + uv * axis_v), s * (uv * axis_u + vv * axis_v)
+                by_scales[k] = top * axis_u + low * axis_v
+                by_axes[0, k], by_axes[1, k] = s * p * top, s * (q * top + r * low)
+            if grad_compensations[i] != 0 and area > 0:
+                weight = grad_compensations[i] / (determinant * math.sqrt(determinant))
+                for k in range(3):
+                    normal[k] /= area
+                _cross(factor[1], normal, across[0])
+                _cross(normal, factor[0], across[1])
+                spread = eps2d * (a + c - eps2d)  # det − |f × g|²; a and c have ε inside
+                for k in range(3):
+                    top = weight * (spread * across[0, k] - eps2d * area * factor[0, k])
+                    low = weight * (spread * across[1, k] - eps2d * area * factor[1, k])
+                    by_scales[k] += top * axes[0, k] + low * axes[1, k]
+                    by_axes[0, k] += top * scales[i, k]
+                    by_axes[1, k] += low * scales[i, k]
+            _matmul(by_axes, rotation.T, by_screen, 2, 3, 3)
+            _matmul(screen.T, by_axes, by_rotation, 3, 2, 3)
+            _matmul(by_screen, turn.T, by_jacobian, 2, 3, 3)
+            x, y, near, fx, fy = camera[0], camera[1], 1.0 / camera[2], K[0, 0], K[1, 1]
+            slope_x, slope_y = _clamped(x * near, K[0, 2], fx, width), _clamped(y * near, K[1, 2], fy, height)
+            by_x, by_y = fx * near * grad_means2d[i, 0], fy * near * grad_means2d[i, 1]
+            by_z = -(by_x * x + by_y * y) * near
+            steep_x, steep_y = fx * near * near, fy * near * near
+            by_z += steep_x * (slope_x * by_jacobian[0, 2] - by_jacobian[0, 0])
+            by_z += steep_y * (slope_y * by_jacobian[1, 2] - by_jacobian[1, 1])
+            if slope_x == x * near:
+                by_x -= steep_x * by_jacobian[0, 2]
+                by_z += steep_x * slope_x * by_jacobian[0, 2]
+            if slope_y == y * near:
+                by_y -= steep_y * by_jacobian[1, 2]
+                by_z += steep_y * slope_y * by_jacobian[1, 2]
+            for k in range(3):
+                to_means[i, k] = viewmat[0, k] * by_x + viewmat[1, k] * by_y + viewmat[2, k] * by_z
+                to_scales[i, k] = by_scales[k]
+            _rotation_adjoint(unit, length, by_rotation, by_quat)
+            for k in range(4):
+                to_quats[i, k] = by_quat[k]
+    return to_means, to_quats, to_scales
 
 
 @inline
@@ -195,5 +232,6 @@ def _rotation_adjoint(unit, length, by, out):
     out[2] = 2 * (w * skew_y + x * (by[0, 1] + by[1, 0]) + z * (by[1, 2] + by[2, 1]) - 2 * y * (by[0, 0] + by[2, 2]))
     out[3] = 2 * (w * skew_z + x * (by[0, 2] + by[2, 0]) + y * (by[1, 2] + by[2, 1]) - 2 * z * (by[0, 0] + by[1, 1]))
     along = out[0] * w + out[1] * x + out[2] * y + out[3] * z
+    shrink = 1.0 / length
     for k in range(4):
-        out[k] = (out[k] - along * unit[k]) / length
+        out[k] = (out[k] - along * unit[k]) * shrink

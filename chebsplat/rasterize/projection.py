@@ -7,15 +7,33 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
+EXTENT = 3.33  # in σ: there even a Gaussian of opacity 1 has fallen to 1/255, √(2 ln 255)
+LARGEST = 1e30  # of a projected variance, pixels²: more is culled, so that float32 can hold what is made of it
+
 
 class Projected(NamedTuple):
     """Gaussians of one view. Rows with `visible` false hold zeros."""
 
     means2d: Tensor  # [N, 2] pixels; pixel centres are at half integers
-    conics: Tensor  # [N, 3] upper triangle of the inverse 2D covariance, pixels⁻²
+    covariances: Tensor  # [N, 3] xx, xy, yy of the 2D covariance, ε included, pixels²
+    conics: Tensor  # [N, 3] upper triangle of its inverse, pixels⁻²
+    whitening: Tensor  # [N, 3] p, q, r of W = [[p, q], [0, r]], WᵀW half the conic: at an offset d, α ∝ exp(−|W d|²)
+    compensations: Tensor  # [N] √(det Σ / det(Σ + ε I)), what ε adds to the ellipse's area
     depths: Tensor  # [N] camera z
-    radii: Tensor  # [N] int, extent of the opacity-independent 3σ ellipse in pixels
+    radii: Tensor  # [N] int, extent of the opacity-independent ellipse of 3.33 σ in pixels
     visible: Tensor  # [N] bool
+
+
+def is_antialiased(rasterize_mode: str) -> bool:
+    """Raises: ValueError unless the mode is `classic` or `antialiased`."""
+    if rasterize_mode not in ("classic", "antialiased"):
+        raise ValueError(f"rasterize_mode {rasterize_mode!r} is neither classic nor antialiased")
+    return rasterize_mode == "antialiased"
+
+
+def compensated(opacities: Tensor, compensations: Tensor) -> Tensor:
+    """Opacities [N] times compensations [N]; one that is not finite becomes 0, and gives neither a gradient."""
+    return torch.where(torch.isfinite(opacities), opacities, 0) * compensations
 
 
 def rotation_matrices(quats: Tensor) -> Tensor:
@@ -72,25 +90,31 @@ def project(
         [torch.stack([fx / z, zero, -fx * tx / z**2], -1), torch.stack([zero, fy / z, -fy * ty / z**2], -1)], -2
     )
     factor = jacobian @ viewmat[:3, :3] @ rotation_matrices(quats) * scales[:, None, :]  # [N, 2, 3]
+    a, b, c, _, determinant = (t.detach() for t in _ellipses(factor, eps2d))
+    largest = 0.5 * (a + c) + eps2d + (0.25 * (a - c) ** 2 + b * b).sqrt()
+    visible = usable & torch.isfinite(determinant) & (determinant > 0) & (largest < LARGEST)
+    factor = torch.where(visible[:, None, None], factor, torch.eye(2, 3).to(factor))
+    a, b, c, cross, determinant = _ellipses(factor, eps2d)
+    covariances = torch.stack([a + eps2d, b, c + eps2d], -1)
+    conics = torch.stack([c + eps2d, -b, a + eps2d], -1) / determinant[:, None]
+    # from the covariance, not from the conic, whose own determinant would cancel
+    p, r = (0.5 * (c + eps2d) / determinant).sqrt(), (0.5 / (c + eps2d)).sqrt()
+    whitening = torch.stack([p, -p * b / (c + eps2d), r], -1)
+    compensations = torch.linalg.vector_norm(cross, dim=-1) / determinant.sqrt()
+    means2d = torch.stack([fx * x / z + cx, fy * y / z + cy], -1)
+
+    reach = (EXTENT * largest.sqrt()).ceil().clamp_max(2**30)
+    u, v = means2d.detach().unbind(-1)
+    visible = visible & (u + reach > 0) & (u - reach < width) & (v + reach > 0) & (v - reach < height)
+    rows = [torch.where(visible[:, None], t, torch.zeros_like(t)) for t in (means2d, covariances, conics, whitening)]
+    numbers = [torch.where(visible, t, torch.zeros_like(t)) for t in (compensations, z, reach)]
+    return Projected(rows[0], rows[1], rows[2], rows[3], numbers[0], numbers[1], numbers[2].int(), visible)
+
+
+def _ellipses(factor: Tensor, eps2d: float) -> tuple[Tensor, ...]:
+    """F Fᵀ of F [N, 2, 3]: xx, xy, yy without ε, the cross product of F's rows [N, 3], and det(F Fᵀ + ε I)."""
     p1, p2 = factor.unbind(-2)
     a, b, c = (p1 * p1).sum(-1), (p1 * p2).sum(-1), (p2 * p2).sum(-1)
     # Cauchy-Binet: a sum of non-negative terms, where (a+ε)(c+ε) − b² cancels for needles.
     cross = torch.linalg.cross(p1, p2)
-    determinant = eps2d**2 + eps2d * (a + c) + (cross * cross).sum(-1)
-    visible = usable & torch.isfinite(determinant)
-    determinant = torch.where(visible, determinant, torch.ones_like(determinant))
-    conics = torch.stack([c + eps2d, -b, a + eps2d], -1) / determinant[:, None]
-    means2d = torch.stack([fx * x / z + cx, fy * y / z + cy], -1)
-
-    largest = 0.5 * (a + c) + eps2d + (0.25 * (a - c) ** 2 + b * b).sqrt()
-    reach = (3 * largest.detach().sqrt()).ceil().clamp_max(2**30)
-    u, v = means2d.detach().unbind(-1)
-    visible = visible & (u + reach > 0) & (u - reach < width) & (v + reach > 0) & (v - reach < height)
-    keep = visible[:, None]
-    return Projected(
-        torch.where(keep, means2d, torch.zeros_like(means2d)),
-        torch.where(keep, conics, torch.zeros_like(conics)),
-        torch.where(visible, z, zero),
-        torch.where(visible, reach, zero).int(),
-        visible,
-    )
+    return a, b, c, cross, eps2d**2 + eps2d * (a + c) + (cross * cross).sum(-1)

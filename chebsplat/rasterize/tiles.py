@@ -1,8 +1,8 @@
 """Compositing and its adjoint, tile by tile, for one view and float32.
 
-A tile of 16×16 pixels is 16 *cells* of 4×4: the 16 pixels of a cell are the lanes of every inner loop, so that each
-is a vector instruction or two. A cell is visited only if the Gaussian's ellipse α ≥ 1/255 may reach it. Backward
-recomputes α front to back, keeps it, and walks back with a suffix sum, so that no division by 1 − α accumulates.
+A tile of 16×16 pixels is 16 cells of 4×4 (see `cells`). Forward tests a tile's Gaussians against all its cells at
+once, in chunks until every pixel is done, then sweeps cell by cell. Backward repeats the sweep, so that only the
+cells' bit masks are kept between the two.
 """
 
 from __future__ import annotations
@@ -11,167 +11,257 @@ import math
 
 import numpy as np
 
-from chebsplat.jit import inline, kernel, prange
-from chebsplat.rasterize.binning import TILE
-from chebsplat.rasterize.lanes import (
-    HALF,
-    LANES,
-    LOG2_255,
-    N_GEOMETRY,
-    ONE,
-    ZERO,
-    accumulate,
-    blend,
-    by_channel,
-    by_geometry,
-    places,
-    reach,
-    sum_lanes,
-)  # fmt: skip
+from chebsplat.jit import inline, kernel, prange, serial
+from chebsplat.rasterize import cells
+from chebsplat.rasterize.binning import TILE, band_start
+from chebsplat.rasterize.blocks import from_lanes, prefetch, to_lanes
+from chebsplat.rasterize.cells import AHEAD, BLOCK, LANES, N_GEOMETRY, NEVER, ONE, SHAPE, SLACK, T_MIN, ZERO
+
+CHUNK = 128  # Gaussians of a tile between two looks at whether it is done
 
 
 @inline
-def _place(means2d, whitening, i, left, top):
-    """Gaussian i's whitening, and (u, v) at the tile's first pixel centre."""
-    p, q, r = whitening[i, 0], whitening[i, 1], whitening[i, 2]
-    dx, dy = np.float32(left) + HALF - means2d[i, 0], np.float32(top) + HALF - means2d[i, 1]
-    return p, q, r, p * dx + q * dy, r * dy
-
-
-@inline
-def _order(j, n):
-    """The j-th tile: neighbours go to different threads, for balance."""
+def _spread(j, n):
+    """The j-th of n tiles: neighbours go to different threads, for balance."""
     stride = (n + 15) // 16
     return j // stride + 16 * (j % stride)
 
 
+@inline
+def padded(channels):
+    return (channels + 3) // 4 * 4
+
+
 @kernel
-def forward(means2d, whitening, opacities, colors, tile_starts, gaussian, width, height, max_alpha):
-    """Composite front to back. colors [N, D] -> render [H, W, D] and transmittance [H, W]."""
-    columns, channels = (width + TILE - 1) // TILE, colors.shape[1]
+def pack(order, means2d, whitening, opacities, colors):
+    """What the tiles read of each Gaussian, in rows of whole cache lines, front to back.
+
+    Returns: splats [V + 1, S]: mean, whitening, log₂ opacity, two unused, the channels, a 1 for alpha, and zeros.
+    """
+    channels = colors.shape[1]
+    splats = np.zeros((len(order) + 1, (SHAPE + channels + LANES) // LANES * LANES), np.float32)
+    for m in prange(len(order)):
+        i = order[m]
+        splats[m, 0], splats[m, 1] = means2d[i, 0], means2d[i, 1]
+        splats[m, 2], splats[m, 3], splats[m, 4] = whitening[i, 0], whitening[i, 1], whitening[i, 2]
+        splats[m, 5] = math.log2(opacities[i])
+        for d in range(channels):
+            splats[m, SHAPE + d] = colors[i, d]
+        splats[m, SHAPE + channels] = ONE
+    return splats
+
+
+@serial
+def _place(splats, ranks, start, n, left, top, shapes):
+    """The tile's shapes (see `cells`)."""
+    ahead, stop, step = 8, len(ranks) - 1, splats.shape[1]
+    for k in range(n):
+        following = np.int64(ranks[min(start + k + ahead, stop)]) * step
+        for d in range(0, step, LANES):
+            prefetch(splats, following + d)
+        m = ranks[start + k]
+        p, q, r = splats[m, 2], splats[m, 3], splats[m, 4]
+        dx, dy = np.float32(left + TILE // 2) - splats[m, 0], np.float32(top + TILE // 2) - splats[m, 1]
+        shapes[k, 0], shapes[k, 1], shapes[k, 2] = p, q, r
+        shapes[k, 3], shapes[k, 4], shapes[k, 5] = p * dx + q * dy, r * dy, splats[m, 5]
+
+
+@serial
+def _begin(states, width, height):
+    """All pixels inside the image open, those outside done."""
+    for cell in range(LANES):
+        for lane in range(LANES):
+            x, y = 4 * (cell & 3) + (lane & 3), 4 * (cell >> 2) + (lane >> 2)
+            states[cell, 0, lane] = ONE
+            states[cell, 1, lane] = T_MIN if x < width and y < height else NEVER
+
+
+@serial
+def _is_done(states, cell):
+    n_open = 0
+    for lane in range(LANES):
+        n_open += states[cell, 1, lane] != NEVER
+    return n_open == 0
+
+
+@serial
+def _forward_tile(splats, ranks, start, stop, left, top, max_alpha, masks, render, transmittance):
+    """One tile of `forward`. Returns how many of its pairs were looked at."""
+    height, width, channels = render.shape
+    states, depth = np.empty((LANES, 2, LANES), np.float32), padded(channels)
+    _begin(states, width - left, height - top)
+    sums = np.zeros((LANES, depth, LANES), np.float32)
+    shapes, chosen = np.empty((CHUNK, SHAPE), np.float32), np.empty((CHUNK + SLACK, depth), np.float32)
+    alphas, weights = np.empty((CHUNK + AHEAD, LANES), np.float32), np.empty((CHUNK, LANES), np.float32)
+    found, rows = np.empty(CHUNK + AHEAD + 1, np.int64), np.empty(CHUNK, np.int64)
+    done, first = 0, start
+    while done != 0xFFFF and first < stop:
+        n = min(CHUNK, stop - first)
+        _place(splats, ranks, first, n, left, top, shapes)
+        for k in range(n):
+            masks[first + k] = cells.reach(shapes, k)
+        for cell in range(LANES):
+            if (done >> cell) & 1:
+                continue
+            count = cells.listed(masks, first, n, cell, found)
+            count = cells.sweep(shapes, found, count, cell, max_alpha, states, alphas, weights, rows)
+            if count > 0:
+                cells.gather(splats, ranks, first, rows, count, chosen)
+                cells.accumulate(chosen, weights, count, cell, sums)
+            if _is_done(states, cell):
+                done |= 1 << cell
+        first += n
+    pixels = np.empty((LANES, depth), np.float32)
+    for cell in range(LANES):
+        for c in range(0, depth, 4):
+            from_lanes(pixels, c, depth, sums, LANES * (cell * depth + c))
+        for lane in range(LANES):
+            x, y = left + 4 * (cell & 3) + (lane & 3), top + 4 * (cell >> 2) + (lane >> 2)
+            if x < width and y < height:
+                transmittance[y, x] = states[cell, 0, lane]
+                for d in range(channels):
+                    render[y, x, d] = pixels[lane, d]
+    return first - start
+
+
+@kernel
+def forward(splats, tile_starts, ranks, channels, width, height, max_alpha):
+    """Composite front to back the splats of `pack`, listed by `binning.bin_gaussians`.
+
+    Returns: render [H, W, D], transmittance [H, W]; masks u16 [P] of the cells each pair may reach, and used [tiles],
+      the pairs that were looked at before all pixels were done: for `backward`.
+    """
+    columns, n_tiles = (width + TILE - 1) // TILE, len(tile_starts) - 1
     render = np.empty((height, width, channels), np.float32)
     transmittance = np.empty((height, width), np.float32)
-    n_tiles = len(tile_starts) - 1
+    masks, used = np.empty(len(ranks), np.uint16), np.zeros(n_tiles, np.int64)
     for j in prange(16 * ((n_tiles + 15) // 16)):
-        tile = _order(j, n_tiles)
-        if tile >= n_tiles:
-            continue
-        top, left = (tile // columns) * TILE, (tile % columns) * TILE
-        before = np.zeros((LANES, LANES), np.float32)  # T; negated once a pixel is done; 0 outside the image
-        for y in range(min(TILE, height - top)):
-            for x in range(min(TILE, width - left)):
-                before[4 * (y >> 2) + (x >> 2), 4 * (y & 3) + (x & 3)] = ONE
-        sums, weights = np.zeros((LANES, channels, LANES), np.float32), np.empty(LANES, np.float32)
-        alphas, fronts = np.empty((LANES, LANES), np.float32), np.empty((LANES, LANES), np.float32)
-        offsets, alive, hits = places(), np.ones(LANES, np.int32), np.empty(LANES, np.int32)
-        cells, n_alive = np.empty(LANES, np.int32), LANES
-        for k in range(tile_starts[tile], tile_starts[tile + 1]):
-            i = gaussian[k]
-            p, q, r, u, v = _place(means2d, whitening, i, left, top)
-            log_opacity = np.float32(math.log2(opacities[i]))
-            n = reach(u, v, p, q, r, log_opacity + LOG2_255, offsets, alive, hits, cells, 0)
-            if n > 0:
-                n_alive -= blend(
-                    u, v, p, q, r, log_opacity, max_alpha, offsets, cells, 0, n, before, alphas, fronts, alive
-                )
-                accumulate(alphas, fronts, weights, cells, n, colors, i, sums)
-            if n_alive == 0:
-                break
-        for y in range(min(TILE, height - top)):
-            for x in range(min(TILE, width - left)):
-                cell, lane = 4 * (y >> 2) + (x >> 2), 4 * (y & 3) + (x & 3)
-                transmittance[top + y, left + x] = abs(before[cell, lane])
+        tile = _spread(j, n_tiles)
+        if tile < n_tiles:
+            used[tile] = _forward_tile(
+                splats, ranks, tile_starts[tile], tile_starts[tile + 1], (tile % columns) * TILE,
+                (tile // columns) * TILE, max_alpha, masks, render, transmittance,
+            )  # fmt: skip
+    return render, transmittance, masks, used
+
+
+@serial
+def _backward_tile(
+    splats, ranks, pair, masks, start, n, left, top, max_alpha, grad, grad_alpha, absolute, base, spare, records
+):
+    """One tile of `backward`: adds to the records of its pairs. Returns whether the gradient is finite.
+
+    `base` is the first pair's number, `spare` a row of records that takes what fills up a block.
+    """
+    height, width, channels = grad.shape
+    depth = channels + 1  # alpha is a channel in which every Gaussian is 1
+    states = np.empty((LANES, 2, LANES), np.float32)
+    _begin(states, width - left, height - top)
+    tall_grads, check = np.empty((LANES, LANES, padded(depth)), np.float32), ZERO
+    grads = np.empty((LANES, padded(depth), LANES), np.float32)
+    for cell in range(LANES):
+        for lane in range(LANES):
+            x, y = left + 4 * (cell & 3) + (lane & 3), top + 4 * (cell >> 2) + (lane >> 2)
+            if x < width and y < height:
                 for d in range(channels):
-                    render[top + y, left + x, d] = sums[cell, d, lane]
-    return render, transmittance
+                    tall_grads[cell, lane, d] = grad[y, x, d]
+                    check += ZERO * grad[y, x, d]
+                tall_grads[cell, lane, channels] = grad_alpha[y, x]
+                check += ZERO * grad_alpha[y, x]
+                tall_grads[cell, lane, depth:] = ZERO
+            else:
+                tall_grads[cell, lane] = ZERO
+        for c in range(0, padded(depth), 4):
+            at = LANES * padded(depth) * cell
+            to_lanes(grads, at + LANES * c, tall_grads, at + c, padded(depth))
+    room = (n + AHEAD + BLOCK) // BLOCK * BLOCK
+    shapes, chosen = np.empty((n, SHAPE), np.float32), np.zeros((room + SLACK, padded(depth)), np.float32)
+    alphas, weights = np.empty((room, LANES), np.float32), np.empty((room, LANES), np.float32)
+    g, places = np.empty((room, LANES), np.float32), np.empty(room, np.int64)
+    found, rows = np.empty(n + AHEAD + 1, np.int64), np.empty(n, np.int64)
+    _place(splats, ranks, start, n, left, top, shapes)
+    for cell in range(LANES):
+        count = cells.listed(masks, start, n, cell, found)
+        count = cells.sweep(shapes, found, count, cell, max_alpha, states, alphas, weights, rows)
+        if count == 0:
+            continue
+        for m in range(count):
+            places[m] = pair[start + rows[m]] - base
+        for m in range(count, (count + BLOCK - 1) // BLOCK * BLOCK):
+            places[m] = spare
+        cells.gather(splats, ranks, start, rows, count, chosen)
+        cells.slopes(chosen, grads, count, cell, depth, g)
+        cells.unwind(alphas, weights, g, count, max_alpha)
+        cells.record_colors(weights, tall_grads, count, cell, places, records)
+        cells.record_geometry(g, count, cell, places, records)
+        if absolute:
+            cells.record_absolute(g, count, cell, shapes, rows, places, records)
+    for k in range(n):
+        cells.whiten(records, pair[start + k] - base, shapes, k)
+    return check == ZERO
+
+
+@serial
+def _sum_records(records, first, last, sums, to_color):
+    """Add the records of one Gaussian in one band."""
+    geometry = np.zeros(N_GEOMETRY)
+    for k in range(first, last):
+        for d in range(N_GEOMETRY):
+            geometry[d] += records[k, d]
+        for d in range(len(to_color)):
+            to_color[d] += records[k, N_GEOMETRY + d]
+    for d in range(N_GEOMETRY):
+        sums[d] += geometry[d]
 
 
 @kernel
 def backward(
-    means2d, whitening, opacities, colors, tile_starts, gaussian, pair, width, height, max_alpha, grad, grad_alpha
+    n, splats, order, tile_starts, ranks, pair, pair_starts, masks, used, max_alpha, grad, grad_alpha, absolute
 ):
-    """Records [P, N_GEOMETRY + D], one a pair, and whether the image's gradient is finite.
+    """Gradients of n Gaussians, band by band, each Gaussian's records summed in the order of its pairs.
 
-    Args: grad [H, W, D] of the render, grad_alpha [H, W].
+    Args: masks, used as `forward` returned them; grad [H, W, D] of the render, grad_alpha [H, W]; absolute: whether to
+      gather the absolute gradient too.
+    Returns: gradients to means2d [n, 2]; moments [n, 3] for `ellipses.project_adjoint`; gradients to opacities [n],
+      the absolute gradient to means2d [n or 0, 2], to colors [n, D]; whether the image's gradient is finite.
     """
-    columns, channels = (width + TILE - 1) // TILE, colors.shape[1]
-    records = np.empty((len(gaussian), N_GEOMETRY + channels), np.float32)
-    n_tiles = len(tile_starts) - 1
-    finite = np.ones(n_tiles, np.bool_)
-    for j in prange(16 * ((n_tiles + 15) // 16)):
-        tile = _order(j, n_tiles)
-        if tile >= n_tiles:
-            continue
-        top, left = (tile // columns) * TILE, (tile % columns) * TILE
-        before, by_alpha = np.zeros((LANES, LANES), np.float32), np.zeros((LANES, LANES), np.float32)
-        grads, check = np.zeros((LANES, channels, LANES), np.float32), ZERO
-        tall_grads = np.zeros((LANES, LANES, (channels + 7) // 8 * 8), np.float32)
-        for y in range(min(TILE, height - top)):
-            for x in range(min(TILE, width - left)):
-                cell, lane = 4 * (y >> 2) + (x >> 2), 4 * (y & 3) + (x & 3)
-                before[cell, lane], by_alpha[cell, lane] = ONE, grad_alpha[top + y, left + x]
-                check += ZERO * by_alpha[cell, lane]
+    height, width, channels = grad.shape
+    columns, rows = (width + TILE - 1) // TILE, (height + TILE - 1) // TILE
+    finite, bands, shown = np.ones(len(tile_starts) - 1, np.bool_), len(pair_starts), len(order)
+    room = 0
+    for band in range(bands):
+        n_tiles = (band_start(band + 1, rows) - band_start(band, rows)) * columns
+        room = max(room, pair_starts[band, shown] - pair_starts[band, 0] + n_tiles)
+    records = np.empty((room, N_GEOMETRY + padded(channels)), np.float32)
+    sums, to_colors = np.zeros((shown, N_GEOMETRY), np.float32), np.zeros((n, channels), np.float32)
+    for band in range(bands):
+        first_tile = band_start(band, rows) * columns
+        n_tiles = band_start(band + 1, rows) * columns - first_tile
+        base, n_pairs = pair_starts[band, 0], pair_starts[band, shown] - pair_starts[band, 0]
+        for j in prange(16 * ((n_tiles + 15) // 16)):
+            if _spread(j, n_tiles) < n_tiles:
+                tile = first_tile + _spread(j, n_tiles)
+                for k in range(tile_starts[tile], tile_starts[tile + 1]):
+                    records[pair[k] - base] = ZERO
+                finite[tile] = _backward_tile(
+                    splats, ranks, pair, masks, tile_starts[tile], used[tile], (tile % columns) * TILE,
+                    (tile // columns) * TILE, max_alpha, grad, grad_alpha, absolute, base,
+                    n_pairs + tile - first_tile, records,
+                )  # fmt: skip
+        for m in prange(shown):
+            for k in range(pair_starts[band, m] - base, pair_starts[band, m + 1] - base):
+                for d in range(N_GEOMETRY):
+                    sums[m, d] += records[k, d]
                 for d in range(channels):
-                    grads[cell, d, lane] = tall_grads[cell, lane, d] = grad[top + y, left + x, d]
-                    check += ZERO * grads[cell, d, lane]
-        finite[tile] = check == ZERO
-        start, n_pairs = tile_starts[tile], tile_starts[tile + 1] - tile_starts[tile]
-        offsets, alive, hits = places(), np.ones(LANES, np.int32), np.empty(LANES, np.int32)
-        cells, firsts = np.empty(LANES * n_pairs + 1, np.int32), np.zeros(n_pairs + 1, np.int64)
-        alphas, fronts = np.empty((LANES * n_pairs, LANES), np.float32), np.empty((LANES * n_pairs, LANES), np.float32)
-        n_alive = LANES
-        for k in range(n_pairs):
-            i, n = gaussian[start + k], 0
-            if n_alive > 0:
-                p, q, r, u, v = _place(means2d, whitening, i, left, top)
-                log_opacity = np.float32(math.log2(opacities[i]))
-                n = reach(u, v, p, q, r, log_opacity + LOG2_255, offsets, alive, hits, cells, firsts[k])
-                n_alive -= blend(
-                    u, v, p, q, r, log_opacity, max_alpha, offsets, cells, firsts[k], n, before, alphas, fronts, alive
-                )
-            firsts[k + 1] = firsts[k] + n
-        behind, slopes = np.zeros((LANES, LANES), np.float32), np.empty((LANES, LANES), np.float32)
-        weights, by_colors = np.empty(LANES, np.float32), np.empty((channels, LANES), np.float32)
-        color = np.zeros((channels + 7) // 8 * 8, np.float32)
-        for k in range(n_pairs - 1, -1, -1):
-            i, first, n = gaussian[start + k], firsts[k], firsts[k + 1] - firsts[k]
-            record = records[pair[start + k]]
-            if n == 0:
-                record[:] = ZERO
-                continue
-            p, q, r, u, v = _place(means2d, whitening, i, left, top)
-            for d in range(channels):
-                color[d] = colors[i, d]
-            by_channel(alphas, fronts, cells, first, n, color, grads, tall_grads, by_alpha, slopes, weights, by_colors)
-            by_geometry(u, v, p, q, r, max_alpha, offsets, cells, first, n, alphas, fronts, slopes, behind, record)
-            sum_lanes(by_colors, record)
-    return records, finite.all()
-
-
-@kernel
-def reduce(records, pair_starts, whitening, opacities):
-    """Sum each Gaussian's records, in the order of its pairs.
-
-    Returns: gradients to means2d [N, 2]; moments [N, 3] for `ellipses.project_adjoint`; gradients to opacities [N],
-      the absolute gradient to means2d [N, 2], and to colors [N, D].
-    """
-    n, channels = len(pair_starts) - 1, records.shape[1] - N_GEOMETRY
+                    to_colors[order[m], d] += records[k, N_GEOMETRY + d]
     to_means2d, moments = np.zeros((n, 2), np.float32), np.zeros((n, 3), np.float32)
-    to_opacities, absolute = np.zeros(n, np.float32), np.zeros((n, 2), np.float32)
-    to_colors = np.zeros((n, channels), np.float32)
-    for i in prange(n):
-        if pair_starts[i] == pair_starts[i + 1]:
-            continue
-        total = np.zeros(N_GEOMETRY)
-        for k in range(pair_starts[i], pair_starts[i + 1]):
-            for d in range(N_GEOMETRY):
-                total[d] += records[k, d]
-            for d in range(channels):
-                to_colors[i, d] += records[k, N_GEOMETRY + d]
-        p, q, r = 1.0 * whitening[i, 0], 1.0 * whitening[i, 1], 1.0 * whitening[i, 2]
-        to_means2d[i, 0] = 2 * p * total[1]
-        to_means2d[i, 1] = 2 * (q * total[1] + r * total[2])
-        moments[i, 0], moments[i, 1], moments[i, 2] = total[3], total[4], total[5]
-        to_opacities[i] = total[0] / (math.log(2.0) * opacities[i])
-        absolute[i, 0], absolute[i, 1] = total[6], total[7]
-    return to_means2d, moments, to_opacities, absolute, to_colors
+    to_opacities, to_absolute = np.zeros(n, np.float32), np.zeros((n if absolute else 0, 2), np.float32)
+    for m in prange(shown):
+        i, p, q, r = order[m], splats[m, 2], splats[m, 3], splats[m, 4]
+        to_means2d[i, 0] = 2 * p * sums[m, 1]
+        to_means2d[i, 1] = 2 * (q * sums[m, 1] + r * sums[m, 2])
+        moments[i, 0], moments[i, 1], moments[i, 2] = sums[m, 3], sums[m, 4], sums[m, 5]
+        to_opacities[i] = sums[m, 0] * 2.0 ** (-splats[m, 5]) / math.log(2.0)
+        if absolute:
+            to_absolute[i, 0], to_absolute[i, 1] = sums[m, 6], sums[m, 7]
+    return to_means2d, moments, to_opacities, to_absolute, to_colors, finite.all()

@@ -1,0 +1,1 @@
+"""How well a simple classifier tells simple shapes from each descriptor."""

@@ -1,0 +1,1 @@
+"""Every stiff and extreme case, through the naive formula and through ours."""

@@ -1,0 +1,95 @@
+"""What a case is, and what the naive formula made of it."""
+
+from __future__ import annotations
+
+import itertools
+import time
+import warnings
+from collections.abc import Callable, Iterable
+from functools import partial
+from typing import Any, NamedTuple
+
+import numpy as np
+
+
+class Outcome(NamedTuple):
+    """What a case returns; it passes if error <= tolerance, so NaN fails."""
+
+    condition: str  # what makes it hard: a condition number or the stiff parameter
+    naive: str  # what the naive formula makes of it: an error, a NaN share, an exception's name
+    error: float  # of our float32 result, relative to the oracle's largest value unless the module says otherwise
+    tolerance: float
+
+
+class Row(NamedTuple):
+    module: str
+    case: str
+    condition: str
+    naive: str
+    error: float
+    tolerance: float
+    passed: bool
+    note: str
+    seconds: float
+
+
+CASES: dict[tuple[str, str], Callable[[], Outcome]] = {}
+
+
+def case(name: str, /, **values: Iterable[Any]) -> Callable[[Callable[..., Outcome]], Callable[..., Outcome]]:
+    """Register a function as a case of its module, or as one for each combination of keyword values.
+
+    Args: name: unique in its module; keyword values are filled in by `str.format`.
+    """
+
+    def register(function: Callable[..., Outcome]) -> Callable[..., Outcome]:
+        module = function.__module__.rpartition(".")[2]
+        for combination in itertools.product(*values.values()):
+            arguments = dict(zip(values, combination, strict=True))
+            key = (module, name.format(**arguments))
+            if key in CASES:
+                raise ValueError(f"two cases are called {key}")
+            CASES[key] = partial(function, **arguments)
+        return function
+
+    return register
+
+
+def run(key: tuple[str, str]) -> Row:
+    """Run a case; an exception or a warning of ours is a failure, and named."""
+    began = time.perf_counter()
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("error")
+            outcome, note = CASES[key](), ""
+    except Exception as error:
+        outcome, note = Outcome("?", "?", float("inf"), 0.0), f"{type(error).__name__}: {error}"
+    passed = bool(outcome.error <= outcome.tolerance)
+    return Row(*key, *outcome, passed, note, time.perf_counter() - began)
+
+
+def naive(attempt: Callable[[], str]) -> str:
+    """What became of the naive formula, its exception's name if it raised one; its warnings do not count."""
+    try:
+        with warnings.catch_warnings(), np.errstate(all="ignore"):
+            warnings.simplefilter("ignore")
+            return attempt()
+    except Exception as error:
+        return type(error).__name__
+
+
+def verdict(found: Any, exact: Any, of: str = "error") -> str:
+    """A share of NaN or infinite entries if there are any, else the largest error relative to the largest value."""
+    found, exact = np.asarray(found), np.asarray(exact)
+    bad = 1 - np.isfinite(found).mean() if found.size else 0.0
+    return f"{100 * bad:.0f} % NaN" if bad else f"{of} {relative(found, exact):.1e}"
+
+
+def relative(found: Any, exact: Any) -> float:
+    """Largest absolute difference over the largest absolute value (over 1 where that is 0); inf where not finite."""
+    found, exact = np.asarray(found, np.float64), np.asarray(exact, np.float64)
+    if found.shape != exact.shape or not (np.isfinite(found).all() and np.isfinite(exact).all()):
+        return float("inf")
+    if not found.size:
+        return 0.0
+    return float(np.abs(found - exact).max() / (np.abs(exact).max() or 1.0))

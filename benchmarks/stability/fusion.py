@@ -1,0 +1,122 @@
+"""Points and regions that break the printed propagation (Eq 8; METHOD section 4). Errors are those of the weights."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import mpmath
+import numpy as np
+import torch
+from torch import Tensor
+
+from benchmarks.stability.case import Outcome, case, naive, relative
+from chebsplat.fusion import propagation_weights
+from chebsplat.rasterize.projection import rotation_matrices
+
+TOLERANCE = 1e-5  # logits reach 16, and float32 rounds each to 1e-6
+N_POINTS, N_REGIONS = 60, 12
+
+
+def room(scale: Any = (0.3, 0.3, 0.03), units: float = 1.0, offset: float = 0.0) -> tuple[Any, ...]:
+    """Arguments of `propagation_weights`: points and regions in a unit box; a region covers what its radius reaches."""
+    g = torch.Generator().manual_seed(0)
+    means, centers = torch.rand(N_POINTS, 3, generator=g), torch.rand(N_REGIONS, 3, generator=g)
+    rotmats = rotation_matrices(torch.randn(N_REGIONS, 4, generator=g))
+    scales = torch.tensor(scale, dtype=torch.float64).expand(N_REGIONS, 3) * 0.1 * units
+    distance = torch.cdist(means, centers)
+    cover = torch.where(distance < 0.5, torch.arange(N_REGIONS), -1)
+    places = ((v.double() * units + offset).float() for v in (means, centers))
+    means, centers = places
+    return means, cover, centers, rotmats, scales.float(), 0.5 * units
+
+
+def printed(means: Tensor, cover: Tensor, centers: Tensor, rotmats: Tensor, scales: Tensor, radius: float) -> Tensor:
+    """exp(−Δᵀ Σ⁻¹ Δ), normalised."""
+    inverse = torch.linalg.inv(rotmats @ torch.diag_embed(scales**2) @ rotmats.transpose(1, 2))
+    delta = means[:, None] - centers
+    weights = torch.exp(-torch.einsum("nmi,mij,nmj->nm", delta, inverse, delta)) * (cover >= 0)
+    return weights / weights.sum(1, keepdim=True)
+
+
+def exact_weights(
+    means: Tensor, cover: Tensor, centers: Tensor, rotmats: Tensor, scales: Tensor, radius: float,
+    temperature: float = 1.0,
+) -> np.ndarray:  # fmt: skip
+    """The documented weights in 60 digits."""
+    mp = np.frompyfunc(mpmath.mpf, 1, 1)
+    with mpmath.workdps(60):
+        p, c, R, s = (mp(v.double().numpy()) for v in (means, centers, rotmats, scales))
+        local = ((p[:, None] - c)[:, :, None, :] @ R[None])[:, :, 0]
+        lengths = (local**2 / (s**2 + (mpmath.mpf(radius) / 4) ** 2)).sum(-1)
+        weights = np.frompyfunc(mpmath.exp, 1, 1)(-lengths / temperature) * mp((cover >= 0).double().numpy())
+        total = weights.sum(1, keepdims=True)
+        return (weights / np.where(total > 0, total, mpmath.mpf(1))).astype(np.float64)
+
+
+def compare(arguments: tuple[Any, ...], condition: str, **options: float) -> Outcome:
+    """Ours against 60 digits; raises ValueError if a gradient is not finite."""
+    means, cover, centers, rotmats, scales, radius = arguments
+    inputs = [v.clone().requires_grad_(True) for v in (means, centers, rotmats, scales)]
+    found = propagation_weights(inputs[0], cover, *inputs[1:], radius, **options)
+    slopes = torch.autograd.grad(found.square().sum(), inputs)
+    if not all(torch.isfinite(slope).all() for slope in slopes):
+        raise ValueError("a gradient is not finite")
+
+    def attempt() -> str:
+        weights = printed(*arguments)
+        reached = (cover >= 0).any(1)
+        bad = 1 - torch.isfinite(weights[reached]).all(1).double().mean().item()
+        if bad:
+            return f"{100 * bad:.0f} % of points NaN"
+        return f"{1 / weights[reached].square().sum(1).mean():.1f} regions of {N_REGIONS}"
+
+    error = relative(found.detach(), exact_weights(*arguments, **options))
+    return Outcome(condition, naive(attempt), error, TOLERANCE)
+
+
+SPLATS: dict[str, tuple[float, ...]] = {
+    "round splats": (1, 1, 1),
+    "flat splats": (0.3, 0.3, 0.03),
+    "thin splats": (0.3, 0.3, 1e-4),
+    "splats of width 1e-9": (0.3, 0.3, 1e-9),
+    "needles 1e6": (1e3, 1e-3, 1e-3),
+    "pancakes 1e12": (1e6, 1e6, 1e-6),
+    "all scales 0": (0, 0, 0),
+    "needles of no width": (1, 0, 0),
+    "scales 1e-30": (1e-30,) * 3,
+    "scales 1e+15": (1e15,) * 3,
+}
+
+
+@case("{name}", name=SPLATS)
+def splats(name: str) -> Outcome:
+    scale = SPLATS[name]
+    return compare(room(scale), f"deviation/radius {min(scale) / 5:.0e}")
+
+
+@case("units {units:.0e}", units=[1e-15, 1e-6, 1e6, 1e15])
+def units(units: float) -> Outcome:
+    return compare(room(units=units), f"unit {units:.0e}")
+
+
+@case("offset {offset:.0e}", offset=[1e3, 1e6])
+def offset(offset: float) -> Outcome:
+    return compare(room(offset=offset), f"offset/radius {2 * offset:.0e}")
+
+
+@case("coincident centres and points")
+def coincident() -> Outcome:
+    means, cover, centers, *rest = room()
+    return compare((means * 0, cover, centers * 0, *rest), "all distances 0")
+
+
+@case("points that nothing covers")
+def uncovered() -> Outcome:
+    means, cover, *rest = room()
+    cover[::2] = -1
+    return compare((means, cover, *rest), "every second point")
+
+
+@case("temperature {temperature:.0e}", temperature=[1e-6, 1e-3, 1e6])
+def temperatures(temperature: float) -> Outcome:
+    return compare(room(), f"temperature {temperature:.0e}", temperature=temperature)

@@ -1,0 +1,132 @@
+"""Projections that break the printed knowledge space (Eqs 14-15; METHOD section 7).
+
+Errors of `update` are those of orthonormality, max |BᵀB − I|; a ρ outside [0, 1] or not finite is one, too.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+
+import mpmath
+import numpy as np
+import torch
+from torch import Tensor
+
+from benchmarks.stability.case import Outcome, case, naive, relative
+from chebsplat.cks import regularizer, update
+
+ORTHONORMAL = 3e-8
+Q = 32
+
+
+def weights(q: int = Q, p: int = Q, rank: int | None = None, seed: int = 0) -> Tensor:
+    g = torch.Generator().manual_seed(seed)
+    if rank is None:
+        return torch.randn(q, p, generator=g)
+    return torch.randn(q, rank, generator=g) @ torch.randn(rank, p, generator=g)
+
+
+def printed(basis: Tensor | None, W: Tensor, energy: float = 0.96) -> Tensor:
+    """Eq 15 as it stands, in float32: one projection, energy of the residual alone, columns appended as they come."""
+    W = W.float()
+    residual = W if basis is None else W - basis @ (basis.T @ W)
+    vectors, values, _ = torch.linalg.svd(residual, full_matrices=False)
+    share = torch.cumsum(values**2, 0) / (residual**2).sum()
+    count = int((share < energy).sum()) + 1
+    return vectors[:, :count] if basis is None else torch.cat([basis, vectors[:, :count]], 1)
+
+
+def off_orthonormal(basis: Tensor) -> float:
+    gram = basis.detach().double().T @ basis.detach().double()
+    return relative(gram, np.eye(basis.shape[1]))
+
+
+def condition_of(W: Tensor) -> str:
+    values = torch.linalg.svdvals(W.double())
+    return f"cond {values[0] / values[-1]:.0e}" if values[-1] > 0 else f"rank {torch.linalg.matrix_rank(W.double())}"
+
+
+def compare(scenes: list[Tensor], condition: str) -> Outcome:
+    """A sequence of scenes through both; raises ValueError on an impossible report."""
+
+    def attempt() -> str:
+        basis = None
+        for W in scenes:
+            basis = printed(basis, W)
+        assert basis is not None
+        return f"{basis.shape[1]} columns of {Q}, off {off_orthonormal(basis):.0e}"
+
+    basis, error = None, 0.0
+    for W in scenes:
+        basis, report = update(basis, W)
+        if not (0 <= report["rho"] <= 1 and 0 <= report["energy"] <= 1 and report["rank_after"] <= Q / 2):
+            raise ValueError(f"impossible report {report}")
+        error = max(error, off_orthonormal(basis))
+    return Outcome(condition, naive(attempt), error, ORTHONORMAL)
+
+
+SEQUENCES: dict[str, Callable[[], list[Tensor]]] = {
+    "W = 0": lambda: [torch.zeros(Q, Q), weights()],
+    "0 after a scene": lambda: [weights(), torch.zeros(Q, Q)],
+    "entries 1e+25": lambda: [weights() * 1e25, weights(seed=1) * 1e25],
+    "entries 1e-25": lambda: [weights() * 1e-25, weights(seed=1) * 1e-25],
+    "entries 1e-25 to 1e+25": lambda: [weights() * 1e25, weights(seed=1) * 1e-25],
+    "columns 1e-20 to 1e+15": lambda: [weights() * torch.logspace(-20, 15, Q)],
+    "rank 1": lambda: [weights(rank=1), weights(rank=1, seed=1)],
+    "nearly parallel columns": lambda: [weights(rank=1) + 1e-7 * weights(seed=1)] * 2,
+    "residual 1e-6": lambda: [weights(rank=4), weights(rank=4) + 1e-6 * weights(seed=8)],
+    "already inside": lambda: [weights(rank=4)] * 4,
+    "4 scenes of full rank": lambda: [weights(seed=s) for s in range(4)],
+    "200 tiny updates": lambda: [weights(p=1, seed=s) * 1e-3 for s in range(200)],
+}
+
+
+@case("{name}", name=SEQUENCES)
+def sequence(name: str) -> Outcome:
+    scenes = SEQUENCES[name]()
+    return compare(scenes, condition_of(scenes[0]))
+
+
+@case("the size of a residual of {size:.0e}", size=[1e-3, 1e-6, 1e-12])
+def residual_size(size: float) -> Outcome:
+    """ρ against 60 digits, relative to itself."""
+    basis, _ = update(None, weights(rank=4), energy=0.999999)
+    inside = torch.linalg.qr(basis.double())[0] @ weights(basis.shape[1], Q, seed=1).double()
+    W = inside + size * weights(seed=8).double()
+    with mpmath.workdps(60):
+        B, M = (mpmath.matrix(v.double().tolist()) for v in (basis, W))
+        Y = mpmath.qr(B, mode="skinny")[0]
+        rest = M - Y * (Y.T * M)
+        exact = float(mpmath.norm(rest) / mpmath.norm(M))
+    rho = update(basis, W)[1]["rho"]
+
+    def attempt() -> str:
+        single = W.float()
+        found = float((single - basis @ (basis.T @ single)).norm() / single.norm())
+        return f"error {abs(found / exact - 1):.0e}"
+
+    # float64 rounds W itself by 1e-16, so a residual of 1e-12 is known to 1e-4.
+    return Outcome(f"rho {exact:.1e}", naive(attempt), abs(rho / exact - 1), max(1e-9, 1e-15 / size))
+
+
+@case("regulariser of entries {size:.0e}", size=[0.0, 1e-25, 1.0, 1e25])
+def regulariser(size: float) -> Outcome:
+    """Its value, and that its gradient is finite; the naive is ‖W − BBᵀW‖² / ‖W‖² in float32."""
+    basis, _ = update(None, weights(rank=6))
+    W = (weights(seed=3) * size).requires_grad_(True)
+    value = regularizer(W, basis)
+    (slope,) = torch.autograd.grad(value, W)
+    if not torch.isfinite(slope).all():
+        raise ValueError("its gradient is not finite")
+    exact = 0.0
+    if size:
+        B, M = basis.double(), W.detach().double() / size
+        exact = float((M - B @ (B.T @ M)).square().sum() / M.square().sum())
+
+    def attempt() -> str:
+        V = W.detach()
+        found = float((V - basis @ (basis.T @ V)).square().sum() / V.square().sum())
+        return f"error {abs(found - exact):.0e}" if math.isfinite(found) else "NaN"
+
+    return Outcome(f"entries {size:.0e}", naive(attempt), abs(value.item() - exact), 1e-6)

@@ -1,0 +1,87 @@
+"""Point sets that break naive farthest-point sampling (METHOD section 2, sampling).
+
+Errors are the covering radius of our centres over that of exact sampling, minus 1 (from another first point, which
+alone moves it by a tenth). The naive one samples in float32, in scene units.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+
+from benchmarks.stability.case import Outcome, case, naive
+from chebsplat.regions import build_regions
+
+N_REGIONS, SIZE = 24, 16
+TOLERANCE = 0.25
+
+
+def box(n: int = 600) -> np.ndarray:
+    return np.random.default_rng(0).random((n, 3))
+
+
+def with_outlier(distance: float) -> np.ndarray:
+    means = box()
+    means[-1] = distance
+    return means
+
+
+POINTS: dict[str, Callable[[], np.ndarray]] = {
+    "1 point": lambda: box(1),
+    "2 points": lambda: box(2),
+    "offset 1e+06": lambda: box() + 1e6,
+    "offset 1e+09": lambda: box() + 1e9,
+    "an outlier at 1e+04": lambda: with_outlier(1e4),
+    "an outlier at 1e+08": lambda: with_outlier(1e8),
+    "units 1e-15": lambda: box() * 1e-15,
+    "units 1e+15": lambda: box() * 1e15,
+    "half of them coincident": lambda: np.repeat(box(300), 2, 0),
+    "all coincident": lambda: np.full((600, 3), 0.3),
+    "collinear": lambda: box() * [1, 0, 0],
+    "coplanar": lambda: box() * [1, 1, 0],
+    "cubic lattice": lambda: np.stack(np.meshgrid(*[np.arange(8.0)] * 3, indexing="ij"), -1).reshape(-1, 3),
+    "half of them in a speck": lambda: np.concatenate([box(300) * 1e-6, box(600)[300:]]),
+}
+
+
+def farthest(means: np.ndarray, count: int, dtype: Any) -> list[int]:
+    means, picked = means.astype(dtype), [0]
+    nearest = ((means - means[0]) ** 2).sum(1)
+    for _ in range(min(count, len(means)) - 1):
+        picked.append(int(nearest.argmax()))
+        nearest = np.minimum(nearest, ((means - means[picked[-1]]) ** 2).sum(1))
+    return picked
+
+
+def reach(means: np.ndarray, centers: Any) -> float:
+    """The largest distance of a point from its nearest centre."""
+    means = means.astype(np.longdouble)
+    return float(np.sqrt(((means[:, None] - means[centers]) ** 2).sum(-1).min(1).max()))
+
+
+@case("{name}", name=POINTS)
+def points(name: str) -> Outcome:
+    """Raises ValueError if members are not unique, not within the radius, or not led by their centre."""
+    means = POINTS[name]()
+    found = build_regions(means, N_REGIONS, SIZE)
+    present = found.members >= 0
+    distance = np.linalg.norm(means[found.members] - means[found.centers][:, None], axis=-1)
+    unique = all(len(np.unique(row[here])) == here.sum() for row, here in zip(found.members, present, strict=True))
+    covered = reach(means, found.centers)
+    if not unique or (found.members[:, 0] != found.centers).any():
+        raise ValueError("members are not unique, or not led by their centre")
+    if (distance[present] > found.radius * (1 + 1e-6)).any() or covered > found.radius:
+        raise ValueError("a member or a point lies beyond the radius")
+    exact = reach(means, farthest(means, N_REGIONS, np.longdouble))
+
+    def attempt() -> str:
+        picked = farthest(means, N_REGIONS, np.float32)
+        return f"{len(set(picked))} centres, radius {reach(means, picked) / (exact or 1.0):.2f}"
+
+    around = np.abs(means - np.median(means, 0)).max(1)
+    typical = np.median(around) or 1.0
+    condition = f"offset {np.abs(means).min() / typical:.0e}, reach {around.max() / typical:.0e}"
+    error = max(covered / exact - 1, 0.0) if exact else covered
+    return Outcome(condition, naive(attempt), error, TOLERANCE)
