@@ -46,6 +46,11 @@ class Descriptors:
         self.n_described = self.n_regions = 0  # over all calls
         self.forget()
 
+    @property
+    def share_described(self) -> float:
+        """Of the regions seen in all calls, the part that was described anew."""
+        return self.n_described / max(self.n_regions, 1)
+
     def forget(self, region_size: int = 0) -> None:
         size = self.parameters["n_angles"] * n_degrees(self.parameters["spectrum"], self.parameters["max_degree"])
         self.given = torch.zeros(0, region_size, 10)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -25,7 +25,7 @@ class Descriptors:
     centers: np.ndarray
     members: np.ndarray
     values: np.ndarray
-    settings: dict[str, Any] = field(default_factory=dict)
+    settings: dict[str, Any]
 
 
 def write_descriptors(out: Path, descriptors: Descriptors) -> None:
@@ -41,4 +41,5 @@ def read_descriptors(path: Path) -> Descriptors:
     manifest = artifact.read_manifest(path, SCHEMA)
     shapes = {"centers": ("m",), "members": ("m", "n"), "values": ("m", "n", "j", "d")}
     arrays = read_tensors(path, manifest, "descriptors.safetensors", shapes)
-    return Descriptors(**{k: arrays[k] for k in shapes}, settings=read_document(path, manifest, "settings.json"))
+    settings = read_document(path, manifest, "settings.json", ("radius", "share"))
+    return Descriptors(**{k: arrays[k] for k in shapes}, settings=settings)

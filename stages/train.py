@@ -58,11 +58,10 @@ def run(job: Job) -> None:
     if model.shape is not None:
         encoder = model.shape.encoder
         notes["encoder"] = {"n_inputs": encoder.n_inputs, "n_channels": encoder.n_channels} | encoder.settings
-    job.facts |= {"n_gaussians": left, "seconds_per_step": trace[-1]["seconds"] / train["steps"]}
-    job.facts["refresh_share"] = trainer.refresh_seconds / trace[-1]["seconds"]
-    if model.shape is not None and model.shape.described.n_regions:
-        described = model.shape.described
-        job.facts["described_anew"] = described.n_described / described.n_regions
+        job.facts["described_anew"] = model.shape.described.share_described
+    seconds = trace[-1]["seconds"]
+    job.facts |= {"n_gaussians": left, "seconds_per_step": seconds / train["steps"]}
+    job.facts["refresh_share"] = trainer.refresh_seconds / seconds
     write_gaussians(job.out, Gaussians(parameters, cameras, modules, optimizer_state(trainer), trace, notes))
 
 
@@ -155,8 +154,11 @@ def first_regions(job: Job, trainer: Trainer, n_points: int) -> None:
     found = read_descriptors(job.inputs["descriptors"])
     if found.members.max(initial=-1) >= n_points:
         raise InputError(f"{job.inputs['descriptors']} describes other points; run the describe stage on these points")
-    radius, share = found.settings["radius"], found.settings["share"]
-    trainer.refresh(Regions(found.centers, found.members, radius, share), torch.from_numpy(found.values))
+    wrong = [f"describe.{k}" for k, value in trainer.describe.items() if found.settings.get(k) != value]
+    if wrong:
+        raise InputError(f"{job.inputs['descriptors']} has another {wrong[0]}; run the describe stage with this config")
+    regions = Regions(found.centers, found.members, found.settings["radius"], found.settings["share"])
+    trainer.refresh(regions, torch.from_numpy(found.values))
 
 
 def follow(job: Job, trainer: Trainer, train: dict[str, Any]) -> list[dict[str, float]]:

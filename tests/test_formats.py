@@ -77,7 +77,7 @@ def make_descriptors():
         np.array([0, 3]),
         np.array([[0, 1, -1], [3, 4, 5]]),
         rng.normal(size=(2, 3, 4, 7)).astype(np.float32),
-        {"n_angles": 4},
+        {"n_angles": 4, "radius": 0.5, "share": 1.0},
     )
 
 

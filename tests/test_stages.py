@@ -276,3 +276,22 @@ def test_the_exported_scene_renders_like_the_checkpoint(toy):
     a, _ = SceneRenderer(scene.parameters).render(view)
     b, _ = SceneRenderer(direct).render(view)
     assert np.array_equal(a, b)
+
+
+@pytest.mark.parametrize("spectrum", ["taper", "hard"])
+def test_a_cut_spectrum_is_described_trained_on_and_recorded(toy, spectrum, tmp_path):
+    config = changed(describe={"spectrum": spectrum, "n_eigs": 4})
+    described, trained = tmp_path / "described", tmp_path / "trained"
+    assert run_stage("describe", described, {"points": toy["sfm"]}, config) == 0
+    facts = artifact.read_manifest(described, STAGES["describe"].schema).facts
+    assert facts["spectrum"] == spectrum
+    assert (facts.get("n_cuts", 0) > 0) == (spectrum == "hard")
+    inputs = {"capture": toy["ingest"], "points": toy["sfm"], "features": toy["teacher"], "descriptors": described}
+    assert run_stage("train", trained, inputs, config) == 0
+
+
+def test_descriptors_of_another_setting_are_exit_3(toy, tmp_path, capsys):
+    config = changed(describe={"bandwidth": 0.9})
+    inputs = {role: toy[of] for role, of in INPUTS["train"].items()}
+    assert run_stage("train", tmp_path / "out", inputs, config) == 3
+    assert "describe.bandwidth" in capsys.readouterr().err
