@@ -10,7 +10,7 @@ CHOICE := $(if $(scene),--scene '$(scene)') $(if $(sequence),--sequence '$(seque
 
 # `make scene=office0` needs no target: naming a scene or a sequence means running it.
 .DEFAULT_GOAL := $(if $(scene)$(sequence),run,help)
-.PHONY: help run plan verify clean-stale setup test test-all stability bench-raster bench-descriptor bench-refresh bench-shapes lint lock
+.PHONY: help run plan verify clean-stale setup test test-all stability bench-raster bench-train bench-descriptor bench-refresh bench-shapes lint lock
 
 run: $(READY)  ## make scene=NAME|FOLDER [stage=] [set=a.b=c,...] [ablation=] [cores=]; or sequence=NAME
 	@$(CHEBSPLAT) run $(CHOICE) $(if $(stage),--stage '$(stage)') $(if $(cores),--cores '$(cores)')
@@ -41,6 +41,10 @@ test-all: $(READY)  ## all tests, the slow ones too
 
 bench-raster: $(READY)  ## the rasterizer against its bars, in build/bench/: table, CSV, figure (4 minutes, quiet machine)
 	@$(PY) benchmarks/rasterize.py $(args)
+
+bench-train: $(READY)  ## office0 without the shape branch: seconds of 3000 steps, PSNR against the reference backend
+	@$(CHEBSPLAT) run --scene office0 --stage teacher
+	@$(PY) benchmarks/training.py --work work/office0 $(args)
 
 stability: $(READY)  ## every extreme case, naive and ours; build/bench/stability.csv; fails if one does (args=--only X)
 	@$(PY) -m benchmarks.stability $(args)
