@@ -21,6 +21,7 @@ SHAPE = 8  # floats of a row of shapes, and of a splat before its channels
 N_GEOMETRY = 8  # of a record: Σg, Σgu, Σgv, Σgu², Σguv, Σgv², Σ|g_x|, Σ|g_y|, where g = dL/d(log₂ α)
 SLACK = 4  # rows of four floats or more that hold 16
 BLOCK = 8  # rows of a product kept in registers at once
+AHEAD = 3  # Gaussians whose α are found together with one
 T_MIN, ALPHA_MIN = np.float32(1e-4), np.float32(1 / 255)
 REACH = np.float32(math.log2(255) + 1e-3)  # beyond the ellipse α = 1/255, with slack for rounding
 LN2, FAINT, NEVER = np.float32(math.log(2)), np.float32(-20), np.float32(np.inf)
@@ -35,15 +36,6 @@ IN_ORDER = np.arange(BLOCK)
 # 2^f on [-½, ½] to 2e-7, by Chebyshev interpolation
 _nodes = 0.5 * np.cos((np.arange(6) + 0.5) * np.pi / 6)
 E0, E1, E2, E3, E4, E5 = (np.float32(c) for c in np.polynomial.polynomial.polyfit(_nodes, 2.0**_nodes, 5))
-
-
-@inline
-def _exp2(x):
-    """2^x for -100 < x < 100."""
-    shifted = x + splat(SHIFT)
-    f = x - (shifted - splat(SHIFT))
-    series = fma(f, fma(f, fma(f, fma(f, fma(f, splat(E5), splat(E4)), splat(E3)), splat(E2)), splat(E1)), splat(E0))
-    return scale_by_power(series, shifted)
 
 
 @inline
@@ -65,46 +57,62 @@ def reach(shapes, k):
 
 @lanes
 def listed(masks, at, n, cell, found):
-    """Which of masks[at : at + n] hold this cell, into `found`; returns how many."""
+    """Which of masks[at : at + n] hold this cell, into `found`, with AHEAD valid rows after them; returns how many."""
     count = 0
     for k in range(n):
         found[count] = k
         count += (masks[at + k] >> cell) & 1
+    for k in range(AHEAD):
+        found[count + k] = 0
     return count
+
+
+@inline
+def _alpha(shapes, k, x, y, dx, dy, ceiling):
+    """α of Gaussian k at the lanes of the cell whose middle is (dx, dy) from the tile's: 2^power, at most `ceiling`."""
+    p, q, r = shapes[k, 0], shapes[k, 1], shapes[k, 2]
+    u = fma(splat(p), x, fma(splat(q), y, splat(shapes[k, 3] + p * dx + q * dy)))
+    v = fma(splat(r), y, splat(shapes[k, 4] + r * dy))
+    power = _larger(splat(shapes[k, 5]) - fma(u, u, v * v), splat(FAINT))
+    shifted = power + splat(SHIFT)
+    f = power - (shifted - splat(SHIFT))
+    series = fma(f, fma(f, fma(f, fma(f, fma(f, splat(E5), splat(E4)), splat(E3)), splat(E2)), splat(E1)), splat(E0))
+    alpha = scale_by_power(series, shifted)
+    return where(alpha < ceiling, alpha, ceiling)
 
 
 @lanes
 def sweep(shapes, found, n, cell, max_alpha, states, alphas, weights, rows):
     """Composite one cell front to back, α and α T of what contributes into rows [16] of `alphas` and `weights`.
 
-    Args: found [n] rows of `shapes`; states [cells, 2, 16]: transmittance, and the T at which a pixel is done, which is
-      infinite once it is, or outside the image.
+    Args: found [n + AHEAD] rows of `shapes`; states [cells, 2, 16]: transmittance, and the T at which a pixel is done,
+      which is infinite once it is, or outside the image; alphas holds AHEAD more rows than the others.
     Returns: how many contribute; rows[:count] says which.
     """
     x, y, dx, dy = load(LANE_X, 0), load(LANE_Y, 0), CELL_X[cell], CELL_Y[cell]
     t, done_at = load(states, 2 * LANES * cell), load(states, 2 * LANES * cell + LANES)
-    count = 0
-    for j in range(n):
-        k = found[j]
-        p, q, r = shapes[k, 0], shapes[k, 1], shapes[k, 2]
-        u = fma(splat(p), x, fma(splat(q), y, splat(shapes[k, 3] + p * dx + q * dy)))
-        v = fma(splat(r), y, splat(shapes[k, 4] + r * dy))
-        power = _larger(splat(shapes[k, 5]) - fma(u, u, v * v), splat(FAINT))
-        alpha = _exp2(power)
-        alpha = where(alpha < splat(max_alpha), alpha, splat(max_alpha))
-        visible = alpha >= splat(ALPHA_MIN)
-        if bits(visible) == 0:
-            continue
-        alpha = where(visible, alpha, splat(ZERO))
-        after = fnma(alpha, t, t)
-        is_open = after > done_at
-        alpha = where(is_open, alpha, splat(ZERO))
-        store(alphas, LANES * count, alpha)
-        store(weights, LANES * count, alpha * t)
-        rows[count] = k
-        count += 1
-        t, done_at = where(is_open, after, t), where(is_open, done_at, splat(NEVER))
-        if bits(is_open) == 0:
+    count, n_open = 0, 1
+    for first in range(0, n, AHEAD + 1):
+        for j in range(first, first + AHEAD + 1):  # none waits for another, as the transmittances below do
+            store(alphas, LANES * j, _alpha(shapes, found[j], x, y, dx, dy, splat(max_alpha)))
+        for j in range(first, min(first + AHEAD + 1, n)):
+            alpha = load(alphas, LANES * j)  # what is stored below never passes row j
+            visible = alpha >= splat(ALPHA_MIN)
+            if bits(visible) == 0:
+                continue
+            alpha = where(visible, alpha, splat(ZERO))
+            after = fnma(alpha, t, t)
+            is_open = after > done_at
+            alpha = where(is_open, alpha, splat(ZERO))
+            store(alphas, LANES * count, alpha)
+            store(weights, LANES * count, alpha * t)
+            rows[count] = found[j]
+            count += 1
+            t, done_at = where(is_open, after, t), where(is_open, done_at, splat(NEVER))
+            n_open = bits(is_open)
+            if n_open == 0:
+                break
+        if n_open == 0:
             break
     store(states, 2 * LANES * cell, t)
     store(states, 2 * LANES * cell + LANES, done_at)

@@ -15,7 +15,7 @@ from chebsplat.jit import inline, kernel, prange, serial
 from chebsplat.rasterize import cells
 from chebsplat.rasterize.binning import TILE, band_start
 from chebsplat.rasterize.blocks import from_lanes, prefetch, to_lanes
-from chebsplat.rasterize.cells import BLOCK, LANES, N_GEOMETRY, NEVER, ONE, SHAPE, SLACK, T_MIN, ZERO
+from chebsplat.rasterize.cells import AHEAD, BLOCK, LANES, N_GEOMETRY, NEVER, ONE, SHAPE, SLACK, T_MIN, ZERO
 
 CHUNK = 128  # Gaussians of a tile between two looks at whether it is done
 
@@ -92,8 +92,8 @@ def _forward_tile(splats, ranks, start, stop, left, top, max_alpha, masks, rende
     _begin(states, width - left, height - top)
     sums = np.zeros((LANES, depth, LANES), np.float32)
     shapes, chosen = np.empty((CHUNK, SHAPE), np.float32), np.empty((CHUNK + SLACK, depth), np.float32)
-    alphas, weights = np.empty((CHUNK, LANES), np.float32), np.empty((CHUNK, LANES), np.float32)
-    found, rows = np.empty(CHUNK + 1, np.int64), np.empty(CHUNK, np.int64)
+    alphas, weights = np.empty((CHUNK + AHEAD, LANES), np.float32), np.empty((CHUNK, LANES), np.float32)
+    found, rows = np.empty(CHUNK + AHEAD + 1, np.int64), np.empty(CHUNK, np.int64)
     done, first = 0, start
     while done != 0xFFFF and first < stop:
         n = min(CHUNK, stop - first)
@@ -174,11 +174,11 @@ def _backward_tile(
         for c in range(0, padded(depth), 4):
             at = LANES * padded(depth) * cell
             to_lanes(grads, at + LANES * c, tall_grads, at + c, padded(depth))
-    room = (n + BLOCK) // BLOCK * BLOCK
+    room = (n + AHEAD + BLOCK) // BLOCK * BLOCK
     shapes, chosen = np.empty((n, SHAPE), np.float32), np.zeros((room + SLACK, padded(depth)), np.float32)
     alphas, weights = np.empty((room, LANES), np.float32), np.empty((room, LANES), np.float32)
     g, places = np.empty((room, LANES), np.float32), np.empty(room, np.int64)
-    found, rows = np.empty(n + 1, np.int64), np.empty(n, np.int64)
+    found, rows = np.empty(n + AHEAD + 1, np.int64), np.empty(n, np.int64)
     _place(splats, ranks, start, n, left, top, shapes)
     for cell in range(LANES):
         count = cells.listed(masks, start, n, cell, found)
