@@ -193,7 +193,8 @@ def main() -> None:
     judged("times the printed non-symmetric eig", rates["ours"] / rates["printed, float32"], 20, True)
     if (four := rates.get("ours, 2048 regions, 4 threads")) is not None:
         busy = rates["cores that others use, before 4 threads"]
-        judged(f"4 threads over 1, 2048 regions, others on {busy:.1f} cores", four / rates["ours, 2048 regions, 1 threads"], 3, True)
+        gain = four / rates["ours, 2048 regions, 1 threads"]
+        judged(f"4 threads over 1, 2048 regions, others on {busy:.1f} cores", gain, 3, True)
     for what in sorted({w for w, n in took if n == 1_000_000}):
         if "stage" in what:
             judged(f"{what}, 1e5 points, seconds", took[what, 100_000] / 1e3, 8, False)
