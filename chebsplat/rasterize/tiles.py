@@ -17,6 +17,7 @@ from chebsplat.rasterize.binning import TILE, band_start
 from chebsplat.rasterize.blocks import from_lanes, prefetch, to_lanes
 from chebsplat.rasterize.cells import AHEAD, BLOCK, LANES, N_GEOMETRY, NEVER, ONE, SHAPE, SLACK, T_MIN, ZERO
 
+AHEAD_OF_CACHE = 16  # rows between asking for one and using it
 CHUNK = 128  # Gaussians of a tile between two looks at whether it is done
 
 
@@ -54,9 +55,9 @@ def pack(order, means2d, whitening, opacities, colors):
 @serial
 def _place(splats, ranks, start, n, left, top, shapes):
     """The tile's shapes (see `cells`)."""
-    ahead, stop, step = 8, len(ranks) - 1, splats.shape[1]
+    stop, step = len(ranks) - 1, splats.shape[1]
     for k in range(n):
-        following = np.int64(ranks[min(start + k + ahead, stop)]) * step
+        following = np.int64(ranks[min(start + k + AHEAD_OF_CACHE, stop)]) * step
         for d in range(0, step, LANES):
             prefetch(splats, following + d)
         m = ranks[start + k]
@@ -251,6 +252,9 @@ def backward(
                     n_pairs + tile - first_tile, records,
                 )  # fmt: skip
         for m in prange(shown):
+            following = np.int64(order[min(m + AHEAD_OF_CACHE, shown - 1)]) * channels
+            prefetch(to_colors, following)
+            prefetch(to_colors, following + channels - 1)
             for k in range(pair_starts[band, m] - base, pair_starts[band, m + 1] - base):
                 for d in range(N_GEOMETRY):
                     sums[m, d] += records[k, d]
