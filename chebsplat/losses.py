@@ -63,16 +63,17 @@ class _Photometric(torch.autograd.Function):
 def photometric(render: Tensor, target: Tensor, mask: Tensor | None, weight_ssim: float) -> Tensor:
     """(1 − w) L1 + w (1 − SSIM) over the pixels that count.
 
-    Args: render, target [H, W, 3] float32 in [0, 1]; mask [H, W] bool, true where a pixel counts; None: all.
-    Choices: masked pixels take the target's colour first, so they have no gradient, not even through SSIM's window.
-      0 where nothing counts.
+    Args: render, target [H, W, 3] float32 in [0, 1]; mask [H, W] bool, true where a pixel counts, or float ≥ 0, how
+      much it does; None: all alike.
+    Choices: pixels that do not count take the target's colour first, so they have no gradient, not even through
+      SSIM's window. 0 where nothing counts.
     """
     if mask is None:
         weight = torch.full_like(target, 1 / target.numel())
     else:
-        render = torch.where(mask[..., None], render, target)
+        render = torch.where(mask[..., None] > 0, render, target)
         weight = mask[..., None].to(target.dtype).expand_as(target)
-        weight = weight / weight.sum().clamp_min(1)
+        weight = weight / weight.sum().clamp_min(1e-6)
     return _Photometric.apply(render, target, weight, weight_ssim)
 
 
@@ -80,7 +81,7 @@ def photometric_reference(render: Tensor, target: Tensor, mask: Tensor | None, w
     """As `photometric`, in plain torch and any float type: the oracle of the fused loss."""
     counted = torch.ones_like(target[..., 0]) if mask is None else mask.to(target.dtype)
     render = torch.where(counted[..., None] > 0, render, target)
-    weight = counted[..., None].expand_as(target) / (counted.sum() * target.shape[-1]).clamp_min(1)
+    weight = counted[..., None].expand_as(target) / (counted.sum() * target.shape[-1]).clamp_min(1e-6)
     distance = (weight * (render - target).abs()).sum()
     return (1 - weight_ssim) * distance + weight_ssim * (weight * (1 - ssim_map(render, target))).sum()
 
@@ -103,7 +104,7 @@ class _FeatureL1(torch.autograd.Function):
 
 
 def _cell_shares(mask: Tensor | None, size: tuple[int, int], kind: torch.dtype) -> Tensor:
-    """What each cell of the target counts, [h, w], summing to 1 (or 0): the share of its pixels that count."""
+    """What each cell of the target counts, [h, w], summing to 1 (or 0): the mean of its pixels' mask."""
     if mask is None:
         return torch.full(size, 1 / (size[0] * size[1]), dtype=kind)
     share = torch.nn.functional.adaptive_avg_pool2d(mask[None].to(kind), size)[0]
@@ -113,8 +114,9 @@ def _cell_shares(mask: Tensor | None, size: tuple[int, int], kind: torch.dtype) 
 def feature_l1(render: Tensor, target: Tensor, mask: Tensor | None = None) -> Tensor:
     """Mean |difference| at the teacher's resolution.
 
-    Args: render [H, W, C]; target [h, w, C], h ≤ H; mask [H, W] bool, true where a pixel counts. float32.
-    Choices: the render is averaged over each cell of the target; a cell counts by the share of its pixels that do.
+    Args: render [H, W, C]; target [h, w, C], h ≤ H; mask [H, W] bool, true where a pixel counts, or float ≥ 0, how
+      much it does. float32.
+    Choices: the render is averaged over each cell of the target; a cell counts by the mean of its pixels' mask.
     """
     share = _cell_shares(mask, (target.shape[0], target.shape[1]), render.dtype)
     return _FeatureL1.apply(render, target.to(render.dtype), share)

@@ -13,11 +13,12 @@ def images(height=40, width=52, seed=0):
 
 
 @pytest.mark.parametrize("weight_ssim", [0.0, 0.2, 1.0])
-@pytest.mark.parametrize("masked", [False, True])
+@pytest.mark.parametrize("counted", ["all alike", "some", "more or less"])
 @pytest.mark.parametrize("size", [(40, 52), (7, 5)], ids=["image", "smaller than the window"])
-def test_photometric_equals_the_oracle(size, masked, weight_ssim):
+def test_photometric_equals_the_oracle(size, counted, weight_ssim):
     render, target = images(*size)
-    mask = torch.rand(size, generator=torch.Generator().manual_seed(1)) > 0.3 if masked else None
+    amounts = (torch.rand(size, generator=torch.Generator().manual_seed(1)) - 0.3).clamp_min(0)
+    mask = {"all alike": None, "some": amounts > 0, "more or less": amounts}[counted]
     exact = render.double().requires_grad_(True)
     value = photometric_reference(exact, target.double(), mask, weight_ssim)
     value.backward()
@@ -70,11 +71,12 @@ def test_feature_distance_is_zero_for_the_pooled_render_and_ignores_masked_pixel
 
 
 @pytest.mark.parametrize(("size", "cells"), [((24, 32), (6, 8)), ((25, 30), (6, 7)), ((9, 11), (9, 11))])
-@pytest.mark.parametrize("masked", [False, True])
-def test_fused_feature_distance_equals_the_oracle(size, cells, masked):
+@pytest.mark.parametrize("counted", ["all alike", "some", "more or less"])
+def test_fused_feature_distance_equals_the_oracle(size, cells, counted):
     g = torch.Generator().manual_seed(0)
     render, target = torch.rand(*size, 5, generator=g), torch.rand(*cells, 5, generator=g)
-    mask = torch.rand(size, generator=g) > 0.4 if masked else None
+    amounts = (torch.rand(size, generator=g) - 0.4).clamp_min(0)
+    mask = {"all alike": None, "some": amounts > 0, "more or less": amounts}[counted]
     a, b = render.clone().requires_grad_(True), render.double().requires_grad_(True)
     value, exact = feature_l1(a, target, mask), feature_l1_reference(b, target.double(), mask)
     (3 * value).backward()
