@@ -62,9 +62,9 @@ def describe_reference(
     rotmats: Tensor,
     mask: Tensor,
     *,
-    n_angles: int = 4,
+    n_angles: int = 8,
     max_degree: int = 8,
-    anisotropy: float = 30.0,
+    anisotropy: float = 10.0,
     bandwidth: float = 0.7,
     spectrum: Spectrum = "full",
     n_eigs: int = 16,
@@ -113,9 +113,9 @@ def describe_compiled(
     rotmats: Tensor,
     mask: Tensor,
     *,
-    n_angles: int = 4,
+    n_angles: int = 8,
     max_degree: int = 8,
-    anisotropy: float = 30.0,
+    anisotropy: float = 10.0,
     bandwidth: float = 0.7,
 ) -> Described:
     """`describe_reference` of the full spectrum, compiled: float64 up to the operator, then float32.

@@ -67,9 +67,11 @@ class TeacherSection(_Section):
 class DescribeSection(_Section):
     """METHOD.md section 2; shared by the describe stage and the refresh inside training."""
 
-    n_angles: int = Field(4, ge=1)  # J
+    n_angles: int = Field(
+        8, ge=1
+    )  # J: with 10 for a, better than 4 and 30 at ghosts and noisy frames (make bench-shapes)
     max_degree: int = Field(8, ge=2)  # D
-    anisotropy: float = Field(30.0, ge=0)
+    anisotropy: float = Field(10.0, ge=0)
     bandwidth: float = Field(0.7, gt=0)
     spectrum: Literal["full", "taper", "hard"] = "full"  # hard: the paper's
     n_eigs: int = Field(16, ge=1)  # K, of taper and hard

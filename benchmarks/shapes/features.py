@@ -114,6 +114,7 @@ def fpfh(regions: Regions, normals: str, radius: float) -> np.ndarray:
 
 FEATURES: dict[str, Callable[[Regions], np.ndarray]] = {
     "ours": ours,
+    "ours, 4 angles, a = 30": lambda regions: ours(regions, n_angles=4, anisotropy=30.0),
     "no rotations": lambda regions: ours(regions, n_angles=1),
     "isotropic": lambda regions: ours(regions, anisotropy=0.0),
     "printed, hard K": printed,

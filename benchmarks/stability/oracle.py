@@ -20,9 +20,9 @@ def describe(
     scales: np.ndarray,
     rotmats: np.ndarray,
     *,
-    n_angles: int = 4,
+    n_angles: int = 8,
     max_degree: int = 8,
-    anisotropy: float = 30.0,
+    anisotropy: float = 10.0,
     bandwidth: float = 0.7,
 ) -> np.ndarray:
     """One region without padding, [n, 3], [n, 3], [n, 3, 3] -> [n, J, D - 1], rounded to float64 at the end."""
