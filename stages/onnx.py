@@ -46,6 +46,8 @@ def export(encoder: Any, path: Path, opset: int) -> None:
     import warnings
     from contextlib import redirect_stdout
 
+    import onnx  # noqa: F401  # torch's exporter loads these two; named, their versions are part of the stage's key
+    import onnxscript  # noqa: F401
     import torch
 
     logging.getLogger("torch.onnx._internal.exporter._registration").setLevel("ERROR")  # "torchvision is absent"

@@ -40,3 +40,15 @@ def test_imports_run_one_way(path):
 def test_formats_know_no_torch():
     for path in (ROOT / "formats").rglob("*.py"):
         assert not any(name.split(".")[0] == "torch" for name in imported_modules(path)), path
+
+
+def test_a_stage_is_known_by_every_kernel_it_runs_and_every_package_it_loads():
+    from chebsplat.pipelines.code import Code, installed
+
+    found: dict[str, list] = {}
+    code = Code(installed(), found)
+    code.stage("train")
+    kernels = [path for path in installed()["chebsplat"].rglob("*.py") if "chebsplat.jit import" in path.read_text()]
+    assert len(kernels) > 8
+    assert not [path for path in kernels if str(path) not in found]
+    assert {"onnx", "onnxscript", "onnxruntime", "torch"} <= set(code.stage("onnx")["packages"])

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from importlib import import_module
 from typing import Any
 
 import torch
@@ -21,9 +20,16 @@ def rasterize(
     if backend == "auto":
         on_cpu = "cpu" if means.dtype == torch.float32 else "reference"
         backend = {"cuda": "cuda", "cpu": on_cpu}.get(means.device.type, "reference")
-    if backend not in ("cpu", "cuda", "reference"):
+    chosen: Any
+    if backend == "cpu":  # spelt out, not looked up by name: a stage's identity is the code that it imports
+        from chebsplat.rasterize import cpu as chosen
+    elif backend == "cuda":
+        from chebsplat.rasterize import cuda as chosen
+    elif backend == "reference":
+        from chebsplat.rasterize import reference as chosen
+    else:
         raise ValueError(f"backend {backend!r} is none of auto, cpu, cuda, reference")
-    return import_module(f"chebsplat.rasterize.{backend}").rasterize(means, *args, **options)
+    return chosen.rasterize(means, *args, **options)
 
 
 __all__ = ["rasterize"]
