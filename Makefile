@@ -25,7 +25,7 @@ clean-stale: $(READY)  ## list artifacts that nothing names; yes=1 removes them
 	@$(CHEBSPLAT) clean-stale $(if $(yes),--yes)
 
 help:  ## list the targets
-	@grep -hE '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed -E 's/:.*## /\t/' | expand -t 14
+	@grep -hE '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed -E 's/:.*## /\t/' | expand -t 18
 
 setup: $(READY)  ## create .venv and install the lock (done on first use by every target)
 
@@ -39,7 +39,7 @@ test: $(READY)  ## the tests, in parallel, without the slow ones
 test-all: $(READY)  ## all tests, the slow ones too
 	@$(PY) -m pytest -q -n auto --dist loadgroup -m "not gpu" $(args)
 
-bench-raster: $(READY)  ## the rasterizer against its bars, in build/bench/: table, CSV, figure (4 minutes, quiet machine)
+bench-raster: $(READY)  ## the rasterizer against its bars, in build/bench/: table, CSV, figure (a minute, on a quiet machine)
 	@$(PY) benchmarks/rasterize.py $(args)
 
 bench-train: $(READY)  ## office0 without the shape branch: seconds of 3000 steps, PSNR against the reference backend
@@ -55,7 +55,7 @@ bench-shapes: $(READY)  ## which shapes a classifier tells apart, ours beside FP
 bench-descriptor: $(READY)  ## routes to the descriptor: error over time, bars, growth; into build/bench/
 	@$(PY) benchmarks/descriptor.py $(args)
 
-bench-refresh: $(READY)  ## args="--capture DIR --points DIR --features DIR": cost of refreshing, and staleness
+bench-refresh: $(READY)  ## cost of refreshing in training, and staleness (args="--capture DIR --points DIR --features DIR")
 	@$(PY) benchmarks/refresh.py $(args)
 
 lint: $(READY)  ## ruff (lint, format) and mypy
