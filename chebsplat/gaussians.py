@@ -8,7 +8,6 @@ import numpy as np
 import torch
 from torch import Tensor
 
-RAW = ("means", "log_scales", "quats", "logit_opacities", "sh0", "shN")
 _C0 = 0.28209479177387814
 
 

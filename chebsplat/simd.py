@@ -23,21 +23,21 @@ FLOAT, INT = ir.FloatType(), ir.IntType(32)
 
 
 class Vector(types.Type):
-    """`width` float32 values; or, with `kind` 1, as many truth values."""
+    """16 values: `kind` is float32 or bool."""
 
-    def __init__(self, width: int, kind: str = "float32"):
-        self.width, self.kind = width, kind
-        super().__init__(f"simd.{kind}x{width}")
+    def __init__(self, kind: str):
+        self.kind = kind
+        super().__init__(f"simd.{kind}x16")
 
 
 @register_model(Vector)
 class _VectorModel(models.PrimitiveModel):  # type: ignore[misc]
     def __init__(self, manager: Any, vector: Vector):
         element = FLOAT if vector.kind == "float32" else ir.IntType(1)
-        super().__init__(manager, vector, ir.VectorType(element, vector.width))
+        super().__init__(manager, vector, ir.VectorType(element, 16))
 
 
-F16, M16 = Vector(16), Vector(16, "bool")
+F16, M16 = Vector("float32"), Vector("bool")
 WIDE = ir.VectorType(FLOAT, 16)
 # 2^f on [-½, ½] to 2e-8, by Chebyshev interpolation
 _nodes = 0.5 * np.cos((np.arange(7) + 0.5) * np.pi / 7)

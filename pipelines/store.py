@@ -14,7 +14,7 @@ from chebsplat.errors import InputError
 
 
 def work() -> Path:
-    """Where everything lies: CHEBSPLAT_WORK, or ./work."""
+    """Where everything lies: the folder CHEBSPLAT_WORK, otherwise `work` where the user stands."""
     return Path(os.environ.get("CHEBSPLAT_WORK") or "work").absolute()
 
 

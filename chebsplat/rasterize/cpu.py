@@ -91,9 +91,6 @@ def rasterize(
 ) -> tuple[Tensor, Tensor, dict[str, Any]]:
     """As `reference.rasterize`, in float32, and fast.
 
-    Args: absgrad: whether meta's `means2d` carries `absgrad` [C, N, 2], after backward the sum over pixels of the
-      absolute gradient.
-
     Raises: ValueError unless all inputs are float32 on the CPU, if a gradient to a camera is asked for, or, in
       backward, on a gradient of the image that is not finite.
     Choices: `conics`, `depths` and `radii` have no gradient here. Bitwise equal for any number of threads.

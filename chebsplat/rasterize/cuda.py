@@ -36,7 +36,7 @@ def rasterize(
     backgrounds: Tensor | None = None,
     absgrad: bool = False,
 ) -> tuple[Tensor, Tensor, dict[str, Any]]:
-    """As `cpu.rasterize`, of float32 tensors on a GPU.
+    """As `reference.rasterize`, of float32 tensors on a GPU.
 
     Raises: ValueError unless the Gaussians are float32 on a GPU, or beyond 512 channels; ImportError, with the remedy,
       without gsplat.

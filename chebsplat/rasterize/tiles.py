@@ -203,19 +203,6 @@ def _backward_tile(
     return finite
 
 
-@serial
-def _sum_records(records, first, last, sums, to_color):
-    """Add the records of one Gaussian in one band."""
-    geometry = np.zeros(N_GEOMETRY)
-    for k in range(first, last):
-        for d in range(N_GEOMETRY):
-            geometry[d] += records[k, d]
-        for d in range(len(to_color)):
-            to_color[d] += records[k, N_GEOMETRY + d]
-    for d in range(N_GEOMETRY):
-        sums[d] += geometry[d]
-
-
 @kernel
 def backward(
     n, splats, order, tile_starts, ranks, pair, pair_starts, masks, used, max_alpha, grad, grad_alpha, absolute
