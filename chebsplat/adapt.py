@@ -6,6 +6,7 @@ Densification (Eqs 11-12) is in `growth`; its functions are offered here too.
 from __future__ import annotations
 
 from collections.abc import Callable
+from functools import partial
 
 import torch
 from torch import Tensor, nn
@@ -14,7 +15,8 @@ from chebsplat.growth import Additions, classic_candidates, clone_or_split, dens
 
 __all__ = [
     "Additions", "SemanticGate", "append", "apply_additions", "apply_mask", "classic_candidates", "clone_or_split",
-    "densify", "extend_optimizer", "hard_mask", "prune_optimizer", "region_gradients", "select", "soft_mask",
+    "densify", "drop", "extend_optimizer", "hard_mask", "prune_optimizer", "region_gradients", "reorder_optimizer",
+    "select", "soft_mask",
 ]  # fmt: skip
 
 MAX_LOGIT = 10.0  # beyond, the sigmoid's gradient is lost in float32
@@ -59,8 +61,8 @@ def apply_mask(mask: Tensor, scales: Tensor, opacities: Tensor) -> tuple[Tensor,
 
 
 def select(raw: dict[str, Tensor], keep: Tensor) -> dict[str, Tensor]:
-    """The rows `keep` ([N] bool, or i64 indices) of every tensor [N, ...]."""
-    return {name: value.detach()[keep] for name, value in raw.items()}
+    """The rows `keep` [N] bool of every tensor [N, ...], or [N_l, ...] that only the first N_l Gaussians have."""
+    return {name: value.detach()[keep[: len(value)]] for name, value in raw.items()}
 
 
 def append(raw: dict[str, Tensor], rows: dict[str, Tensor]) -> dict[str, Tensor]:
@@ -73,7 +75,21 @@ def append(raw: dict[str, Tensor], rows: dict[str, Tensor]) -> dict[str, Tensor]
 
 def prune_optimizer(optimizer: torch.optim.Optimizer, raw: dict[str, Tensor], keep: Tensor) -> None:
     """Keep the rows `keep` [N] bool of parameters and moments; `raw` and the groups get the new leaves."""
-    _replace(optimizer, raw, select(raw, keep), lambda moment: moment[keep])
+    _replace(optimizer, raw, select(raw, keep), lambda moment: moment[keep[: len(moment)]])
+
+
+def reorder_optimizer(optimizer: torch.optim.Optimizer, raw: dict[str, Tensor], rows: dict[str, Tensor]) -> None:
+    """Parameters and moments by name become their rows i64; those that have none left are gone, groups and all."""
+    for name, order in rows.items():
+        _replace(optimizer, raw, {name: raw[name].detach()[order]}, partial(torch.index_select, dim=0, index=order))
+        if len(order) == 0:
+            drop(optimizer, raw, name)
+
+
+def drop(optimizer: torch.optim.Optimizer, raw: dict[str, Tensor], name: str) -> None:
+    """One parameter less to hold and to train."""
+    optimizer.state.pop(raw.pop(name), None)
+    optimizer.param_groups[:] = [group for group in optimizer.param_groups if group.get("name") != name]
 
 
 def extend_optimizer(optimizer: torch.optim.Optimizer, raw: dict[str, Tensor], rows: dict[str, Tensor]) -> None:

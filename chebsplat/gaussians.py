@@ -47,7 +47,7 @@ def initial_gaussians(
     """Raw parameters (float32) of Gaussians that start from points.
 
     Args: means [N, 3]; colors u8 [N, 3]; covariances [N, 3, 3] symmetric positive definite, scene units².
-    Returns: `means`, `log_scales`, `quats` (wxyz, unit), `logit_opacities`, `sh0` [N,1,3], `shN` [N,15,3] zeros.
+    Returns: `means`, `log_scales`, `quats` (wxyz, unit), `logit_opacities`, `sh0` [N,1,3].
     """
     from scipy.spatial.transform import Rotation
 
@@ -62,7 +62,6 @@ def initial_gaussians(
         "quats": quats,
         "logit_opacities": np.full(n, np.log(opacity / (1 - opacity))),
         "sh0": (colors[:, None].astype(np.float64) / 255 - 0.5) / _C0,
-        "shN": np.zeros((n, 15, 3)),
     }
     return {name: torch.as_tensor(np.ascontiguousarray(value), dtype=torch.float32) for name, value in raw.items()}
 

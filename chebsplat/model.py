@@ -80,6 +80,14 @@ class Shape(nn.Module):
             self.described.keep(rows[torch.as_tensor(centers)])
             self.regions = self.regions._replace(centers=(np.cumsum(kept) - 1)[centers[kept[centers]]])
 
+    def reorder(self, order: Tensor) -> None:
+        """The Gaussians were put into another order i64 [N]."""
+        self.names.keep(order.numpy())
+        if self.regions is not None:
+            place = np.empty(len(order), np.int64)
+            place[order.numpy()] = np.arange(len(order))
+            self.regions = self.regions._replace(centers=place[self.regions.centers])
+
     @torch.no_grad()
     def refresh(
         self,
@@ -152,17 +160,20 @@ class Shape(nn.Module):
 class SceneModel:
     """Raw parameters by name, each [N, ...] and a leaf tensor, and the modules beside them.
 
-    `features` [N, C], `prune_logits` [N] and `sh_logits` [N, 3] are there only if the scene needs them.
+    `features` [N, C], `prune_logits` [N] and `sh_logits` [N, 3] are there only if the scene needs them, and SH band l,
+    `sh<l>` [N_l, 2 l + 1, 3], only for the first N_l Gaussians: all until the trainer freezes them.
     """
 
     def __init__(self, raw: dict[str, Tensor], describe: dict[str, Any], train: dict[str, Any], n_channels: int | None):
         n = len(raw["means"])
         self.raw = dict(raw)
+        for band in range(1, train["sh_degree"] + 1):
+            self.raw[f"sh{band}"] = torch.zeros(n, 2 * band + 1, 3)
         if n_channels is not None:
             self.raw["features"] = torch.zeros(n, n_channels)
         if train["prune"]:
             self.raw["prune_logits"] = torch.full((n,), 1.0)
-        if train["sh_prune"]:
+        if train["sh_prune"] and train["sh_degree"] > 0:
             self.raw["sh_logits"] = torch.zeros(n, 3)
         for value in self.raw.values():
             value.requires_grad_(True)
@@ -178,6 +189,10 @@ class SceneModel:
     def modules(self) -> dict[str, nn.Module]:
         parts = {"shape": self.shape, "semantic_gate": self.semantic_gate}
         return {name: module for name, module in parts.items() if module is not None}
+
+    def bands(self) -> list[Tensor]:
+        """Coefficients [N_l, 2 l + 1, 3] of the SH bands, from 0 to the highest that any Gaussian has."""
+        return [self.raw[name] for name in ("sh0", "sh1", "sh2", "sh3") if name in self.raw]
 
     def soft_mask(self, index: Tensor, features: Tensor | None) -> Tensor | None:
         """m̂ [V] in (0, 1) of the pruning gates, None where pruning is off."""
@@ -220,11 +235,11 @@ class SceneModel:
         if masked and (soft := self.soft_mask(index, features)) is not None:
             aside["mask"] = soft
             scales, opacities = adapt.apply_mask(adapt.hard_mask(soft), scales, opacities)
-        bands = self.sh_mask(index) if masked and degree > 0 else None
-        if bands is not None:
-            aside["bands"] = bands
+        masks = self.sh_mask(index) if masked and degree > 0 else None
+        if masks is not None:
+            aside["bands"] = masks
         eye = -view.viewmat[:3, :3].T @ view.viewmat[:3, 3]
-        colors = colors_in_view(raw["sh0"], raw["shN"], bands, index, raw["means"], eye, degree)
+        colors = colors_in_view(self.bands(), masks, index, raw["means"], eye, degree)
         channels = colors if features is None else torch.cat([colors, features], -1)
         render, alpha, meta = rasterize(
             means, quats, scales, opacities, channels, view.viewmat[None], view.K[None], view.width, view.height

@@ -27,20 +27,26 @@ def degrees(mask: Tensor) -> Tensor:
     return (mask > 0.5).sum(-1).to(torch.uint8)
 
 
-def ragged(sh0: Tensor, shN: Tensor, degree: Tensor) -> tuple[Tensor, list[Tensor]]:
-    """Gaussians sorted by degree, and the coefficients that each degree really has.
+def ragged_rows(degree: Tensor) -> list[Tensor]:
+    """Which Gaussians, and in which order, have each band once every one keeps only those up to its degree.
 
-    Args: sh0 [N, 1, 3]; shN [N, 15, 3]; degree u8 [N], 0 to 3.
-    Returns: order i64 [N], stable, lowest degree first; four tensors [N_l, (l + 1)², 3], which together hold the
-      Gaussians in that order.
+    Args: degree u8 [N], 0 to 3.
+    Returns: for bands 0 to 3, i64 [N_l]: the highest degree first and otherwise in their order, so that each list
+      starts the one before: band l belongs to the first N_l Gaussians, and nothing has to point at its rows.
     Raises: ValueError on a degree beyond 3.
     """
     if (degree > 3).any():
         raise ValueError(f"degree {int(degree.max())} is beyond 3")
-    order = torch.argsort(degree.long(), stable=True)
-    counts = torch.bincount(degree.long(), minlength=4).tolist()
-    whole = torch.cat([sh0, shN], 1)
-    return order, [whole[part, : (band + 1) ** 2] for band, part in enumerate(order.split(counts))]
+    order = torch.argsort(degree.long(), descending=True, stable=True)
+    return [order[: int((degree >= band).sum())] for band in range(4)]
+
+
+def dense(bands: list[Tensor], n: int) -> Tensor:
+    """shN [n, 15, 3] of bands 1, 2, ... [N_l, 2 l + 1, 3], zero where a Gaussian does not have a band."""
+    shN = bands[0].new_zeros(n, 15, 3) if bands else torch.zeros(n, 15, 3)
+    for (first, last), band in zip(BANDS, bands, strict=False):
+        shN[: len(band), first:last] = band
+    return shN
 
 
 def soft_histogram(values: Tensor, valid: Tensor, n_bins: int, low: Tensor, high: Tensor) -> Tensor:

@@ -25,6 +25,9 @@ RATES = {
     "quats": "lr_quats",
     "logit_opacities": "lr_opacities",
     "sh0": "lr_sh0",
+    "sh1": "lr_sh",
+    "sh2": "lr_sh",
+    "sh3": "lr_sh",
     "features": "lr_features",
     "prune_logits": "lr_masks",
     "sh_logits": "lr_sh_masks",
@@ -53,7 +56,6 @@ class Trainer:
         self.basis = basis if model.shape is not None else {}
         self.guidance: Tensor | None = None
         self.optimizer = self._optimizer()
-        self.rates = [group["lr"] for group in self.optimizer.param_groups]
         self.order_generator = np.random.default_rng(settings["seed"])
         self.generator = torch.Generator().manual_seed(settings["seed"])
         self.n_added = self.n_removed = 0
@@ -69,11 +71,11 @@ class Trainer:
     def _optimizer(self) -> torch.optim.Adam:
         groups = []
         for name, value in self.model.raw.items():
-            rate = self.settings["lr_sh0"] / 20 if name == "shN" else self.settings[RATES[name]]
-            groups.append({"params": [value], "lr": rate * (self.extent if name == "means" else 1), "name": name})
+            rate = self.settings[RATES[name]] * (self.extent if name == "means" else 1)
+            groups.append({"params": [value], "rate": rate, "name": name})
         weights = [p for module in self.model.modules.values() for p in module.parameters()]
         if weights:
-            groups.append({"params": weights, "lr": self.settings["lr_encoder"], "name": "modules"})
+            groups.append({"params": weights, "rate": self.settings["lr_encoder"], "name": "modules"})
         return torch.optim.Adam(groups, eps=1e-15, fused=True)
 
     def _clear_gradients(self) -> None:
@@ -90,8 +92,8 @@ class Trainer:
         order: list[int] = []
         for step in range(1, total + 1):
             order = order or self.order_generator.permutation(n_views).tolist()
-            for group, rate in zip(self.optimizer.param_groups, self.rates, strict=True):
-                group["lr"] = rate * FASTER.get(group["name"], 0.1) ** (step / total)
+            for group in self.optimizer.param_groups:
+                group["lr"] = group["rate"] * FASTER.get(group["name"], 0.1) ** (step / total)
             figures = self._step(step, order.pop())
             growing = step in self.growth
             if growing:
@@ -121,8 +123,9 @@ class Trainer:
             regions = build_regions(means, *(self.describe[k] for k in ("n_regions", "region_size", "seed")))
         assert regions is not None
         self.members = torch.as_tensor(regions.members)
-        if settings["sh_prune"] and settings["sh_guided"] and settings["sh_degree"] > 0:
-            self.guidance = sh_prune.region_guidance(self.model.raw["shN"].detach(), self.members, len(self.model))
+        if settings["sh_guided"] and "sh_logits" in self.model.raw:
+            shN = sh_prune.dense([band.detach() for band in self.model.bands()[1:]], len(self.model))
+            self.guidance = sh_prune.region_guidance(shN, self.members, len(self.model))
         self.refresh_seconds += time.perf_counter() - began
 
     def _step(self, step: int, index: int) -> dict[str, float]:
@@ -143,7 +146,7 @@ class Trainer:
             losses["features"] = settings["weight_features"] * feature_l1(rendered.features, wanted, mask)
         if "mask" in aside and pruning:
             losses["mask"] = settings["weight_mask"] * aside["mask"].mean()
-        if "bands" in aside and step < self.freeze_step:
+        if "bands" in aside:
             guidance = None if self.guidance is None else self.guidance[rendered.index]
             losses["sh"] = settings["weight_sh"] * sh_prune.sh_loss(aside["bands"], guidance)
         if self.basis and self.model.shape is not None:
@@ -212,14 +215,19 @@ class Trainer:
 
     @torch.no_grad()
     def _freeze_bands(self) -> None:
-        """Fix every Gaussian's SH degree: the logits go to their bounds and learn no more."""
-        if "sh_logits" not in self.model.raw:
+        """Fix every Gaussian's SH degree: what is closed leaves parameters, moments and memory."""
+        raw, shape = self.model.raw, self.model.shape
+        if "sh_logits" not in raw:
             return
-        logits = self.model.raw["sh_logits"]
-        logits.copy_(torch.where(sh_prune.band_mask(logits) > 0.5, 10.0, -10.0))
-        for index, group in enumerate(self.optimizer.param_groups):
-            if group["name"] == "sh_logits":
-                self.rates[index] = 0.0
+        degrees = sh_prune.degrees(sh_prune.band_mask(raw["sh_logits"])).clamp_max(self.settings["sh_degree"])
+        rows = sh_prune.ragged_rows(degrees)
+        adapt.drop(self.optimizer, raw, "sh_logits")
+        bands = {f"sh{band}": rows[band] for band in range(1, 4)}
+        adapt.reorder_optimizer(self.optimizer, raw, {name: bands.get(name, rows[0]) for name in raw})
+        self._clear_gradients()
+        if shape is not None:
+            shape.reorder(rows[0])
+        self.refresh()
 
     @torch.no_grad()
     def held_in_psnr(self, indices: list[int], step: int) -> float:
@@ -236,15 +244,13 @@ class Trainer:
     @torch.no_grad()
     def finish(self) -> dict[str, np.ndarray]:
         """Final raw parameters: degrees fixed, bands above them zero, fused features of every Gaussian."""
-        raw = self.model.raw
-        mask = self.model.sh_mask(torch.arange(len(self.model)))
-        top = self.degree(self.settings["steps"])
-        degrees = torch.full((len(self.model),), top, dtype=torch.uint8)
-        if mask is not None:
-            degrees = sh_prune.degrees(mask).clamp_max(top)
-        bands = (torch.arange(1, 4)[None] <= degrees[:, None]).float()
-        parameters = {name: value.detach().numpy() for name, value in raw.items() if not name.endswith("_logits")}
-        parameters["shN"] = sh_prune.masked_sh(raw["shN"].detach(), bands).numpy()
-        parameters["degrees"] = degrees.numpy()
+        self._freeze_bands()
+        bands = [band.detach() for band in self.model.bands()][: self.degree(self.settings["steps"]) + 1]
+        others = self.model.raw.keys() - {"sh1", "sh2", "sh3", "prune_logits"}
+        parameters = {name: self.model.raw[name].detach().numpy() for name in sorted(others)}
+        parameters["shN"] = sh_prune.dense(bands[1:], len(self.model)).numpy()
+        parameters["degrees"] = np.zeros(len(self.model), np.uint8)
+        for band in bands[1:]:
+            parameters["degrees"][: len(band)] += 1
         fused = self.model.fused_features()
         return parameters if fused is None else parameters | {"fused": fused}

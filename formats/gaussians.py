@@ -33,7 +33,7 @@ class Gaussians:
     """Raw parameters in float32; the name of each carries its transform.
 
     parameters: `means` [N,3] scene units, `log_scales` [N,3], `quats` [N,4] wxyz, `logit_opacities` [N],
-                `sh0` [N,1,3], `shN` [N,K-1,3], `degrees` u8 [N] highest SH band kept, and, where the scene has a
+                `sh0` [N,1,3], `shN` [N,15,3], `degrees` u8 [N] highest SH band kept, and, where the scene has a
                 semantic branch, `features` [N,C] and `fused` [N,C].
     cameras:    of the views it was trained and may be evaluated on.
     modules:    weights of the encoder, gate and masks by dotted name; empty where they were left out.
@@ -59,8 +59,13 @@ class Gaussians:
 
 
 def write_gaussians(out: Path, gaussians: Gaussians) -> None:
-    """Fill the directory that `artifact.publish` yields. Raises ValueError on a non-finite parameter."""
-    write_tensors(out / "parameters.safetensors", gaussians.parameters)
+    """Fill the directory that `artifact.publish` yields. Raises ValueError on a non-finite parameter.
+
+    Choices: SH bands that no Gaussian keeps are left out of the file; reading gives them back as zeros.
+    """
+    degrees, shN = gaussians.parameters["degrees"], gaussians.parameters["shN"]
+    kept = shN[:, : (int(degrees.max(initial=0)) + 1) ** 2 - 1]
+    write_tensors(out / "parameters.safetensors", gaussians.parameters | {"shN": kept})
     write_cameras(out, gaussians.cameras)
     write_document(out / "notes.json", gaussians.notes)
     for name, arrays in (("modules", gaussians.modules), ("optimizer", gaussians.optimizer)):
@@ -77,7 +82,8 @@ def read_gaussians(path: Path) -> Gaussians:
     """Raises: InputError naming the damaged file and the remedy."""
     manifest = artifact.read_manifest(path, SCHEMA)
     parameters = read_tensors(path, manifest, "parameters.safetensors", SHAPES)
-    n = len(parameters["means"])
+    n, shN = len(parameters["means"]), parameters["shN"]
+    parameters["shN"] = np.concatenate([shN, np.zeros((n, 15 - shN.shape[1], 3), np.float32)], 1)
     for name in {"features", "fused"} & set(parameters):
         if parameters[name].ndim != 2 or len(parameters[name]) != n:
             raise InputError(

@@ -8,7 +8,7 @@ import tomllib
 from pathlib import Path
 from typing import Any, Literal
 
-from pydantic import BaseModel, ConfigDict, Field, ValidationError
+from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
 
 from chebsplat.errors import ConfigError
 
@@ -120,6 +120,7 @@ class TrainSection(_Section):
     lr_quats: float = 1e-3
     lr_opacities: float = 5e-2
     lr_sh0: float = 2.5e-3
+    lr_sh: float = 1.25e-4  # of bands 1 to 3
     lr_features: float = 3e-3
     lr_encoder: float = 1e-3
     lr_masks: float = 1e-2
@@ -131,6 +132,12 @@ class TrainSection(_Section):
     weight_sh: float = Field(3.3e-4, ge=0)
     weight_basis: float = Field(1.0, ge=0)
     warm_start: bool = True  # start the encoder from the basis' stored weights
+
+    @model_validator(mode="after")
+    def _grows_before_bands_close(self) -> TrainSection:
+        if self.sh_prune and self.densify != "off" and self.densify_until > self.sh_freeze:
+            raise ValueError("densify_until must not lie after sh_freeze, when SH bands are closed for good")
+        return self
 
 
 class ExportSection(_Section):

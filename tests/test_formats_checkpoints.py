@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+from safetensors.numpy import load_file
 
 from chebsplat.errors import InputError
 from chebsplat.formats import artifact
@@ -13,12 +14,14 @@ from chebsplat.formats.gaussians import Gaussians, read_gaussians, write_gaussia
 CAMERAS = Cameras(["a"], np.eye(3)[None], np.eye(4)[None], 5, 4)
 
 
-def example(n=5, seed=0):
+def example(n=5, seed=0, top=3):
     rng = np.random.default_rng(seed)
     shapes = {"means": (n, 3), "log_scales": (n, 3), "quats": (n, 4), "logit_opacities": (n,)}
     shapes |= {"sh0": (n, 1, 3), "shN": (n, 15, 3), "features": (n, 13)}
     parameters = {k: rng.normal(size=s).astype(np.float32) for k, s in shapes.items()}
-    return parameters | {"degrees": rng.integers(0, 4, n).astype(np.uint8)}
+    degrees = rng.integers(0, top + 1, n).astype(np.uint8)
+    parameters["shN"][np.arange(1, 16) >= (degrees[:, None] + 1) ** 2] = 0
+    return parameters | {"degrees": degrees}
 
 
 def publish_gaussians(path, gaussians):
@@ -44,6 +47,13 @@ def test_checkpoint_round_trip_is_exact(tmp_path, n):
         np.testing.assert_array_equal(found.parameters[name], array)
     assert found.trace == given.trace
     assert found.optimizer == {}
+
+
+def test_bands_that_nobody_keeps_are_not_in_the_file(tmp_path):
+    given = Gaussians(example(50, top=1), CAMERAS)
+    path = publish_gaussians(tmp_path / "g", given)
+    assert load_file(path / "parameters.safetensors")["shN"].shape == (50, 3, 3)
+    np.testing.assert_array_equal(read_gaussians(path).parameters["shN"], given.parameters["shN"])
 
 
 @pytest.mark.parametrize(("name", "shape"), [("quats", (5, 3)), ("means", (4, 3)), ("features", (4, 13))])

@@ -6,27 +6,28 @@ import torch
 
 from chebsplat.sh import eval_sh, n_coefficients
 from chebsplat.sh_kernels import colors_in_view
-from chebsplat.sh_prune import masked_sh
+from chebsplat.sh_prune import dense, masked_sh
 
 
-def scene(held=15, n=60):
+def scene(held=(60, 60, 60, 60)):
+    """Coefficients by band of the first held[l] of 60 Gaussians, and nested masks of the 40 in view."""
     g = torch.Generator().manual_seed(0)
-    index = torch.randperm(n, generator=g)[:40]
-    degrees = torch.randint(0, 4, (40, 1), generator=g)
-    bands = (torch.arange(3) < degrees).float()
-    parameters = [torch.randn(n, 1, 3, generator=g), torch.randn(n, held, 3, generator=g), bands]
-    return parameters, index, torch.randn(n, 3, generator=g), torch.randn(3, generator=g)
+    index = torch.randperm(60, generator=g)[:40]
+    masks = (torch.arange(3) < torch.randint(0, 4, (40, 1), generator=g)).float()
+    parameters = [torch.randn(n, 2 * band + 1, 3, generator=g) for band, n in enumerate(held)] + [masks]
+    return parameters, index, torch.randn(60, 3, generator=g), torch.randn(3, generator=g)
 
 
 @pytest.mark.parametrize("degree", [0, 1, 2, 3])
 @pytest.mark.parametrize("masked", [False, True])
-def test_colors_equal_the_oracle(degree, masked):
-    parameters, index, means, eye = scene()
+@pytest.mark.parametrize("held", [(60, 60, 60, 60), (60, 31, 30, 2), (60, 60, 0, 0)])
+def test_colors_equal_the_oracle(degree, masked, held):
+    parameters, index, means, eye = scene(held)
     a = [p.clone().requires_grad_(True) for p in parameters]
     b = [p.double().requires_grad_(True) for p in parameters]
-    fast = colors_in_view(a[0], a[1], a[2] if masked else None, index, means, eye, degree)
-    shN = b[1][index][:, : n_coefficients(degree) - 1]
-    shN = masked_sh(shN, b[2]) if masked and degree else shN
+    fast = colors_in_view(a[:4], a[4] if masked else None, index, means, eye, degree)
+    shN = dense(b[1:4], 60)[index][:, : n_coefficients(degree) - 1]
+    shN = masked_sh(shN, b[4]) if masked and degree else shN
     exact = eval_sh(b[0][index], shN, means[index].double() - eye.double(), degree)
     torch.testing.assert_close(fast.double(), exact, rtol=0, atol=2e-6)
     weights = torch.randn(exact.shape, generator=torch.Generator().manual_seed(1))
@@ -41,14 +42,22 @@ def test_colors_equal_the_oracle(degree, masked):
 def test_a_mask_that_no_longer_learns_gets_no_gradient_and_changes_none_of_the_others():
     parameters, index, means, eye = scene()
     learning, frozen = [[p.clone().requires_grad_(True) for p in parameters] for _ in range(2)]
-    colors_in_view(*learning, index, means, eye, 3).sum().backward()
-    colors_in_view(*frozen[:2], frozen[2].detach(), index, means, eye, 3).sum().backward()
-    assert torch.equal(learning[0].grad, frozen[0].grad) and torch.equal(learning[1].grad, frozen[1].grad)
-    assert frozen[2].grad is None and learning[2].grad.abs().sum() > 0
+    colors_in_view(learning[:4], learning[4], index, means, eye, 3).sum().backward()
+    colors_in_view(frozen[:4], frozen[4].detach(), index, means, eye, 3).sum().backward()
+    assert all(torch.equal(a.grad, b.grad) for a, b in zip(learning[:4], frozen[:4], strict=True))
+    assert frozen[4].grad is None and learning[4].grad.abs().sum() > 0
 
 
-def test_too_few_coefficients_are_refused():
-    parameters, index, means, eye = scene(held=3)
-    assert colors_in_view(*parameters, index, means, eye, 1).shape == (40, 3)
-    with pytest.raises(ValueError, match="degree 2 needs 8"):
-        colors_in_view(*parameters, index, means, eye, 2)
+def test_a_band_that_is_not_used_gets_no_gradient():
+    parameters, index, means, eye = scene()
+    bands = [p.clone().requires_grad_(True) for p in parameters[:4]]
+    colors_in_view(bands, None, index, means, eye, 1).sum().backward()
+    assert [band.grad is not None for band in bands] == [True, True, False, False]
+    with pytest.raises(ValueError, match="degree 4"):
+        colors_in_view(bands, None, index, means, eye, 4)
+
+
+def test_bands_that_do_not_exist_add_nothing():
+    parameters, index, means, eye = scene()
+    some = colors_in_view(parameters[:2], None, index, means, eye, 3)
+    assert torch.equal(some, colors_in_view(parameters[:4], None, index, means, eye, 1))

@@ -1,5 +1,7 @@
 """SH masks are nested, histograms keep their mass, and gradients stay finite."""
 
+from itertools import pairwise
+
 import pytest
 import torch
 from hypothesis import given, settings
@@ -51,28 +53,22 @@ def test_masked_bands_vanish_and_band_zero_is_untouched():
 def test_ragged_coefficients_render_like_masked_ones(degree):
     n = 60
     sh0, shN, kept = normal(n, 1, 3), normal(n, 15, 3, seed=1), torch.arange(n).remainder(degree + 1).to(torch.uint8)
-    order, buckets = sh_prune.ragged(sh0, shN, kept)
-    assert [b.shape[1] for b in buckets] == [1, 4, 9, 16]
-    assert sum(len(b) for b in buckets) == n
-    mask = (torch.arange(1, 4) <= kept[:, None]).float()
-    directions = normal(n, 3, seed=2)
-    whole = eval_sh(sh0, sh_prune.masked_sh(shN, mask), directions, 3)[order]
-    start = 0
-    for band, bucket in enumerate(buckets):
-        rows = order[start : start + len(bucket)]
-        assert (kept[rows] == band).all()
-        assert (rows.diff() > 0).all()  # stable
-        assert torch.allclose(eval_sh(bucket[:, :1], bucket[:, 1:], directions[rows], band),
-                              whole[start : start + len(bucket)], atol=1e-5)  # fmt: skip
-        start += len(bucket)
+    rows = sh_prune.ragged_rows(kept)
+    assert all(torch.equal(longer[: len(shorter)], shorter) for longer, shorter in pairwise(rows))
+    assert all((kept[rows[band]] >= band).all() and len(rows[band]) == (kept >= band).sum() for band in range(4))
+    assert all((rows[0][kept[rows[0]] == band].diff() > 0).all() for band in range(4))  # stable
+    bands = [shN[part, first:last] for part, (first, last) in zip(rows[1:], sh_prune.BANDS, strict=True)]
+    directions = normal(n, 3, seed=2)[rows[0]]
+    masked = sh_prune.masked_sh(shN, (torch.arange(1, 4) <= kept[:, None]).float())[rows[0]]
+    found = eval_sh(sh0[rows[0]], sh_prune.dense(bands, n), directions, 3)
+    assert torch.equal(found, eval_sh(sh0[rows[0]], masked, directions, 3))
 
 
 def test_ragged_of_nothing_and_of_a_degree_that_does_not_exist():
-    order, buckets = sh_prune.ragged(torch.zeros(0, 1, 3), torch.zeros(0, 15, 3), torch.zeros(0, dtype=torch.uint8))
-    assert len(order) == 0
-    assert [len(b) for b in buckets] == [0, 0, 0, 0]
+    assert [len(rows) for rows in sh_prune.ragged_rows(torch.zeros(0, dtype=torch.uint8))] == [0, 0, 0, 0]
+    assert sh_prune.dense([], 2).shape == (2, 15, 3)
     with pytest.raises(ValueError, match="degree 4"):
-        sh_prune.ragged(torch.zeros(1, 1, 3), torch.zeros(1, 15, 3), torch.full((1,), 4, dtype=torch.uint8))
+        sh_prune.ragged_rows(torch.tensor([0, 4], dtype=torch.uint8))
 
 
 # histograms
