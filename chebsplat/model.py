@@ -12,7 +12,8 @@ from torch import Tensor, nn
 from chebsplat import adapt, sh_prune
 from chebsplat.descriptor import n_degrees
 from chebsplat.encoder import RegionEncoder
-from chebsplat.fusion import Gate, propagate, propagation_weights
+from chebsplat.fusion import Gate, propagation_weights
+from chebsplat.fusion_kernels import fuse_in_view
 from chebsplat.rasterize import rasterize
 from chebsplat.rasterize.projection import rotation_matrices
 from chebsplat.refresh import Descriptors, Names
@@ -137,24 +138,22 @@ class Shape(nn.Module):
             inputs = torch.cat([inputs, features.detach()[members.clamp_min(0)]], -1)
         return self.encoder(inputs, self.positions[chosen], members >= 0)
 
-    def fuse(self, features: Tensor, index: Tensor, generator: torch.Generator | None = None) -> tuple[Tensor, Tensor]:
-        """Fused features [V, C] and gate [V, C] of the Gaussians `index` [V].
+    def fuse(self, features: Tensor, index: Tensor, generator: torch.Generator | None = None) -> Tensor:
+        """Fused features [V, C] of the Gaussians `index` [V].
 
         With a generator, `regions_per_step` of the regions that reach them are encoded anew, with gradient, and
         the rest come from the cache; without one the cache alone is used.
         """
-        encodings = self.cache
+        chosen, fresh = torch.zeros(0, dtype=torch.int64), self.cache[:0]
+        cache = self.cache
         if generator is not None:
             reached = torch.unique(self.cover[index])
             reached = reached[reached >= 0]
             order = torch.randperm(len(reached), generator=generator)[: self.train_settings["regions_per_step"]]
             chosen = reached[order]
             fresh = self.encode(features, chosen)
-            encodings = self.cache.index_copy(0, chosen, fresh)
             self.cache = self.cache.index_copy(0, chosen, fresh.detach())
-        cover = self.cover[index]
-        shape = propagate(encodings, cover, self.weights[index])
-        return self.gate(take(features, index), shape, cover[:, 0] >= 0)
+        return fuse_in_view(self.gate, features, (cache, fresh, chosen), self.cover, self.weights, index)
 
 
 class SceneModel:
@@ -216,7 +215,7 @@ class SceneModel:
         fused: bool = False,
         generator: torch.Generator | None = None,
     ) -> tuple[Rendered, dict[str, Tensor]]:
-        """Colour and features in one pass; the second result holds masks and gate for the losses.
+        """Colour and features in one pass; the second result holds masks for the losses.
 
         degree: SH bands in use; masked: apply the pruning masks; fused: render fused features, not the raw ones.
         """
@@ -229,7 +228,7 @@ class SceneModel:
         aside: dict[str, Tensor] = {}
         features = None
         if fused and self.shape is not None and self.shape.regions is not None:
-            features, aside["gate"] = self.shape.fuse(raw["features"], index, generator)
+            features = self.shape.fuse(raw["features"], index, generator)
         elif "features" in raw:
             features = take(raw["features"], index)
         if masked and (soft := self.soft_mask(index, features)) is not None:
@@ -254,4 +253,4 @@ class SceneModel:
         if self.shape is None:
             return None
         self.shape.refresh(self.raw, anew=True)
-        return self.shape.fuse(self.raw["features"], torch.arange(len(self)))[0].numpy()
+        return self.shape.fuse(self.raw["features"], torch.arange(len(self))).numpy()

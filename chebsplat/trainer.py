@@ -202,7 +202,7 @@ class Trainer:
             features = raw.get("features")
             if self.model.semantic_gate is not None and self._encodes(step) and self.model.shape is not None:
                 self.refresh()
-                features, _ = self.model.shape.fuse(raw["features"], torch.arange(len(self.model)))
+                features = self.model.shape.fuse(raw["features"], torch.arange(len(self.model)))
             soft = self.model.soft_mask(torch.arange(len(self.model)), features)
             strength = strength if soft is None else strength * adapt.hard_mask(soft)
         keep = (strength >= 0.005) & torch.isfinite(raw["means"]).all(1)
