@@ -70,7 +70,8 @@ def main() -> None:
     begin = round(trainer.settings["encode_from"] * trainer.settings["steps"])
     before, spent, began = torch.zeros(0), 0.0, 0.0
     rows: list[dict[str, Any]] = []
-    for step, _ in trainer.steps():
+    for _ in trainer.steps():
+        step = trainer.step
         if step == begin:
             trainer.refresh()
             before = descriptors(trainer)

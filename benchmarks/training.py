@@ -66,7 +66,7 @@ def train(work: Path, backend: str, steps: int, seed: int) -> dict[str, Any]:
             pass
         seconds = time.perf_counter() - began
         trainer.views = test_views(work)
-        psnr = trainer.held_in_psnr(list(range(len(trainer.views.names))), steps)
+        psnr = trainer.held_in_psnr(list(range(len(trainer.views.names))))
     found = {"backend": backend, "steps": steps, "seed": seed, "seconds": seconds, "psnr": psnr}
     return found | {"gaussians": len(model), "channels": features.features.shape[-1]}
 

@@ -53,6 +53,10 @@ class Rendered:
     index: Tensor
 
 
+HELD = ("members", "centers", "descriptors", "positions", "cover", "weights", "cache")  # by `Shape`
+DESCRIBED = ("given", "mask", "values", "n_described", "n_regions")  # by its `Descriptors`
+
+
 class Shape(nn.Module):
     """Regions of the current Gaussians, their descriptors, and the encoder and gate that use them (Eqs 4-10)."""
 
@@ -127,6 +131,25 @@ class Shape(nn.Module):
         self.weights = propagation_weights(means, self.cover, where, frames, scales[self.centers], regions.radius)
         self.cache = torch.cat([self.encode(raw["features"], part) for part in self._chunks()])
 
+    def state(self) -> dict[str, Any]:
+        """What `refresh` found and steps have changed since, as tensors and plain values."""
+        regions, described, ids = self.regions, self.described, self.names.of(len(self.cover))
+        assert regions is not None
+        return {name: getattr(self, name) for name in HELD} | {
+            "regions": [torch.from_numpy(a) for a in regions[:2]] + [float(v) for v in regions[2:]],
+            "names": [torch.from_numpy(ids), self.names.next],
+            "described": {name: getattr(described, name) for name in DESCRIBED},
+        }
+
+    def restore(self, state: dict[str, Any]) -> None:
+        for name in HELD:
+            setattr(self, name, state[name])
+        centers, members, radius, share = state["regions"]
+        self.regions = Regions(centers.numpy(), members.numpy(), radius, share)
+        self.names.ids, self.names.next = state["names"][0].numpy(), state["names"][1]
+        for name, value in state["described"].items():
+            setattr(self.described, name, value)
+
     def _chunks(self) -> tuple[Tensor, ...]:
         return torch.arange(len(self.members)).split(256)
 
@@ -192,6 +215,15 @@ class SceneModel:
     def bands(self) -> list[Tensor]:
         """Coefficients [N_l, 2 l + 1, 3] of the SH bands, from 0 to the highest that any Gaussian has."""
         return [self.raw[name] for name in ("sh0", "sh1", "sh2", "sh3") if name in self.raw]
+
+    def sh_kept(self) -> float:
+        """Part of all SH coefficients up to degree 3 that the Gaussians keep."""
+        counts = [len(band) for band in self.bands()[1:]]
+        if "sh_logits" in self.raw:
+            open_bands = sh_prune.band_mask(self.raw["sh_logits"].detach()) > 0.5
+            counts = open_bands.sum(0).tolist()[: len(counts)]
+        kept = sum(count * (2 * band + 3) for band, count in enumerate(counts))
+        return float((len(self) + kept) / (16 * max(len(self), 1)))
 
     def soft_mask(self, index: Tensor, features: Tensor | None) -> Tensor | None:
         """m̂ [V] in (0, 1) of the pruning gates, None where pruning is off."""

@@ -15,20 +15,20 @@ class Names:
     """A number for each Gaussian that it keeps while others are removed or added behind the last."""
 
     def __init__(self) -> None:
-        self._ids, self._next = np.zeros(0, np.int64), 0
+        self.ids, self.next = np.zeros(0, np.int64), 0
 
     def of(self, n: int) -> np.ndarray:
         """Ids i64 [n] of the Gaussians as they are now."""
-        added = n - len(self._ids)
+        added = n - len(self.ids)
         if added < 0:
             raise ValueError(f"{-added} Gaussians were removed and not announced")
-        self._ids = np.concatenate([self._ids, np.arange(self._next, self._next + added)])
-        self._next += added
-        return self._ids
+        self.ids = np.concatenate([self.ids, np.arange(self.next, self.next + added)])
+        self.next += added
+        return self.ids
 
     def keep(self, rows: np.ndarray) -> None:
         """Those where `rows` [N] is false are gone."""
-        self._ids = self.of(len(rows))[rows]
+        self.ids = self.of(len(rows))[rows]
 
 
 class Descriptors:

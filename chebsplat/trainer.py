@@ -16,7 +16,7 @@ from chebsplat.losses import feature_l1, photometric
 from chebsplat.metrics import psnr
 from chebsplat.model import Rendered, SceneModel
 from chebsplat.regions import Regions, build_regions
-from chebsplat.sh import MAX_DEGREE
+from chebsplat.schedule import Schedule
 from chebsplat.views import Views
 
 RATES = {
@@ -32,7 +32,10 @@ RATES = {
     "prune_logits": "lr_masks",
     "sh_logits": "lr_sh_masks",
 }
-FASTER = {"means": 0.01, "features": 0.01}  # what a rate has fallen to at the end; 0.1 elsewhere
+HELD = (
+    "step", "seconds", "refresh_seconds", "order", "n_grown", "n_added", "n_removed", "n_broken",
+    "members", "guidance", "gradient_sum", "gradient_count",
+)  # fmt: skip
 
 
 class Trainer:
@@ -41,6 +44,8 @@ class Trainer:
     Args:
       settings, describe: the config's sections; extent: scene units, scales the means' learning rate.
       basis:    matrices [q, r] by name of an earlier scene's knowledge, empty for none.
+    `state()` between two steps holds all that the steps to come depend on: a trainer that is given it by `restore`
+    takes them as this one does, to the bit, with as many threads.
     """
 
     def __init__(
@@ -54,19 +59,20 @@ class Trainer:
     ):
         self.model, self.views, self.settings, self.describe, self.extent = model, views, settings, describe, extent
         self.basis = basis if model.shape is not None else {}
+        self.schedule = Schedule(settings)
         self.guidance: Tensor | None = None
         self.optimizer = self._optimizer()
         self.order_generator = np.random.default_rng(settings["seed"])
         self.generator = torch.Generator().manual_seed(settings["seed"])
-        self.n_added = self.n_removed = 0
-        self.refresh_seconds = 0.0  # of the steps alone
+        self.order: list[int] = []  # views still to be seen before any is seen again
+        self.step = self.n_grown = self.n_added = self.n_removed = self.n_broken = 0
+        self.seconds = self.refresh_seconds = 0.0  # of the steps
         self._clear_gradients()
-        total = settings["steps"]
-        first, last = round(settings["densify_from"] * total), round(settings["densify_until"] * total)
-        self.growth = set(np.linspace(first, last, settings["n_densify"] + 2)[1:-1].round().astype(int).tolist())
-        if settings["densify"] == "off":
-            self.growth = set()
-        self.freeze_step = round(settings["sh_freeze"] * total)
+
+    @property
+    def share(self) -> float:
+        """Part of the budget that is spent."""
+        return self.schedule.share(self.step, self.seconds)
 
     def _optimizer(self) -> torch.optim.Adam:
         groups = []
@@ -81,35 +87,65 @@ class Trainer:
     def _clear_gradients(self) -> None:
         self.gradient_sum, self.gradient_count = (torch.zeros(len(self.model)) for _ in range(2))
 
-    def degree(self, step: int) -> int:
-        """SH bands in use: one more every tenth of the training."""
-        return min(step * 10 // self.settings["steps"], self.settings["sh_degree"], MAX_DEGREE)
-
-    def steps(self) -> Iterator[tuple[int, dict[str, float]]]:
-        """Train; yields (step, figures) after each step."""
-        total, n_views = self.settings["steps"], len(self.views.names)
-        self.refresh_seconds = 0.0
-        order: list[int] = []
-        for step in range(1, total + 1):
-            order = order or self.order_generator.permutation(n_views).tolist()
+    def steps(self) -> Iterator[dict[str, float]]:
+        """Train until the budget is spent; yields each step's figures."""
+        while self.share < 1:
+            began = time.perf_counter()
+            self.step += 1
+            share = self.share  # of a budget in steps, with this one; of one in seconds, what was spent before
             for group in self.optimizer.param_groups:
-                group["lr"] = group["rate"] * FASTER.get(group["name"], 0.1) ** (step / total)
-            figures = self._step(step, order.pop())
-            growing = step in self.growth
-            if growing:
-                self._grow()
-            if growing or (step > self.settings["densify_until"] * total and step % 200 == 0):
-                self._remove(step)
-                self._clear_gradients()
-                self.refresh()
-            elif step % self.settings["refresh_every"] == 0:
-                self.refresh()
-            if step == self.freeze_step:
-                self._freeze_bands()
-            yield step, figures | {"n": len(self.model)}
+                group["lr"] = group["rate"] * self.schedule.rate(group["name"], share)
+            self.order = self.order or self.order_generator.permutation(len(self.views.names)).tolist()
+            figures = self._step(self.order.pop(), share)
+            self._adapt(share)
+            self.seconds += time.perf_counter() - began
+            yield figures | {"n": len(self.model)}
 
-    def _encodes(self, step: int) -> bool:
-        return self.model.shape is not None and step >= self.settings["encode_from"] * self.settings["steps"]
+    def _adapt(self, share: float) -> None:
+        """Growth, pruning, the freeze and refreshes that are due after a step."""
+        if self.step % self.settings["refresh_every"] == 0 or self.schedule.grown(share) > self.n_grown:
+            self._drop_broken()
+        growing = self.schedule.grown(share) > self.n_grown
+        if growing:
+            self.n_grown = self.schedule.grown(share)
+            self._grow()
+        if growing or (self.schedule.has("densify_until", share) and self.step % 200 == 0):
+            self._remove(share)
+            self._clear_gradients()
+            self.refresh()
+        elif self.step % self.settings["refresh_every"] == 0:
+            self.refresh()
+        if self.schedule.has("sh_freeze", share):
+            self._freeze_bands()
+
+    def state(self) -> dict[str, Any]:
+        """All that the steps to come depend on: tensors (shared, not copied) and plain values."""
+        return {
+            "raw": {name: value.detach() for name, value in self.model.raw.items()},
+            "modules": {name: module.state_dict() for name, module in self.model.modules.items()},
+            "shape": None if self.model.shape is None else self.model.shape.state(),
+            "optimizer": self.optimizer.state_dict(),
+            "order_generator": self.order_generator.bit_generator.state,
+            "generator": self.generator.get_state(),
+        } | {name: getattr(self, name) for name in HELD}
+
+    def restore(self, state: dict[str, Any]) -> None:
+        """Go on as the trainer whose `state()` this is; it is not to be used otherwise afterwards."""
+        model = self.model
+        model.raw = {name: value.requires_grad_(True) for name, value in state["raw"].items()}
+        for name, module in model.modules.items():
+            module.load_state_dict(state["modules"][name])
+        if model.shape is not None:
+            model.shape.restore(state["shape"])
+        self.optimizer = self._optimizer()
+        self.optimizer.load_state_dict(state["optimizer"])
+        self.order_generator.bit_generator.state = state["order_generator"]
+        self.generator.set_state(state["generator"])
+        for name in HELD:
+            setattr(self, name, state[name])
+
+    def _encodes(self, share: float) -> bool:
+        return self.model.shape is not None and self.schedule.has("encode_from", share)
 
     def refresh(self, regions: Regions | None = None, descriptors: Tensor | None = None) -> None:
         """Regions, descriptors and band guidance of the Gaussians as they are now."""
@@ -128,16 +164,15 @@ class Trainer:
             self.guidance = sh_prune.region_guidance(shN, self.members, len(self.model))
         self.refresh_seconds += time.perf_counter() - began
 
-    def _step(self, step: int, index: int) -> dict[str, float]:
-        settings = self.settings
-        factor = 2 if step <= settings["coarse_until"] * settings["steps"] else 1
+    def _step(self, index: int, share: float) -> dict[str, float]:
+        settings, factor = self.settings, self.schedule.factor(share)
         target, mask = self.views.target(index, factor)
-        pruning = step >= settings["prune_from"] * settings["steps"]
+        pruning = self.schedule.has("prune_from", share)
         rendered, aside = self.model.render(
             self.views.camera(index, factor),
-            self.degree(step),
+            self.schedule.degree(share),
             masked=pruning,
-            fused=self._encodes(step),
+            fused=self._encodes(share),
             generator=self.generator,
         )
         losses = {"color": photometric(rendered.rgb, target, mask, settings["weight_ssim"])}
@@ -155,12 +190,22 @@ class Trainer:
         loss = torch.stack(list(losses.values())).sum()
         if not torch.isfinite(loss):
             bad = [name for name, value in losses.items() if not torch.isfinite(value)]
-            raise DataFailure(f"step {step}, view {self.views.names[index]}: loss {', '.join(bad)} is not finite")
+            where = f"step {self.step}, view {self.views.names[index]}"
+            raise DataFailure(f"{where}: loss {', '.join(bad)} is not finite{self._broken()}")
         self.optimizer.zero_grad(set_to_none=True)
         loss.backward()
         self._note_gradients(rendered)
         self.optimizer.step()
         return {"loss": float(loss.detach())} | {f"loss_{k}": float(v.detach()) for k, v in losses.items()}
+
+    def _broken(self) -> str:
+        """Which parameters are not finite, for a message."""
+        rows = {name: ~value.isfinite().reshape(len(value), -1).all(1) for name, value in self.model.raw.items()}
+        found = [(name, bad.nonzero()[:, 0]) for name, bad in rows.items()]
+        parts = [f"{name} of {len(bad)} Gaussians, first {bad[0]}" for name, bad in found if len(bad)]
+        for name, module in self.model.modules.items():
+            parts += [f"{name}.{k}" for k, value in module.named_parameters() if not value.isfinite().all()]
+        return f"; not finite: {', '.join(parts)}" if parts else "; all parameters are finite: look at the view itself"
 
     def _note_gradients(self, rendered: Rendered) -> None:
         """Length of the total loss' gradient to the 2D means, in half image widths as gsplat counts it."""
@@ -194,24 +239,39 @@ class Trainer:
         adapt.apply_additions(self.optimizer, self.model.raw, additions)
 
     @torch.no_grad()
-    def _remove(self, step: int) -> None:
+    def _remove(self, share: float) -> None:
         """Hard-prune what is masked out or too faint, but never below `min_gaussians`."""
         settings, raw = self.settings, self.model.raw
         strength = raw["logit_opacities"].sigmoid()
-        if step >= settings["prune_from"] * settings["steps"]:
+        if self.schedule.has("prune_from", share):
             features = raw.get("features")
-            if self.model.semantic_gate is not None and self._encodes(step) and self.model.shape is not None:
+            if self.model.semantic_gate is not None and self._encodes(share) and self.model.shape is not None:
                 self.refresh()
                 features = self.model.shape.fuse(raw["features"], torch.arange(len(self.model)))
             soft = self.model.soft_mask(torch.arange(len(self.model)), features)
             strength = strength if soft is None else strength * adapt.hard_mask(soft)
-        keep = (strength >= 0.005) & torch.isfinite(raw["means"]).all(1)
+        keep = strength >= 0.005
         if keep.sum() < settings["min_gaussians"]:
             keep[strength.topk(min(settings["min_gaussians"], len(strength))).indices] = True
         self.n_removed += int((~keep).sum())
-        adapt.prune_optimizer(self.optimizer, raw, keep)
+        self._keep(keep)
+
+    def _keep(self, rows: Tensor) -> None:
+        adapt.prune_optimizer(self.optimizer, self.model.raw, rows)
         if self.model.shape is not None:
-            self.model.shape.keep(keep)
+            self.model.shape.keep(rows)
+
+    @torch.no_grad()
+    def _drop_broken(self) -> None:
+        """Remove Gaussians that a step has made non-finite; `n_broken` counts them."""
+        sound = torch.ones(len(self.model), dtype=torch.bool)
+        for value in self.model.raw.values():
+            sound[: len(value)] &= value.isfinite().reshape(len(value), -1).all(1)
+        if not sound.all():
+            self.n_broken += int((~sound).sum())
+            self._keep(sound)
+            self._clear_gradients()
+            self.refresh()
 
     @torch.no_grad()
     def _freeze_bands(self) -> None:
@@ -230,11 +290,11 @@ class Trainer:
         self.refresh()
 
     @torch.no_grad()
-    def held_in_psnr(self, indices: list[int], step: int) -> float:
+    def held_in_psnr(self, indices: list[int]) -> float:
         """Mean PSNR over training views at full resolution, dB."""
         scores = []
         for index in indices:
-            rendered, _ = self.model.render(self.views.camera(index, 1), self.degree(step))
+            rendered, _ = self.model.render(self.views.camera(index, 1), self.schedule.degree(self.share))
             image = (rendered.rgb.clamp(0, 1) * 255).round().byte().numpy()
             mask = None if self.views.masks is None else self.views.masks[index].numpy()
             truth = self.views.images[index].numpy()
@@ -244,8 +304,12 @@ class Trainer:
     @torch.no_grad()
     def finish(self) -> dict[str, np.ndarray]:
         """Final raw parameters: degrees fixed, bands above them zero, fused features of every Gaussian."""
+        self._drop_broken()
+        weights = [weight for module in self.model.modules.values() for weight in module.parameters()]
+        if not all(weight.isfinite().all() for weight in weights):
+            raise DataFailure(f"step {self.step}: the training has broken down{self._broken()}")
         self._freeze_bands()
-        bands = [band.detach() for band in self.model.bands()][: self.degree(self.settings["steps"]) + 1]
+        bands = [band.detach() for band in self.model.bands()][: self.schedule.degree(1.0) + 1]
         others = self.model.raw.keys() - {"sh1", "sh2", "sh3", "prune_logits"}
         parameters = {name: self.model.raw[name].detach().numpy() for name in sorted(others)}
         parameters["shN"] = sh_prune.dense(bands[1:], len(self.model)).numpy()

@@ -82,6 +82,7 @@ class DescribeSection(_Section):
 
 class TrainSection(_Section):
     steps: int = Field(3000, ge=1)
+    seconds: float | None = Field(None, gt=0)  # of training, instead of steps: the schedule follows the clock
     seed: int = 0
     # what is built
     semantics: bool = True
@@ -103,7 +104,7 @@ class TrainSection(_Section):
     regions_per_step: int = Field(64, ge=1)  # encoded anew in a step; the others come from the cache
     n_covers: int = Field(4, ge=1)  # regions that reach a Gaussian, at most
     context: Literal["features", "none"] = "features"  # what tokens hold beside the descriptor
-    # schedule, as fractions of `steps`
+    # schedule, as fractions of the budget
     coarse_until: float = Field(0.1, ge=0, le=1)  # half resolution until here
     encode_from: float = Field(0.1, ge=0, le=1)
     densify_from: float = Field(0.1, ge=0, le=1)

@@ -6,7 +6,7 @@ import json
 import logging
 import sys
 import time
-from collections.abc import Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, TextIO, TypeVar
@@ -36,8 +36,13 @@ class Progress:
         if self._log is not None:
             self._log.write(json.dumps(values) + "\n")
 
-    def track(self, items: Iterable[T], total: int, what: str, start: int = 0) -> Iterator[tuple[T, dict[str, Any]]]:
-        """Yield (item, status); what the caller puts into `status` is shown beside rate and ETA."""
+    def track(
+        self, items: Iterable[T], total: int | Callable[[], int], what: str, start: int = 0
+    ) -> Iterator[tuple[T, dict[str, Any]]]:
+        """Yield (item, status); what the caller puts into `status` is shown beside rate and ETA.
+
+        total: how many there will be, `start` of them done before; a function where that is only found out on the way.
+        """
         status: dict[str, Any] = {}
         began = last = time.perf_counter()
         for done, item in enumerate(items):  # the first item warms up and is not counted in the rate
@@ -46,14 +51,15 @@ class Progress:
             if done == 0:
                 began = now
             at = done + start + 1
-            if now - last >= (0.2 if self.show else self.every) or at == total:
+            n = total if isinstance(total, int) else total()
+            if now - last >= (0.2 if self.show else self.every) or at == n:
                 last = now
                 rate = done / max(now - began, 1e-9)
-                eta = f"{(total - at) / rate:.0f} s" if rate > 0 else "unknown"
+                eta = f"{(n - at) / rate:.0f} s" if rate > 0 else "unknown"
                 notes = "".join(f"  {k} {v}" for k, v in status.items())
-                line = f"{what} {at}/{total}{notes}  {rate:.1f}/s  ETA {eta}"
+                line = f"{what} {at}/{n}{notes}  {rate:.1f}/s  ETA {eta}"
                 if self.show:
-                    end = "\n" if at == total else ""
+                    end = "\n" if at == n else ""
                     print(f"\r\x1b[K{line}", end=end, file=sys.stderr, flush=True)
                 else:
                     log.info("%s", line)

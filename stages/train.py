@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
-import time
+import logging
+from functools import partial
 from typing import TYPE_CHECKING, Any
 
 from chebsplat.errors import ConfigError, DataFailure, InputError
 from chebsplat.stages.command import Job, command
+from chebsplat.stages.resume import Saves
 
 if TYPE_CHECKING:
     import numpy as np
@@ -16,6 +18,9 @@ if TYPE_CHECKING:
     from chebsplat.formats.points import Points
     from chebsplat.trainer import Trainer
     from chebsplat.views import Views
+
+
+log = logging.getLogger("chebsplat")
 
 
 def run(job: Job) -> None:
@@ -46,13 +51,15 @@ def run(job: Job) -> None:
     first_regions(job, trainer, len(points.means))
     trace = follow(job, trainer, train)
     parameters = trainer.finish()
+    if trainer.n_broken:
+        log.warning("%d Gaussians became non-finite and were removed", trainer.n_broken)
     left = parameters["degrees"].size
     if left == 0:
         raise DataFailure("no Gaussian is left; lower train.weight_mask or raise train.min_gaussians")
     modules = {f"{n}.{k}": v.detach().numpy() for n, m in model.modules.items() for k, v in m.state_dict().items()}
     cameras = Cameras(points.names, points.Ks, points.cam_from_world, *capture.size)
     notes: dict[str, Any] = {"left_out": job.facts.get("left_out", {}), "n_added": trainer.n_added}
-    notes |= {"n_removed": trainer.n_removed, "n_initial": len(points.means)}
+    notes |= {"n_removed": trainer.n_removed, "n_broken": trainer.n_broken, "n_initial": len(points.means)}
     if features is not None:
         notes |= {"label_names": features.label_names, "convention": features.convention}
     if model.shape is not None:
@@ -60,7 +67,7 @@ def run(job: Job) -> None:
         notes["encoder"] = {"n_inputs": encoder.n_inputs, "n_channels": encoder.n_channels} | encoder.settings
         job.facts["described_anew"] = model.shape.described.share_described
     seconds = trace[-1]["seconds"]
-    job.facts |= {"n_gaussians": left, "seconds_per_step": seconds / train["steps"]}
+    job.facts |= {"n_gaussians": left, "steps": trainer.step, "seconds_per_step": seconds / trainer.step}
     job.facts["refresh_share"] = trainer.refresh_seconds / seconds
     write_gaussians(job.out, Gaussians(parameters, cameras, modules, optimizer_state(trainer), trace, notes))
 
@@ -162,31 +169,47 @@ def first_regions(job: Job, trainer: Trainer, n_points: int) -> None:
 
 
 def follow(job: Job, trainer: Trainer, train: dict[str, Any]) -> list[dict[str, float]]:
-    """Run the steps; returns the trace.
+    """Run the steps, from the last save where there is one; returns the trace.
 
     A row holds means of the losses since the row before; its seconds count training alone, not the held-in
     measurements.
     """
     n_views = len(trainer.views.names)
     watched = list(range(0, n_views, max(n_views // 4, 1)))[:4]
+    saves = Saves(job)
     trace: list[dict[str, float]] = []
     since: list[dict[str, float]] = []
-    began, spent_measuring = time.perf_counter(), 0.0
-    for (step, figures), status in job.progress.track(trainer.steps(), train["steps"], "train"):
+    if (held := saves.load()) is not None:
+        trainer.restore(held["trainer"])
+        trace, since = held["trace"], held["since"]
+        job.facts["resumed_at"] = [*held["resumed_at"], trainer.step]
+        log.info("resumed at step %d", trainer.step)
+    rounds = trainer.steps()
+    shown = {"psnr": f"{trace[-1]['psnr']:.2f}"} if trace else {}
+    for figures, status in job.progress.track(rounds, lambda: expected(trainer), "train", start=trainer.step):
         since.append(figures)
-        status |= {"loss": f"{figures['loss']:.4f}", "n": figures["n"]}
-        if step % train["report_every"] == 0 or step == train["steps"]:
-            paused = time.perf_counter()
-            row = {"step": step, "seconds": paused - began - spent_measuring, "n": figures["n"]}
+        if trainer.step % train["report_every"] == 0 or trainer.share >= 1:
+            row = {"step": trainer.step, "seconds": trainer.seconds, "n": figures["n"]}
             for name in figures.keys() - row.keys():
                 row[name] = sum(entry.get(name, 0.0) for entry in since) / len(since)
-            row["psnr"] = trainer.held_in_psnr(watched, step)
+            row |= {"psnr": trainer.held_in_psnr(watched), "sh_kept": trainer.model.sh_kept()}
             since = []
-            spent_measuring += time.perf_counter() - paused
             trace.append({k: float(v) for k, v in row.items()})
             job.progress.record(**trace[-1])
+            shown = {"psnr": f"{row['psnr']:.2f}", "sh": f"{row['sh_kept']:.0%}"}
+        status |= {"loss": f"{figures['loss']:.4f}", "gaussians": figures["n"]} | shown
+        saves.offer(partial(state, trainer, trace, since, job))
     columns = sorted({k for row in trace for k in row}, key=lambda k: (k != "step", k != "seconds", k))
     return [{k: row.get(k, 0.0) for k in columns} for row in trace]
+
+
+def expected(trainer: Trainer) -> int:
+    return trainer.schedule.last_step(trainer.step, trainer.seconds)
+
+
+def state(trainer: Trainer, trace: list[dict[str, float]], since: list[dict[str, float]], job: Job) -> dict[str, Any]:
+    resumed = job.facts.get("resumed_at", [])
+    return {"trainer": trainer.state(), "trace": trace, "since": since, "resumed_at": resumed}
 
 
 def optimizer_state(trainer: Trainer) -> dict[str, np.ndarray]:

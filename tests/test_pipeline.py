@@ -65,7 +65,7 @@ def touch(tree):
 
 
 def comment(tree):
-    edit(tree["chebsplat"] / "trainer.py", "class Trainer", "# a remark\n\n\nclass Trainer")
+    edit(tree["chebsplat"] / "schedule.py", '"means": 0.01', '"means": 0.02')
 
 
 def docstring(tree):
@@ -77,7 +77,7 @@ def plumbing(tree):
 
 
 def trainer_code(tree):
-    edit(tree["chebsplat"] / "trainer.py", '"means": 0.01', '"means": 0.02')
+    edit(tree["chebsplat"] / "schedule.py", '"means": 0.01', '"means": 0.02')
 
 
 def deep_code(tree):

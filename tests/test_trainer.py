@@ -6,7 +6,7 @@ import pytest
 import torch
 from training import trainer
 
-from chebsplat.errors import ConfigError
+from chebsplat.errors import ConfigError, DataFailure
 from chebsplat.stages import config
 
 
@@ -61,7 +61,7 @@ def test_gaussians_removed_after_the_freeze_take_their_bands_along():
     before = made.finish()
     with torch.no_grad():
         raw["logit_opacities"][::3] = -20.0
-    made._remove(1)
+    made._remove(0.0)
     after = made.finish()
     kept = np.arange(len(before["means"])) % 3 != 0
     for name in ("means", "sh0", "shN", "degrees"):
@@ -71,3 +71,73 @@ def test_gaussians_removed_after_the_freeze_take_their_bands_along():
 def test_growth_after_the_freeze_is_refused():
     with pytest.raises(ConfigError, match="densify_until"):
         config.build({"train": {"densify_until": 0.9}}, "test")
+
+
+def bits(made):
+    parts = {f"raw {name}": value.detach() for name, value in made.model.raw.items()}
+    for group in made.optimizer.param_groups:
+        for index, parameter in enumerate(group["params"]):
+            state = made.optimizer.state[parameter]
+            parts |= {f"{group['name']} {index} {key}": value for key, value in state.items()}
+            parts[f"{group['name']} {index}"] = parameter.detach()
+    return {name: value.clone() for name, value in parts.items()}
+
+
+@pytest.mark.parametrize("densify", ["region", "classic"])
+def test_a_resumed_training_takes_the_same_steps_to_the_bit(tmp_path, densify):
+    """Saved after every step, through a file; over growth, removal, refreshes and the freeze."""
+    settings = {"steps": 24, "refresh_every": 5, "densify": densify, "grow_threshold": 1e-6}
+    whole, sizes = trainer(**settings), []
+    for _ in whole.steps():
+        torch.save(whole.state(), tmp_path / f"{whole.step}.pt")
+        sizes.append(len(whole.model))
+    assert len(set(sizes)) > 1 and "sh_logits" not in whole.model.raw
+    wanted, parameters = bits(whole), whole.finish()
+    for step in (1, 5, 9, 14, 16, 20, 23):
+        resumed = trainer(**settings)
+        resumed.restore(torch.load(tmp_path / f"{step}.pt", weights_only=True))
+        assert resumed.step == step
+        for _ in resumed.steps():
+            pass
+        found = bits(resumed)
+        assert found.keys() == wanted.keys()
+        assert not [name for name, value in wanted.items() if not torch.equal(found[name], value)], step
+        for name, value in resumed.finish().items():
+            assert np.array_equal(value, parameters[name]), name
+
+
+def test_a_budget_of_seconds_runs_the_whole_schedule():
+    made = trainer(seconds=1.0, steps=10**6, refresh_every=5)
+    for _ in made.steps():
+        pass
+    assert made.share == 1 and made.seconds >= 1
+    assert 1 < made.step < 10**6 and made.n_grown == 2 and "sh_logits" not in made.model.raw
+    assert made.schedule.last_step(made.step, made.seconds) == made.step
+
+
+def test_gaussians_that_break_are_removed_and_counted():
+    made = trainer(refresh_every=5)
+    steps = made.steps()
+    next(steps)
+    with torch.no_grad():
+        made.model.raw["sh0"][7] = torch.nan  # the rasterizer leaves both out, so the loss stays finite
+        made.model.raw["features"][8] = torch.nan
+    for _ in steps:
+        pass
+    assert made.n_broken == 2
+    assert all(np.isfinite(value).all() for value in made.finish().values())
+
+
+def test_a_view_that_makes_the_loss_non_finite_is_named():
+    made = trainer()
+    made.views.features = lambda index: torch.full((10, 12, 8), torch.nan)
+    with pytest.raises(DataFailure, match=r"step 1, view view\d: loss features is not finite; .* look at the view"):
+        next(made.steps())
+
+
+def test_weights_that_break_are_never_published():
+    made = trainer()
+    with torch.no_grad():
+        made.model.shape.encoder.region_token[0] = torch.inf
+    with pytest.raises(DataFailure, match=r"not finite: shape.encoder.region_token"):
+        made.finish()

@@ -1,0 +1,63 @@
+"""An interrupted training goes on where it was last saved, to the same bytes."""
+
+from __future__ import annotations
+
+import logging
+import os
+import time
+from typing import Any
+
+from chebsplat.formats.artifact import digest, read_manifest
+from chebsplat.stages.command import Job, n_threads
+
+log = logging.getLogger("chebsplat")
+SECONDS = 30.0  # between two saves
+
+
+class Saves:
+    """States of one training, the last one kept, in the job's scratch folder.
+
+    A state fits only the same settings, inputs, package versions and number of threads: from another one the training
+    starts anew and says so.
+    """
+
+    def __init__(self, job: Job):
+        from importlib.metadata import version
+
+        inputs = {role: read_manifest(path).key for role, path in job.inputs.items()}
+        settings = job.config.sections(("describe", "train"))
+        versions = {name: version(name) for name in ("torch", "numba")}
+        self.identity = digest({"inputs": inputs, "config": settings, "versions": versions, "threads": n_threads()})
+        self.file = job.scratch / "training.pt"
+        self.saved = time.monotonic()
+
+    def load(self) -> dict[str, Any] | None:
+        """The last state, or None."""
+        import torch
+
+        if not self.file.is_file():
+            return None
+        try:
+            held = torch.load(self.file, weights_only=True)
+        except Exception as error:  # whatever a damaged file makes torch raise
+            log.warning("%s is damaged (%s): training starts anew", self.file, error)
+            return None
+        if held["identity"] != self.identity:
+            log.warning("%s is of another training: this one starts anew", self.file)
+            return None
+        return dict(held["state"])
+
+    def offer(self, state: Any) -> None:
+        """Save what `state()` returns if the last save is long ago: whole or not at all."""
+        if time.monotonic() - self.saved < SECONDS:
+            return
+        import torch
+
+        self.file.parent.mkdir(parents=True, exist_ok=True)
+        part = self.file.with_suffix(".part")
+        with part.open("wb") as handle:
+            torch.save({"identity": self.identity, "state": state()}, handle)
+            handle.flush()
+            os.fsync(handle.fileno())
+        os.replace(part, self.file)
+        self.saved = time.monotonic()
