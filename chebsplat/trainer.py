@@ -10,11 +10,13 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from chebsplat import adapt, cks, sh_prune
+from chebsplat import cks, sh_prune
 from chebsplat.errors import DataFailure
 from chebsplat.losses import feature_l1, photometric
 from chebsplat.metrics import psnr
-from chebsplat.model import Rendered, SceneModel
+from chebsplat.model import SceneModel
+from chebsplat.population import HELD as POPULATION
+from chebsplat.population import Population, broken
 from chebsplat.regions import Regions, build_regions
 from chebsplat.schedule import Schedule
 from chebsplat.views import Views
@@ -32,10 +34,7 @@ RATES = {
     "prune_logits": "lr_masks",
     "sh_logits": "lr_sh_masks",
 }
-HELD = (
-    "step", "seconds", "refresh_seconds", "order", "n_grown", "n_added", "n_removed", "n_broken",
-    "members", "guidance", "gradient_sum", "gradient_count",
-)  # fmt: skip
+HELD = ("step", "seconds", "refresh_seconds", "order", "members", "guidance")
 
 
 class Trainer:
@@ -65,9 +64,9 @@ class Trainer:
         self.order_generator = np.random.default_rng(settings["seed"])
         self.generator = torch.Generator().manual_seed(settings["seed"])
         self.order: list[int] = []  # views still to be seen before any is seen again
-        self.step = self.n_grown = self.n_added = self.n_removed = self.n_broken = 0
+        self.step = 0
         self.seconds = self.refresh_seconds = 0.0  # of the steps
-        self._clear_gradients()
+        self.population = Population(model, settings, extent)
 
     @property
     def share(self) -> float:
@@ -83,9 +82,6 @@ class Trainer:
         if weights:
             groups.append({"params": weights, "rate": self.settings["lr_encoder"], "name": "modules"})
         return torch.optim.Adam(groups, eps=1e-15, fused=True)
-
-    def _clear_gradients(self) -> None:
-        self.gradient_sum, self.gradient_count = (torch.zeros(len(self.model)) for _ in range(2))
 
     def steps(self) -> Iterator[dict[str, float]]:
         """Train until the budget is spent; yields each step's figures."""
@@ -103,20 +99,36 @@ class Trainer:
 
     def _adapt(self, share: float) -> None:
         """Growth, pruning, the freeze and refreshes that are due after a step."""
-        if self.step % self.settings["refresh_every"] == 0 or self.schedule.grown(share) > self.n_grown:
+        due = self.step % self.settings["refresh_every"] == 0
+        growing = self.schedule.grown(share) > self.population.n_grown
+        removing = growing or (self.schedule.has("densify_until", share) and self.step % 200 == 0)
+        if growing or due:
             self._drop_broken()
-        growing = self.schedule.grown(share) > self.n_grown
         if growing:
-            self.n_grown = self.schedule.grown(share)
-            self._grow()
-        if growing or (self.schedule.has("densify_until", share) and self.step % 200 == 0):
-            self._remove(share)
-            self._clear_gradients()
+            self.population.grow(self.optimizer, self.members, self.generator)
+        if removing:
+            self.population.remove(self.optimizer, self._soft_mask(share))
+        if removing or due:
             self.refresh()
-        elif self.step % self.settings["refresh_every"] == 0:
+        if self.schedule.has("sh_freeze", share) and self.population.freeze_bands(self.optimizer):
             self.refresh()
-        if self.schedule.has("sh_freeze", share):
-            self._freeze_bands()
+
+    def _drop_broken(self) -> None:
+        if self.population.drop_broken(self.optimizer):
+            self.refresh()
+        elif names := broken(self.model):
+            raise DataFailure(f"step {self.step}: the training has broken down; not finite: {names}")
+
+    @torch.no_grad()
+    def _soft_mask(self, share: float) -> Tensor | None:
+        """Of all Gaussians, once pruning has begun; their regions are as the last refresh found them."""
+        if not self.schedule.has("prune_from", share):
+            return None
+        everyone, features, shape = torch.arange(len(self.model)), self.model.raw.get("features"), self.model.shape
+        if shape is not None and features is not None and self._encodes(share) and self.model.semantic_gate is not None:
+            self.refresh()
+            features = shape.fuse(features, everyone)
+        return self.model.soft_mask(everyone, features)
 
     def state(self) -> dict[str, Any]:
         """All that the steps to come depend on: tensors (shared, not copied) and plain values."""
@@ -127,6 +139,7 @@ class Trainer:
             "optimizer": self.optimizer.state_dict(),
             "order_generator": self.order_generator.bit_generator.state,
             "generator": self.generator.get_state(),
+            "population": {name: getattr(self.population, name) for name in POPULATION},
         } | {name: getattr(self, name) for name in HELD}
 
     def restore(self, state: dict[str, Any]) -> None:
@@ -141,8 +154,10 @@ class Trainer:
         self.optimizer.load_state_dict(state["optimizer"])
         self.order_generator.bit_generator.state = state["order_generator"]
         self.generator.set_state(state["generator"])
-        for name in HELD:
-            setattr(self, name, state[name])
+        for name, value in ({k: state[k] for k in HELD}).items():
+            setattr(self, name, value)
+        for name, value in state["population"].items():
+            setattr(self.population, name, value)
 
     def _encodes(self, share: float) -> bool:
         return self.model.shape is not None and self.schedule.has("encode_from", share)
@@ -190,104 +205,15 @@ class Trainer:
         loss = torch.stack(list(losses.values())).sum()
         if not torch.isfinite(loss):
             bad = [name for name, value in losses.items() if not torch.isfinite(value)]
+            names = broken(self.model)
+            why = f"not finite: {names}" if names else "all parameters are finite: look at the view itself"
             where = f"step {self.step}, view {self.views.names[index]}"
-            raise DataFailure(f"{where}: loss {', '.join(bad)} is not finite{self._broken()}")
+            raise DataFailure(f"{where}: loss {', '.join(bad)} is not finite; {why}")
         self.optimizer.zero_grad(set_to_none=True)
         loss.backward()
-        self._note_gradients(rendered)
+        self.population.note_gradients(rendered)
         self.optimizer.step()
         return {"loss": float(loss.detach())} | {f"loss_{k}": float(v.detach()) for k, v in losses.items()}
-
-    def _broken(self) -> str:
-        """Which parameters are not finite, for a message."""
-        rows = {name: ~value.isfinite().reshape(len(value), -1).all(1) for name, value in self.model.raw.items()}
-        found = [(name, bad.nonzero()[:, 0]) for name, bad in rows.items()]
-        parts = [f"{name} of {len(bad)} Gaussians, first {bad[0]}" for name, bad in found if len(bad)]
-        for name, module in self.model.modules.items():
-            parts += [f"{name}.{k}" for k, value in module.named_parameters() if not value.isfinite().all()]
-        return f"; not finite: {', '.join(parts)}" if parts else "; all parameters are finite: look at the view itself"
-
-    def _note_gradients(self, rendered: Rendered) -> None:
-        """Length of the total loss' gradient to the 2D means, in half image widths as gsplat counts it."""
-        gradient = rendered.meta["means2d"].grad
-        if gradient is None:
-            return
-        height, width = rendered.rgb.shape[:2]
-        length = (gradient[0] * torch.tensor([0.5 * width, 0.5 * height])).norm(dim=-1)
-        seen = rendered.meta["radii"][0] > 0
-        index = rendered.index[seen]
-        self.gradient_sum[index] += length[seen]
-        self.gradient_count[index] += 1
-
-    def _grow(self) -> None:
-        """Densify: by regions (Eqs 11-12) or by classic clone and split."""
-        settings = self.settings
-        left = max(settings["max_gaussians"] - len(self.model), 0)
-        budget = min(left, settings["max_gaussians"] // max(settings["n_densify"], 1))
-        gradient = self.gradient_sum / self.gradient_count.clamp_min(1)
-        if budget == 0:
-            return
-        raw = {name: value.detach() for name, value in self.model.raw.items()}
-        if settings["densify"] == "classic":
-            additions = adapt.clone_or_split(
-                raw, gradient, settings["grow_threshold"], 0.01 * self.extent, budget, self.generator
-            )
-        else:
-            mean = adapt.region_gradients(gradient, self.members)
-            additions = adapt.densify(raw, self.members, mean, settings["grow_threshold"], budget, self.generator)
-        self.n_added += len(additions.parents)
-        adapt.apply_additions(self.optimizer, self.model.raw, additions)
-
-    @torch.no_grad()
-    def _remove(self, share: float) -> None:
-        """Hard-prune what is masked out or too faint, but never below `min_gaussians`."""
-        settings, raw = self.settings, self.model.raw
-        strength = raw["logit_opacities"].sigmoid()
-        if self.schedule.has("prune_from", share):
-            features = raw.get("features")
-            if self.model.semantic_gate is not None and self._encodes(share) and self.model.shape is not None:
-                self.refresh()
-                features = self.model.shape.fuse(raw["features"], torch.arange(len(self.model)))
-            soft = self.model.soft_mask(torch.arange(len(self.model)), features)
-            strength = strength if soft is None else strength * adapt.hard_mask(soft)
-        keep = strength >= 0.005
-        if keep.sum() < settings["min_gaussians"]:
-            keep[strength.topk(min(settings["min_gaussians"], len(strength))).indices] = True
-        self.n_removed += int((~keep).sum())
-        self._keep(keep)
-
-    def _keep(self, rows: Tensor) -> None:
-        adapt.prune_optimizer(self.optimizer, self.model.raw, rows)
-        if self.model.shape is not None:
-            self.model.shape.keep(rows)
-
-    @torch.no_grad()
-    def _drop_broken(self) -> None:
-        """Remove Gaussians that a step has made non-finite; `n_broken` counts them."""
-        sound = torch.ones(len(self.model), dtype=torch.bool)
-        for value in self.model.raw.values():
-            sound[: len(value)] &= value.isfinite().reshape(len(value), -1).all(1)
-        if not sound.all():
-            self.n_broken += int((~sound).sum())
-            self._keep(sound)
-            self._clear_gradients()
-            self.refresh()
-
-    @torch.no_grad()
-    def _freeze_bands(self) -> None:
-        """Fix every Gaussian's SH degree: what is closed leaves parameters, moments and memory."""
-        raw, shape = self.model.raw, self.model.shape
-        if "sh_logits" not in raw:
-            return
-        degrees = sh_prune.degrees(sh_prune.band_mask(raw["sh_logits"])).clamp_max(self.settings["sh_degree"])
-        rows = sh_prune.ragged_rows(degrees)
-        adapt.drop(self.optimizer, raw, "sh_logits")
-        bands = {f"sh{band}": rows[band] for band in range(1, 4)}
-        adapt.reorder_optimizer(self.optimizer, raw, {name: bands.get(name, rows[0]) for name in raw})
-        self._clear_gradients()
-        if shape is not None:
-            shape.reorder(rows[0])
-        self.refresh()
 
     @torch.no_grad()
     def held_in_psnr(self, indices: list[int]) -> float:
@@ -305,10 +231,7 @@ class Trainer:
     def finish(self) -> dict[str, np.ndarray]:
         """Final raw parameters: degrees fixed, bands above them zero, fused features of every Gaussian."""
         self._drop_broken()
-        weights = [weight for module in self.model.modules.values() for weight in module.parameters()]
-        if not all(weight.isfinite().all() for weight in weights):
-            raise DataFailure(f"step {self.step}: the training has broken down{self._broken()}")
-        self._freeze_bands()
+        self.population.freeze_bands(self.optimizer)
         bands = [band.detach() for band in self.model.bands()][: self.schedule.degree(1.0) + 1]
         others = self.model.raw.keys() - {"sh1", "sh2", "sh3", "prune_logits"}
         parameters = {name: self.model.raw[name].detach().numpy() for name in sorted(others)}

@@ -50,16 +50,16 @@ def run(job: Job) -> None:
     trainer = Trainer(model, views, train, describe, extent(points.cam_from_world), bases)
     first_regions(job, trainer, len(points.means))
     trace = follow(job, trainer, train)
-    parameters = trainer.finish()
-    if trainer.n_broken:
-        log.warning("%d Gaussians became non-finite and were removed", trainer.n_broken)
+    parameters, people = trainer.finish(), trainer.population
+    if people.n_broken:
+        log.warning("%d Gaussians became non-finite and were removed", people.n_broken)
     left = parameters["degrees"].size
     if left == 0:
         raise DataFailure("no Gaussian is left; lower train.weight_mask or raise train.min_gaussians")
     modules = {f"{n}.{k}": v.detach().numpy() for n, m in model.modules.items() for k, v in m.state_dict().items()}
     cameras = Cameras(points.names, points.Ks, points.cam_from_world, *capture.size)
-    notes: dict[str, Any] = {"left_out": job.facts.get("left_out", {}), "n_added": trainer.n_added}
-    notes |= {"n_removed": trainer.n_removed, "n_broken": trainer.n_broken, "n_initial": len(points.means)}
+    notes: dict[str, Any] = {"left_out": job.facts.get("left_out", {}), "n_added": people.n_added}
+    notes |= {"n_removed": people.n_removed, "n_broken": people.n_broken, "n_initial": len(points.means)}
     if features is not None:
         notes |= {"label_names": features.label_names, "convention": features.convention}
     if model.shape is not None:
