@@ -1,5 +1,6 @@
 """Killed at any moment, a run leaves nothing half made that looks whole, and the next one finishes."""
 
+import json
 import os
 import random
 import signal
@@ -8,7 +9,7 @@ import sys
 import time
 
 import pytest
-from shared import ROOT
+from shared import INPUTS, ROOT, TOY
 
 from chebsplat.formats import artifact
 from chebsplat.pipelines import store
@@ -56,3 +57,34 @@ def test_thirty_kills_leave_no_half_artifact_and_a_rerun_finishes(tmp_path, monk
     for path, _ in store.unnamed():
         store.remove(path)
     assert not list((tmp_path / "0/store").glob("*/.*"))
+
+
+TRAIN = "import chebsplat.stages.resume as r; r.SECONDS = 0.0; from chebsplat.stages.train import main; main()"
+
+
+@pytest.mark.slow
+@pytest.mark.xdist_group("toy")
+def test_a_training_killed_at_any_moment_ends_in_the_same_bytes(toy, tmp_path):
+    config = TOY | {"train": TOY["train"] | {"steps": 150, "n_densify": 4}}
+    (tmp_path / "config.json").write_text(json.dumps(config))
+    command = [sys.executable, "-c", TRAIN, "--config", tmp_path / "config.json", "--no-progress"]
+    command += [part for role, of in INPUTS["train"].items() for part in (f"--in-{role}", toy[of])]
+
+    def train(out, timeout=None):
+        try:
+            done = subprocess.run([*command, "--out", out], capture_output=True, timeout=timeout, text=True)
+        except subprocess.TimeoutExpired:  # kills it with SIGKILL
+            return False
+        assert done.returncode == 0, done.stderr
+        return True
+
+    began = time.perf_counter()
+    train(tmp_path / "whole")
+    whole, rng, killed = time.perf_counter() - began, random.Random(0), 0
+    while not train(tmp_path / "killed", rng.uniform(0.5, 0.9) * whole if killed < 8 else None):
+        killed += 1
+    facts = artifact.read_manifest(tmp_path / "killed").facts
+    assert killed >= 2 and facts["resumed_at"]
+    for name in ("parameters", "modules", "optimizer"):
+        file = f"{name}.safetensors"
+        assert (tmp_path / "killed" / file).read_bytes() == (tmp_path / "whole" / file).read_bytes(), facts
