@@ -194,7 +194,8 @@ def _link(source: Path, target: Path) -> None:
 
 def write_features(out: Path, features: Features) -> None:
     """Fill the directory that `artifact.publish` yields. Raises ValueError naming a view with a non-finite value."""
-    writer = FeatureWriter(out / ".writer", features.names, features.features.shape[1:])
+    _, h, w, c = features.features.shape
+    writer = FeatureWriter(out / ".writer", features.names, (h, w, c))
     extra = (features.pseudo_labels, features.confidence)
     for view in range(len(features.names)):
         writer.add(view, features.features[view], *(None if array is None else array[view] for array in extra))

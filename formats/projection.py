@@ -56,7 +56,7 @@ def tensors(projection: Projection) -> dict[str, np.ndarray]:
 
 
 def from_parts(arrays: Mapping[str, np.ndarray], document: Mapping[str, Any]) -> Projection:
-    return Projection(*(arrays[name] for name in SHAPES), document["teacher"], document["notes"])
+    return Projection(**{name: arrays[name] for name in SHAPES}, teacher=document["teacher"], notes=document["notes"])
 
 
 def write_projection(out: Path, projection: Projection) -> None:
