@@ -65,3 +65,13 @@ def projection(
     matrix = matrix * np.where(largest < 0, -1.0, 1.0)
     energy = np.cumsum((matrix * (features @ matrix)).sum(0))
     return matrix[:, : min(n_channels, span.shape[1])], np.clip(energy, 0, 1)
+
+
+def agreement(features: np.ndarray, words: np.ndarray, matrix: np.ndarray) -> float:
+    """Share of features [N, C] whose word of the largest inner product, of [L, C], is the same after projection."""
+    kept, few = words @ matrix, features @ matrix
+    same = [
+        (features[start : start + ROWS] @ words.T).argmax(1) == (few[start : start + ROWS] @ kept.T).argmax(1)
+        for start in range(0, len(features), ROWS)
+    ]
+    return float(np.concatenate(same).mean())
