@@ -65,6 +65,15 @@ class TeacherSection(_Section):
     seed: int = 0
 
 
+class ProjectionSection(_Section):
+    """What a teacher's channels are reduced to, for all scenes alike."""
+
+    n_channels: int = Field(32, ge=2, le=64)  # at most; fewer where the teacher's features span fewer
+    model: str | None = None  # .onnx; in a scene it is the teacher's, filled in by the planner
+    reference: str | None = None  # folder of images; None: generated rooms
+    n_rooms: int = Field(12, ge=1, le=100)
+
+
 class DescribeSection(_Section):
     """METHOD.md section 2; shared by the describe stage and the refresh inside training."""
 
@@ -164,6 +173,7 @@ class Config(_Section):
     source: SourceSection = SourceSection()
     ingest: IngestSection = IngestSection()
     sfm: SfmSection = SfmSection()
+    projection: ProjectionSection = ProjectionSection()
     teacher: TeacherSection = TeacherSection()
     describe: DescribeSection = DescribeSection()
     train: TrainSection = TrainSection()
