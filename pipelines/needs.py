@@ -14,9 +14,7 @@ def teacher_kind(config: Any, probe: dict[str, bool]) -> tuple[str, str]:
     if not config.train.semantics:
         return "none", "train.semantics is false"
     if wanted == "labels" and not probe["labels"]:
-        raise ConfigError(
-            "teacher.kind is labels, but the source has none; use teacher.kind=auto or give teacher.model"
-        )
+        raise ConfigError("teacher.kind is labels, but the source has none; use teacher.kind=auto, or teacher.model")
     if config.teacher.model and wanted in ("labels", "none"):
         raise ConfigError(f"teacher.kind is {wanted}, so teacher.model would not be used; set teacher.kind=onnx too")
     if wanted == "none":

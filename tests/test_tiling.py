@@ -1,5 +1,7 @@
 """Maps of windows make one map of the whole image."""
 
+import itertools
+
 import numpy as np
 import pytest
 
@@ -12,7 +14,7 @@ def test_windows_cover_an_axis_and_overlap(length, window):
     assert starts[0] == 0
     assert length <= starts[-1] + window
     assert starts[-1] == max(length - window, 0)
-    assert all(b - a <= window * (1 - OVERLAP) + 1 for a, b in zip(starts, starts[1:], strict=False))
+    assert all(b - a <= window * (1 - OVERLAP) + 1 for a, b in itertools.pairwise(starts))
 
 
 @pytest.mark.parametrize(("length", "window"), [(481, 480), (640, 480), (1000, 480)])
