@@ -1,4 +1,4 @@
-"""The `chebsplat` command: run, plan, query, check-teacher, verify, clean-stale, scenes, and every stage as a plain command."""
+"""The `chebsplat` command: runs, plans, queries, checks and listings, and every stage as a plain command."""
 
 from __future__ import annotations
 

@@ -59,8 +59,8 @@ def from_encoder(job: Job, capture: Capture, settings: TeacherSection) -> None:
             projection = read_projection(job.inputs["projection"])
         elif n_channels > MAX_CHANNELS:
             raise ConfigError(
-                f"{teacher.path} has {n_channels} channels, at most {MAX_CHANNELS} can be rendered; use `chebsplat run`, "
-                "or make its projection with `chebsplat projection` and pass --in-projection"
+                f"{teacher.path} has {n_channels} channels, at most {MAX_CHANNELS} can be rendered; use "
+                "`chebsplat run`, or make its projection with `chebsplat projection` and pass --in-projection"
             )
         labels = label_set(teacher, settings.labels, capture.class_names)
         space = open_vocabulary(teacher, labels, n_channels, projection)

@@ -51,7 +51,7 @@ def check(model: Path, photo: Path | None = None, labels: str | None = None) -> 
         ("image", f"{name}, {image.shape[1]} x {image.shape[0]}, seen at {size[1]} x {size[0]}"),
         (
             "windows",
-            f"{n_windows(size, window)} of {window[1]} x {window[0]}" + ("" if encoder.size else " (any size)"),
+            f"{n_windows(size, window)} of {window[1]} x {window[0]}{'' if encoder.size else ' (any size)'}",
         ),
         ("map", f"{grid[1]} x {grid[0]}: one feature every {image.shape[0] / grid[0]:.3g} pixels"),
         ("labels", f"{len(space.names)}, from {labels or teacher.labels}"),
