@@ -31,7 +31,7 @@ class ImageEncoder:
         options.use_deterministic_compute = True
         options.add_session_config_entry(
             "session.intra_op.allow_spinning", "0"
-        )  # waiting threads leave cores to others
+        )  # leave the cores to others
         options.log_severity_level = 4  # what fails is raised, and told once
         try:
             self.session: Any = onnxruntime.InferenceSession(
