@@ -68,7 +68,7 @@ class ProjectionSection(_Section):
     """What a teacher's channels are reduced to, for all scenes alike."""
 
     n_channels: int = Field(32, ge=2, le=64)  # at most; fewer where the teacher's features span fewer
-    model: str | None = None  # .onnx; in a scene it is the teacher's, filled in by the planner
+    model: str | None = None  # .onnx; in a scene the planner puts teacher.model here; None: the embedded teacher
     reference: str | None = None  # folder of images; None: generated rooms
     n_rooms: int = Field(12, ge=1, le=100)
 
