@@ -90,12 +90,8 @@ def read_teacher(path: Path) -> TeacherModel:
     return found
 
 
-def _is_list(value: Any, kinds: type | tuple[type, ...], length: int) -> bool:
-    return isinstance(value, list) and len(value) == length and all(type(v) in _tuple(kinds) for v in value)
-
-
-def _tuple(kinds: type | tuple[type, ...]) -> tuple[type, ...]:
-    return kinds if isinstance(kinds, tuple) else (kinds,)
+def _is_list(value: Any, kinds: tuple[type, ...], length: int) -> bool:
+    return isinstance(value, list) and len(value) == length and all(type(v) in kinds for v in value)
 
 
 RULES = {
@@ -103,7 +99,7 @@ RULES = {
     "output": ('"features" or "logits"', lambda v: v in ("features", "logits")),
     "mean": ("three numbers", lambda v: _is_list(v, (int, float), 3)),
     "std": ("three numbers above 0", lambda v: _is_list(v, (int, float), 3) and min(v) > 0),
-    "size": ("[height, width] in pixels", lambda v: _is_list(v, int, 2) and min(v) > 0),
+    "size": ("[height, width] in pixels", lambda v: _is_list(v, (int,), 2) and min(v) > 0),
     "multiple": ("a whole number above 0", lambda v: type(v) is int and v > 0),
     "base": ("a whole number of pixels", lambda v: type(v) is int and v > 0),
     "labels": ("a file's name", lambda v: isinstance(v, str) and v),

@@ -1,4 +1,4 @@
-"""The `chebsplat` command: run, plan, verify, clean-stale, scenes, and every stage as a plain command."""
+"""The `chebsplat` command: run, plan, query, verify, clean-stale, scenes, and every stage as a plain command."""
 
 from __future__ import annotations
 
@@ -126,6 +126,51 @@ def plan(scene: str | None, sequence: str | None, settings: str, ablation: str) 
                 print(f"  {'fresh' if step.fresh else 'would run':9s} {step.stage:9s} {step.key}")
             for what, why in found.left_out.items():
                 print(f"  left out  {what}: {why}")
+        return 0
+
+    guarded(action)
+
+
+def scene_folder(scene: str) -> Path:
+    """The folder of a finished scene, given itself or by the name of its links. Raises ConfigError with near names."""
+    from chebsplat.pipelines import store
+
+    for folder in (store.work() / scene, Path(scene)):
+        if (folder / "export").is_dir():
+            return folder
+    import difflib
+
+    known = sorted(path.parent.name for path in store.work().glob("*/export"))
+    near = difflib.get_close_matches(scene, known, 3) or known
+    raise ConfigError(
+        f"{scene} is no finished scene in {store.work()}, and no folder of one; "
+        + (f"there is {', '.join(near)}" if near else f"run it first: make scene={scene}")
+    )
+
+
+@main.command()
+@click.argument("scene")
+@click.argument("text")
+@click.option("--against", default="", help="phrases it is weighed against; default: object,things,stuff,texture")
+@click.option("--out", type=click.Path(path_type=Path), help="default: query/<text> in the scene's folder")
+@click.option("--top", type=click.IntRange(1), default=8, show_default=True, help="labels in the table")
+def query(scene: str, text: str, against: str, out: Path | None, top: int) -> None:
+    """Where in a finished SCENE is TEXT, such as "something to sit on"? Relevancy by Gaussian, and heat maps."""
+
+    def action() -> int:
+        import logging
+
+        from chebsplat.pipelines.plan import suffix
+        from chebsplat.stages.query import run as answer
+
+        logging.basicConfig(stream=sys.stderr, format="query: %(message)s", level="WARNING", force=True)
+        logging.getLogger("chebsplat").setLevel("INFO")
+        folder = scene_folder(scene)
+        if not text.strip():
+            raise ConfigError("the query is empty; say what to look for")
+        place = (out or folder / "query" / suffix(text.strip())).absolute()
+        answer(folder, text.strip(), [word.strip() for word in against.split(",") if word.strip()], place, top)
+        print(place)
         return 0
 
     guarded(action)

@@ -13,15 +13,13 @@ def teacher_kind(config: Any, probe: dict[str, bool]) -> tuple[str, str]:
     wanted = config.teacher.kind
     if not config.train.semantics:
         return "none", "train.semantics is false"
+    if wanted == "labels" and not probe["labels"]:
+        raise ConfigError("teacher.kind is labels, but the source has none; use teacher.kind=auto, or teacher.model")
+    if config.teacher.model and wanted in ("labels", "none"):
+        raise ConfigError(f"teacher.kind is {wanted}, so teacher.model would not be used; set teacher.kind=onnx too")
     if wanted == "none":
         return "none", "teacher.kind is none"
-    if wanted == "labels" and not probe["labels"]:
-        raise ConfigError(
-            "teacher.kind is labels, but the source has none; give teacher.model or use teacher.kind=auto"
-        )
-    if wanted == "auto":
-        wanted = "onnx" if config.teacher.model else "labels" if probe["labels"] else "none"
-    return wanted, "the source has no labels and teacher.model names no encoder: rendering only"
+    return ("onnx" if wanted == "auto" else wanted), ""
 
 
 def left_out_stages(config: Any, kind: str, why: str, probe: dict[str, bool], knowledge: bool) -> dict[str, str]:

@@ -13,11 +13,13 @@ from pathlib import Path
 from typing import Any
 
 from chebsplat.errors import ConfigError, InputError
+from chebsplat.formats.teacher_model import read_teacher
 from chebsplat.pipelines import store
 from chebsplat.pipelines.code import Code, installed
 from chebsplat.pipelines.keys import PLACES, content_hash, step_key
 from chebsplat.pipelines.needs import left_out_stages, source_sentence, teacher_kind
 from chebsplat.stages.registry import STAGES
+from chebsplat.teachers import EMBEDDED
 
 CONFIGS = Path(__file__).parent / "configs"
 
@@ -167,13 +169,15 @@ class Planner:
         probe, files = self._probe(source)
         kind, why = teacher_kind(config, probe)
         teacher = config.teacher.model_copy(update={"kind": kind})
+        if kind == "onnx" and teacher.model is None:
+            teacher = teacher.model_copy(update={"model": str(EMBEDDED)})
         config = config.model_copy(update={"source": source, "teacher": teacher})
         left_out = left_out_stages(config, kind, why, probe, basis is not None or keep_knowledge)
         steps: dict[str, Step] = {}
         root = Path(source.path) if source.path else None
         raw = {"ingest": content_hash(files, root, self.file_memo.values)}
         if kind == "onnx":
-            raw["teacher"] = self._hash_named(teacher.model, teacher.labels)
+            raw["teacher"] = self._hash_teacher(teacher)
         for stage in STAGES.values():
             if stage.name in left_out or (stage.name == "cks" and not keep_knowledge):
                 continue
@@ -198,11 +202,13 @@ class Planner:
         module = import_module(f"chebsplat.stages.sources.{source.kind}")
         return module.probe(folder), module.files(folder)
 
-    def _hash_named(self, *paths: str | None) -> str:
-        files = [Path(path) for path in paths if path]
-        for file in files:
-            if not file.is_file():
-                raise InputError(f"{file} is missing; correct teacher.model or teacher.labels")
+    def _hash_teacher(self, teacher: Any) -> str:
+        """Of the model's files, and of the file of labels."""
+        files = read_teacher(Path(teacher.model)).files()
+        if teacher.labels:
+            files.append(Path(teacher.labels))
+            if not files[-1].is_file():
+                raise InputError(f"{files[-1]} is missing; correct teacher.labels")
         return content_hash(files, None, self.file_memo.values)
 
 

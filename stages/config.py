@@ -6,7 +6,7 @@ import difflib
 import json
 import tomllib
 from pathlib import Path
-from typing import Any, Literal
+from typing import Annotated, Any, Literal
 
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
@@ -48,20 +48,21 @@ class SfmSection(_Section):
 
 
 class TeacherSection(_Section):
-    """`auto`: an ONNX model if given, pseudo labels if the capture has labels, otherwise left out."""
+    """`auto`: the ONNX model if one is given, otherwise the embedded teacher; `labels`: the noisy-labels teacher."""
 
     kind: Literal["auto", "labels", "onnx", "none"] = "auto"
-    n_channels: int = Field(13, ge=2)
-    downscale: int = Field(4, ge=1)
+    downscale: int = Field(4, ge=1)  # pixels of a view that an entry of its map is wide; a coarser model's own
+    n_channels: int = Field(13, ge=2)  # of class codes: of labels, and of a closed-set segmenter
+    # an ONNX model (docs/teachers.md)
+    model: str | None = None  # .onnx with a .toml beside it
+    labels: str | None = None  # text file of the labels to ask for; None: the capture's classes, else the model's own
+    scales: tuple[Annotated[float, Field(gt=0)], ...] = Field((1.0,), min_length=1)
+    flips: bool = False
+    # labels
     confusion: float = Field(0.3, ge=0, le=1)  # p of METHOD.md section 9
     blur: float = Field(1.0, ge=0)  # sigma in feature pixels
     noise: float = Field(0.1, ge=0)
     seed: int = 0
-    model: str | None = None  # .onnx, [1,3,H,W] -> [1,C,h,w]
-    labels: str | None = None  # .npz with names and embeddings
-    mean: tuple[float, float, float] = (0.5, 0.5, 0.5)
-    std: tuple[float, float, float] = (0.5, 0.5, 0.5)
-    size: tuple[int, int] | None = None  # (H, W) the model wants; None: the image's own
 
 
 class ProjectionSection(_Section):

@@ -13,6 +13,7 @@ TOY = {
     "scene": {"name": "toy"},
     "source": {"kind": "generated", "preset": "toy", "seed": 1},
     "sfm": {"max_points": 300},
+    "teacher": {"kind": "labels"},
     "describe": {"n_regions": 24, "region_size": 8},
     "train": {"steps": 24, "max_gaussians": 500, "n_densify": 2, "report_every": 8, "refresh_every": 8},
 }

@@ -109,7 +109,7 @@ def without_labels(toy, tmp):
     record = read_capture(toy["ingest"])
     record.labels = None
     path = published(tmp / "c", "chebsplat.capture/1", write_capture, record)
-    return {"capture": path}, changed(teacher={"kind": "labels"})
+    return {"capture": path}, TOY
 
 
 def without_points(toy, tmp):
@@ -239,26 +239,6 @@ def test_a_second_scene_starts_from_the_basis_of_the_first(toy, tmp_path):
     assert artifact.read_manifest(tmp_path / "second").facts["warm_started"] > 0
     assert run_stage("cks", tmp_path / "basis", {"gaussians": tmp_path / "second", "basis": toy["cks"]}) == 0
     assert read_basis(tmp_path / "basis").revision == 2
-
-
-def test_an_onnx_teacher_gives_features_of_its_own_channels(toy, tmp_path):
-    import warnings
-
-    import torch
-
-    model, path = torch.nn.Conv2d(3, 6, 4, stride=4).eval(), tmp_path / "teacher.onnx"
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore")  # the exporter warns about its own internals
-        torch.onnx.export(model, (torch.zeros(1, 3, 72, 96),), path, dynamo=True, external_data=False, verbose=False)
-    np.savez(tmp_path / "labels.npz", names=np.array(["wall", "floor"]), embeddings=np.eye(2, 6, dtype=np.float32))
-    config = changed(teacher={"kind": "onnx", "model": str(path), "labels": str(tmp_path / "labels.npz")})
-    assert run_stage("teacher", tmp_path / "out", {"capture": toy["ingest"]}, config) == 0
-    from chebsplat.formats.features import read_features
-
-    features = read_features(tmp_path / "out")
-    assert features.features.shape == (16, 18, 24, 6)
-    (tmp_path / "labels.npz").unlink()
-    assert run_stage("teacher", tmp_path / "other", {"capture": toy["ingest"]}, config) == 3
 
 
 def test_the_exported_scene_renders_like_the_checkpoint(toy):
