@@ -174,7 +174,7 @@ class Planner:
             teacher = teacher.model_copy(update={"model": str(EMBEDDED)})
         projection = config.projection.model_copy(update={"model": teacher.model})
         config = config.model_copy(update={"source": source, "teacher": teacher, "projection": projection})
-        model = read_teacher(Path(teacher.model)) if kind == "onnx" else None
+        model = read_teacher(Path(teacher.model)) if kind == "onnx" and teacher.model else None
         left_out = left_out_stages(config, kind, why, probe, basis is not None or keep_knowledge)
         left_out |= left_out_projection(kind, model)
         steps: dict[str, Step] = {}

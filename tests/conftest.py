@@ -10,7 +10,7 @@ from tiny_teachers import color_reference, color_teacher
 def toy(tmp_path_factory):
     """Paths of toy artifacts by stage."""
     root = tmp_path_factory.mktemp("toy")
-    model, reference = color_teacher(root, channels=6), color_reference(root / "reference")
+    model, reference = color_teacher(root), color_reference(root / "reference")
     config = TOY | {"projection": {"model": str(model), "reference": str(reference)}}
     made = {}
     for stage, roles in INPUTS.items():

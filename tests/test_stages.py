@@ -108,7 +108,7 @@ def without_depth(toy, tmp):
 def teacher_of_nothing(toy, tmp):
     from tiny_teachers import color_reference, color_teacher
 
-    model = color_teacher(tmp, weights=np.zeros((6, 3)))
+    model = color_teacher(tmp, weights=np.zeros((3, 3)))
     return {}, {"projection": {"model": str(model), "reference": str(color_reference(tmp / "reference"))}}
 
 
