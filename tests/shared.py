@@ -28,7 +28,13 @@ INPUTS = {
     "onnx": {"gaussians": "train"},
     "cks": {"gaussians": "train"},
     "evaluate": {"capture": "ingest", "scene": "export", "features": "teacher"},
-    "report": {"evaluation": "evaluate", "gaussians": "train", "scene": "export", "encoder": "onnx"},
+    "report": {
+        "evaluation": "evaluate",
+        "gaussians": "train",
+        "scene": "export",
+        "encoder": "onnx",
+        "features": "teacher",
+    },
 }
 
 

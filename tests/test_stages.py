@@ -212,6 +212,7 @@ def test_the_report_is_one_page_with_pictures_curve_and_what_was_left_out(toy):
     assert text.count("data:image/png;base64") >= 4
     assert "http://" not in text.replace("http://www.w3.org", "").replace("http://purl.org", "").replace("http://creativecommons.org", "")  # fmt: skip  # noqa: E501
     assert "no sequence is named" in text
+    assert "2D teacher: <b>noisy labels</b>" in text
     assert "LPIPS" in text
     assert (toy["report"] / "figures.csv").read_text().startswith("figure,")
 
