@@ -31,6 +31,7 @@ from chebsplat.projection import ROWS, Moments, projection
 from chebsplat.teachers import EMBEDDED
 
 SIZE, N_CHANNELS, N_WORDS = (360, 480), 512, 150
+WIDTH = 32  # the default of projection.n_channels
 WIDTHS = (13, 16, 24, 32, 48, 57)  # 57: the most that 20 MB a view hold before compression
 REFERENCES = 24
 MAX_BYTES, MAX_ERROR, MAX_GROWTH = 20e6, 0.01, 0.1
@@ -99,11 +100,12 @@ def embedded(n_views: int) -> tuple[np.ndarray, Iterator[np.ndarray], Iterator[n
 
 
 def measured(name: str, words: np.ndarray, references: Iterator, views: list[np.ndarray]) -> list[dict]:
-    """A row for each width."""
+    """A row for each width, and one for the width of a scene by energy alone: what the vocabulary's weight is for."""
     moments = Moments(words.shape[1])
     for features in references:
         moments.add(features)
-    return [row(name, words, views, *projection(moments, words, width)) for width in WIDTHS]
+    cases = [(width, 1.0) for width in WIDTHS] + [(WIDTH, 0.0)]
+    return [row(name, words, views, *projection(moments, words, *case)) | {"weight": case[1]} for case in cases]
 
 
 def row(name: str, words: np.ndarray, views: list[np.ndarray], matrix: np.ndarray, energy: np.ndarray) -> dict:
@@ -157,7 +159,7 @@ def write(out: Path, names: list[str], views: Iterator[np.ndarray], shape: tuple
 
 def memory(what: str, folder: Path, n_views: int) -> int:
     """Peak bytes of a process that writes a store, or reads it as training does; called in a process of its own."""
-    shape = (*SIZE, 32)
+    shape = (*SIZE, WIDTH)
     if what == "write":
         one = np.random.default_rng(0).standard_normal(shape, np.float32)
         views = (np.roll(one, k, 0) for k in range(n_views))
@@ -185,7 +187,7 @@ def memories() -> list[dict]:
                 command = [sys.executable, __file__, "--memory", what, "--folder", folder, "--views", str(n_views)]
                 done = subprocess.run(command, stdout=subprocess.PIPE, text=True, check=True)
                 peak = json.loads(done.stdout)
-                rows.append({"features": f"{what} {n_views} views", "shape": "360x480x32", "peak_mb": peak / 1e6})
+                rows.append({"features": f"{what} {n_views} views", "shape": f"360x480x{WIDTH}", "peak_mb": peak / 1e6})
     return rows
 
 
