@@ -20,6 +20,7 @@ TOY = {
 INPUTS = {
     "ingest": {},
     "sfm": {"capture": "ingest"},
+    "projection": {},
     "teacher": {"capture": "ingest"},
     "describe": {"points": "sfm"},
     "train": {"capture": "ingest", "points": "sfm", "features": "teacher", "descriptors": "describe"},

@@ -105,6 +105,13 @@ def without_depth(toy, tmp):
     return {"capture": published(tmp / "c", "chebsplat.capture/1", write_capture, record)}, TOY
 
 
+def teacher_of_nothing(toy, tmp):
+    from tiny_teachers import color_reference, color_teacher
+
+    model = color_teacher(tmp, weights=np.zeros((3, 3)))
+    return {}, {"projection": {"model": str(model), "reference": str(color_reference(tmp / "reference"))}}
+
+
 def without_labels(toy, tmp):
     record = read_capture(toy["ingest"])
     record.labels = None
@@ -160,6 +167,7 @@ def without_trace(toy, tmp):
 FAILURES = {
     "ingest": one_photo,
     "sfm": without_depth,
+    "projection": teacher_of_nothing,
     "teacher": without_labels,
     "describe": without_points,
     "train": only_test_views,
