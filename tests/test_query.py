@@ -164,6 +164,10 @@ def other_model(folder):
     (folder / "toy.onnx").write_bytes(b"another")
 
 
+def small_table(folder):
+    np.savez(folder / "toy.npz", names=np.array(LABELS), embeddings=vectors(LABELS))
+
+
 def nothing(folder):
     pass
 
@@ -178,6 +182,7 @@ def nothing(folder):
         (nothing, ["words", " "], 2, "empty"),
         (remove_teacher, ["words", "seat"], 3, "teacher is missing"),
         (other_model, ["words", "seat"], 3, "toy.onnx is not the model"),
+        (small_table, ["words", "sofa"], 3, "choose with --against"),
     ],
 )
 def test_what_cannot_be_answered_is_told_with_the_remedy(folder, damage, arguments, code, said):
