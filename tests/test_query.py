@@ -92,6 +92,7 @@ def made(tmp_path_factory):
 def folder(made, tmp_path, monkeypatch):
     """A copy that a test may damage; names are looked up in it."""
     shutil.copytree(made, tmp_path / "work")
+    (tmp_path / "work/store/export").mkdir(parents=True)  # no scene, though it looks like one
     monkeypatch.setenv("CHEBSPLAT_WORK", str(tmp_path / "work"))
     teacher = tmp_path / "work/words/teacher"
     manifest = (teacher / "artifact.json").read_text()
@@ -179,6 +180,7 @@ def nothing(folder):
         (nothing, ["labels", "something to sit on"], 2, "teacher.kind=auto"),
         (nothing, ["words", "seatz"], 3, "near: seat"),
         (nothing, ["word", "seat"], 2, "there is words"),
+        (nothing, ["store", "seat"], 2, "no finished scene"),
         (nothing, ["words", " "], 2, "empty"),
         (remove_teacher, ["words", "seat"], 3, "teacher is missing"),
         (other_model, ["words", "seat"], 3, "toy.onnx is not the model"),
