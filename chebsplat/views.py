@@ -34,6 +34,28 @@ def in_frustum(means: Tensor, view: View, reach: Tensor, margin: float = 0.15) -
     return (near & inside).nonzero()[:, 0]
 
 
+def remembered(read: Callable[[int], Tensor], budget: int) -> Callable[[int], Tensor]:
+    """`read`, whose results stay in memory while `budget` bytes last; the others are read at every call.
+
+    Choices: what came first stays. Views are visited in random order, once a round: to drop the least recently used
+      for another would lose it before it is needed again.
+    """
+    kept: dict[int, Tensor] = {}
+    left = budget
+
+    def recall(index: int) -> Tensor:
+        nonlocal left
+        if index in kept:
+            return kept[index]
+        found = read(index)
+        if found.nbytes <= left:
+            kept[index] = found
+            left -= found.nbytes
+        return found
+
+    return recall
+
+
 @dataclass
 class Views:
     """Training views. images [V, H, W, 3] u8; masks [V, H, W] bool or None; features: view index -> [h, w, C]."""

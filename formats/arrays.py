@@ -1,4 +1,4 @@
-"""Chunked arrays in zarr v3, one view a chunk; every chunk present and checksummed, so that no fill value is read.
+"""Chunked arrays in zarr v3, one view a file; every chunk present and checksummed, so that no fill value is read.
 
 Measured traps this closes: a missing chunk and a zero-byte one read silently as fill values, a flipped bit reads
 silently as data. Presence and size come from the manifest, the bits from each chunk's crc32c.
@@ -19,33 +19,61 @@ from chebsplat.formats import artifact
 from chebsplat.formats.artifact import Manifest
 
 
-def write_array(
-    path: Path, data: np.ndarray, dimensions: Sequence[str], units: str = "", chunks: tuple[int, ...] | None = None
-) -> None:
-    """Write one array; `chunks` defaults to one entry of the first dimension. Float arrays have nan as fill value."""
+def create_array(
+    path: Path,
+    shape: Sequence[int],
+    dtype: Any,
+    dimensions: Sequence[str],
+    units: str = "",
+    chunks: Sequence[int] | None = None,
+    shards: Sequence[int] | None = None,
+) -> Any:
+    """An empty zarr array; `chunks` defaults to one entry of the first dimension. Float arrays have nan as fill value.
+
+    Args: shards: what one file holds, whole chunks of it in every dimension; None: a chunk a file.
+    """
     import zarr
     from zarr.codecs import Crc32cCodec, ZstdCodec
 
-    array = zarr.create_array(
+    return zarr.create_array(
         str(path),
-        shape=data.shape,
-        dtype=data.dtype,
-        chunks=chunks or (1, *(max(n, 1) for n in data.shape[1:])),
+        shape=tuple(shape),
+        dtype=dtype,
+        chunks=tuple(chunks or (1, *(max(n, 1) for n in shape[1:]))),
+        shards=None if shards is None else tuple(shards),
         compressors=[ZstdCodec(level=3), Crc32cCodec()],
-        fill_value=float("nan") if data.dtype.kind == "f" else 0,
+        fill_value=float("nan") if np.dtype(dtype).kind == "f" else 0,
         dimension_names=list(dimensions),
         attributes={"units": units},
         config={"write_empty_chunks": True},
     )
+
+
+def write_array(
+    path: Path,
+    data: np.ndarray,
+    dimensions: Sequence[str],
+    units: str = "",
+    chunks: Sequence[int] | None = None,
+    shards: Sequence[int] | None = None,
+) -> None:
+    """Write one array whole; see `create_array`. Raises OSError if a chunk is not on disk afterwards."""
+    array = create_array(path, data.shape, data.dtype, dimensions, units, chunks, shards)
     array[:] = data
-    absent = [name for name in _chunk_names(array) if not (path / name).is_file()]
+    absent = [name for name in chunk_names(array) if not (path / name).is_file()]
     if absent:
         raise OSError(f"{path / absent[0]} was not written ({len(absent)} chunks absent)")
 
 
-def _chunk_names(array: Any) -> list[str]:
-    grid = [range(math.ceil(n / c)) for n, c in zip(array.shape, array.chunks, strict=True)]
+def chunk_names(array: Any) -> list[str]:
+    """Files that hold an array's values, below its folder."""
+    grid = [range(math.ceil(n / c)) for n, c in zip(array.shape, _file_shape(array), strict=True)]
     return ["/".join(["c", *map(str, index)]) for index in itertools.product(*grid)]
+
+
+def _file_shape(array: Any) -> tuple[int, ...]:
+    """Entries that one file holds: a shard, or a chunk of an array without shards."""
+    return array.shards or array.chunks
 
 
 class StoredArray:
@@ -63,7 +91,7 @@ class StoredArray:
             raise InputError(
                 f"{self.path / 'zarr.json'} is not zarr metadata ({error}); {artifact.remedy(root)}"
             ) from None
-        for chunk in _chunk_names(self._array):
+        for chunk in chunk_names(self._array):
             if f"{name}/{chunk}" not in manifest.files:
                 raise InputError(f"{self.path / chunk} is missing; {artifact.remedy(root)}")
         self.shape: tuple[int, ...] = self._array.shape
@@ -85,8 +113,8 @@ class StoredArray:
 
     def _culprit(self) -> str:
         """The first chunk that does not decode, for the message."""
-        sizes = self._array.chunks
-        for name in _chunk_names(self._array):
+        sizes = _file_shape(self._array)
+        for name in chunk_names(self._array):
             where = tuple(slice(int(k) * n, (int(k) + 1) * n) for k, n in zip(name.split("/")[1:], sizes, strict=True))
             try:
                 self._array[where]

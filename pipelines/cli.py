@@ -1,4 +1,4 @@
-"""The `chebsplat` command: run, plan, verify, clean-stale, scenes, and every stage as a plain command."""
+"""The `chebsplat` command: runs, plans, queries, checks and listings, and every stage as a plain command."""
 
 from __future__ import annotations
 
@@ -131,6 +131,51 @@ def plan(scene: str | None, sequence: str | None, settings: str, ablation: str) 
     guarded(action)
 
 
+def scene_folder(scene: str) -> Path:
+    """The folder of a finished scene, given itself or by the name of its links. Raises ConfigError with near names."""
+    from chebsplat.pipelines import store
+
+    for folder in (store.work() / scene, Path(scene)):
+        if store.is_fresh(folder / "export"):
+            return folder
+    import difflib
+
+    known = sorted(path.parent.parent.name for path in store.work().glob("*/export/artifact.json"))
+    near = difflib.get_close_matches(scene, known, 3) or known
+    raise ConfigError(
+        f"{scene} is no finished scene in {store.work()}, and no folder of one; "
+        + (f"there is {', '.join(near)}" if near else f"run it first: make scene={scene}")
+    )
+
+
+@main.command()
+@click.argument("scene")
+@click.argument("text")
+@click.option("--against", default="", help="phrases it is weighed against; default: object,things,stuff,texture")
+@click.option("--out", type=click.Path(path_type=Path), help="default: query/<text> in the scene's folder")
+@click.option("--top", type=click.IntRange(1), default=8, show_default=True, help="labels in the table")
+def query(scene: str, text: str, against: str, out: Path | None, top: int) -> None:
+    """Where in a finished SCENE is TEXT, such as "something to sit on"? Relevancy by Gaussian, and heat maps."""
+
+    def action() -> int:
+        import logging
+
+        from chebsplat.pipelines.plan import suffix
+        from chebsplat.stages.query import run as answer
+
+        logging.basicConfig(stream=sys.stderr, format="query: %(message)s", level="WARNING", force=True)
+        logging.getLogger("chebsplat").setLevel("INFO")
+        folder = scene_folder(scene)
+        if not text.strip():
+            raise ConfigError("the query is empty; say what to look for")
+        place = (out or folder / "query" / suffix(text.strip())).absolute()
+        answer(folder, text.strip(), [word.strip() for word in against.split(",") if word.strip()], place, top)
+        print(place)
+        return 0
+
+    guarded(action)
+
+
 @main.command()
 @click.argument("folders", nargs=-1, required=True, type=click.Path(path_type=Path))
 def verify(folders: tuple[Path, ...]) -> None:
@@ -165,6 +210,23 @@ def clean_stale(yes: bool) -> None:
         if yes:
             for path, _ in found:
                 store.remove(path)
+        return 0
+
+    guarded(action)
+
+
+@main.command("check-teacher")
+@click.argument("model", type=click.Path(path_type=Path))
+@click.option("--photo", type=click.Path(path_type=Path), help="default: a view of a generated room")
+@click.option("--labels", help="text file of labels; default: the teacher's own")
+def check_teacher(model: Path, photo: Path | None, labels: str | None) -> None:
+    """Run one image through a teacher MODEL (.onnx): what it is, what it costs, what it sees."""
+
+    def action() -> int:
+        from chebsplat.stages.teacher_check import check
+
+        for what, finding in check(model, photo, labels):
+            print(f"{what:9s}{finding}")
         return 0
 
     guarded(action)

@@ -3,9 +3,12 @@
 from __future__ import annotations
 
 import os
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from chebsplat.errors import ConfigError
+
+if TYPE_CHECKING:
+    from chebsplat.formats.teacher_model import TeacherModel
 
 
 def teacher_kind(config: Any, probe: dict[str, bool]) -> tuple[str, str]:
@@ -13,15 +16,13 @@ def teacher_kind(config: Any, probe: dict[str, bool]) -> tuple[str, str]:
     wanted = config.teacher.kind
     if not config.train.semantics:
         return "none", "train.semantics is false"
+    if wanted == "labels" and not probe["labels"]:
+        raise ConfigError("teacher.kind is labels, but the source has none; use teacher.kind=auto, or teacher.model")
+    if config.teacher.model and wanted in ("labels", "none"):
+        raise ConfigError(f"teacher.kind is {wanted}, so teacher.model would not be used; set teacher.kind=onnx too")
     if wanted == "none":
         return "none", "teacher.kind is none"
-    if wanted == "labels" and not probe["labels"]:
-        raise ConfigError(
-            "teacher.kind is labels, but the source has none; give teacher.model or use teacher.kind=auto"
-        )
-    if wanted == "auto":
-        wanted = "onnx" if config.teacher.model else "labels" if probe["labels"] else "none"
-    return wanted, "the source has no labels and teacher.model names no encoder: rendering only"
+    return ("onnx" if wanted == "auto" else wanted), ""
 
 
 def left_out_stages(config: Any, kind: str, why: str, probe: dict[str, bool], knowledge: bool) -> dict[str, str]:
@@ -41,6 +42,15 @@ def left_out_stages(config: Any, kind: str, why: str, probe: dict[str, bool], kn
     elif probe["poses"]:
         left_out["sfm: pose estimation"] = "poses are given"
     return left_out
+
+
+def left_out_projection(kind: str, model: TeacherModel | None) -> dict[str, str]:
+    """Why there is no projection, if there is none."""
+    if model is None:
+        return {"projection": f"teacher.kind is {kind}: no teacher's channels to reduce"}
+    if model.output != "features":
+        return {"projection": f"{model.name} is a closed-set teacher: its classes have codes of few channels"}
+    return {}
 
 
 def source_sentence(name: str, asked: Any, source: Any) -> str:

@@ -21,6 +21,36 @@ def colored(labels: np.ndarray, n: int) -> np.ndarray:
     return np.concatenate([np.zeros((1, 3), np.uint8), palette(n)])[labels.astype(int) + 1]
 
 
+def heat(image: np.ndarray, relevancy: np.ndarray) -> np.ndarray:
+    """A render u8 [H, W, 3] under the heat of a relevancy [H, W]: grey up to 0.5, then cyan to red at 1."""
+    grey = image.mean(-1, keepdims=True)
+    warmth = (2 * relevancy - 1).clip(0, 1)[..., None]
+    opacity = np.where(warmth > 0, 0.5 + 0.4 * warmth, 0)
+    return np.round((1 - opacity) * 0.8 * grey + opacity * (0.7 + 0.3 * grey / 255) * _warm(warmth)).astype(np.uint8)
+
+
+def heat_scale(title: str, width: int) -> np.ndarray:
+    """A strip u8 [28, width, 3]: the title, and the colours of `heat` from 0.5 to 1."""
+    from PIL import Image, ImageDraw
+
+    strip = np.full((28, width, 3), 255, np.uint8)
+    left, right = round(0.82 * width), round(0.97 * width)
+    strip[9:19, left:right] = _warm(np.linspace(0, 1, right - left)[None, :, None]).round()
+    picture = Image.fromarray(strip)
+    draw, room = ImageDraw.Draw(picture), max(left - 40, 0) // 6  # letters of the built-in font
+    draw.text((8, 8), title if len(title) <= room else f"{title[: max(room - 3, 0)]}...", fill="black")
+    draw.text((left - 22, 8), "0.5", fill="black")
+    draw.text((right + 6, 8), "1", fill="black")
+    return np.asarray(picture)
+
+
+def _warm(warmth: np.ndarray) -> np.ndarray:
+    """Colours [..., 3] up to 255 of warmth [..., 1] in [0, 1], from the warmer part of turbo."""
+    from matplotlib import colormaps
+
+    return 255 * colormaps["turbo"](0.3 + 0.58 * warmth[..., 0])[..., :3]
+
+
 def data_uri(image: np.ndarray) -> str:
     from PIL import Image
 

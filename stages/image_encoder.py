@@ -1,100 +1,188 @@
-"""A user's image encoder in ONNX, `[1, 3, H, W]` float32 -> `[1, C, h, w]`, run over the views."""
+"""A teacher's image encoder in ONNX, `[1, 3, H, W]` float32 -> `[1, C, h, w]`: windows, scales and flips of a view."""
 
 from __future__ import annotations
 
-from pathlib import Path
+import math
 from typing import TYPE_CHECKING, Any
 
-from chebsplat.errors import ConfigError, InputError
-from chebsplat.stages.command import Job
+from chebsplat.errors import DataFailure, InputError
 
 if TYPE_CHECKING:
     import numpy as np
 
-    from chebsplat.formats.capture import Capture
-    from chebsplat.formats.features import Features
-    from chebsplat.stages.config import TeacherSection
+    from chebsplat.formats.teacher_model import TeacherModel
+
+MAX_SHARE = 0.5  # of the image's side that an entry of the map may be wide
 
 
-def encode_views(job: Job, capture: Capture, settings: TeacherSection) -> Features:
-    """Features of every view.
+class ImageEncoder:
+    """Runs one teacher, one window at a time: on a CPU a batch gains nothing, and memory stays that of one window.
 
-    Raises: ConfigError without a model or labels file; InputError naming a file that cannot be used.
-    Choices: channels beyond `teacher.n_channels` are reduced by the projection that is stored in the labels file
-      (`projection` [C, n_channels]); it belongs to the teacher, never to a scene, so none is made up here.
+    Args: threads: that onnxruntime may use.
+    Raises: InputError naming a model that cannot be used.
     """
-    import numpy as np
 
-    from chebsplat import noisy_teacher as model
-    from chebsplat.formats.features import Features
+    def __init__(self, teacher: TeacherModel, threads: int):
+        import onnxruntime
 
-    if not settings.model or not settings.labels:
-        raise ConfigError("an ONNX teacher needs teacher.model and teacher.labels (.npz with names and embeddings)")
-    names, embeddings, projection = _labels(Path(settings.labels))
-    session = _session(Path(settings.model))
-    entry = session.get_inputs()[0].name
-    mean, std = (np.array(v, np.float32)[:, None, None] for v in (settings.mean, settings.std))
-    rows = []
-    for view, _ in job.progress.track(range(len(capture.names)), len(capture.names), "teacher"):
-        image = _sized(capture.images[view], settings.size).astype(np.float32).transpose(2, 0, 1) / 255
-        found = np.asarray(session.run(None, {entry: ((image - mean) / std)[None]})[0])
-        if found.ndim != 4 or found.shape[1] != len(embeddings[0]):
-            raise InputError(
-                f"{settings.model} gives {found.shape} for one image; [1, {len(embeddings[0])}, h, w] is needed to "
-                f"match the embeddings of {settings.labels}"
+        self.teacher = teacher
+        options = onnxruntime.SessionOptions()
+        options.intra_op_num_threads, options.inter_op_num_threads = threads, 1
+        options.use_deterministic_compute = True
+        options.add_session_config_entry(
+            "session.intra_op.allow_spinning", "0"
+        )  # leave the cores to others
+        options.log_severity_level = 4  # what fails is raised, and told once
+        try:
+            self.session: Any = onnxruntime.InferenceSession(
+                str(teacher.path), options, providers=["CPUExecutionProvider"]
             )
-        features = found[0].transpose(1, 2, 0)
-        if projection is not None:
-            features = features @ projection
-        rows.append((features / np.linalg.norm(features, axis=-1, keepdims=True).clip(1e-6)).astype(np.float16))
-    stacked = np.stack(rows)
-    if projection is not None:
-        embeddings = embeddings @ projection
-    embeddings = embeddings / np.linalg.norm(embeddings, axis=1, keepdims=True).clip(1e-6)
-    if stacked.shape[-1] > 64:
-        raise ConfigError(
-            f"{settings.model} has {stacked.shape[-1]} channels, at most 64 can be rendered; store a `projection` "
-            f"[{stacked.shape[-1]}, {settings.n_channels}] in {settings.labels}"
-        )
-    pseudo, confidence = model.decode(stacked.astype(np.float32), embeddings)
-    convention = {"kind": "onnx", "normalized": True, "n_scales": 1, "flips": False, "size": settings.size}
-    return Features(capture.names, stacked, names, embeddings, pseudo, confidence, convention)
+        except Exception as error:  # onnxruntime's own exception types are not public
+            raise InputError(f"{teacher.path} is not a usable ONNX model ({_line(error)}); export it again") from None
+        self.size = self._window_size()
+
+    def _window_size(self) -> tuple[int, int] | None:
+        """(H, W) of the graph or of the TOML; None where the model takes any size."""
+        path, entries = self.teacher.path, self.session.get_inputs()
+        shape, kind = list(entries[0].shape), entries[0].type
+        if len(entries) != 1:
+            raise InputError(f"{path} has {len(entries)} inputs; one image [1, 3, H, W] is needed: export it again")
+        if len(shape) != 4 or not (shape[1] == 3 or shape[1] is None or isinstance(shape[1], str)):
+            raise InputError(f"{path} takes {shape}; one image [1, 3, H, W] is needed: export it again")
+        if kind != "tensor(float)":
+            raise InputError(f"{path} takes {kind}; export it with a float32 input (weights may be float16)")
+        fixed = tuple(side for side in shape[2:] if isinstance(side, int))
+        if len(fixed) < 2:
+            return self.teacher.size
+        if self.teacher.size not in (None, fixed):
+            raise InputError(
+                f"{path} takes {list(fixed)}, {self.teacher.settings} says size = {list(self.teacher.size or ())}; "
+                "correct it"
+            )
+        return fixed[0], fixed[1]
+
+    def scaled_size(self, image: np.ndarray, scale: float) -> tuple[int, int]:
+        """(H, W) of an image at a scale; the aspect ratio stays, to half a pixel."""
+        height, width = image.shape[:2]
+        factor = scale * (self.teacher.base / max(height, width) if self.teacher.base else 1)
+        return max(round(height * factor), 1), max(round(width * factor), 1)
+
+    def window(self, size: tuple[int, int]) -> tuple[int, int]:
+        """What the model is fed of an image of a size: the model's size, or the image's own up to a multiple."""
+        if self.size is not None:
+            return self.size
+        height, width = (math.ceil(side / self.teacher.multiple) * self.teacher.multiple for side in size)
+        return height, width
+
+    def grid(self, image: np.ndarray, downscale: int) -> tuple[tuple[int, int], int]:
+        """((h, w), C): entries of a view's map, and the encoder's channels.
+
+        Choices: an entry is `downscale` pixels of the view wide, or as wide as the encoder's own at scale 1 where
+          these are wider.
+        """
+        scaled = self.scaled_size(image, 1.0)
+        side = self.window(scaled)
+        cells = self.run(_padded(_resized(image, scaled), side)[: side[0], : side[1]], "the first view")
+        sides = []
+        for n, m, window, count in zip(image.shape[:2], scaled, side, cells.shape[1:], strict=True):
+            entry = max(window / count * n / m, downscale)
+            if entry > MAX_SHARE * n:
+                raise InputError(
+                    f"{self.teacher.path} gives one feature every {entry:.0f} pixels, for views of {n}; give larger "
+                    f"images, or `base` in {self.teacher.settings}"
+                )
+            sides.append(math.ceil(n / entry - 1e-9))
+        return (sides[0], sides[1]), cells.shape[0]
+
+    def encode(
+        self, image: np.ndarray, grid: tuple[int, int], scales: tuple[float, ...], flips: bool, name: str
+    ) -> np.ndarray:
+        """The map f32 [h, w, C] of a view, u8 [H, W, 3]: unit features, or probabilities of a closed set.
+
+        Choices: every window's codes are unit (or probabilities) before windows are blended; every scale's and flip's
+          map counts the same in the mean, which is made unit again. Padding repeats the image's edge.
+        """
+        import numpy as np
+
+        from chebsplat.tiling import blended
+
+        total = np.zeros(0)
+        for scale in scales:
+            size = self.scaled_size(image, scale)
+            side, resized = self.window(size), _resized(image, size)
+            for flip in (False, True) if flips else (False,):
+                padded = _padded(resized[:, ::-1] if flip else resized, side)
+
+                def codes(top: int, left: int, padded: Any = padded, side: Any = side) -> np.ndarray:
+                    found = self.run(padded[top : top + side[0], left : left + side[1]], name)
+                    return softmax(found) if self.teacher.output == "logits" else unit(found, 0)
+
+                part = self._normal(blended(codes, size, side, grid))
+                part = part[:, ::-1] if flip else part
+                total = total + part if total.size else part
+        return self._normal(total)
+
+    def _normal(self, values: np.ndarray) -> np.ndarray:
+        return values / values.sum(-1, keepdims=True) if self.teacher.output == "logits" else unit(values, -1)
+
+    def run(self, window: np.ndarray, name: str) -> np.ndarray:
+        """The model's output f32 [C, h, w] for one window u8 [H, W, 3]. `name` of the view is for errors.
+
+        Raises: InputError on a model that does not run or gives another rank; DataFailure on non-finite values.
+        """
+        import numpy as np
+
+        teacher = self.teacher
+        mean, std = (np.array(v, np.float32)[:, None, None] for v in (teacher.mean, teacher.std))
+        image = (window.transpose(2, 0, 1).astype(np.float32) / 255 - mean) / std
+        try:
+            found = np.asarray(self.session.run(None, {self.session.get_inputs()[0].name: image[None]})[0])
+        except Exception as error:
+            raise InputError(
+                f"{teacher.path} fails on an image [1, 3, {image.shape[1]}, {image.shape[2]}] ({_line(error)}); "
+                f"correct `size` or `multiple` in {teacher.settings}, or export it again"
+            ) from None
+        if found.ndim != 4 or found.shape[0] != 1 or not found.size:
+            raise InputError(f"{teacher.path} gives {list(found.shape)}; [1, C, h, w] is needed: export it again")
+        if not np.isfinite(found).all():
+            raise DataFailure(
+                f"{teacher.path} gives {np.sum(~np.isfinite(found))} non-finite values for {name}; check mean and std "
+                f"in {teacher.settings}, and export it in float32"
+            )
+        return found[0].astype(np.float32)
 
 
-def _labels(path: Path) -> tuple[list[str], np.ndarray, np.ndarray | None]:
+def unit(values: np.ndarray, axis: int) -> np.ndarray:
+    """Unit vectors along an axis; a vector of length 0 stays."""
     import numpy as np
 
-    try:
-        with np.load(path, allow_pickle=False) as arrays:
-            held: dict[str, Any] = {name: arrays[name] for name in arrays.files}
-        names, embeddings = [str(name) for name in held["names"]], held["embeddings"].astype(np.float32)
-    except FileNotFoundError:
-        raise InputError(f"{path} is missing; correct teacher.labels") from None
-    except (OSError, ValueError, KeyError) as error:
-        raise InputError(f"{path} is not an .npz with names and embeddings ({error}); write it again") from None
-    projection = held.get("projection")
-    if embeddings.ndim != 2 or len(embeddings) != len(names) or not np.isfinite(embeddings).all():
-        raise InputError(f"{path}: embeddings {embeddings.shape} do not fit {len(names)} names; write it again")
-    if projection is not None and (projection.ndim != 2 or len(projection) != embeddings.shape[1]):
-        raise InputError(f"{path}: projection {projection.shape} does not fit {embeddings.shape[1]} channels")
-    return names, embeddings, None if projection is None else projection.astype(np.float32)
+    return values / np.linalg.norm(values, axis=axis, keepdims=True).clip(1e-6)
 
 
-def _session(path: Path) -> Any:
-    import onnxruntime
+def softmax(logits: np.ndarray) -> np.ndarray:
+    """Probabilities [C, h, w] of logits [C, h, w]."""
+    import numpy as np
 
-    if not path.is_file():
-        raise InputError(f"{path} is missing; correct teacher.model")
-    try:
-        return onnxruntime.InferenceSession(str(path), providers=["CPUExecutionProvider"])
-    except Exception as error:  # onnxruntime's own exception types are not public
-        raise InputError(f"{path} is not a usable ONNX model ({error}); export it again") from None
+    weights = np.exp(logits - logits.max(0))
+    return weights / weights.sum(0)
 
 
-def _sized(image: np.ndarray, size: tuple[int, int] | None) -> np.ndarray:
+def _resized(image: np.ndarray, size: tuple[int, int]) -> np.ndarray:
     import numpy as np
     from PIL import Image
 
-    if size is None:
+    if image.shape[:2] == size:
         return image
     return np.asarray(Image.fromarray(image).resize((size[1], size[0]), Image.Resampling.BILINEAR))
+
+
+def _padded(image: np.ndarray, side: tuple[int, int]) -> np.ndarray:
+    """At least `side` large."""
+    import numpy as np
+
+    below, right = (max(side[k] - image.shape[k], 0) for k in (0, 1))
+    return np.pad(image, ((0, below), (0, right), (0, 0)), "edge")
+
+
+def _line(error: Exception) -> str:
+    return " ".join(str(error).split())[:200]

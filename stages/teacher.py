@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import logging
 from typing import TYPE_CHECKING
 
 from chebsplat.errors import ConfigError, DataFailure
+from chebsplat.formats.artifact import read_manifest, sha256_file
 from chebsplat.stages.command import Job, command
 
 if TYPE_CHECKING:
@@ -12,25 +14,85 @@ if TYPE_CHECKING:
     from chebsplat.formats.features import Features
     from chebsplat.stages.config import TeacherSection
 
+log = logging.getLogger("chebsplat")
+
 
 def run(job: Job) -> None:
     from chebsplat.formats.capture import read_capture
     from chebsplat.formats.features import write_features
 
     settings, capture = job.config.teacher, read_capture(job.inputs["capture"])
-    kind = settings.kind
-    if kind == "auto":
-        kind = "onnx" if settings.model else "labels" if capture.labels is not None else "none"
-    if kind == "none":
-        raise ConfigError("this scene has no teacher: no labels, and teacher.model names no ONNX model")
-    if kind == "labels":
+    if settings.kind == "none":
+        raise ConfigError("teacher.kind is none: this scene has no teacher; leave the stage out")
+    if settings.kind == "labels":
         features = from_labels(job, capture, settings)
+        job.facts |= {"kind": "labels", "n_labels": len(features.label_names), "convention": features.convention}
+        write_features(job.out, features)
     else:
-        from chebsplat.stages.image_encoder import encode_views
+        from_encoder(job, capture, settings)
 
-        features = encode_views(job, capture, settings)
-    job.facts |= {"kind": kind, "n_labels": len(features.label_names), "convention": features.convention}
-    write_features(job.out, features)
+
+def from_encoder(job: Job, capture: Capture, settings: TeacherSection) -> None:
+    """Features of every view by an ONNX model, the embedded one if none is given; of a killed run, finished views stay.
+
+    Choices: test views are encoded too, because evaluate reports the teacher's own figures on them.
+    """
+    from pathlib import Path
+
+    from chebsplat.formats.features import FeatureWriter
+    from chebsplat.formats.projection import read_projection
+    from chebsplat.formats.teacher_model import read_teacher
+    from chebsplat.stages.command import n_threads
+    from chebsplat.stages.image_encoder import ImageEncoder
+    from chebsplat.stages.label_space import MAX_CHANNELS, closed_set, label_set, open_vocabulary
+    from chebsplat.teachers import EMBEDDED
+
+    teacher = read_teacher(Path(settings.model) if settings.model else EMBEDDED)
+    encoder = ImageEncoder(teacher, n_threads())
+    grid, n_channels = encoder.grid(capture.images[0], settings.downscale)
+    projection = None
+    if teacher.output == "logits":
+        labels = label_set(teacher, settings.labels, None) if settings.labels else None
+        space = closed_set(teacher, labels, n_channels, settings.n_channels)
+    else:
+        if "projection" in job.inputs:
+            projection = read_projection(job.inputs["projection"])
+        elif n_channels > MAX_CHANNELS:
+            raise ConfigError(
+                f"{teacher.path} has {n_channels} channels, at most {MAX_CHANNELS} can be rendered; use "
+                "`chebsplat run`, or make its projection with `chebsplat projection` and pass --in-projection"
+            )
+        labels = label_set(teacher, settings.labels, capture.class_names)
+        space = open_vocabulary(teacher, labels, n_channels, projection)
+    convention = {
+        "kind": "onnx",
+        "teacher": teacher.name,
+        "sha256": sha256_file(teacher.path),
+        "output": teacher.output,
+        "normalized": True,  # before projection
+        "n_scales": len(settings.scales),
+        "scales": list(settings.scales),
+        "flips": settings.flips,
+        "stride": [side / n for side, n in zip(capture.images.shape[1:3], grid, strict=True)],
+    }
+    made_with = {
+        "capture": read_manifest(job.inputs["capture"]).key,
+        "projection": read_manifest(job.inputs["projection"]).key if projection else None,
+        "teacher": [sha256_file(path) for path in teacher.files()],
+        "labels": labels,
+        "convention": convention,
+    }
+    shape = (*grid, space.embeddings.shape[1])
+    writer = FeatureWriter(job.scratch / "features", capture.names, shape, made_with)
+    waiting = [view for view in range(len(capture.names)) if view not in writer.done]
+    if writer.done:
+        log.info("%d of %d views are there from a run that was stopped", len(writer.done), len(capture.names))
+    for view, _ in job.progress.track(waiting, len(capture.names), "teacher", len(writer.done)):
+        name = capture.names[view]
+        found = encoder.encode(capture.images[view], grid, settings.scales, settings.flips, name)
+        writer.add(view, *space.split(found))
+    writer.finish(job.out, space.names, space.embeddings, convention, projection)
+    job.facts |= {"kind": "onnx", "n_labels": len(space.names), "convention": convention}
 
 
 def from_labels(job: Job, capture: Capture, settings: TeacherSection) -> Features:
@@ -44,7 +106,7 @@ def from_labels(job: Job, capture: Capture, settings: TeacherSection) -> Feature
     from chebsplat.formats.features import Features
 
     if capture.labels is None or not capture.class_names:
-        raise DataFailure("the capture has no labels; set teacher.model to an ONNX model, or teacher.kind = none")
+        raise DataFailure("the capture has no labels; use teacher.kind = auto (the embedded teacher, or teacher.model)")
     codes = class_codes(capture.class_names, settings.n_channels)
     training = np.flatnonzero(~capture.is_test)
     images, labels = np.asarray(capture.images[:])[training], np.asarray(capture.labels[:])[training]

@@ -19,6 +19,8 @@ if TYPE_CHECKING:
     from chebsplat.trainer import Trainer
     from chebsplat.views import Views
 
+FEATURE_BYTES = 64 << 20  # of features that are kept in memory; what is beyond is read when its view is looked at
+
 
 log = logging.getLogger("chebsplat")
 
@@ -92,10 +94,9 @@ def note_left_out(job: Job, train: dict[str, Any], has_semantics: bool) -> None:
 
 def training_views(capture: Capture, points: Points, features: Features | None) -> Views:
     """The registered training views, joined by name. Raises InputError if artifacts do not belong together."""
-    import numpy as np
     import torch
 
-    from chebsplat.views import Views
+    from chebsplat.views import Views, remembered
 
     row = {name: view for view, name in enumerate(capture.names)}
     unknown = [name for name in points.names if name not in row]
@@ -113,10 +114,11 @@ def training_views(capture: Capture, points: Points, features: Features | None) 
         absent = [name for name in names if name not in source]
         if absent:
             raise InputError(f"the features have no view {absent[0]}; run the teacher stage on this capture")
-        held = features
+        stored = features.features
+        read = remembered(lambda index: torch.from_numpy(stored[source[names[index]]]), FEATURE_BYTES)
 
         def of(index: int) -> torch.Tensor:
-            return torch.from_numpy(held.features[source[names[index]]].astype(np.float32))
+            return read(index).float()
 
     return Views(
         names,

@@ -13,12 +13,14 @@ TOY = {
     "scene": {"name": "toy"},
     "source": {"kind": "generated", "preset": "toy", "seed": 1},
     "sfm": {"max_points": 300},
+    "teacher": {"kind": "labels"},
     "describe": {"n_regions": 24, "region_size": 8},
     "train": {"steps": 24, "max_gaussians": 500, "n_densify": 2, "report_every": 8, "refresh_every": 8},
 }
 INPUTS = {
     "ingest": {},
     "sfm": {"capture": "ingest"},
+    "projection": {},
     "teacher": {"capture": "ingest"},
     "describe": {"points": "sfm"},
     "train": {"capture": "ingest", "points": "sfm", "features": "teacher", "descriptors": "describe"},
@@ -26,7 +28,13 @@ INPUTS = {
     "onnx": {"gaussians": "train"},
     "cks": {"gaussians": "train"},
     "evaluate": {"capture": "ingest", "scene": "export", "features": "teacher"},
-    "report": {"evaluation": "evaluate", "gaussians": "train", "scene": "export", "encoder": "onnx"},
+    "report": {
+        "evaluation": "evaluate",
+        "gaussians": "train",
+        "scene": "export",
+        "encoder": "onnx",
+        "features": "teacher",
+    },
 }
 
 

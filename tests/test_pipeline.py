@@ -17,7 +17,7 @@ from chebsplat.pipelines.plan import CONFIGS, Planner, names, overrides, read_to
 from chebsplat.pipelines.run import failures
 from chebsplat.stages.registry import STAGES
 
-ALL = [stage for stage in STAGES if stage != "cks"]
+ALL = [stage for stage in STAGES if stage not in ("projection", "cks")]  # of a scene: a projection is its teacher's
 AFTER_TRAIN = ["train", "export", "onnx", "evaluate", "report"]
 
 
@@ -166,7 +166,7 @@ def test_content_of_raw_files_counts_and_their_time_and_place_do_not(tmp_path):
     shutil.move(tmp_path / "photos", moved / "photos")
     assert stale(scene=f"{moved}/photos/") == []
     shutil.copy(moved / "photos/1.jpg", moved / "photos/2.jpg")
-    assert stale(scene=f"{moved}/photos/") == ["ingest", "sfm", "train", "export", "evaluate", "report"]
+    assert stale(scene=f"{moved}/photos/") == ALL
 
 
 def test_a_raw_file_under_another_folder_is_other_content(tmp_path):
@@ -183,20 +183,43 @@ def test_paths_are_those_of_the_user_s_folder_not_of_the_stage_s(tmp_path, monke
     monkeypatch.setenv("HOME", str(tmp_path))
     keys = set()
     for path in ("photos", "~/photos", "${NO_SUCH_VARIABLE:-.}/photos", str(tmp_path / "photos")):
-        plan = Planner().plan("toy", f"source.kind=photos,source.path={path}")
+        plan = Planner().plan("toy", f"teacher.kind=none,source.kind=photos,source.path={path}")
         assert plan.steps[0].sections["source"]["path"] == str(tmp_path / "photos")
         keys.add(plan.steps[-1].key)
     assert len(keys) == 1
-    for name in ("model.onnx", "labels.npz"):
+    for name in ("model.onnx", "table.npz", "names.txt"):
         (tmp_path / name).write_bytes(b"x")
-    plan = Planner().plan("toy", "teacher.model=model.onnx,teacher.labels=labels.npz")
+    (tmp_path / "model.toml").write_text('labels = "table.npz"')
+    settings = "teacher.kind=onnx,teacher.model=model.onnx,teacher.labels=names.txt"
+    plan = Planner().plan("toy", settings)
     teacher = next(step for step in plan.steps if step.stage == "teacher")
     assert teacher.sections["teacher"]["kind"] == "onnx"
     assert teacher.sections["teacher"]["model"] == str(tmp_path / "model.onnx")
-    (tmp_path / "model.onnx").write_bytes(b"another")
-    again = Planner().plan("toy", "teacher.model=model.onnx,teacher.labels=labels.npz")
-    changed = [a.stage for a, b in zip(plan.steps, again.steps, strict=True) if a.key != b.key]
-    assert changed == [s.stage for s in plan.steps if s.stage not in ("ingest", "sfm", "describe")]
+    for name in ("model.onnx", "model.toml", "table.npz", "names.txt"):
+        (tmp_path / name).write_text('labels = "table.npz"  # another')
+        again = Planner().plan("toy", settings)
+        changed = [a.stage for a, b in zip(plan.steps, again.steps, strict=True) if a.key != b.key]
+        assert changed == [*(["projection"] if name != "names.txt" else []), "teacher", *AFTER_TRAIN]
+        plan = again
+
+
+def teacher_of(*arguments):
+    return next(step for step in Planner().plan(*arguments).steps if step.stage == "teacher").sections["teacher"]
+
+
+def test_the_embedded_teacher_is_used_unless_another_is_asked_for(tmp_path):
+    from chebsplat.teachers import EMBEDDED
+
+    for scene in (("office0",), ("toy", "teacher.kind=auto"), (photo_folder(tmp_path / "photos"),)):
+        teacher = teacher_of(*scene)
+        assert (teacher["kind"], teacher["model"]) == ("onnx", str(EMBEDDED))
+    assert teacher_of("toy")["kind"] == teacher_of("office0", "teacher.kind=labels")["kind"] == "labels"
+
+
+@pytest.mark.parametrize("kind", ["labels", "none"])
+def test_a_model_that_would_not_be_used_is_an_error(kind):
+    with pytest.raises(ConfigError, match=r"teacher\.kind=onnx"):
+        Planner().plan("toy", f"teacher.kind={kind},teacher.model=model.onnx")
 
 
 def test_a_scene_may_be_any_folder_that_no_scene_is_named_after(tmp_path, monkeypatch):
@@ -238,11 +261,11 @@ def test_generated_and_replica_scenes_never_share_a_key(tmp_path, monkeypatch):
 @pytest.mark.parametrize(
     ("settings", "left_out"),
     [
-        ("", {"cks"}),
-        ("train.semantics=false", {"teacher", "describe", "onnx", "cks"}),
-        ("teacher.kind=none", {"teacher", "describe", "onnx", "cks"}),
-        ("train.encoder=off", {"describe", "onnx", "cks"}),
-        ("train.albo=false", {"describe", "cks"}),
+        ("", {"projection", "cks"}),
+        ("train.semantics=false", {"projection", "teacher", "describe", "onnx", "cks"}),
+        ("teacher.kind=none", {"projection", "teacher", "describe", "onnx", "cks"}),
+        ("train.encoder=off", {"projection", "describe", "onnx", "cks"}),
+        ("train.albo=false", {"projection", "describe", "cks"}),
     ],
 )
 def test_a_scene_leaves_out_what_it_does_not_need_and_says_why(settings, left_out):
@@ -309,9 +332,9 @@ def test_a_folder_that_is_not_there_is_an_input_error(tmp_path):
 
 
 def test_set_takes_scalars_words_switches_and_lists():
-    found = overrides("train.albo=off,train.encoder=off,train.steps=5,teacher.mean=[0.1,0.2,0.3],source.kind=photos")
+    found = overrides("train.albo=off,train.encoder=off,train.steps=5,teacher.scales=[0.75,1.0],source.kind=photos")
     assert found["train"] == {"albo": False, "encoder": "off", "steps": 5}
-    assert found["teacher"] == {"mean": [0.1, 0.2, 0.3]}
+    assert found["teacher"] == {"scales": [0.75, 1.0]}
     assert found["source"] == {"kind": "photos"}
 
 

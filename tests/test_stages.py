@@ -105,11 +105,18 @@ def without_depth(toy, tmp):
     return {"capture": published(tmp / "c", "chebsplat.capture/1", write_capture, record)}, TOY
 
 
+def teacher_of_nothing(toy, tmp):
+    from tiny_teachers import color_reference, color_teacher
+
+    model = color_teacher(tmp, weights=np.zeros((3, 3)))
+    return {}, {"projection": {"model": str(model), "reference": str(color_reference(tmp / "reference"))}}
+
+
 def without_labels(toy, tmp):
     record = read_capture(toy["ingest"])
     record.labels = None
     path = published(tmp / "c", "chebsplat.capture/1", write_capture, record)
-    return {"capture": path}, changed(teacher={"kind": "labels"})
+    return {"capture": path}, TOY
 
 
 def without_points(toy, tmp):
@@ -160,6 +167,7 @@ def without_trace(toy, tmp):
 FAILURES = {
     "ingest": one_photo,
     "sfm": without_depth,
+    "projection": teacher_of_nothing,
     "teacher": without_labels,
     "describe": without_points,
     "train": only_test_views,
@@ -204,6 +212,7 @@ def test_the_report_is_one_page_with_pictures_curve_and_what_was_left_out(toy):
     assert text.count("data:image/png;base64") >= 4
     assert "http://" not in text.replace("http://www.w3.org", "").replace("http://purl.org", "").replace("http://creativecommons.org", "")  # fmt: skip  # noqa: E501
     assert "no sequence is named" in text
+    assert "2D teacher: <b>noisy labels</b>" in text
     assert "LPIPS" in text
     assert (toy["report"] / "figures.csv").read_text().startswith("figure,")
 
@@ -239,26 +248,6 @@ def test_a_second_scene_starts_from_the_basis_of_the_first(toy, tmp_path):
     assert artifact.read_manifest(tmp_path / "second").facts["warm_started"] > 0
     assert run_stage("cks", tmp_path / "basis", {"gaussians": tmp_path / "second", "basis": toy["cks"]}) == 0
     assert read_basis(tmp_path / "basis").revision == 2
-
-
-def test_an_onnx_teacher_gives_features_of_its_own_channels(toy, tmp_path):
-    import warnings
-
-    import torch
-
-    model, path = torch.nn.Conv2d(3, 6, 4, stride=4).eval(), tmp_path / "teacher.onnx"
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore")  # the exporter warns about its own internals
-        torch.onnx.export(model, (torch.zeros(1, 3, 72, 96),), path, dynamo=True, external_data=False, verbose=False)
-    np.savez(tmp_path / "labels.npz", names=np.array(["wall", "floor"]), embeddings=np.eye(2, 6, dtype=np.float32))
-    config = changed(teacher={"kind": "onnx", "model": str(path), "labels": str(tmp_path / "labels.npz")})
-    assert run_stage("teacher", tmp_path / "out", {"capture": toy["ingest"]}, config) == 0
-    from chebsplat.formats.features import read_features
-
-    features = read_features(tmp_path / "out")
-    assert features.features.shape == (16, 18, 24, 6)
-    (tmp_path / "labels.npz").unlink()
-    assert run_stage("teacher", tmp_path / "other", {"capture": toy["ingest"]}, config) == 3
 
 
 def test_the_exported_scene_renders_like_the_checkpoint(toy):

@@ -1,0 +1,73 @@
+"""`projection/1`: the linear map from a teacher's channels to the fewer that scenes are trained in."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from chebsplat.formats import artifact
+from chebsplat.formats.documents import read_document, write_document
+from chebsplat.formats.tensors import Shape, read_tensors, write_tensors
+
+SCHEMA = "chebsplat.projection/1"
+SHAPES: dict[str, Shape] = {"matrix": ("C", "d"), "inverse": ("d", "C"), "energy": ("C",)}
+
+
+@dataclass
+class Projection:
+    """A teacher's projection from C to d channels; one for all scenes, computed by `chebsplat.projection`.
+
+    matrix:  f32 [C, d] orthonormal columns, of falling weight.
+    inverse: f32 [d, C], back to the teacher's channels.
+    energy:  f32 [C] share of the reference's squared length that the first k + 1 directions hold.
+    teacher: its name.
+    notes:   the teacher's digest, what the reference was, numbers of its pixels and of the vocabulary's words.
+    """
+
+    matrix: np.ndarray
+    inverse: np.ndarray
+    energy: np.ndarray
+    teacher: str
+    notes: dict[str, Any]
+
+    def apply(self, features: np.ndarray) -> np.ndarray:
+        """Features [..., C] -> f32 [..., d]."""
+        return np.asarray(features, np.float32) @ self.matrix
+
+    def embed(self, embeddings: np.ndarray) -> np.ndarray:
+        """Unit embeddings [L, C] of words -> f32 [L, d].
+
+        Choices: not made unit again, so that an inner product with projected features is the teacher's own; unit
+          rows would favour the words that the reference shows least.
+        """
+        return np.asarray(embeddings, np.float32) @ self.matrix
+
+    def restore(self, features: np.ndarray) -> np.ndarray:
+        """Projected features [..., d] -> f32 [..., C]."""
+        return np.asarray(features, np.float32) @ self.inverse
+
+
+def tensors(projection: Projection) -> dict[str, np.ndarray]:
+    return {name: getattr(projection, name).astype(np.float32) for name in SHAPES}
+
+
+def from_parts(arrays: Mapping[str, np.ndarray], document: Mapping[str, Any]) -> Projection:
+    return Projection(**{name: arrays[name] for name in SHAPES}, teacher=document["teacher"], notes=document["notes"])
+
+
+def write_projection(out: Path, projection: Projection) -> None:
+    """Fill the directory that `artifact.publish` yields. Raises ValueError on a non-finite value."""
+    write_tensors(out / "projection.safetensors", tensors(projection))
+    write_document(out / "projection.json", {"teacher": projection.teacher, "notes": projection.notes})
+
+
+def read_projection(path: Path) -> Projection:
+    """Raises InputError naming the damaged file and the remedy."""
+    path = Path(path)
+    manifest = artifact.read_manifest(path, SCHEMA)
+    arrays = read_tensors(path, manifest, "projection.safetensors", SHAPES)
+    return from_parts(arrays, read_document(path, manifest, "projection.json", ("teacher", "notes")))

@@ -1,0 +1,117 @@
+"""The labels that a teacher's maps are asked for, and the vectors that a scene learns of them."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from chebsplat.errors import ConfigError, InputError
+
+if TYPE_CHECKING:
+    import numpy as np
+
+    from chebsplat.formats.projection import Projection
+    from chebsplat.formats.teacher_model import TeacherModel
+
+MAX_CHANNELS = 64  # that can be rendered
+
+
+@dataclass
+class LabelSpace:
+    """names [L]; embeddings f32 [L, d]; `split`: map [h, w, C] -> (features [h, w, d], labels, confidence [h, w])."""
+
+    names: list[str]
+    embeddings: np.ndarray
+    split: Callable[[np.ndarray], tuple[np.ndarray, np.ndarray, np.ndarray]]
+
+
+def label_set(teacher: TeacherModel, file: str | None, class_names: list[str] | None) -> dict[str, list[str]]:
+    """Names in order with the words that mean them: of the file asked for, else of the capture, else the teacher's."""
+    from chebsplat.formats.teacher_model import read_label_set, read_label_table
+
+    if file:
+        return read_label_set(Path(file))
+    if class_names:
+        return {name: [name] for name in class_names}
+    if teacher.labels is None:
+        raise ConfigError(
+            f"no labels to ask for: the capture names no classes and {teacher.settings} has no `labels`; "
+            "give teacher.labels, a text file with one name a line"
+        )
+    return {name: [name] for name in read_label_table(teacher.labels)[0]}
+
+
+def open_vocabulary(
+    teacher: TeacherModel, labels: dict[str, list[str]], n_channels: int, projection: Projection | None
+) -> LabelSpace:
+    """The space of an encoder of `n_channels` features.
+
+    Raises: InputError where embeddings or the projection have other channels.
+    Choices: a label's vector is the mean of the unit embeddings of its words, made unit again. Labels and confidence
+      are told before projection: they are the teacher's own.
+    """
+    import numpy as np
+
+    from chebsplat.noisy_teacher import decode
+    from chebsplat.stages.image_encoder import unit
+    from chebsplat.stages.text import text_embeddings
+
+    words = list(dict.fromkeys(word for group in labels.values() for word in group))
+    known = dict(zip(words, unit(text_embeddings(words, teacher), -1), strict=True))
+    own = unit(np.stack([np.mean([known[word] for word in group], 0) for group in labels.values()]), -1)
+    if own.shape[1] != n_channels:
+        raise InputError(
+            f"{teacher.path} gives {n_channels} channels, its text embeddings have {own.shape[1]} "
+            f"({teacher.labels or teacher.text}); correct `labels` or `text` in {teacher.settings}"
+        )
+    if projection is not None and len(projection.matrix) != n_channels:
+        raise InputError(
+            f"the projection is of {len(projection.matrix)} channels ({projection.teacher}), {teacher.path} has "
+            f"{n_channels}; pass the projection of this teacher"
+        )
+
+    def split(found: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        kept = found if projection is None else projection.apply(found)
+        return kept, *decode(found, own)
+
+    return LabelSpace(list(labels), own if projection is None else projection.embed(own), split)
+
+
+def closed_set(teacher: TeacherModel, labels: dict[str, list[str]] | None, n_channels: int, n_codes: int) -> LabelSpace:
+    """The space of a segmenter with `n_channels` classes.
+
+    Args: labels: where a file was asked for: classes that are words of one label become that label; the others keep
+      their own names.
+    Raises: InputError where names and channels differ in number, or a label has no class.
+    Choices: a pixel's feature is the unit mean of the class codes (`chebsplat.codes`), weighted by its probabilities,
+      so that training is the same as for features; its label is the likeliest, its confidence that probability.
+    """
+    import numpy as np
+
+    from chebsplat.codes import class_codes
+    from chebsplat.formats.teacher_model import read_label_table
+    from chebsplat.stages.image_encoder import unit
+
+    assert teacher.labels is not None  # `read_teacher` has seen to it
+    classes = read_label_table(teacher.labels)[0]
+    if len(classes) != n_channels:
+        raise InputError(
+            f"{teacher.path} gives {n_channels} channels, {teacher.labels} names {len(classes)} classes; name every "
+            "channel in order"
+        )
+    label_of = {word.lower(): name for name, group in (labels or {}).items() for word in group}
+    named = [label_of.get(word.lower(), word) for word in classes]
+    absent = [name for name in labels or {} if name not in named]
+    if absent:
+        raise InputError(f"no class of {teacher.labels} is called {absent[0]} or one of its synonyms; correct the file")
+    names = list(dict.fromkeys(named))
+    merge = np.array([[name == of for name in names] for of in named], np.float32)
+    codes = class_codes(names, n_codes)
+
+    def split(found: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        shares = found @ merge
+        return unit(shares @ codes, -1), shares.argmax(-1).astype(np.int16), shares.max(-1)
+
+    return LabelSpace(names, codes, split)

