@@ -4,14 +4,22 @@ import chebsplat  # noqa: F401  # isort: skip
 import numpy as np
 import pytest
 import torch
-from training import trainer
+from shared import ROOT
 
 from chebsplat.errors import ConfigError, DataFailure
 from chebsplat.stages import config
 
 
-def test_closed_bands_leave_parameters_and_moments_and_the_picture_stays():
-    made = trainer(sh_freeze=0.9, steps=20, densify="off", prune_from=0.0)
+@pytest.fixture
+def tiny_trainer(monkeypatch):
+    monkeypatch.syspath_prepend(str(ROOT))
+    from benchmarks.stability.training import tiny_trainer
+
+    return tiny_trainer
+
+
+def test_closed_bands_leave_parameters_and_moments_and_the_picture_stays(tiny_trainer):
+    made = tiny_trainer(sh_freeze=0.9, steps=20, densify="off", prune_from=0.0)
     steps = made.steps()
     for _ in range(17):
         next(steps)
@@ -41,8 +49,8 @@ def test_closed_bands_leave_parameters_and_moments_and_the_picture_stays():
     assert not parameters["shN"][absent].any()
 
 
-def test_a_band_that_nobody_keeps_is_gone():
-    made = trainer(densify="off")
+def test_a_band_that_nobody_keeps_is_gone(tiny_trainer):
+    made = tiny_trainer(densify="off")
     with torch.no_grad():
         made.model.raw["sh_logits"].copy_(torch.tensor([8.0, -8.0, 8.0]).expand_as(made.model.raw["sh_logits"]))
     made.population.freeze_bands(made.optimizer)
@@ -50,8 +58,8 @@ def test_a_band_that_nobody_keeps_is_gone():
     assert {"sh2", "sh3"}.isdisjoint(group["name"] for group in made.optimizer.param_groups)
 
 
-def test_gaussians_removed_after_the_freeze_take_their_bands_along():
-    made = trainer(densify="off", prune=False)
+def test_gaussians_removed_after_the_freeze_take_their_bands_along(tiny_trainer):
+    made = tiny_trainer(densify="off", prune=False)
     raw = made.model.raw
     with torch.no_grad():
         raw["sh_logits"].copy_(torch.randn(raw["sh_logits"].shape) * 6)
@@ -84,17 +92,17 @@ def bits(made):
 
 
 @pytest.mark.parametrize("densify", ["region", "classic"])
-def test_a_resumed_training_takes_the_same_steps_to_the_bit(tmp_path, densify):
+def test_a_resumed_training_takes_the_same_steps_to_the_bit(tiny_trainer, tmp_path, densify):
     """Saved after every step, through a file; over growth, removal, refreshes and the freeze."""
     settings = {"steps": 24, "refresh_every": 5, "densify": densify, "grow_threshold": 1e-6}
-    whole, sizes = trainer(**settings), []
+    whole, sizes = tiny_trainer(**settings), []
     for _ in whole.steps():
         torch.save(whole.state(), tmp_path / f"{whole.step}.pt")
         sizes.append(len(whole.model))
     assert len(set(sizes)) > 1 and "sh_logits" not in whole.model.raw
     wanted, parameters = bits(whole), whole.finish()
     for step in (1, 5, 9, 14, 16, 20, 23):
-        resumed = trainer(**settings)
+        resumed = tiny_trainer(**settings)
         resumed.restore(torch.load(tmp_path / f"{step}.pt", weights_only=True))
         assert resumed.step == step
         for _ in resumed.steps():
@@ -106,8 +114,8 @@ def test_a_resumed_training_takes_the_same_steps_to_the_bit(tmp_path, densify):
             assert np.array_equal(value, parameters[name]), name
 
 
-def test_a_budget_of_seconds_runs_the_whole_schedule():
-    made = trainer(seconds=1.0, steps=10**6, refresh_every=5)
+def test_a_budget_of_seconds_runs_the_whole_schedule(tiny_trainer):
+    made = tiny_trainer(seconds=1.0, steps=10**6, refresh_every=5)
     for _ in made.steps():
         pass
     assert made.share == 1 and made.seconds >= 1
@@ -115,8 +123,8 @@ def test_a_budget_of_seconds_runs_the_whole_schedule():
     assert made.schedule.last_step(made.step, made.seconds) == made.step
 
 
-def test_gaussians_that_break_are_removed_and_counted():
-    made = trainer(refresh_every=5)
+def test_gaussians_that_break_are_removed_and_counted(tiny_trainer):
+    made = tiny_trainer(refresh_every=5)
     steps = made.steps()
     next(steps)
     with torch.no_grad():
@@ -127,23 +135,23 @@ def test_gaussians_that_break_are_removed_and_counted():
     assert all(np.isfinite(value).all() for value in made.finish().values())
 
 
-def test_a_view_that_makes_the_loss_non_finite_is_named():
-    made = trainer()
+def test_a_view_that_makes_the_loss_non_finite_is_named(tiny_trainer):
+    made = tiny_trainer()
     made.views.features = lambda index: torch.full((10, 12, 8), torch.nan)
     with pytest.raises(DataFailure, match=r"step 1, view view\d: loss features is not finite; .* look at the view"):
         next(made.steps())
 
 
-def test_a_breakdown_is_named():
-    made = trainer()
+def test_a_breakdown_is_named(tiny_trainer):
+    made = tiny_trainer()
     with torch.no_grad():
         made.model.raw["features"][7] = torch.nan  # regions see it, and all that they reach
     with pytest.raises(DataFailure, match=r"step \d+.*: .*not finite: .*features of \d+ Gaussians"):
         list(made.steps())
 
 
-def test_weights_that_break_are_never_published():
-    made = trainer()
+def test_weights_that_break_are_never_published(tiny_trainer):
+    made = tiny_trainer()
     with torch.no_grad():
         made.model.shape.encoder.region_token[0] = torch.inf
     with pytest.raises(DataFailure, match=r"not finite: shape.encoder.region_token"):

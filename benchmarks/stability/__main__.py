@@ -22,6 +22,7 @@ from benchmarks.stability import (  # noqa: F401  # importing a module registers
     pruning,
     rasterizer,
     regions,
+    training,
 )
 from benchmarks.stability.case import CASES, Row, run
 

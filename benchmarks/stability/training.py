@@ -1,0 +1,158 @@
+"""Trainings that ought to break: each ends with finite Gaussians, or stops and names its step and cause.
+
+The error is the share of values that are not finite in what would be published, 1 where the training stopped without
+naming its step. The naive column says how it ended.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import torch
+
+from benchmarks.stability.case import Outcome, case
+from chebsplat.errors import DataFailure
+from chebsplat.gaussians import initial_gaussians, local_shape
+from chebsplat.model import SceneModel
+from chebsplat.stages.config import Config
+from chebsplat.trainer import Trainer
+from chebsplat.views import Views
+
+HEIGHT, WIDTH, CHANNELS = 40, 48, 8
+
+
+def four_views() -> Views:
+    """Photos of noise, 48 x 40, in an arc about the origin, with unit features of noise at a quarter of the size."""
+    g = torch.Generator().manual_seed(1)
+    K = torch.tensor([[40.0, 0, WIDTH / 2], [0, 40.0, HEIGHT / 2], [0, 0, 1]])
+    angles, poses = torch.linspace(0, 1.2, 4), torch.eye(4).repeat(4, 1, 1)
+    poses[:, 0, 0], poses[:, 0, 2] = angles.cos(), angles.sin()
+    poses[:, 2, 0], poses[:, 2, 2] = -angles.sin(), angles.cos()
+    poses[:, 2, 3] = 4
+    images = (torch.rand(4, HEIGHT, WIDTH, 3, generator=g) * 255).byte()
+    features = torch.nn.functional.normalize(torch.randn(4, 10, 12, CHANNELS, generator=g), dim=-1)
+    return Views([f"view{k}" for k in range(4)], images, K.repeat(4, 1, 1), poses, None, lambda k: features[k])
+
+
+def sphere(n: int) -> np.ndarray:
+    points = torch.randn(n, 3, generator=torch.Generator().manual_seed(0))
+    return torch.nn.functional.normalize(points, dim=-1).numpy()
+
+
+def tiny_trainer(means: np.ndarray | None = None, views: Views | None = None, **settings: Any) -> Trainer:
+    """A trainer of few Gaussians, by default 300 on a unit sphere, after its first refresh.
+
+    Args: settings: what differs in the config's train section.
+    """
+    means = sphere(300) if means is None else means
+    colors = (torch.rand(len(means), 3, generator=torch.Generator().manual_seed(2)) * 255).byte().numpy()
+    shapes = local_shape(means, 8)[0] if len(means) > 1 else np.eye(3, dtype=np.float32)[None] * 0.01
+    small = {"steps": 20, "min_gaussians": 8, "max_gaussians": len(means) + 100, "n_densify": 2, "width": 16}
+    config = Config.model_validate({"train": small | settings, "describe": {"n_regions": 24, "region_size": 16}})
+    train, describe = config.train.model_dump(), config.describe.model_dump()
+    torch.manual_seed(train["seed"])
+    model = SceneModel(initial_gaussians(means, colors, shapes, opacity=0.5), describe, train, CHANNELS)
+    trainer = Trainer(model, four_views() if views is None else views, train, describe, 1.0, {})
+    trainer.refresh()
+    return trainer
+
+
+def ended(trainer: Trainer) -> tuple[str, float]:
+    """How a training ends, and its error."""
+    try:
+        for _ in trainer.steps():
+            pass
+        parameters = trainer.finish()
+    except DataFailure as failure:
+        told = str(failure)
+        return f"stopped: {told[:20]}...", float(not told.startswith("step "))
+    values = np.concatenate([value.ravel().astype(np.float64) for value in parameters.values()])
+    psnr = trainer.held_in_psnr(list(range(4)))
+    broken = f", {trainer.population.n_broken} removed" if trainer.population.n_broken else ""
+    return f"{len(trainer.model)} left{broken}, {psnr:.1f} dB", float(1 - np.isfinite([*values, psnr]).mean())
+
+
+def _with_views(**changes: Callable[[Views], Any]) -> Trainer:
+    views = four_views()
+    return tiny_trainer(views=replace(views, **{name: change(views) for name, change in changes.items()}))
+
+
+def _corrupt(value: float) -> Callable[[Views], Any]:
+    """Features of which one view's are `value`."""
+
+    def change(views: Views) -> Any:
+        of = views.features
+        assert of is not None
+        return lambda k: torch.full((10, 12, CHANNELS), value) if k == 1 else of(k)
+
+    return change
+
+
+def _black(views: Views) -> torch.Tensor:
+    images = views.images.clone()
+    images[1] = 0
+    return images
+
+
+def _lost(views: Views) -> torch.Tensor:
+    poses = views.viewmats.clone()
+    poses[1, 0, 3] = torch.nan
+    return poses
+
+
+def _raw(**changes: Callable[[torch.Tensor], Any]) -> Trainer:
+    trainer = tiny_trainer()
+    with torch.no_grad():
+        for name, change in changes.items():
+            change(trainer.model.raw[name])
+    trainer.refresh()
+    return trainer
+
+
+def _at_the_camera(means: torch.Tensor) -> None:
+    views = four_views()
+    means[0] = -views.viewmats[0, :3, :3].T @ views.viewmats[0, :3, 3]
+
+
+def _rates(factor: float) -> Trainer:
+    names = [name for name in Config().train.model_dump() if name.startswith("lr_")]
+    return tiny_trainer(**{name: getattr(Config().train, name) * factor for name in names})
+
+
+def _flat() -> np.ndarray:
+    return sphere(300) * np.array([1, 1, 0], np.float32)
+
+
+SCENES: dict[str, Callable[[], Trainer]] = {
+    "all masks closing": lambda: tiny_trainer(weight_mask=1e4, lr_masks=10.0, prune_from=0.1),
+    "all bands closing": lambda: tiny_trainer(weight_sh=1e6, lr_sh_masks=10.0),
+    "one Gaussian": lambda: tiny_trainer(sphere(1), min_gaussians=1),
+    "two coincident Gaussians": lambda: tiny_trainer(np.zeros((2, 3), np.float32), min_gaussians=1),
+    "one plane": lambda: tiny_trainer(_flat()),
+    "a line": lambda: tiny_trainer(_flat() * np.array([1, 0, 0], np.float32)),
+    "a camera inside a Gaussian": lambda: _raw(means=_at_the_camera, log_scales=lambda v: v[0].fill_(1.0)),
+    "a Gaussian of scale 1e30": lambda: _raw(log_scales=lambda v: v[0].fill_(69.0)),
+    "needles of 1e-20": lambda: _raw(log_scales=lambda v: v[:, 0].fill_(-46.0)),
+    "quaternions of 0": lambda: _raw(quats=lambda v: v[::5].zero_()),
+    "opacity logits of ±1e4": lambda: _raw(logit_opacities=lambda v: (v[::2].fill_(1e4), v[1::2].fill_(-1e4))),
+    "a NaN colour": lambda: _raw(sh0=lambda v: v[3].fill_(torch.nan)),
+    "NaN features of one Gaussian": lambda: _raw(features=lambda v: v[3].fill_(torch.nan)),
+    "teacher features of norm 1e6": lambda: _with_views(features=lambda v: lambda k: 1e6 * v.features(k)),  # type: ignore[misc]
+    "teacher features of 0": lambda: _with_views(features=lambda v: lambda k: 0 * v.features(k)),  # type: ignore[misc]
+    "one view's features NaN": lambda: _with_views(features=_corrupt(float("nan"))),
+    "one view's features 1e30": lambda: _with_views(features=_corrupt(1e30)),
+    "one view black": lambda: _with_views(images=_black),
+    "one view's pose NaN": lambda: _with_views(viewmats=_lost),
+    "rates 10 times too high": lambda: _rates(10),
+    "rates 1000 times too high": lambda: _rates(1000),
+    "scene in units of 1e6": lambda: tiny_trainer(1e6 * sphere(300)),
+}
+
+
+@case("{name}", name=SCENES)
+def training(name: str) -> Outcome:
+    how, error = ended(SCENES[name]())
+    return Outcome("20 steps", how, error, 0.0)
