@@ -10,7 +10,7 @@ CHOICE := $(if $(scene),--scene '$(scene)') $(if $(sequence),--sequence '$(seque
 
 # `make scene=office0` needs no target: naming a scene or a sequence means running it.
 .DEFAULT_GOAL := $(if $(scene)$(sequence),run,help)
-.PHONY: help run plan verify clean-stale setup test test-all stability bench-raster bench-train bench-descriptor bench-refresh bench-shapes nouns lint lock
+.PHONY: help run plan verify clean-stale setup test test-all stability bench-raster bench-train bench-descriptor bench-refresh bench-shapes nouns teacher teacher-quality lint lock
 
 run: $(READY)  ## make scene=NAME|FOLDER [stage=] [set=a.b=c,...] [ablation=] [cores=]; or sequence=NAME
 	@$(CHEBSPLAT) run $(CHOICE) $(if $(stage),--stage '$(stage)') $(if $(cores),--cores '$(cores)')
@@ -62,10 +62,19 @@ nouns: $(READY)  ## teachers/embedded.npz from teachers/nouns.txt, by the senten
 	@$(PY) -m uv pip install --quiet --python $(PY) --editable '.[text]'
 	@$(PY) -m chebsplat.teachers.nouns
 
+teacher: $(READY)  ## train, export and measure the embedded teacher: seeds fixed, about TIME on 4 quiet cores
+	@$(PY) -m uv pip install --quiet --python $(PY) --editable '.[text]'
+	@OMP_WAIT_POLICY=PASSIVE $(PY) -m chebsplat.teachers.train $(args)
+	@$(PY) -m chebsplat.teachers.quality
+
+teacher-quality: $(READY)  ## measure the shipped embedded teacher on held-out rooms and the houses; quality.json
+	@$(PY) -m uv pip install --quiet --python $(PY) --editable '.[text]'
+	@$(PY) -m chebsplat.teachers.quality $(args)
+
 lint: $(READY)  ## ruff (lint, format) and mypy
 	@$(PY) -m ruff check . && $(PY) -m ruff format --check .
 	@mkdir -p build/types/chebsplat && ln -sfn $(CURDIR)/chebsplat/* build/types/chebsplat/
-	@for layer in formats stages pipelines; do ln -sfn $(CURDIR)/$$layer build/types/chebsplat/$$layer; done
+	@for layer in formats stages pipelines teachers; do ln -sfn $(CURDIR)/$$layer build/types/chebsplat/$$layer; done
 	@cd build/types && ../../$(PY) -m mypy --config-file ../../pyproject.toml -p chebsplat
 
 lock: $(READY)  ## resolve requirements.lock anew

@@ -1,0 +1,92 @@
+"""The encoder: a residual U-Net without its first level, and a fixed linear map into the space of the text."""
+
+from __future__ import annotations
+
+from itertools import pairwise
+
+import torch
+from torch import Tensor, nn
+from torch.nn import functional as F
+
+RANK = 32  # channels before the linear map; see README.md for how it was chosen
+MULTIPLE = 16  # sides of an image must be a multiple of it
+STRIDE = 2  # of the output
+WIDTHS = (16, 48, 96, 128)  # channels at 1/2, 1/4, 1/8 and 1/16 of the resolution
+DEPTHS = (0, 1, 2, 5)  # residual blocks there
+DILATIONS = (1, 2, 4)  # in turn at 1/16: an image of 320 x 240 is met as a whole
+
+
+class Residual(nn.Module):
+    def __init__(self, channels: int, dilation: int):
+        super().__init__()
+        self.body = nn.Sequential(
+            nn.Conv2d(channels, channels, 3, padding=dilation, dilation=dilation, bias=False),
+            nn.BatchNorm2d(channels),
+            nn.ReLU(inplace=True),
+            nn.Conv2d(channels, channels, 1, bias=False),
+            nn.BatchNorm2d(channels),
+        )
+        nn.init.zeros_(self.body[-1].weight)  # type: ignore[arg-type]  # a block begins as the identity
+
+    def forward(self, x: Tensor) -> Tensor:
+        return F.relu(x + self.body(x), inplace=True)
+
+
+def _step(inward: int, outward: int, kernel: int, stride: int = 1) -> nn.Sequential:
+    """Convolution, normalisation, ReLU; a kernel of 4 at stride 2 keeps cells centred on the pixels they cover."""
+    conv = nn.Conv2d(inward, outward, kernel, stride, padding=1 if kernel > 1 else 0, bias=False)
+    return nn.Sequential(conv, nn.BatchNorm2d(outward), nn.ReLU(inplace=True))
+
+
+class Trunk(nn.Module):
+    """Images [B, 3, H, W], normalised by mean and std, to unit vectors [B, RANK, H/2, W/2]."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.down, self.levels = nn.ModuleList(), nn.ModuleList()
+        for level, (inward, outward) in enumerate(pairwise((3, *WIDTHS))):
+            self.down.append(_step(inward, outward, 4, 2))
+            turns = DILATIONS if level == len(WIDTHS) - 1 else (1,)
+            blocks = [Residual(outward, turns[k % len(turns)]) for k in range(DEPTHS[level])]
+            self.levels.append(nn.Sequential(*blocks))
+        self.overview = nn.Conv2d(WIDTHS[-1], WIDTHS[-1], 1)
+        self.narrow = nn.ModuleList(_step(w, n, 1) for n, w in pairwise(WIDTHS))
+        self.merge = nn.ModuleList(_step(w, w, 3) for w in WIDTHS[:-1])
+        self.head, self.detail = nn.Conv2d(WIDTHS[1], RANK, 1), nn.Conv2d(WIDTHS[0], RANK, 1)
+
+    def forward(self, images: Tensor) -> Tensor:
+        x, skips = images, []
+        for down, blocks in zip(self.down, self.levels, strict=True):
+            x = blocks(down(x))
+            skips.append(x)
+        x = x + self.overview(x.mean((2, 3), keepdim=True))
+        for level in (2, 1):
+            x = self.merge[level](_twice(self.narrow[level](x)) + skips[level])
+        fine = self.merge[0](_twice(self.narrow[0](x)) + skips[0])
+        return F.normalize((_twice(self.head(x)) + self.detail(fine)).float(), dim=1, eps=1e-6)
+
+
+def _twice(x: Tensor) -> Tensor:
+    return F.interpolate(x, scale_factor=2.0, mode="nearest")
+
+
+class Encoder(nn.Module):
+    """The trunk and the linear map [C, RANK] with orthonormal columns: unit vectors [B, C, H/2, W/2].
+
+    Choices: vectors are of unit length inside the graph, so all pixels weigh the same in averages and projections;
+      the map is fixed (`span`), so the features' rank is RANK and a projection to as many channels is exact.
+    """
+
+    def __init__(self, trunk: Trunk, basis: Tensor):
+        super().__init__()
+        self.trunk = trunk
+        self.register_buffer("basis", basis[:, :, None, None].clone())
+
+    def forward(self, images: Tensor) -> Tensor:
+        return F.conv2d(self.trunk(images), self.basis)
+
+
+def span(embeddings: Tensor, rank: int = RANK) -> Tensor:
+    """Orthonormal columns [C, rank] that hold most of the energy of embeddings [L, C]."""
+    basis = torch.linalg.svd(embeddings.double(), full_matrices=False).Vh[:rank].T
+    return (basis * torch.sign(basis.abs().max(0, keepdim=True).values * basis.sum(0, keepdim=True))).float()

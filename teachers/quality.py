@@ -1,0 +1,146 @@
+"""`make teacher-quality`: what the shipped model is worth, measured on rooms and a house it never met.
+
+Choices: the model is run as the teacher stage runs it, one pass a view, no flips; each class is asked for by one word,
+  and a pixel goes to the word of the greatest cosine after bilinear upsampling; one confusion matrix over all views.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import time
+import tomllib
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import click
+import numpy as np
+
+from chebsplat.formats.teacher_model import read_teacher
+from chebsplat.metrics import IGNORE, confusion, segmentation
+from chebsplat.stages.image_encoder import ImageEncoder
+from chebsplat.stages.text import text_embeddings
+from chebsplat.synthetic import CLASS_NAMES
+from chebsplat.synthetic.seeds import HELD_OUT
+from chebsplat.teachers import EMBEDDED
+from chebsplat.teachers.words import words
+
+VIEWS, WIDTH, HEIGHT = 8, 320, 240  # of each held-out room, along its path
+HOUSES = ("house_kitchen", "house_living")
+MAPPING = Path(__file__).parent / "houses.toml"
+View = tuple[np.ndarray, np.ndarray]  # image u8 [H, W, 3], class index i64 [H, W]
+
+
+def labelled(vectors: np.ndarray, texts: np.ndarray, height: int, width: int) -> np.ndarray:
+    """Index i64 [height, width] of the text [L, C] of greatest cosine for vectors [C, h, w]."""
+    import torch
+    from torch.nn import functional as F
+
+    cosines = torch.einsum("lc,chw->lhw", torch.from_numpy(texts), torch.from_numpy(vectors))[None]
+    return F.interpolate(cosines, (height, width), mode="bilinear", align_corners=False)[0].argmax(0).numpy()
+
+
+def held_out_room(seed: int, n_views: int = VIEWS, width: int = WIDTH, height: int = HEIGHT) -> list[View]:
+    """Views of a held-out room along its path, as the named scenes are photographed."""
+    from chebsplat.formats.meshes import RayCaster
+    from chebsplat.stages.sources.generated import photograph
+    from chebsplat.synthetic.layout import build
+    from chebsplat.synthetic.path import intrinsics, walk
+
+    room = build("office" if seed < HELD_OUT[len(HELD_OUT) // 2] else "room", seed)
+    caster, K = RayCaster(room.soup.vertices, room.soup.triangles), intrinsics(width, height)
+    shots = [photograph(room, caster, K, pose, width, height) for pose in walk(room.size, n_views, seed)]
+    return [(image, labels.astype(np.int64)) for image, _, labels in shots]
+
+
+def house(folder: Path, names: list[str]) -> Iterator[View]:
+    """All views of a house at half size; labels that the mapping leaves out are IGNORE."""
+    from PIL import Image
+
+    mapping = tomllib.loads(MAPPING.read_text())
+    listed = json.loads((folder / "scene.json").read_text())["labels"]
+    table = np.full(256, IGNORE, np.int64)
+    for key, label in listed.items():
+        if label in mapping:
+            table[int(key)] = names.index(mapping[label])
+    for path in sorted((folder / "images").glob("*.png")):
+        with Image.open(path) as image, Image.open(folder / "semantic" / path.name) as semantic:
+            half = image.convert("RGB").resize((image.width // 2, image.height // 2), Image.Resampling.BOX)
+            yield np.asarray(half), table[np.asarray(semantic)[::2, ::2]]
+
+
+def figures(matrix: np.ndarray, names: list[str]) -> dict[str, Any]:
+    found = segmentation(matrix)
+    iou = {name: round(float(v), 4) for name, v in zip(names, found.iou, strict=True) if not np.isnan(v)}
+    return {"miou": round(found.miou, 4), "macc": round(found.macc, 4), "oa": round(found.oa, 4), "iou": iou}
+
+
+def runner(model: Path, threads: int) -> Callable[[np.ndarray], np.ndarray]:
+    """From a view u8 [H, W, 3], sides multiples of the model's, to vectors f32 [C, h, w]."""
+    encoder = ImageEncoder(read_teacher(model), threads)
+    return lambda image: encoder.run(image, "a view")
+
+
+def measured(model: Path, data: Path, threads: int) -> dict[str, Any]:
+    """All figures; the houses only where their folders are."""
+    encode, teacher, names = runner(model, threads), read_teacher(model), list(CLASS_NAMES)
+    texts, unseen = text_embeddings(names, teacher), words("unseen")
+    draws = len(next(iter(unseen.values())))
+    others = [text_embeddings([unseen[name][k] for name in names], teacher) for k in range(draws)]
+    n = len(names)
+    matrix, strange, seconds = np.zeros((n, n), np.int64), np.zeros((draws, n, n), np.int64), []
+    for seed in HELD_OUT:
+        for image, truth in held_out_room(seed):
+            began = time.perf_counter()
+            vectors = encode(image)
+            seconds.append(time.perf_counter() - began)
+            matrix += confusion(labelled(vectors, texts, *truth.shape), truth, n)
+            for k, rows in enumerate(others):
+                strange[k] += confusion(labelled(vectors, rows, *truth.shape), truth, n)
+    result: dict[str, Any] = {
+        "held_out": {"rooms": len(HELD_OUT), "views": len(HELD_OUT) * VIEWS, **figures(matrix, names)},
+        "unseen_words": [
+            {"miou": figures(strange[k], names)["miou"], "words": [unseen[name][k] for name in names],
+             "iou": figures(strange[k], names)["iou"]} for k in range(draws)
+        ],
+        "encode": {"seconds": round(float(np.median(seconds)), 4), "size": [WIDTH, HEIGHT], "threads": threads,
+                   "load": round(os.getloadavg()[0], 1)},
+    }  # fmt: skip
+    asked = [name for name in names if name in set(tomllib.loads(MAPPING.read_text()).values())]
+    for name in HOUSES:
+        if (data / name).is_dir():
+            result[name] = house_figures(encode, data / name, asked, text_embeddings(asked, teacher))
+        else:
+            click.echo(f"{data / name} is not there: not measured (CHEBSPLAT_TEST_DATA)", err=True)
+    return result
+
+
+def house_figures(encode: Callable, folder: Path, asked: list[str], texts: np.ndarray) -> dict[str, Any]:
+    matrix, counted, total, views = np.zeros((len(asked),) * 2, np.int64), 0, 0, 0
+    for image, truth in house(folder, asked):
+        matrix += confusion(labelled(encode(image), texts, *truth.shape), truth, len(asked))
+        counted, total, views = counted + int((truth != IGNORE).sum()), total + truth.size, views + 1
+    return {"views": views, "pixels_counted": round(counted / total, 4), **figures(matrix, asked)}
+
+
+@click.command()
+@click.option("--model", type=click.Path(path_type=Path), default=EMBEDDED)
+@click.option("--data", type=click.Path(path_type=Path), envvar="CHEBSPLAT_TEST_DATA", default=Path("../shared/data"))
+@click.option("--threads", default=4, show_default=True, help="of onnxruntime")
+def main(model: Path, data: Path, threads: int) -> None:
+    """Measure the model and write quality.json beside it."""
+    result = measured(model, data, threads)
+    (model.parent / "quality.json").write_text(json.dumps(result, indent=1) + "\n")
+    for name in ("held_out", *HOUSES):
+        if name in result:
+            part = result[name]
+            click.echo(f"{name}: mIoU {part['miou']:.3f}, accuracy {part['oa']:.3f} over {part['views']} views")
+            click.echo("  " + ", ".join(f"{label} {v:.2f}" for label, v in part["iou"].items()))
+    for part in result["unseen_words"]:
+        click.echo(f"words not in training: mIoU {part['miou']:.3f}")
+    click.echo(f"one view: {result['encode']}")
+
+
+if __name__ == "__main__":
+    main()
