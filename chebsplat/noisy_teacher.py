@@ -80,7 +80,7 @@ def noisy_features(
 def decode(features: np.ndarray, embeddings: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Label of the largest cosine, and its confidence.
 
-    Args: features [..., C] of any length; embeddings [L, C] unit.
+    Args: features [..., C] of any length; embeddings [L, C] unit, or what a projection keeps of them.
     Returns: labels i16 [...], confidence f32 [...]: softmax of cosines at temperature 0.1, its largest entry.
     """
     rows = features.reshape(-1, features.shape[-1])

@@ -73,9 +73,10 @@ def shown(photo: Path | None) -> tuple[str, np.ndarray]:
     from PIL import Image
 
     from chebsplat.stages.projection import generated
+    from chebsplat.synthetic.seeds import REFERENCE
 
     if photo is None:
-        return next(generated(1))
+        return next(generated(REFERENCE[:1]))
     try:
         with Image.open(photo) as image:
             return photo.name, np.asarray(image.convert("RGB"))

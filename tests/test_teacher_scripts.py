@@ -1,4 +1,4 @@
-"""The export scripts of docs/teachers.md run as they stand, on small stand-ins with the interface of the real models."""
+"""The export scripts of docs/teachers.md run as they stand, on small stand-ins with the real models' interface."""
 
 import re
 import sys
