@@ -77,7 +77,7 @@ class ProjectionSection(_Section):
     n_channels: int = Field(32, ge=2, le=64)  # at most; fewer where the teacher's features span fewer
     model: str | None = None  # .onnx; in a scene the planner puts teacher.model here; None: the embedded teacher
     reference: str | None = None  # folder of images; None: generated rooms
-    n_rooms: int = Field(12, ge=1, le=100)
+    n_rooms: int = Field(8, ge=1, le=100)
 
 
 class DescribeSection(_Section):
