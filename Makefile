@@ -43,8 +43,9 @@ bench-raster: $(READY)  ## the rasterizer against its bars, in build/bench/: tab
 	@$(PY) benchmarks/rasterize.py $(args)
 
 bench-train: $(READY)  ## office0 without the shape branch: seconds of 3000 steps, PSNR against the reference backend
-	@$(CHEBSPLAT) run --scene office0 --stage describe && $(CHEBSPLAT) run --scene office0 --stage teacher
-	@$(PY) benchmarks/training.py --work work/office0 $(args)
+	@$(CHEBSPLAT) run --scene office0 --set teacher.kind=labels --stage describe
+	@$(CHEBSPLAT) run --scene office0 --set teacher.kind=labels --stage teacher
+	@$(PY) benchmarks/training.py --work work/office0@teacher.kind=labels $(args)
 
 stability: $(READY)  ## every extreme case, naive and ours; build/bench/stability.csv; fails if one does (args=--only X)
 	@$(PY) -m benchmarks.stability $(args)

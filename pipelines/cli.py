@@ -136,11 +136,11 @@ def scene_folder(scene: str) -> Path:
     from chebsplat.pipelines import store
 
     for folder in (store.work() / scene, Path(scene)):
-        if (folder / "export").is_dir():
+        if store.is_fresh(folder / "export"):
             return folder
     import difflib
 
-    known = sorted(path.parent.name for path in store.work().glob("*/export"))
+    known = sorted(path.parent.parent.name for path in store.work().glob("*/export/artifact.json"))
     near = difflib.get_close_matches(scene, known, 3) or known
     raise ConfigError(
         f"{scene} is no finished scene in {store.work()}, and no folder of one; "

@@ -11,8 +11,8 @@ from torch.nn import functional as F
 RANK = 32  # channels before the linear map; see README.md for how it was chosen
 MULTIPLE = 16  # sides of an image must be a multiple of it
 STRIDE = 2  # of the output
-WIDTHS = (32, 32, 64, 128)  # channels at 1/2, 1/4, 1/8 and 1/16 of the resolution
-DEPTHS = (0, 2, 3, 6)  # residual blocks there
+WIDTHS = (16, 48, 96, 128)  # channels at 1/2, 1/4, 1/8 and 1/16 of the resolution
+DEPTHS = (0, 1, 2, 5)  # residual blocks there
 DILATIONS = (1, 2, 4)  # in turn at 1/16: an image of 320 x 240 is met as a whole
 
 
@@ -26,6 +26,7 @@ class Residual(nn.Module):
             nn.Conv2d(channels, channels, 1, bias=False),
             nn.BatchNorm2d(channels),
         )
+        nn.init.zeros_(self.body[-1].weight)  # type: ignore[arg-type]  # a block begins as the identity
 
     def forward(self, x: Tensor) -> Tensor:
         return F.relu(x + self.body(x), inplace=True)
@@ -51,7 +52,7 @@ class Trunk(nn.Module):
         self.overview = nn.Conv2d(WIDTHS[-1], WIDTHS[-1], 1)
         self.narrow = nn.ModuleList(_step(w, n, 1) for n, w in pairwise(WIDTHS))
         self.merge = nn.ModuleList(_step(w, w, 3) for w in WIDTHS[:-1])
-        self.head = nn.Conv2d(WIDTHS[0], RANK, 1)
+        self.head, self.detail = nn.Conv2d(WIDTHS[1], RANK, 1), nn.Conv2d(WIDTHS[0], RANK, 1)
 
     def forward(self, images: Tensor) -> Tensor:
         x, skips = images, []
@@ -59,10 +60,14 @@ class Trunk(nn.Module):
             x = blocks(down(x))
             skips.append(x)
         x = x + self.overview(x.mean((2, 3), keepdim=True))
-        for level in (2, 1, 0):
-            wide = F.interpolate(self.narrow[level](x), scale_factor=2.0, mode="nearest")
-            x = self.merge[level](wide + skips[level])
-        return F.normalize(self.head(x).float(), dim=1, eps=1e-6)
+        for level in (2, 1):
+            x = self.merge[level](_twice(self.narrow[level](x)) + skips[level])
+        fine = self.merge[0](_twice(self.narrow[0](x)) + skips[0])
+        return F.normalize((_twice(self.head(x)) + self.detail(fine)).float(), dim=1, eps=1e-6)
+
+
+def _twice(x: Tensor) -> Tensor:
+    return F.interpolate(x, scale_factor=2.0, mode="nearest")
 
 
 class Encoder(nn.Module):

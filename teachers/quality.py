@@ -1,8 +1,7 @@
 """`make teacher-quality`: what the shipped model is worth, measured on rooms and a house it never met.
 
-Choices: the model is run as shipped, by onnxruntime, one pass a view; each class is asked for by one word, and a pixel
-  goes to the word of the greatest cosine after bilinear upsampling; one confusion matrix over all views. The words of
-  classes come from the table beside the model; unseen words from the sentence model that made that table.
+Choices: the model is run as the teacher stage runs it, one pass a view, no flips; each class is asked for by one word,
+  and a pixel goes to the word of the greatest cosine after bilinear upsampling; one confusion matrix over all views.
 """
 
 from __future__ import annotations
@@ -13,38 +12,24 @@ import time
 import tomllib
 from collections.abc import Callable, Iterator
 from pathlib import Path
+from typing import Any
 
 import click
 import numpy as np
 
-from chebsplat.errors import InputError
+from chebsplat.formats.teacher_model import read_teacher
 from chebsplat.metrics import IGNORE, confusion, segmentation
+from chebsplat.stages.image_encoder import ImageEncoder
+from chebsplat.stages.text import text_embeddings
 from chebsplat.synthetic import CLASS_NAMES
 from chebsplat.synthetic.seeds import HELD_OUT
 from chebsplat.teachers import EMBEDDED
-from chebsplat.teachers.words import embedded, words
+from chebsplat.teachers.words import words
 
 VIEWS, WIDTH, HEIGHT = 8, 320, 240  # of each held-out room, along its path
 HOUSES = ("house_kitchen", "house_living")
 MAPPING = Path(__file__).parent / "houses.toml"
 View = tuple[np.ndarray, np.ndarray]  # image u8 [H, W, 3], class index i64 [H, W]
-
-
-def encoder(model: Path, threads: int) -> Callable[[np.ndarray], np.ndarray]:
-    """From an image u8 [H, W, 3] to vectors f32 [C, h, w]."""
-    import onnxruntime
-
-    options = onnxruntime.SessionOptions()
-    options.intra_op_num_threads = threads
-    run = onnxruntime.InferenceSession(str(model), options, providers=["CPUExecutionProvider"]).run
-    card = tomllib.loads(model.with_suffix(".toml").read_text())
-    mean, std = np.float32(card["mean"]), np.float32(card["std"])
-
-    def encode(image: np.ndarray) -> np.ndarray:
-        values = (image.astype(np.float32) / 255 - mean) / std
-        return run(None, {"image": np.ascontiguousarray(values.transpose(2, 0, 1)[None])})[0][0]
-
-    return encode
 
 
 def labelled(vectors: np.ndarray, texts: np.ndarray, height: int, width: int) -> np.ndarray:
@@ -85,29 +70,24 @@ def house(folder: Path, names: list[str]) -> Iterator[View]:
             yield np.asarray(half), table[np.asarray(semantic)[::2, ::2]]
 
 
-def class_texts(model: Path, names: list[str]) -> np.ndarray:
-    """Unit rows f32 [L, C] of names in the table beside the model. Raises InputError if one is not there."""
-    with np.load(model.with_suffix(".npz")) as table:
-        where = {str(name): index for index, name in enumerate(table["names"])}
-        missing = [name for name in names if name not in where]
-        if missing:
-            raise InputError(f"{model.with_suffix('.npz')} has no embedding of {', '.join(missing)}; make it anew")
-        rows = table["embeddings"][[where[name] for name in names]].astype(np.float32)
-    return rows / np.linalg.norm(rows, axis=1, keepdims=True)
-
-
-def figures(matrix: np.ndarray, names: list[str]) -> dict[str, object]:
+def figures(matrix: np.ndarray, names: list[str]) -> dict[str, Any]:
     found = segmentation(matrix)
     iou = {name: round(float(v), 4) for name, v in zip(names, found.iou, strict=True) if not np.isnan(v)}
     return {"miou": round(found.miou, 4), "macc": round(found.macc, 4), "oa": round(found.oa, 4), "iou": iou}
 
 
-def measured(model: Path, data: Path, threads: int) -> dict[str, object]:
+def runner(model: Path, threads: int) -> Callable[[np.ndarray], np.ndarray]:
+    """From a view u8 [H, W, 3], sides multiples of the model's, to vectors f32 [C, h, w]."""
+    encoder = ImageEncoder(read_teacher(model), threads)
+    return lambda image: encoder.run(image, "a view")
+
+
+def measured(model: Path, data: Path, threads: int) -> dict[str, Any]:
     """All figures; the houses only where their folders are."""
-    encode, names = encoder(model, threads), list(CLASS_NAMES)
-    texts, unseen = class_texts(model, names), words("unseen")
+    encode, teacher, names = runner(model, threads), read_teacher(model), list(CLASS_NAMES)
+    texts, unseen = text_embeddings(names, teacher), words("unseen")
     draws = len(next(iter(unseen.values())))
-    others = [embedded([unseen[name][k] for name in names]) for k in range(draws)]
+    others = [text_embeddings([unseen[name][k] for name in names], teacher) for k in range(draws)]
     n = len(names)
     matrix, strange, seconds = np.zeros((n, n), np.int64), np.zeros((draws, n, n), np.int64), []
     for seed in HELD_OUT:
@@ -118,7 +98,7 @@ def measured(model: Path, data: Path, threads: int) -> dict[str, object]:
             matrix += confusion(labelled(vectors, texts, *truth.shape), truth, n)
             for k, rows in enumerate(others):
                 strange[k] += confusion(labelled(vectors, rows, *truth.shape), truth, n)
-    result: dict[str, object] = {
+    result: dict[str, Any] = {
         "held_out": {"rooms": len(HELD_OUT), "views": len(HELD_OUT) * VIEWS, **figures(matrix, names)},
         "unseen_words": [
             {"miou": figures(strange[k], names)["miou"], "words": [unseen[name][k] for name in names],
@@ -130,13 +110,13 @@ def measured(model: Path, data: Path, threads: int) -> dict[str, object]:
     asked = [name for name in names if name in set(tomllib.loads(MAPPING.read_text()).values())]
     for name in HOUSES:
         if (data / name).is_dir():
-            result[name] = house_figures(encode, data / name, asked, class_texts(model, asked))
+            result[name] = house_figures(encode, data / name, asked, text_embeddings(asked, teacher))
         else:
             click.echo(f"{data / name} is not there: not measured (CHEBSPLAT_TEST_DATA)", err=True)
     return result
 
 
-def house_figures(encode: Callable, folder: Path, asked: list[str], texts: np.ndarray) -> dict[str, object]:
+def house_figures(encode: Callable, folder: Path, asked: list[str], texts: np.ndarray) -> dict[str, Any]:
     matrix, counted, total, views = np.zeros((len(asked),) * 2, np.int64), 0, 0, 0
     for image, truth in house(folder, asked):
         matrix += confusion(labelled(encode(image), texts, *truth.shape), truth, len(asked))
@@ -155,10 +135,9 @@ def main(model: Path, data: Path, threads: int) -> None:
     for name in ("held_out", *HOUSES):
         if name in result:
             part = result[name]
-            assert isinstance(part, dict)
             click.echo(f"{name}: mIoU {part['miou']:.3f}, accuracy {part['oa']:.3f} over {part['views']} views")
             click.echo("  " + ", ".join(f"{label} {v:.2f}" for label, v in part["iou"].items()))
-    for part in result["unseen_words"]:  # type: ignore[attr-defined]
+    for part in result["unseen_words"]:
         click.echo(f"words not in training: mIoU {part['miou']:.3f}")
     click.echo(f"one view: {result['encode']}")
 

@@ -27,12 +27,14 @@ from chebsplat.teachers import EMBEDDED
 from chebsplat.teachers.augment import crops, recolored
 from chebsplat.teachers.dataset import rendered
 from chebsplat.teachers.network import Encoder, Trunk, span
+from chebsplat.teachers.rooms import KINDS
 from chebsplat.teachers.words import embedded, words
 
 ROOMS, VALIDATION, VIEWS = TRAINING[:480], TRAINING[-12:], 8  # rooms, and views of each
-BATCH, HEIGHT, WIDTH = 16, 160, 192  # crops
-RATE, DECAY, WARM_UP = 3e-3, 0.02, 200
-TEMPERATURE, PULL = 0.07, 0.5
+PRESETS = ("office", "room")  # drawn twice as often as rooms of the other kinds, of which there are twice as many
+BATCH, HEIGHT, WIDTH = 8, 192, 256  # crops
+RATE, DECAY, WARM_UP = 2e-3, 0.02, 100
+TEMPERATURE, PULL = 0.07, 0.2
 AVERAGE = 0.995  # of the weights, from step to step
 MEAN, STD = (0.5, 0.5, 0.5), (0.25, 0.25, 0.25)
 
@@ -69,7 +71,12 @@ def validated(trunk: Trunk, images: np.ndarray, labels: np.ndarray, texts: Tenso
 
 
 def train(
-    images: np.ndarray, labels: np.ndarray, held: tuple[np.ndarray, np.ndarray], steps: int, out: Path
+    images: np.ndarray,
+    labels: np.ndarray,
+    share: np.ndarray,
+    held: tuple[np.ndarray, np.ndarray],
+    steps: int,
+    out: Path,
 ) -> Encoder:
     """Trains for `steps`; the log goes to out/training.csv, the averaged network to out/teacher.pt now and then."""
     torch.manual_seed(0)
@@ -92,7 +99,7 @@ def train(
         for step, status in progress.track(range(steps), steps, "teacher"):
             for group in optimizer.param_groups:
                 group["lr"] = RATE * rate(step, steps)
-            index = rng.choice(len(images), BATCH, replace=False)
+            index = rng.choice(len(images), BATCH, replace=False, p=share)
             image, label = crops(
                 torch.from_numpy(images[index]), torch.from_numpy(labels[index]), HEIGHT, WIDTH, generator
             )
@@ -143,7 +150,8 @@ def main(steps: int, threads: int, cache: Path, out: Path) -> None:
     out.mkdir(parents=True, exist_ok=True)
     images, labels = rendered(cache / "rooms", ROOMS, VIEWS, threads)
     held = rendered(cache / "rooms", VALIDATION, VIEWS, threads)
-    encoder = train(images, labels, held, steps, cache)
+    often = np.repeat([2.0 if KINDS[seed % len(KINDS)] in PRESETS else 1.0 for seed in ROOMS], VIEWS)
+    encoder = train(images, labels, often / often.sum(), held, steps, cache)
     (out / "training.csv").write_bytes((cache / "training.csv").read_bytes())
     export(encoder, out, MEAN, STD)
 

@@ -364,6 +364,22 @@ def test_a_bad_label_file_is_a_clear_error(tmp_path, content, message):
         read_label_set(tmp_path / "labels.txt")
 
 
+def test_check_teacher_tells_what_a_teacher_is_and_sees(tmp_path):
+    from click.testing import CliRunner
+    from PIL import Image
+
+    from chebsplat.pipelines.cli import main
+
+    Image.new("RGB", (64, 48), (0, 0, 255)).save(tmp_path / "photo.png")
+    model, photo = color_teacher(tmp_path, size=[32, 32]), ["--photo", str(tmp_path / "photo.png")]
+    told = CliRunner().invoke(main, ["check-teacher", str(model), *photo])
+    assert told.exit_code == 0
+    for what in ("tiny (", "features, 3 channels", "64 x 48", "4 of 32 x 32", "16 x 12", "3, from", "blue 100%"):
+        assert what in told.stdout
+    model.with_suffix(".toml").unlink()
+    assert CliRunner().invoke(main, ["check-teacher", str(model), *photo]).exit_code == 3
+
+
 # a run that is killed
 
 

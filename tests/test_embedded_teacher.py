@@ -1,0 +1,90 @@
+"""The embedded teacher that ships: it runs, is as good as its figures say, and never saw what it is measured on."""
+
+import json
+import tomllib
+from itertools import pairwise
+
+import numpy as np
+import pytest
+from shared import ROOT
+
+from chebsplat.formats.teacher_model import read_teacher
+from chebsplat.stages.image_encoder import ImageEncoder
+from chebsplat.synthetic import CLASS_NAMES, seeds
+from chebsplat.teachers import EMBEDDED
+
+
+@pytest.fixture(scope="module")
+def encoder():
+    return ImageEncoder(read_teacher(EMBEDDED), 1)
+
+
+@pytest.mark.parametrize("size", [(16, 32), (96, 64), (112, 176)])
+def test_any_size_that_is_a_multiple_gives_unit_vectors_as_wide_as_the_text(encoder, size):
+    image = np.random.default_rng(0).integers(0, 256, (*size, 3), np.uint8)
+    found = encoder.run(image, "noise")
+    assert found.shape == (384, size[0] // 2, size[1] // 2)
+    assert found.dtype == np.float32
+    np.testing.assert_allclose(np.linalg.norm(found, axis=0), 1, atol=2e-3)  # the map's columns are float16
+
+
+def test_the_rank_of_its_features_is_small(encoder):
+    from chebsplat.teachers.network import RANK
+
+    image = np.random.default_rng(0).integers(0, 256, (96, 96, 3), np.uint8)
+    sizes = np.linalg.svd(encoder.run(image, "noise").reshape(384, -1).astype(np.float64), compute_uv=False)
+    assert sizes[RANK] < 1e-5 * sizes[0]
+
+
+def test_a_held_out_room_is_told_about_as_well_as_the_published_figures_say():
+    from chebsplat.metrics import confusion, segmentation
+    from chebsplat.stages.text import text_embeddings
+    from chebsplat.teachers.quality import held_out_room, labelled, runner
+
+    published = json.loads((EMBEDDED.parent / "quality.json").read_text())["held_out"]
+    encode, n = runner(EMBEDDED, 1), len(CLASS_NAMES)
+    texts = text_embeddings(list(CLASS_NAMES), read_teacher(EMBEDDED))
+    matrix = np.zeros((n, n), np.int64)
+    for image, truth in held_out_room(seeds.HELD_OUT[0], n_views=4):
+        matrix += confusion(labelled(encode(image), texts, *truth.shape), truth, n)
+    assert published["miou"] >= 0.55
+    assert segmentation(matrix).miou == pytest.approx(published["miou"], abs=0.15)  # one room of twenty, four views
+    assert segmentation(matrix).oa == pytest.approx(published["oa"], abs=0.08)
+
+
+def test_no_seed_serves_two_ends():
+    ranges = [seeds.SCENES, seeds.REFERENCE, seeds.HELD_OUT, seeds.TRAINING]
+    assert all(a.stop <= b.start for a, b in pairwise(ranges))
+    for path in (ROOT / "pipelines/configs/scenes").glob("*.toml"):
+        source = tomllib.loads(path.read_text())["source"]
+        assert "seed" not in source or source["seed"] in seeds.SCENES, path
+
+
+def test_training_takes_no_other_seeds_and_its_validation_none_of_its_own():
+    from chebsplat.teachers.rooms import training_views
+    from chebsplat.teachers.train import ROOMS, VALIDATION
+
+    assert not set(ROOMS) & set(VALIDATION)
+    assert {*ROOMS, *VALIDATION} <= set(seeds.TRAINING)
+    for seed in (seeds.SCENES[0], seeds.HELD_OUT[0], seeds.REFERENCE[0]):
+        with pytest.raises(ValueError, match="not one for training"):
+            training_views(seed, 1)
+
+
+def test_shuffled_rooms_differ_in_layout_and_keep_their_furniture_inside():
+    from chebsplat.teachers.rooms import shuffled
+
+    rooms = [shuffled(seed) for seed in seeds.TRAINING[4:9]]
+    assert len({len(room.soup.triangles) for room in rooms}) > 1
+    for room in rooms:
+        assert (room.soup.vertices.min(0) >= -0.11).all()
+        assert (room.soup.vertices.max(0) <= np.array(room.size) + 0.11).all()
+
+
+def test_words_that_measure_are_not_words_that_trained():
+    from chebsplat.teachers.words import words
+
+    training, unseen = words("training"), words("unseen")
+    assert not {w for of in training.values() for w in of} & {w for of in unseen.values() for w in of}
+    assert all(of[0] == name for name, of in training.items())
+    assert len({len(of) for of in unseen.values()}) == 1
