@@ -67,7 +67,7 @@ teacher: $(READY)  ## train, export and measure the embedded teacher: seeds fixe
 	@OMP_WAIT_POLICY=PASSIVE $(PY) -m chebsplat.teachers.train $(args)
 	@$(PY) -m chebsplat.teachers.quality
 
-teacher-quality: $(READY)  ## measure the shipped embedded teacher on held-out rooms and the houses; quality.json
+teacher-quality: $(READY)  ## measure the shipped embedded teacher on held-out rooms and the houses: teachers/quality.md
 	@$(PY) -m uv pip install --quiet --python $(PY) --editable '.[text]'
 	@$(PY) -m chebsplat.teachers.quality $(args)
 
