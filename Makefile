@@ -66,12 +66,12 @@ nouns: $(READY)  ## teachers/embedded.npz from teachers/nouns.txt, by the senten
 	@$(PY) -m uv pip install --quiet --python $(PY) --editable '.[text]'
 	@$(PY) -m chebsplat.teachers.nouns
 
-teacher: $(READY)  ## train, export and measure the embedded teacher: seeds fixed, about TIME on 4 quiet cores
+teacher: $(READY)  ## train, export and measure the embedded teacher: seeds fixed; about half an hour on 4 cores
 	@$(PY) -m uv pip install --quiet --python $(PY) --editable '.[text]'
 	@OMP_WAIT_POLICY=PASSIVE $(PY) -m chebsplat.teachers.train $(args)
 	@$(PY) -m chebsplat.teachers.quality
 
-teacher-quality: $(READY)  ## measure the shipped embedded teacher on held-out rooms and the houses; quality.json
+teacher-quality: $(READY)  ## measure the shipped embedded teacher on held-out rooms and the houses: teachers/quality.md
 	@$(PY) -m uv pip install --quiet --python $(PY) --editable '.[text]'
 	@$(PY) -m chebsplat.teachers.quality $(args)
 

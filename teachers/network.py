@@ -77,6 +77,8 @@ class Encoder(nn.Module):
       the map is fixed (`span`), so the features' rank is RANK and a projection to as many channels is exact.
     """
 
+    basis: Tensor
+
     def __init__(self, trunk: Trunk, basis: Tensor):
         super().__init__()
         self.trunk = trunk
@@ -89,4 +91,4 @@ class Encoder(nn.Module):
 def span(embeddings: Tensor, rank: int = RANK) -> Tensor:
     """Orthonormal columns [C, rank] that hold most of the energy of embeddings [L, C]."""
     basis = torch.linalg.svd(embeddings.double(), full_matrices=False).Vh[:rank].T
-    return (basis * torch.sign(basis.abs().max(0, keepdim=True).values * basis.sum(0, keepdim=True))).float()
+    return (basis * torch.sign(basis.sum(0))).float()  # a singular vector's sign is free

@@ -101,8 +101,7 @@ def measured(model: Path, data: Path, threads: int) -> dict[str, Any]:
     result: dict[str, Any] = {
         "held_out": {"rooms": len(HELD_OUT), "views": len(HELD_OUT) * VIEWS, **figures(matrix, names)},
         "unseen_words": [
-            {"miou": figures(strange[k], names)["miou"], "words": [unseen[name][k] for name in names],
-             "iou": figures(strange[k], names)["iou"]} for k in range(draws)
+            {"words": [unseen[name][k] for name in names], **figures(strange[k], names)} for k in range(draws)
         ],
         "encode": {"seconds": round(float(np.median(seconds)), 4), "size": [WIDTH, HEIGHT], "threads": threads,
                    "load": round(os.getloadavg()[0], 1)},
@@ -121,7 +120,34 @@ def house_figures(encode: Callable, folder: Path, asked: list[str], texts: np.nd
     for image, truth in house(folder, asked):
         matrix += confusion(labelled(encode(image), texts, *truth.shape), truth, len(asked))
         counted, total, views = counted + int((truth != IGNORE).sum()), total + truth.size, views + 1
-    return {"views": views, "pixels_counted": round(counted / total, 4), **figures(matrix, asked)}
+    return {"views": views, "counted": round(counted / total, 4), **figures(matrix, asked)}
+
+
+def table(result: dict[str, Any]) -> str:
+    """The figures as markdown."""
+    columns = {"held-out rooms": result["held_out"]} | {name: result[name] for name in HOUSES if name in result}
+    columns |= {f"unseen words {k + 1}": part for k, part in enumerate(result["unseen_words"])}
+    encode = result["encode"]
+    lines = [
+        "Written by `make teacher-quality`; IoU of each class, one confusion matrix a column.",
+        "",
+        "| | " + " | ".join(columns) + " |",
+        "|---|" + "---|" * len(columns),
+    ]
+    for key, title in (("miou", "**mIoU**"), ("oa", "**pixels right**"), ("views", "views"), ("counted", "counted")):
+        lines.append(f"| {title} | " + " | ".join(str(part.get(key, "")) for part in columns.values()) + " |")
+    for name in CLASS_NAMES:
+        cells = [f"{part['iou'][name]:.3f}" if name in part["iou"] else "" for part in columns.values()]
+        lines.append(f"| {name} | " + " | ".join(cells) + " |")
+    lines += [
+        "",
+        "Counted: share of pixels whose label has a counterpart (houses.toml). Unseen words, in the order of classes: "
+        + "; ".join(f"{k + 1}: " + ", ".join(part["words"]) for k, part in enumerate(result["unseen_words"])) + ".",
+        "",
+        f"One view of {encode['size'][0]} x {encode['size'][1]}: {encode['seconds']} s (median), {encode['threads']} "
+        f"threads of onnxruntime, load average {encode['load']}.",
+    ]  # fmt: skip
+    return "\n".join(lines) + "\n"
 
 
 @click.command()
@@ -129,17 +155,11 @@ def house_figures(encode: Callable, folder: Path, asked: list[str], texts: np.nd
 @click.option("--data", type=click.Path(path_type=Path), envvar="CHEBSPLAT_TEST_DATA", default=Path("../shared/data"))
 @click.option("--threads", default=4, show_default=True, help="of onnxruntime")
 def main(model: Path, data: Path, threads: int) -> None:
-    """Measure the model and write quality.json beside it."""
+    """Measure the model; write quality.json and quality.md beside it."""
     result = measured(model, data, threads)
     (model.parent / "quality.json").write_text(json.dumps(result, indent=1) + "\n")
-    for name in ("held_out", *HOUSES):
-        if name in result:
-            part = result[name]
-            click.echo(f"{name}: mIoU {part['miou']:.3f}, accuracy {part['oa']:.3f} over {part['views']} views")
-            click.echo("  " + ", ".join(f"{label} {v:.2f}" for label, v in part["iou"].items()))
-    for part in result["unseen_words"]:
-        click.echo(f"words not in training: mIoU {part['miou']:.3f}")
-    click.echo(f"one view: {result['encode']}")
+    (model.parent / "quality.md").write_text(table(result))
+    click.echo(table(result))
 
 
 if __name__ == "__main__":

@@ -11,6 +11,7 @@ from __future__ import annotations
 import copy
 import csv
 import logging
+from dataclasses import dataclass
 from pathlib import Path
 
 import click
@@ -70,17 +71,25 @@ def validated(trunk: Trunk, images: np.ndarray, labels: np.ndarray, texts: Tenso
     return segmentation(matrix).miou
 
 
-def train(
-    images: np.ndarray,
-    labels: np.ndarray,
-    share: np.ndarray,
-    held: tuple[np.ndarray, np.ndarray],
-    steps: int,
-    out: Path,
-) -> Encoder:
-    """Trains for `steps`; the log goes to out/training.csv, the averaged network to out/teacher.pt now and then."""
-    torch.manual_seed(0)
-    rng, generator = np.random.default_rng(0), torch.Generator().manual_seed(0)
+@dataclass
+class Target:
+    """What vectors are drawn to: basis [384, RANK]; in its coordinates the words [W, RANK] of classes owner [W], the
+    classes' mean words [22, RANK], unit, and their names [22, RANK].
+    """
+
+    basis: Tensor
+    words: Tensor
+    owner: np.ndarray
+    means: Tensor
+    names: Tensor
+
+    def drawn(self, rng: np.random.Generator) -> Tensor:
+        """One word of each class, [22, RANK]."""
+        return self.words[[int(rng.choice(np.flatnonzero(self.owner == k))) for k in range(len(self.means))]]
+
+
+def target() -> Target:
+    """Choices: the basis holds all words of training, and each class's mean three times over."""
     listed = words("training")
     owner = np.repeat(np.arange(len(listed)), [len(of) for of in listed.values()])
     vectors = torch.from_numpy(embedded([word for of in listed.values() for word in of]))
@@ -88,56 +97,71 @@ def train(
     basis = span(torch.cat([vectors, 3 * means]))
     texts, means = vectors @ basis, F.normalize(means @ basis, dim=1)
     names = torch.stack([texts[int(np.flatnonzero(owner == k)[0])] for k in range(len(listed))])
+    return Target(basis, texts, owner, means, names)
+
+
+def train(
+    rooms: tuple[np.ndarray, np.ndarray],
+    share: np.ndarray,
+    held: tuple[np.ndarray, np.ndarray],
+    steps: int,
+    out: Path,
+) -> Encoder:
+    """Trains on views, each drawn with its share; the log goes to out/training.csv, the network to out/teacher.pt.
+
+    Args: rooms, held: images u8 [N, H, W, 3] and labels i8 [N, H, W]; share [N], its sum 1.
+    """
+    torch.manual_seed(0)
+    rng, generator = np.random.default_rng(0), torch.Generator().manual_seed(0)
+    (images, labels), aim = rooms, target()
     trunk = Trunk().to(memory_format=torch.channels_last)  # type: ignore[call-overload]
     average = copy.deepcopy(trunk)
     weights = class_weights(labels)
     optimizer = torch.optim.AdamW(trunk.parameters(), lr=RATE, weight_decay=DECAY)
-    progress, sums = Progress(every=20), np.zeros(3)
+    sums, last = np.zeros(3), steps - 1
     with (out / "training.csv").open("w", newline="") as stream:
         log = csv.writer(stream)
         log.writerow(["step", "loss", "accuracy", "validation_miou"])
-        for step, status in progress.track(range(steps), steps, "teacher"):
-            for group in optimizer.param_groups:
-                group["lr"] = RATE * rate(step, steps)
+        for step, status in Progress(every=20).track(range(steps), steps, "teacher"):
+            optimizer.param_groups[0]["lr"] = RATE * rate(step, steps)
             index = rng.choice(len(images), BATCH, replace=False, p=share)
-            image, label = crops(
-                torch.from_numpy(images[index]), torch.from_numpy(labels[index]), HEIGHT, WIDTH, generator
-            )
-            image = normalized(recolored(image, generator))
-            drawn = [int(rng.choice(np.flatnonzero(owner == k))) for k in range(len(listed))]
+            views = torch.from_numpy(images[index]), torch.from_numpy(labels[index])
+            image, label = crops(*views, HEIGHT, WIDTH, generator)
+            image, texts = normalized(recolored(image, generator)), aim.drawn(rng)
             trunk.train()
             with torch.autocast("cpu", torch.bfloat16):
                 found = trunk(image)
-            found = found.permute(0, 2, 3, 1)[label >= 0]
-            target = label[label >= 0]
-            logits = found.float() @ texts[drawn].T
-            pull = (1 - (found * means[target]).sum(1)).mean()
-            loss = F.cross_entropy(logits / TEMPERATURE, target, weights) + PULL * pull
+            found, truth = found.permute(0, 2, 3, 1)[label >= 0], label[label >= 0]
+            cosines = found.float() @ texts.T
+            pull = (1 - (found * aim.means[truth]).sum(1)).mean()
+            loss = F.cross_entropy(cosines / TEMPERATURE, truth, weights) + PULL * pull
             optimizer.zero_grad()
             loss.backward()
             torch.nn.utils.clip_grad_norm_(trunk.parameters(), 5.0)
             optimizer.step()
-            with torch.no_grad():
-                kept = min(AVERAGE, (step + 1) / (step + 20))
-                for a, b in zip(average.state_dict().values(), trunk.state_dict().values(), strict=True):
-                    a.lerp_(b, 1 - kept) if a.is_floating_point() else a.copy_(b)
-            right = float((logits.argmax(1) == target).float().mean())
-            sums += (1, float(loss.detach()), right)
-            if (step + 1) % 100 == 0 or step + 1 == steps:
+            average_in(average, trunk, min(AVERAGE, (step + 1) / (step + 20)))
+            sums += 1, float(loss.detach()), float((cosines.argmax(1) == truth).float().mean())
+            if (step + 1) % 100 == 0 or step == last:
+                status["loss"] = f"{sums[1] / sums[0]:.3f}"
                 miou = ""
-                if (step + 1) % 500 == 0 or step + 1 == steps:
-                    miou = f"{validated(average, *held, names):.4f}"
-                    status["mIoU"] = miou
-                    torch.save({"trunk": average.state_dict(), "basis": basis}, out / "teacher.pt")
+                if (step + 1) % 500 == 0 or step == last:
+                    miou = status["mIoU"] = f"{validated(average, *held, aim.names):.4f}"
+                    torch.save({"trunk": average.state_dict(), "basis": aim.basis}, out / "teacher.pt")
                 log.writerow([step + 1, f"{sums[1] / sums[0]:.4f}", f"{sums[2] / sums[0]:.4f}", miou])
                 stream.flush()
-                status["loss"] = f"{sums[1] / sums[0]:.3f}"
                 sums[:] = 0
-    return Encoder(average, basis)
+    return Encoder(average, aim.basis)
+
+
+@torch.no_grad()
+def average_in(average: Trunk, trunk: Trunk, kept: float) -> None:
+    """Moves the averaged weights towards the trunk's."""
+    for a, b in zip(average.state_dict().values(), trunk.state_dict().values(), strict=True):
+        a.lerp_(b, 1 - kept) if a.is_floating_point() else a.copy_(b)
 
 
 @click.command()
-@click.option("--steps", default=4000, show_default=True)
+@click.option("--steps", default=3600, show_default=True)
 @click.option("--threads", default=4, show_default=True, help="of torch, and processes that render")
 @click.option("--cache", type=click.Path(path_type=Path), default=Path("build/teacher"), help="rendered rooms")
 @click.option("--out", type=click.Path(path_type=Path), default=EMBEDDED.parent, help="the model goes here")
@@ -148,10 +172,10 @@ def main(steps: int, threads: int, cache: Path, out: Path) -> None:
     logging.basicConfig(level=logging.INFO, format="%(message)s")
     torch.set_num_threads(threads)
     out.mkdir(parents=True, exist_ok=True)
-    images, labels = rendered(cache / "rooms", ROOMS, VIEWS, threads)
+    rooms = rendered(cache / "rooms", ROOMS, VIEWS, threads)
     held = rendered(cache / "rooms", VALIDATION, VIEWS, threads)
     often = np.repeat([2.0 if KINDS[seed % len(KINDS)] in PRESETS else 1.0 for seed in ROOMS], VIEWS)
-    encoder = train(images, labels, often / often.sum(), held, steps, cache)
+    encoder = train(rooms, often / often.sum(), held, steps, cache)
     (out / "training.csv").write_bytes((cache / "training.csv").read_bytes())
     export(encoder, out, MEAN, STD)
 

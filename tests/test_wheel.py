@@ -28,6 +28,8 @@ def test_a_wheel_mounts_every_layer_under_chebsplat(tmp_path):
         "chebsplat/teachers/embedded.toml",
         "chebsplat/teachers/embedded.npz",
         "chebsplat/teachers/words.toml",
+        "chebsplat/teachers/quality.json",
+        "chebsplat/teachers/training.csv",
         "chebsplat/pipelines/Snakefile",
         "chebsplat/pipelines/profiles/default/config.yaml",
         "chebsplat/pipelines/configs/scenes/office0.toml",
