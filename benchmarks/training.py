@@ -4,7 +4,7 @@ Trains once in full on the cpu backend, then again with few steps on both cpu an
 seeds and schedules. Test views are looked at once, at the end of each training.
 
 Usage: python benchmarks/training.py --work work/office0 [--steps 3000] [--equal-steps 200] [--out build/bench]
-The folder holds the links `ingest`, `sfm` and `teacher`, from `make scene=office0 stage=...`.
+The folder holds the links `ingest`, `sfm` and `teacher`, from `make scene=office0 set=teacher.kind=labels stage=...`.
 """
 
 from __future__ import annotations

@@ -80,10 +80,17 @@ def noisy_features(
 def decode(features: np.ndarray, embeddings: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Label of the largest cosine, and its confidence.
 
-    Args: features [..., C] of any length; embeddings [L, C] unit.
+    Args: features [..., C] of any length; embeddings [L, C] unit, or what a projection keeps of them.
     Returns: labels i16 [...], confidence f32 [...]: softmax of cosines at temperature 0.1, its largest entry.
     """
-    lengths = np.linalg.norm(features, axis=-1, keepdims=True).clip(1e-6)
-    cosines = (features / lengths) @ embeddings.T
-    weights = np.exp((cosines - cosines.max(-1, keepdims=True)) / 0.1)
-    return cosines.argmax(-1).astype(np.int16), (1 / weights.sum(-1)).astype(np.float32)
+    rows = features.reshape(-1, features.shape[-1])
+    labels, confidence = np.zeros(len(rows), np.int16), np.zeros(len(rows), np.float32)
+    step = max(4_000_000 // len(embeddings), 1)  # so that thousands of labels do not cost gigabytes
+    for start in range(0, len(rows), step):
+        part = rows[start : start + step]
+        lengths = np.linalg.norm(part, axis=-1, keepdims=True).clip(1e-6)
+        cosines = (part / lengths) @ embeddings.T
+        labels[start : start + step] = cosines.argmax(-1)
+        weights = np.exp((cosines - cosines.max(-1, keepdims=True)) / 0.1)
+        confidence[start : start + step] = 1 / weights.sum(-1)
+    return labels.reshape(features.shape[:-1]), confidence.reshape(features.shape[:-1])

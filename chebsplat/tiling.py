@@ -56,7 +56,8 @@ def blended(
             cells = np.asarray(encode(top, left), np.float32)
             down = sampling(size[0], grid[0], starts[0], row, window[0], cells.shape[1])
             across = sampling(size[1], grid[1], starts[1], column, window[1], cells.shape[2])
-            part = np.moveaxis(down @ (cells @ across.T), 0, -1)
+            rows = np.tensordot(down, cells, ([1], [1]))  # [h, C, wc]; two large products, not one a channel
+            part = np.tensordot(rows, across, ([2], [1])).transpose(0, 2, 1)
             total = part if not total.size else total + part
             weight += np.outer(down.sum(1), across.sum(1))[..., None]
     return total / weight

@@ -1,4 +1,4 @@
-"""The `chebsplat` command: run, plan, query, verify, clean-stale, scenes, and every stage as a plain command."""
+"""The `chebsplat` command: runs, plans, queries, checks and listings, and every stage as a plain command."""
 
 from __future__ import annotations
 
@@ -136,11 +136,11 @@ def scene_folder(scene: str) -> Path:
     from chebsplat.pipelines import store
 
     for folder in (store.work() / scene, Path(scene)):
-        if (folder / "export").is_dir():
+        if store.is_fresh(folder / "export"):
             return folder
     import difflib
 
-    known = sorted(path.parent.name for path in store.work().glob("*/export"))
+    known = sorted(path.parent.parent.name for path in store.work().glob("*/export/artifact.json"))
     near = difflib.get_close_matches(scene, known, 3) or known
     raise ConfigError(
         f"{scene} is no finished scene in {store.work()}, and no folder of one; "
@@ -210,6 +210,23 @@ def clean_stale(yes: bool) -> None:
         if yes:
             for path, _ in found:
                 store.remove(path)
+        return 0
+
+    guarded(action)
+
+
+@main.command("check-teacher")
+@click.argument("model", type=click.Path(path_type=Path))
+@click.option("--photo", type=click.Path(path_type=Path), help="default: a view of a generated room")
+@click.option("--labels", help="text file of labels; default: the teacher's own")
+def check_teacher(model: Path, photo: Path | None, labels: str | None) -> None:
+    """Run one image through a teacher MODEL (.onnx): what it is, what it costs, what it sees."""
+
+    def action() -> int:
+        from chebsplat.stages.teacher_check import check
+
+        for what, finding in check(model, photo, labels):
+            print(f"{what:9s}{finding}")
         return 0
 
     guarded(action)

@@ -12,7 +12,13 @@ from typing import Any
 from chebsplat.stages.registry import Stage
 
 # Settings that say where raw files lie. Their content is hashed instead: where it lies is no matter.
-PLACES = (("source", "path"), ("teacher", "model"), ("teacher", "labels"))
+PLACES = (
+    ("source", "path"),
+    ("projection", "model"),
+    ("projection", "reference"),
+    ("teacher", "model"),
+    ("teacher", "labels"),
+)
 
 
 def step_key(

@@ -3,9 +3,12 @@
 from __future__ import annotations
 
 import os
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from chebsplat.errors import ConfigError
+
+if TYPE_CHECKING:
+    from chebsplat.formats.teacher_model import TeacherModel
 
 
 def teacher_kind(config: Any, probe: dict[str, bool]) -> tuple[str, str]:
@@ -39,6 +42,15 @@ def left_out_stages(config: Any, kind: str, why: str, probe: dict[str, bool], kn
     elif probe["poses"]:
         left_out["sfm: pose estimation"] = "poses are given"
     return left_out
+
+
+def left_out_projection(kind: str, model: TeacherModel | None) -> dict[str, str]:
+    """Why there is no projection, if there is none."""
+    if model is None:
+        return {"projection": f"teacher.kind is {kind}: no teacher's channels to reduce"}
+    if model.output != "features":
+        return {"projection": f"{model.name} is a closed-set teacher: its classes have codes of few channels"}
+    return {}
 
 
 def source_sentence(name: str, asked: Any, source: Any) -> str:

@@ -13,11 +13,12 @@ from pathlib import Path
 from typing import Any
 
 from chebsplat.errors import ConfigError, InputError
-from chebsplat.formats.teacher_model import read_teacher
+from chebsplat.formats.teacher_model import TeacherModel, read_teacher
 from chebsplat.pipelines import store
 from chebsplat.pipelines.code import Code, installed
 from chebsplat.pipelines.keys import PLACES, content_hash, step_key
-from chebsplat.pipelines.needs import left_out_stages, source_sentence, teacher_kind
+from chebsplat.pipelines.needs import left_out_projection, left_out_stages, source_sentence, teacher_kind
+from chebsplat.stages.projection import reference_files
 from chebsplat.stages.registry import STAGES
 from chebsplat.teachers import EMBEDDED
 
@@ -171,13 +172,17 @@ class Planner:
         teacher = config.teacher.model_copy(update={"kind": kind})
         if kind == "onnx" and teacher.model is None:
             teacher = teacher.model_copy(update={"model": str(EMBEDDED)})
-        config = config.model_copy(update={"source": source, "teacher": teacher})
+        projection = config.projection.model_copy(update={"model": teacher.model})
+        config = config.model_copy(update={"source": source, "teacher": teacher, "projection": projection})
+        model = read_teacher(Path(teacher.model)) if kind == "onnx" and teacher.model else None
         left_out = left_out_stages(config, kind, why, probe, basis is not None or keep_knowledge)
+        left_out |= left_out_projection(kind, model)
         steps: dict[str, Step] = {}
         root = Path(source.path) if source.path else None
         raw = {"ingest": content_hash(files, root, self.file_memo.values)}
-        if kind == "onnx":
-            raw["teacher"] = self._hash_teacher(teacher)
+        if model is not None:
+            raw["teacher"] = self._hash_teacher(model, teacher)
+            raw["projection"] = self._hash_projection(model, projection)
         for stage in STAGES.values():
             if stage.name in left_out or (stage.name == "cks" and not keep_knowledge):
                 continue
@@ -202,9 +207,16 @@ class Planner:
         module = import_module(f"chebsplat.stages.sources.{source.kind}")
         return module.probe(folder), module.files(folder)
 
-    def _hash_teacher(self, teacher: Any) -> str:
+    def _hash_projection(self, model: TeacherModel, projection: Any) -> str:
+        """Of the model's files, and of the reference images; of no scene's."""
+        files = model.files()
+        if projection.reference:
+            files += reference_files(Path(projection.reference))
+        return content_hash(files, None, self.file_memo.values)
+
+    def _hash_teacher(self, model: TeacherModel, teacher: Any) -> str:
         """Of the model's files, and of the file of labels."""
-        files = read_teacher(Path(teacher.model)).files()
+        files = model.files()
         if teacher.labels:
             files.append(Path(teacher.labels))
             if not files[-1].is_file():

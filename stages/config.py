@@ -66,10 +66,16 @@ class TeacherSection(_Section):
 
 
 class ProjectionSection(_Section):
-    """What a teacher's channels are reduced to, for all scenes alike."""
+    """What a teacher's channels are reduced to, for all scenes alike.
+
+    Choices: 32 channels, the rank of the embedded teacher, which they hold exactly. Of 512 channels stood in for LSeg's
+      (make bench-store) they keep 99.8 % of the decisions between 150 words where the spectrum falls as k^-3 and 95 %
+      where it falls as k^-1; 13 keep 98 and 77 %. 48 are needed for 1 % relative error in the first case; in the
+      second no 57 channels, the most that 20 MB a view hold, come below 18 %.
+    """
 
     n_channels: int = Field(32, ge=2, le=64)  # at most; fewer where the teacher's features span fewer
-    model: str | None = None  # .onnx; in a scene it is the teacher's, filled in by the planner
+    model: str | None = None  # .onnx; in a scene the planner puts teacher.model here; None: the embedded teacher
     reference: str | None = None  # folder of images; None: generated rooms
     n_rooms: int = Field(12, ge=1, le=100)
 

@@ -127,8 +127,7 @@ def label_figures(
     if teacher is not None:
         row = {name: k for k, name in enumerate(teacher.names)}
         size = predicted.shape[1:]
-        maps = [teacher.features[row[capture.names[v]]].astype(np.float32) for v in views]
-        found = [decode(features, teacher.label_embeddings)[0] for features in maps]
+        found = (labels_of(teacher, row[capture.names[v]]) for v in views)  # one view's features at a time
         of_teacher = pictures["teacher"] = np.stack([enlarged(labels, size) for labels in found])
     if capture.labels is None or capture.class_names is None:
         job.left_out("mIoU", "the capture has no labels to compare with")
@@ -139,6 +138,17 @@ def label_figures(
     if of_teacher is not None and teacher is not None:
         result["teacher"] = measured(of_teacher, teacher.label_names, truth, classes, job)
     return result
+
+
+def labels_of(teacher: Features, view: int) -> np.ndarray:
+    """What a teacher says of a view, [h, w]: its own labels where it told them, before any projection."""
+    import numpy as np
+
+    from chebsplat.noisy_teacher import decode
+
+    if teacher.pseudo_labels is not None:
+        return np.asarray(teacher.pseudo_labels[view])
+    return decode(teacher.features[view].astype(np.float32), teacher.label_embeddings)[0]
 
 
 def enlarged(labels: np.ndarray, size: tuple[int, int]) -> np.ndarray:

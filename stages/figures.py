@@ -34,14 +34,13 @@ def heat_scale(title: str, width: int) -> np.ndarray:
     from PIL import Image, ImageDraw
 
     strip = np.full((28, width, 3), 255, np.uint8)
-    bar = slice(width - 150, width - 40)
-    strip[9:19, bar] = _warm(np.linspace(0, 1, 110)[None, :, None]).round()
+    left, right = round(0.82 * width), round(0.97 * width)
+    strip[9:19, left:right] = _warm(np.linspace(0, 1, right - left)[None, :, None]).round()
     picture = Image.fromarray(strip)
-    draw = ImageDraw.Draw(picture)
-    room = (width - 190) // 6  # letters of the built-in font
-    draw.text((8, 8), title if len(title) <= room else f"{title[: room - 3]}...", fill="black")
-    draw.text((width - 172, 8), "0.5", fill="black")
-    draw.text((width - 34, 8), "1", fill="black")
+    draw, room = ImageDraw.Draw(picture), max(left - 40, 0) // 6  # letters of the built-in font
+    draw.text((8, 8), title if len(title) <= room else f"{title[: max(room - 3, 0)]}...", fill="black")
+    draw.text((left - 22, 8), "0.5", fill="black")
+    draw.text((right + 6, 8), "1", fill="black")
     return np.asarray(picture)
 
 

@@ -29,6 +29,7 @@ class ImageEncoder:
         options = onnxruntime.SessionOptions()
         options.intra_op_num_threads, options.inter_op_num_threads = threads, 1
         options.use_deterministic_compute = True
+        options.add_session_config_entry("session.intra_op.allow_spinning", "0")  # leave the cores to others
         options.log_severity_level = 4  # what fails is raised, and told once
         try:
             self.session: Any = onnxruntime.InferenceSession(

@@ -48,7 +48,7 @@ def open_vocabulary(
 ) -> LabelSpace:
     """The space of an encoder of `n_channels` features.
 
-    Raises: InputError where embeddings have other channels; ConfigError where there are too many to render.
+    Raises: InputError where embeddings or the projection have other channels.
     Choices: a label's vector is the mean of the unit embeddings of its words, made unit again. Labels and confidence
       are told before projection: they are the teacher's own.
     """
@@ -65,11 +65,6 @@ def open_vocabulary(
         raise InputError(
             f"{teacher.path} gives {n_channels} channels, its text embeddings have {own.shape[1]} "
             f"({teacher.labels or teacher.text}); correct `labels` or `text` in {teacher.settings}"
-        )
-    if projection is None and n_channels > MAX_CHANNELS:
-        raise ConfigError(
-            f"{teacher.path} has {n_channels} channels, at most {MAX_CHANNELS} can be rendered; run it through "
-            "`chebsplat run`, or make its projection with `chebsplat projection` and pass --in-projection"
         )
     if projection is not None and len(projection.matrix) != n_channels:
         raise InputError(

@@ -15,6 +15,7 @@ figcaption { font-size: .8em; color: #4a5568 } .key { display: inline-block; mar
 <h1>{{ name }}</h1>
 <p>Source: <b>{{ source.kind }}</b>{% if source.seed is defined %}, preset {{ source.preset }}, seed {{ source.seed }}{% endif %}.
 Protocol <b>{{ protocol.name }}</b>, split: {{ protocol.split }}.
+{% if teacher %}2D teacher: <b>{{ teacher[0] }}</b>, {{ teacher[1] }}.{% endif %}
 {% for note in source.notes or [] %}{{ note }} {% endfor %}</p>
 <h2>Figures on the test views</h2>
 <table><tr><th>figure</th><th class="n">scene</th><th class="n">2D teacher</th></tr>

@@ -32,11 +32,10 @@ def run(job: Job) -> None:
     from chebsplat.formats.projection import Projection, write_projection
     from chebsplat.formats.teacher_model import read_teacher
     from chebsplat.stages.image_encoder import ImageEncoder
+    from chebsplat.teachers import EMBEDDED
 
     settings = job.config.projection
-    if settings.model is None:
-        raise ConfigError("projection.model is missing; name the teacher's .onnx file")
-    teacher = read_teacher(Path(settings.model))
+    teacher = read_teacher(Path(settings.model) if settings.model else EMBEDDED)
     if teacher.output != "features":
         raise ConfigError(f"{teacher.settings}: output is {teacher.output}; only a teacher of features is projected")
     words = vocabulary(job, teacher)
@@ -107,7 +106,9 @@ def reference_files(folder: Path) -> list[Path]:
 def reference(settings: ProjectionSection) -> tuple[Iterator[tuple[str, np.ndarray]], int]:
     """(name, image u8 [H, W, 3]) one by one, and how many."""
     if settings.reference is None:
-        return generated(settings.n_rooms), settings.n_rooms * VIEWS
+        from chebsplat.synthetic.seeds import REFERENCE
+
+        return generated(REFERENCE[: settings.n_rooms]), settings.n_rooms * VIEWS
     files = reference_files(Path(settings.reference))
     return photos(files), len(files)
 
@@ -125,15 +126,14 @@ def photos(files: list[Path]) -> Iterator[tuple[str, np.ndarray]]:
         yield str(file), pixels
 
 
-def generated(n_rooms: int) -> Iterator[tuple[str, np.ndarray]]:
-    """Views of rooms whose seeds serve nothing else, offices and living rooms in turn."""
+def generated(seeds: range) -> Iterator[tuple[str, np.ndarray]]:
+    """Views of generated rooms, offices and living rooms in turn."""
     from chebsplat.formats.meshes import RayCaster
     from chebsplat.stages.sources.generated import SIZES, photograph
     from chebsplat.synthetic.layout import build
     from chebsplat.synthetic.path import intrinsics, walk
-    from chebsplat.synthetic.seeds import REFERENCE
 
-    for seed in REFERENCE[:n_rooms]:
+    for seed in seeds:
         preset = ("office", "room")[seed % 2]
         _, width, height = SIZES[preset]
         room = build(preset, seed)

@@ -65,10 +65,14 @@ def understood(path: Path, text: str, phrases: list[str]) -> Query:
     features = read_features(path)
     if features.convention["kind"] == "labels" or features.convention.get("output") == "logits":
         return among_labels(features, text, phrases)
-    phrases = phrases or list(CANONICAL)
-    settings = read_manifest(path).config["teacher"]
-    vectors = embedded([text, *phrases], features, settings.get("model"))
-    return Query(text, vectors[0], phrases, vectors[1:])
+    model = read_manifest(path).config["teacher"]["model"]
+    try:
+        vectors = embedded([text, *(phrases or CANONICAL)], features, model)
+    except InputError as error:
+        if phrases or repr(CANONICAL[0]) not in str(error):
+            raise
+        raise InputError(f"{error}; or choose with --against what the query is weighed against") from None
+    return Query(text, vectors[0], phrases or list(CANONICAL), vectors[1:])
 
 
 def embedded(words: list[str], features: Features, model: str | None) -> np.ndarray:

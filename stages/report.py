@@ -63,6 +63,7 @@ def run(job: Job) -> None:
         name=figures["source"].get("name") or figures["source"].get("kind", "scene"),
         source=figures["source"],
         protocol=figures["protocol"],
+        teacher=teacher_words(manifests["features"].facts) if "features" in manifests else None,
         rows=rows[1:],
         segmentation=segmentation,
         legend=legend,
@@ -79,6 +80,15 @@ def run(job: Job) -> None:
         known = manifests["descriptors"].facts
         names = ("spectrum", "n_cuts", "n_cuts_in_clusters", "n_in_float64")
         job.facts["descriptors"] = {name: known[name] for name in names if name in known}
+
+
+def teacher_words(facts: dict[str, Any]) -> tuple[str, str]:
+    """(name, in a few words what it is) of the 2D teacher."""
+    convention = facts["convention"]
+    if facts["kind"] == "labels":
+        return "noisy labels", f"the source's own with {convention['confusion']:.0%} of the segments confused"
+    views = f"{convention['n_scales']} scale(s){', flips' if convention['flips'] else ''}"
+    return convention["teacher"], f"ONNX {convention['output']} of {views}, {facts['n_labels']} labels"
 
 
 def absent_stages(job: Job, gaussians: Gaussians) -> dict[str, str]:

@@ -44,7 +44,7 @@ def from_encoder(job: Job, capture: Capture, settings: TeacherSection) -> None:
     from chebsplat.formats.teacher_model import read_teacher
     from chebsplat.stages.command import n_threads
     from chebsplat.stages.image_encoder import ImageEncoder
-    from chebsplat.stages.label_space import closed_set, label_set, open_vocabulary
+    from chebsplat.stages.label_space import MAX_CHANNELS, closed_set, label_set, open_vocabulary
     from chebsplat.teachers import EMBEDDED
 
     teacher = read_teacher(Path(settings.model) if settings.model else EMBEDDED)
@@ -57,6 +57,11 @@ def from_encoder(job: Job, capture: Capture, settings: TeacherSection) -> None:
     else:
         if "projection" in job.inputs:
             projection = read_projection(job.inputs["projection"])
+        elif n_channels > MAX_CHANNELS:
+            raise ConfigError(
+                f"{teacher.path} has {n_channels} channels, at most {MAX_CHANNELS} can be rendered; use "
+                "`chebsplat run`, or make its projection with `chebsplat projection` and pass --in-projection"
+            )
         labels = label_set(teacher, settings.labels, capture.class_names)
         space = open_vocabulary(teacher, labels, n_channels, projection)
     convention = {

@@ -62,7 +62,7 @@ def forms(name: str) -> Iterator[str]:
     """What to look a name up as: itself, then what its last word may be the plural of."""
     whole = folded(name)
     yield whole
-    for plural, singular in (("ies", "y"), ("ves", "f"), ("es", ""), ("s", "")):
+    for plural, singular in (("ies", "y"), ("ves", "f"), ("ves", "fe"), ("es", ""), ("s", "")):
         if whole.endswith(plural) and not whole.endswith("ss") and len(whole) > len(plural) + 2:
             yield whole[: -len(plural)] + singular
 

@@ -20,6 +20,7 @@ TOY = {
 INPUTS = {
     "ingest": {},
     "sfm": {"capture": "ingest"},
+    "projection": {},
     "teacher": {"capture": "ingest"},
     "describe": {"points": "sfm"},
     "train": {"capture": "ingest", "points": "sfm", "features": "teacher", "descriptors": "describe"},
@@ -27,7 +28,13 @@ INPUTS = {
     "onnx": {"gaussians": "train"},
     "cks": {"gaussians": "train"},
     "evaluate": {"capture": "ingest", "scene": "export", "features": "teacher"},
-    "report": {"evaluation": "evaluate", "gaussians": "train", "scene": "export", "encoder": "onnx"},
+    "report": {
+        "evaluation": "evaluate",
+        "gaussians": "train",
+        "scene": "export",
+        "encoder": "onnx",
+        "features": "teacher",
+    },
 }
 
 

@@ -170,3 +170,13 @@ def test_propagation_weights_do_not_depend_on_units_and_stay_finite(unit, temper
     torch.testing.assert_close(weights.sum(1), covered.float())
     (weights * torch.rand(weights.shape, generator=g)).sum().backward()
     assert torch.isfinite(means.grad).all()
+
+
+def test_labels_are_told_in_parts_as_they_are_in_one():
+    rng = np.random.default_rng(5)
+    features, embeddings = rng.normal(size=(60, 80, 3)), rng.normal(size=(2000, 3))
+    embeddings /= np.linalg.norm(embeddings, axis=1, keepdims=True)
+    labels, confidence = decode(features, embeddings)
+    cosines = features / np.linalg.norm(features, axis=-1, keepdims=True) @ embeddings.T
+    assert np.array_equal(labels, cosines.argmax(-1))
+    assert np.allclose(confidence, 1 / np.exp((cosines - cosines.max(-1, keepdims=True)) / 0.1).sum(-1))

@@ -17,7 +17,7 @@ from chebsplat.pipelines.plan import CONFIGS, Planner, names, overrides, read_to
 from chebsplat.pipelines.run import failures
 from chebsplat.stages.registry import STAGES
 
-ALL = [stage for stage in STAGES if stage != "cks"]
+ALL = [stage for stage in STAGES if stage not in ("projection", "cks")]  # of a scene: a projection is its teacher's
 AFTER_TRAIN = ["train", "export", "onnx", "evaluate", "report"]
 
 
@@ -199,7 +199,7 @@ def test_paths_are_those_of_the_user_s_folder_not_of_the_stage_s(tmp_path, monke
         (tmp_path / name).write_text('labels = "table.npz"  # another')
         again = Planner().plan("toy", settings)
         changed = [a.stage for a, b in zip(plan.steps, again.steps, strict=True) if a.key != b.key]
-        assert changed == ["teacher", *AFTER_TRAIN]
+        assert changed == [*(["projection"] if name != "names.txt" else []), "teacher", *AFTER_TRAIN]
         plan = again
 
 
@@ -255,17 +255,19 @@ def test_generated_and_replica_scenes_never_share_a_key(tmp_path, monkeypatch):
     monkeypatch.setenv("REPLICA_ROOT", str(tmp_path / "replica"))
     real = Planner().plan("office0")
     assert "replica" in real.source
-    assert not {s.key for s in generated.steps} & {s.key for s in real.steps}
+    keys = {s.key for s in generated.steps}
+    shared = {s.stage for s in real.steps if s.key in keys}
+    assert shared == {"projection"}  # the teacher's, not the scene's
 
 
 @pytest.mark.parametrize(
     ("settings", "left_out"),
     [
-        ("", {"cks"}),
-        ("train.semantics=false", {"teacher", "describe", "onnx", "cks"}),
-        ("teacher.kind=none", {"teacher", "describe", "onnx", "cks"}),
-        ("train.encoder=off", {"describe", "onnx", "cks"}),
-        ("train.albo=false", {"describe", "cks"}),
+        ("", {"projection", "cks"}),
+        ("train.semantics=false", {"projection", "teacher", "describe", "onnx", "cks"}),
+        ("teacher.kind=none", {"projection", "teacher", "describe", "onnx", "cks"}),
+        ("train.encoder=off", {"projection", "describe", "onnx", "cks"}),
+        ("train.albo=false", {"projection", "describe", "cks"}),
     ],
 )
 def test_a_scene_leaves_out_what_it_does_not_need_and_says_why(settings, left_out):

@@ -105,6 +105,13 @@ def without_depth(toy, tmp):
     return {"capture": published(tmp / "c", "chebsplat.capture/1", write_capture, record)}, TOY
 
 
+def teacher_of_nothing(toy, tmp):
+    from tiny_teachers import color_reference, color_teacher
+
+    model = color_teacher(tmp, weights=np.zeros((3, 3)))
+    return {}, {"projection": {"model": str(model), "reference": str(color_reference(tmp / "reference"))}}
+
+
 def without_labels(toy, tmp):
     record = read_capture(toy["ingest"])
     record.labels = None
@@ -160,6 +167,7 @@ def without_trace(toy, tmp):
 FAILURES = {
     "ingest": one_photo,
     "sfm": without_depth,
+    "projection": teacher_of_nothing,
     "teacher": without_labels,
     "describe": without_points,
     "train": only_test_views,
@@ -204,6 +212,7 @@ def test_the_report_is_one_page_with_pictures_curve_and_what_was_left_out(toy):
     assert text.count("data:image/png;base64") >= 4
     assert "http://" not in text.replace("http://www.w3.org", "").replace("http://purl.org", "").replace("http://creativecommons.org", "")  # fmt: skip  # noqa: E501
     assert "no sequence is named" in text
+    assert "2D teacher: <b>noisy labels</b>" in text
     assert "LPIPS" in text
     assert (toy["report"] / "figures.csv").read_text().startswith("figure,")
 

@@ -33,6 +33,8 @@ def test_a_wheel_mounts_every_layer_under_chebsplat(tmp_path):
         "chebsplat/pipelines/Snakefile",
         "chebsplat/pipelines/profiles/default/config.yaml",
         "chebsplat/pipelines/configs/scenes/office0.toml",
+        "chebsplat/teachers/embedded.npz",
+        "chebsplat/teachers/labels/ade20k.txt",
     ):
         assert wanted in names
     assert not any("test" in name for name in names)

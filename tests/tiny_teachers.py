@@ -45,3 +45,15 @@ def color_teacher(folder, stride=4, channels=3, weights=None, shape=(1, 3, "H", 
     write_model(path, [node], shape=shape, constants={"kernel": kernel.astype(np.float32)})
     write_settings(path, **({"multiple": stride} | settings))
     return path
+
+
+def color_reference(folder, n_images=2, size=(48, 64)):
+    """A folder of images of coloured noise in blocks."""
+    from PIL import Image
+
+    folder.mkdir()
+    rng = np.random.default_rng(0)
+    for k in range(n_images):
+        blocks = rng.integers(0, 256, (size[0] // 8, size[1] // 8, 3), dtype=np.uint8)
+        Image.fromarray(np.kron(blocks, np.ones((8, 8, 1), np.uint8))).save(folder / f"{k}.png")
+    return folder

@@ -1,0 +1,84 @@
+"""One image through a teacher, before a scene is: what it is, what it costs, what it sees."""
+
+from __future__ import annotations
+
+import time
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from chebsplat.errors import InputError
+
+if TYPE_CHECKING:
+    import numpy as np
+
+SHOWN = 8  # labels
+
+
+def check(model: Path, photo: Path | None = None, labels: str | None = None) -> list[tuple[str, str]]:
+    """(what, finding) of a teacher. Raises what the teacher stage would.
+
+    Args: photo: None: a view of a generated room; labels: as teacher.labels, None: the teacher's own.
+    """
+    import numpy as np
+
+    from chebsplat.formats.teacher_model import read_teacher
+    from chebsplat.stages.command import n_threads
+    from chebsplat.stages.config import TeacherSection
+    from chebsplat.stages.image_encoder import ImageEncoder
+    from chebsplat.stages.label_space import MAX_CHANNELS, closed_set, label_set, open_vocabulary
+
+    settings = TeacherSection()
+    teacher = read_teacher(model)
+    encoder = ImageEncoder(teacher, n_threads())
+    name, image = shown(photo)
+    grid, n_channels = encoder.grid(image, settings.downscale)
+    if teacher.output == "logits":
+        asked = label_set(teacher, labels, None) if labels else None
+        space = closed_set(teacher, asked, n_channels, settings.n_channels)
+    else:
+        space = open_vocabulary(teacher, label_set(teacher, labels, None), n_channels, None)
+    began = time.perf_counter()
+    _, found, confidence = space.split(encoder.encode(image, grid, settings.scales, settings.flips, name))
+    seconds = time.perf_counter() - began
+    size = encoder.scaled_size(image, 1.0)
+    window = encoder.window(size)
+    counts = np.bincount(found.ravel(), minlength=len(space.names))
+    seen = [f"{space.names[k]} {counts[k] / found.size:.0%}" for k in np.argsort(-counts, kind="stable")[:SHOWN] if counts[k]]  # fmt: skip  # noqa: E501
+    wide = teacher.output == "features" and n_channels > MAX_CHANNELS
+    return [
+        ("name", f"{teacher.name} ({model}, {model.stat().st_size / 2**20:.1f} MB)"),
+        ("output", f"{teacher.output}, {n_channels} channels" + (", projected to fewer in a scene" if wide else "")),
+        ("image", f"{name}, {image.shape[1]} x {image.shape[0]}, seen at {size[1]} x {size[0]}"),
+        (
+            "windows",
+            f"{n_windows(size, window)} of {window[1]} x {window[0]}{'' if encoder.size else ' (any size)'}",
+        ),
+        ("map", f"{grid[1]} x {grid[0]}: one feature every {image.shape[0] / grid[0]:.3g} pixels"),
+        ("labels", f"{len(space.names)}, from {labels or teacher.labels}"),
+        ("seconds", f"{seconds:.2f} a view, on {n_threads()} threads"),
+        ("sees", f"{', '.join(seen)} (mean confidence {confidence.mean():.2f})"),
+    ]
+
+
+def n_windows(size: tuple[int, int], window: tuple[int, int]) -> int:
+    from chebsplat.tiling import window_starts
+
+    rows, columns = (window_starts(n, side) for n, side in zip(size, window, strict=True))
+    return len(rows) * len(columns)
+
+
+def shown(photo: Path | None) -> tuple[str, np.ndarray]:
+    """(name, image u8 [H, W, 3])."""
+    import numpy as np
+    from PIL import Image
+
+    from chebsplat.stages.projection import generated
+    from chebsplat.synthetic.seeds import REFERENCE
+
+    if photo is None:
+        return next(generated(REFERENCE[:1]))
+    try:
+        with Image.open(photo) as image:
+            return photo.name, np.asarray(image.convert("RGB"))
+    except OSError as error:
+        raise InputError(f"{photo} is not an image ({error}); give another --photo") from None

@@ -1,0 +1,125 @@
+"""The projection is the teacher's: every scene of a teacher shares one, and nothing of a scene changes it."""
+
+import hashlib
+
+import numpy as np
+import pytest
+from shared import ROOT, run_stage
+from tiny_teachers import color_reference, color_teacher, write_settings, write_table
+
+from chebsplat.formats.artifact import read_manifest
+from chebsplat.formats.projection import SCHEMA, read_projection
+from chebsplat.pipelines.plan import Planner
+from chebsplat.stages.projection import IMAGES, generated
+from chebsplat.synthetic import seeds
+
+
+@pytest.fixture
+def tiny(tmp_path, monkeypatch):
+    """(model, reference) of a teacher whose 6 channels span 3."""
+    monkeypatch.setenv("CHEBSPLAT_WORK", str(tmp_path / "work"))
+    monkeypatch.delenv("REPLICA_ROOT", raising=False)
+    monkeypatch.chdir(ROOT)
+    rng = np.random.default_rng(0)
+    mixing = np.linalg.qr(rng.normal(size=(6, 6)))[0][:, :3]
+    model = color_teacher(tmp_path, weights=mixing)
+    write_table(tmp_path / "tiny.npz", embeddings=np.array([[1, -1, -1], [-1, 1, -1], [-1, -1, 1]]) @ mixing.T)
+    return model, color_reference(tmp_path / "reference")
+
+
+def projected(tmp_path, model, reference, **settings):
+    values = {"model": str(model), "reference": None if reference is None else str(reference)} | settings
+    code = run_stage("projection", tmp_path / "out", {}, {"projection": {k: v for k, v in values.items() if v}})
+    return code, read_projection(tmp_path / "out") if code == 0 else None
+
+
+def test_a_teacher_is_projected_to_the_channels_that_its_features_span(tmp_path, tiny):
+    code, found = projected(tmp_path, *tiny)
+    assert code == 0
+    assert found.matrix.shape == (6, 3)
+    assert found.energy[2] == pytest.approx(1)
+    assert (found.notes["n_pixels"], found.notes["n_words"], found.notes["n_images"]) == (2 * 12 * 16, 3, 2)
+    facts = read_manifest(tmp_path / "out", SCHEMA).facts
+    assert (facts["n_channels"], facts["of"], facts["label_agreement"]) == (3, 6, 1.0)
+    assert facts["relative_error"] < 1e-3
+
+
+def test_fewer_channels_lose_what_the_facts_say(tmp_path, tiny):
+    _, found = projected(tmp_path, *tiny, n_channels=2)
+    facts = read_manifest(tmp_path / "out", SCHEMA).facts
+    assert found.matrix.shape == (6, 2)
+    assert facts["relative_error"] == pytest.approx((1 - found.energy[1]) ** 0.5, rel=1e-4)
+    assert 0.05 < facts["relative_error"] < 1
+    assert facts["label_agreement"] > 0.95  # three words differ in two directions
+
+
+def test_a_teacher_without_a_table_is_projected_by_energy_alone(tmp_path, tiny):
+    model, reference = tiny
+    tokens = model.with_name("tokenizer.json")
+    tokens.write_text("{}")
+    write_settings(model, multiple=4, labels=None, text=model.name, tokenizer=tokens.name)
+    code, _ = projected(tmp_path, model, reference)
+    assert code == 0
+    facts = read_manifest(tmp_path / "out", SCHEMA).facts
+    assert "vocabulary" in facts["left_out"]
+    assert facts["n_words"] == 0
+
+
+@pytest.mark.parametrize("bad", ["empty folder", "not an image", "other channels", "zero word", "closed set"])
+def test_what_cannot_be_projected_is_named(tmp_path, tiny, bad, capsys):
+    model, reference = tiny
+    named = reference
+    if bad == "empty folder":
+        for image in reference.iterdir():
+            image.unlink()
+    elif bad == "not an image":
+        named = reference / "a.png"
+        named.write_text("hello")
+    elif bad in ("other channels", "zero word"):
+        named = tmp_path / "tiny.npz"
+        write_table(named, embeddings=np.eye(3, 5) if bad == "other channels" else np.zeros((3, 6)))
+    else:
+        write_settings(model, output="logits")
+        named = model.with_suffix(".toml")
+    code, _ = projected(tmp_path, model, reference)
+    assert code == (2 if bad == "closed set" else 3)
+    assert str(named) in capsys.readouterr().err
+    assert not (tmp_path / "out").exists()
+
+
+def test_the_reference_rooms_are_the_same_every_time_and_serve_nothing_else():
+    digests = [[hashlib.sha256(image.tobytes()).digest() for _, image in generated(range(8000, 8001))] for _ in "ab"]
+    assert digests[0] == digests[1]
+    assert len(set(digests[0])) == len(digests[0]) > 1
+    ranges = [set(seeds.SCENES), set(seeds.REFERENCE), set(seeds.HELD_OUT), set(seeds.TRAINING)]
+    assert sum(map(len, ranges)) == len(set().union(*ranges))
+
+
+def key(scene, settings, stage="projection"):
+    return next(step.key for step in Planner().plan(scene, settings).steps if step.stage == stage)
+
+
+def test_scenes_share_one_projection_which_only_its_teacher_changes(tmp_path, tiny):
+    model, reference = tiny
+    settings = f"teacher.kind=onnx,teacher.model={model}"
+    shared = key("toy", settings)
+    changes = ["source.seed=7", "ingest.test_every=5", "train.steps=9", "teacher.downscale=8", "teacher.flips=true"]
+    assert {key(scene, settings) for scene in ("office0", "room0")} == {shared}
+    assert {key("toy", f"{settings},{change}") for change in changes} == {shared}
+    assert key("toy", f"{settings},projection.n_channels=2") != shared
+    of_photos = key("toy", f"{settings},projection.reference={reference}")
+    (reference / f"again{IMAGES[-1]}").write_bytes((reference / "0.png").read_bytes())
+    assert len({shared, of_photos, key("toy", f"{settings},projection.reference={reference}")}) == 3
+    before = key("toy", settings, "teacher")
+    write_table(tmp_path / "tiny.npz", embeddings=np.eye(3, 6))
+    assert key("toy", settings) != shared
+    assert key("toy", settings, "teacher") != before
+
+
+def test_a_closed_set_teacher_and_labels_need_no_projection(tiny):
+    model, _ = tiny
+    assert "projection" in Planner().plan("toy").left_out
+    write_settings(model, output="logits")
+    plan = Planner().plan("toy", f"teacher.kind=onnx,teacher.model={model}")
+    assert "closed-set" in plan.left_out["projection"]
+    assert all("projection" not in step.inputs for step in plan.steps)

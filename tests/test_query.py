@@ -1,0 +1,196 @@
+"""`chebsplat query` finds what words mean in a finished scene, or says why it cannot."""
+
+import logging
+import shutil
+
+import numpy as np
+import pytest
+from click.testing import CliRunner
+from PIL import Image
+
+from chebsplat.formats import artifact
+from chebsplat.formats.artifact import Manifest, sha256_file
+from chebsplat.formats.cameras import Cameras
+from chebsplat.formats.capture import Capture, write_capture
+from chebsplat.formats.features import Features, write_features
+from chebsplat.formats.projection import Projection
+from chebsplat.formats.scene import Scene, write_scene
+from chebsplat.pipelines.cli import main
+from chebsplat.relevancy import relevancy
+
+EMBEDDINGS = {
+    "chair": [1, 0, 0, 0, 0, 0], "sofa": [0.8, 0.6, 0, 0, 0, 0], "wall": [0, 0, 1, 0, 0, 0],
+    "seat": [0.9, 0.4, 0, 0, 0.17, 0], "object": [0.3, 0, 0.3, 0.9, 0, 0], "things": [0, 0.3, 0.2, 0.9, 0, 0.2],
+    "stuff": [0, 0, 0.3, 0.95, 0, 0], "texture": [0, 0, 0.5, 0.87, 0, 0],
+}  # fmt: skip
+LABELS = ["chair", "sofa", "wall"]
+CANONICAL = ["object", "things", "stuff", "texture"]
+N = 12  # Gaussians of a label
+SIZE = (32, 48)
+
+
+@pytest.fixture(autouse=True)
+def _release_logging():
+    yield
+    logging.getLogger().handlers.clear()
+
+
+def vectors(names):
+    rows = np.array([EMBEDDINGS[name] for name in names], np.float32)
+    return rows / np.linalg.norm(rows, axis=1, keepdims=True)
+
+
+def published(path, schema, write, record, **facts):
+    with artifact.publish(path, Manifest(f"chebsplat.{schema}/1", "k", "test", **facts)) as tmp:
+        write(tmp, record)
+
+
+def write_toy(folder, teacher=None):
+    """A chair left, a sofa in the middle, a wall right; four of the teacher's six channels, or codes of labels."""
+    rng = np.random.default_rng(0)
+    means = np.concatenate([rng.normal([x, 0, 4], 0.15, (N, 3)) for x in (-1.2, 0, 1.2)]).astype(np.float32)
+    labels = np.repeat(np.arange(3), N).astype(np.int32)
+    matrix = np.eye(6, 4, dtype=np.float32)
+    projection = Projection(matrix, matrix.T.copy(), np.ones(6, np.float32), "toy", {})
+    known = vectors(LABELS) if teacher is None else projection.embed(vectors(LABELS))
+    n = len(means)
+    parameters = {
+        "means": means, "log_scales": np.full((n, 3), -1.6, np.float32), "quats": np.eye(4, dtype=np.float32)[[0] * n],
+        "logit_opacities": np.full(n, 4, np.float32), "sh0": rng.normal(0, 0.3, (n, 1, 3)).astype(np.float32),
+        "shN": np.zeros((n, 15, 3), np.float32), "degrees": np.zeros(n, np.uint8), "features": known[labels],
+    }  # fmt: skip
+    K = np.array([[40, 0, SIZE[1] / 2], [0, 40, SIZE[0] / 2], [0, 0, 1]], float)
+    views, Ks, poses = ["a.png", "b.png"], np.stack([K, K]), np.stack([np.eye(4)] * 2)
+    scene = Scene(parameters, Cameras(views, Ks, poses, SIZE[1], SIZE[0]), labels, LABELS, known)
+    published(folder / "export", "scene", write_scene, scene)
+    capture = Capture(views, np.zeros((2, *SIZE, 3), np.uint8), Ks, poses, np.array([False, True]))
+    published(folder / "ingest", "capture", write_capture, capture)
+    convention, model = {"kind": "labels"}, None
+    if teacher is not None:
+        convention, model = {"kind": "onnx", "output": "features", "sha256": sha256_file(teacher)}, str(teacher)
+    features = Features(
+        views, np.zeros((2, 2, 2, known.shape[1]), np.float16), LABELS, known, convention=convention,
+        projection=None if teacher is None else projection,
+    )  # fmt: skip
+    published(folder / "teacher", "features", write_features, features, config={"teacher": {"model": model}})
+
+
+@pytest.fixture(scope="module")
+def made(tmp_path_factory):
+    """Folders `words` and `labels` of scenes, beside the teacher's files."""
+    root = tmp_path_factory.mktemp("query")
+    model = root / "toy.onnx"
+    model.write_bytes(b"not run by a query")
+    model.with_suffix(".toml").write_text('labels = "toy.npz"\n')
+    np.savez(root / "toy.npz", names=np.array(list(EMBEDDINGS)), embeddings=vectors(EMBEDDINGS))
+    write_toy(root / "words", model)
+    write_toy(root / "labels")
+    return root
+
+
+@pytest.fixture
+def folder(made, tmp_path, monkeypatch):
+    """A copy that a test may damage; names are looked up in it."""
+    shutil.copytree(made, tmp_path / "work")
+    (tmp_path / "work/store/export").mkdir(parents=True)  # no scene, though it looks like one
+    monkeypatch.setenv("CHEBSPLAT_WORK", str(tmp_path / "work"))
+    teacher = tmp_path / "work/words/teacher"
+    manifest = (teacher / "artifact.json").read_text()
+    (teacher / "artifact.json").write_text(manifest.replace(str(made), str(tmp_path / "work")))
+    return tmp_path / "work"
+
+
+def held_in(out):
+    with np.load(out / "relevancy.npz") as arrays:
+        return dict(arrays)
+
+
+def asked(*arguments):
+    return CliRunner().invoke(main, ["query", *map(str, arguments)])
+
+
+def test_a_word_is_found_in_the_scene_and_in_its_test_views(folder):
+    done = asked("words", "seat")
+    out = folder / "words/query/seat"
+    assert (done.exit_code, done.stdout) == (0, f"{out}\n")
+    held = held_in(out)
+    assert held["relevancy"].dtype == np.float32
+    assert held["relevancy"].shape == (3 * N,)
+    assert (str(held["query"]), held["against"].tolist()) == ("seat", CANONICAL)
+    assert held["relevancy"][: 2 * N].min() > 0.9
+    assert held["relevancy"][2 * N :].max() < 0.1
+    assert [path.name for path in (out / "heat").iterdir()] == ["b.png"]  # a.png is of training
+    heat = np.asarray(Image.open(out / "heat/b.png")).astype(int)
+    colored = np.ptp(heat, axis=-1) > 40
+    middle = SIZE[0] // 2
+    assert heat.shape == (*SIZE, 3)
+    assert colored[middle, 12] and colored[middle, 24]
+    assert not colored[:, 34:].any()
+    assert np.asarray(Image.open(out / "sheet.png")).shape == (28 + SIZE[0], 2 * SIZE[1], 3)
+
+
+def test_the_table_tells_the_labels_that_fit_best(folder):
+    lines = asked("words", "seat", "--top", 2).stderr.splitlines()
+    assert f"{2 * N} of {3 * N} Gaussians" in "".join(lines)
+    rows = [line.split()[1] for line in lines[-2:]]
+    assert rows == ["sofa", "chair"]
+
+
+def test_a_projection_that_holds_the_features_leaves_relevancy_as_it_is(folder):
+    asked("words", "seat")
+    own = relevancy(vectors(LABELS).repeat(N, 0), vectors(["seat"])[0], vectors(CANONICAL))
+    assert np.allclose(held_in(folder / "words/query/seat")["relevancy"], own, atol=2e-3)
+
+
+def test_what_it_is_weighed_against_and_where_it_goes_can_be_chosen(folder, tmp_path):
+    done = asked(folder / "words", "seat", "--against", "sofa, wall", "--out", tmp_path / "elsewhere")
+    assert done.stdout == f"{tmp_path / 'elsewhere'}\n"
+    held = held_in(tmp_path / "elsewhere")
+    assert held["against"].tolist() == ["sofa", "wall"]
+    assert held["relevancy"][N : 2 * N].max() < 0.5 < held["relevancy"][:N].min()
+
+
+def test_a_scene_of_labels_is_asked_for_a_label_against_the_others(folder):
+    assert asked("labels", "Sofa").exit_code == 0
+    held = held_in(folder / "labels/query/Sofa")
+    assert held["against"].tolist() == ["chair", "wall"]
+    assert np.all((held["relevancy"] > 0.5) == (np.arange(3 * N) // N == 1))
+
+
+def remove_teacher(folder):
+    shutil.rmtree(folder / "words/teacher")
+
+
+def other_model(folder):
+    (folder / "toy.onnx").write_bytes(b"another")
+
+
+def small_table(folder):
+    np.savez(folder / "toy.npz", names=np.array(LABELS), embeddings=vectors(LABELS))
+
+
+def nothing(folder):
+    pass
+
+
+@pytest.mark.parametrize(
+    ("damage", "arguments", "code", "said"),
+    [
+        (nothing, ["labels", "something to sit on"], 2, "no label of this scene"),
+        (nothing, ["labels", "something to sit on"], 2, "teacher.kind=auto"),
+        (nothing, ["words", "seatz"], 3, "near: seat"),
+        (nothing, ["word", "seat"], 2, "there is words"),
+        (nothing, ["store", "seat"], 2, "no finished scene"),
+        (nothing, ["words", " "], 2, "empty"),
+        (remove_teacher, ["words", "seat"], 3, "teacher is missing"),
+        (other_model, ["words", "seat"], 3, "toy.onnx is not the model"),
+        (small_table, ["words", "sofa"], 3, "choose with --against"),
+    ],
+)
+def test_what_cannot_be_answered_is_told_with_the_remedy(folder, damage, arguments, code, said):
+    damage(folder)
+    done = asked(*arguments)
+    assert done.exit_code == code
+    assert said in done.stderr
+    assert not done.stdout
+    assert not list(folder.glob("*/query"))

