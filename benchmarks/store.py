@@ -96,7 +96,7 @@ def embedded(n_views: int) -> tuple[np.ndarray, Iterator[np.ndarray], Iterator[n
             yield encoder.encode(image, encoder.grid(image, 4)[0], (1.0,), False, name)
 
     n_rooms = -(-n_views // VIEWS)
-    return unit(words), features(REFERENCE[: REFERENCES // 2]), features(HELD_OUT[:n_rooms])
+    return unit(words), features(REFERENCE[: REFERENCES // VIEWS]), features(HELD_OUT[:n_rooms])
 
 
 def measured(name: str, words: np.ndarray, references: Iterator, views: list[np.ndarray]) -> list[dict]:

@@ -128,6 +128,9 @@ def photos(files: list[Path]) -> Iterator[tuple[str, np.ndarray]]:
 
 def generated(seeds: range) -> Iterator[tuple[str, np.ndarray]]:
     """Views of generated rooms, offices and living rooms in turn."""
+    from concurrent.futures import ThreadPoolExecutor
+    from functools import partial
+
     from chebsplat.formats.meshes import RayCaster
     from chebsplat.stages.sources.generated import SIZES, photograph
     from chebsplat.synthetic.layout import build
@@ -138,8 +141,10 @@ def generated(seeds: range) -> Iterator[tuple[str, np.ndarray]]:
         _, width, height = SIZES[preset]
         room = build(preset, seed)
         caster, K = RayCaster(room.soup.vertices, room.soup.triangles), intrinsics(width, height)
-        for view, pose in enumerate(walk(room.size, VIEWS, seed)):
-            yield f"room {seed}, view {view}", photograph(room, caster, K, pose, width, height)[0]
+        shoot = partial(photograph, room, caster, K, width=width, height=height)
+        with ThreadPoolExecutor(VIEWS) as pool:
+            for view, (image, _, _) in enumerate(pool.map(shoot, walk(room.size, VIEWS, seed))):
+                yield f"room {seed}, view {view}", image
 
 
 main = command("projection", run)

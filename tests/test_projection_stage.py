@@ -95,25 +95,25 @@ def test_the_reference_rooms_are_the_same_every_time_and_serve_nothing_else():
     assert sum(map(len, ranges)) == len(set().union(*ranges))
 
 
-def key(scene, settings, stage="projection"):
-    return next(step.key for step in Planner().plan(scene, settings).steps if step.stage == stage)
+def key(planner, scene, settings, stage="projection"):
+    return next(step.key for step in planner.plan(scene, settings).steps if step.stage == stage)
 
 
 def test_scenes_share_one_projection_which_only_its_teacher_changes(tmp_path, tiny):
-    model, reference = tiny
+    planner, (model, reference) = Planner(), tiny
     settings = f"teacher.kind=onnx,teacher.model={model}"
-    shared = key("toy", settings)
+    shared = key(planner, "toy", settings)
     changes = ["source.seed=7", "ingest.test_every=5", "train.steps=9", "teacher.downscale=8", "teacher.flips=true"]
-    assert {key(scene, settings) for scene in ("office0", "room0")} == {shared}
-    assert {key("toy", f"{settings},{change}") for change in changes} == {shared}
-    assert key("toy", f"{settings},projection.n_channels=2") != shared
-    of_photos = key("toy", f"{settings},projection.reference={reference}")
+    assert {key(planner, scene, settings) for scene in ("office0", "room0")} == {shared}
+    assert {key(planner, "toy", f"{settings},{change}") for change in changes} == {shared}
+    assert key(planner, "toy", f"{settings},projection.n_channels=2") != shared
+    of_photos = key(planner, "toy", f"{settings},projection.reference={reference}")
     (reference / f"again{IMAGES[-1]}").write_bytes((reference / "0.png").read_bytes())
-    assert len({shared, of_photos, key("toy", f"{settings},projection.reference={reference}")}) == 3
-    before = key("toy", settings, "teacher")
+    assert len({shared, of_photos, key(planner, "toy", f"{settings},projection.reference={reference}")}) == 3
+    before = key(planner, "toy", settings, "teacher")
     write_table(tmp_path / "tiny.npz", embeddings=np.eye(3, 6))
-    assert key("toy", settings) != shared
-    assert key("toy", settings, "teacher") != before
+    assert key(planner, "toy", settings) != shared
+    assert key(planner, "toy", settings, "teacher") != before
 
 
 def test_a_closed_set_teacher_and_labels_need_no_projection(tiny):
