@@ -374,7 +374,7 @@ def test_check_teacher_tells_what_a_teacher_is_and_sees(tmp_path):
     model, photo = color_teacher(tmp_path, size=[32, 32]), ["--photo", str(tmp_path / "photo.png")]
     told = CliRunner().invoke(main, ["check-teacher", str(model), *photo])
     assert told.exit_code == 0
-    for what in ("tiny (", "features, 3 channels", "64 x 48", "4 of 32 x 32", "16 x 12", "3, from", "blue 100%"):
+    for what in ("tiny (", "features, 3 channels", "64 x 48", "6 of 32 x 32", "16 x 12", "3, from", "blue 100%"):
         assert what in told.stdout
     model.with_suffix(".toml").unlink()
     assert CliRunner().invoke(main, ["check-teacher", str(model), *photo]).exit_code == 3
