@@ -65,7 +65,7 @@ def touch(tree):
 
 
 def comment(tree):
-    edit(tree["chebsplat"] / "schedule.py", '"means": 0.01', '"means": 0.02')
+    edit(tree["chebsplat"] / "trainer.py", "class Trainer", "# a remark\n\n\nclass Trainer")
 
 
 def docstring(tree):
