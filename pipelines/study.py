@@ -165,10 +165,8 @@ def _knowledge(run: Run) -> list[Step]:
 def execute(name: str, runs: list[Run], cores: int, threads: int) -> Outcome:
     """Compute what is outstanding, cores // threads jobs at once; links in `work/study-NAME` keep its artifacts.
 
-    A step that fails costs the runs that need it, and no other. Raises ConfigError for more threads than cores.
+    A step that fails costs the runs that need it, and no other.
     """
-    if threads > cores:
-        raise ConfigError(f"threads={threads} of cores={cores}: a job needs all its threads; lower threads=")
     waiting = outstanding(runs)
     outcome = Outcome()
     if waiting:
