@@ -139,7 +139,7 @@ def plan(scene: str | None, sequence: str | None, settings: str, ablation: str) 
 @click.option("--plan", "only_plan", is_flag=True, help="say what would run, and stop")
 @click.option("--no-run", is_flag=True, help="write the tables of what is there, and run nothing")
 def study(name: str, cores: int, threads: int, out: Path | None, only_plan: bool, no_run: bool) -> None:
-    """Run a study (pipelines/configs/studies) and write its table, figure and page; goes on where it stopped."""
+    """Run a study (of pipelines/configs/studies, or a .toml): its table, figure and page; goes on where it stopped."""
 
     def action() -> int:
         from chebsplat.pipelines import results, study_page
@@ -153,10 +153,11 @@ def study(name: str, cores: int, threads: int, out: Path | None, only_plan: bool
             print(studies.describe(studies.outstanding(runs)))
             return 0
         used = min(threads, cores)
-        outcome = Outcome() if no_run else studies.execute(name, runs, cores, used)
+        folder = out or Path("build/studies") / Path(name).stem
+        outcome = Outcome() if no_run else studies.execute(Path(name).stem, runs, cores, used)
         rows = [results.row_of(run, outcome.failed) for run in runs]
         command = f"make study={name} cores={cores} threads={used}"
-        print(study_page.write(out or Path("build/studies") / name, name, asked, runs, rows, command).absolute())
+        print(study_page.write(folder, asked, runs, rows, command).absolute())
         return outcome.code
 
     guarded(action)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import tomllib
 from collections.abc import Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -80,8 +81,16 @@ class Run:
 
 
 def read_study(name: str) -> Study:
-    """Raises ConfigError naming the first bad key, or the nearest study's name."""
-    return checked_study(planning.read_toml("studies", name), f"study {name}")
+    """A study of ours by name, or a file of the user's that ends in .toml.
+
+    Raises ConfigError naming the first bad key, or the nearest study's name.
+    """
+    if not name.endswith(".toml"):
+        return checked_study(planning.read_toml("studies", name), f"study {name}")
+    try:
+        return checked_study(tomllib.loads(Path(name).read_text()), name)
+    except (OSError, tomllib.TOMLDecodeError) as error:
+        raise ConfigError(f"{name}: {error}") from None
 
 
 def checked_study(values: dict[str, Any], origin: str) -> Study:

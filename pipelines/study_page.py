@@ -18,7 +18,7 @@ PICTURE = "error-against-time.png"
 BY_SCENE = ("miou", "miou_gain", "psnr", "n_gaussians", "train_seconds")
 
 
-def write(out: Path, name: str, study: Study, runs: list[Run], rows: list[Row], command: str) -> Path:
+def write(out: Path, study: Study, runs: list[Run], rows: list[Row], command: str) -> Path:
     """Fill `out`; returns the page. Runs that failed or have not run are named, and count in no mean."""
     out.mkdir(parents=True, exist_ok=True)
     with (out / "results.csv").open("w", newline="") as handle:
@@ -29,7 +29,6 @@ def write(out: Path, name: str, study: Study, runs: list[Run], rows: list[Row], 
     study_figures.draw(out / PICTURE, rows, traces(runs, rows), settings, study.against)
     lines = compare(rows, study.baseline)
     parts = {
-        "name": name,
         "study": study,
         "facts": facts(runs, rows, command),
         "labels": labels(lines),
