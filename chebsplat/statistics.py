@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
+
+Values = np.ndarray | Sequence[float]
 
 CONFIDENCE = 0.95
 
@@ -40,13 +43,13 @@ class Difference:
         return bool(self.low > self.neutral or self.high < self.neutral)
 
 
-def summarize(values: np.ndarray) -> Summary:
+def summarize(values: Values) -> Summary:
     """Mean ± sample standard deviation of values [N]. Raises ValueError on none, or on a value that is not finite."""
     values = _finite(values)
     return Summary(float(values.mean()), float(values.std(ddof=1)) if len(values) > 1 else float("nan"), len(values))
 
 
-def paired_difference(values: np.ndarray, baseline: np.ndarray, scenes: list[str], ratio: bool = False) -> Difference:
+def paired_difference(values: Values, baseline: Values, scenes: list[str], ratio: bool = False) -> Difference:
     """values − baseline (or values / baseline) over pairs of the same scene and seed.
 
     Args: values, baseline [N], the same scene and seed at each place; scenes: N names; ratio: positive values whose
@@ -81,7 +84,7 @@ def quantile(freedom: int) -> float:
     return float(stdtrit(freedom, 0.5 + CONFIDENCE / 2))
 
 
-def _finite(values: np.ndarray) -> np.ndarray:
+def _finite(values: Values) -> np.ndarray:
     values = np.asarray(values, np.float64)
     if values.ndim != 1 or len(values) == 0 or not np.isfinite(values).all():
         raise ValueError(f"finite values [N], N > 0, are needed, not {values!r}")

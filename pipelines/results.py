@@ -6,8 +6,6 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-
 from chebsplat.formats import artifact
 from chebsplat.formats.documents import read_document
 from chebsplat.formats.gaussians import read_trace
@@ -138,11 +136,11 @@ def compare(rows: list[Row], baseline: str) -> list[Line]:
         for figure in FIGURES:
             values = [row[figure.key] for row in done if row[figure.key] is not None]
             if values:
-                summaries[figure.key] = summarize(np.array(values))
+                summaries[figure.key] = summarize(values)
             pairs = _pairs(done, against, figure.key) if variant != baseline else []
             if pairs:
                 scenes, mine, other = zip(*pairs, strict=True)
-                found = paired_difference(np.array(mine), np.array(other), list(scenes), figure.ratio)
+                found = paired_difference(mine, other, list(scenes), figure.ratio)
                 differences[figure.key] = found
         lines.append(Line(condition, budget, variant, len(done), len(members), summaries, differences))
     return lines

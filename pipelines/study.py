@@ -31,7 +31,8 @@ class Budgets(_Strict):
 
     def settings(self) -> dict[str, dict[str, Any]]:
         """train settings by the budget's name; one unnamed budget, the scene's own, where none is given."""
-        found = {f"{n} steps": {"steps": n} for n in self.steps} | {f"{s:g} s": {"seconds": s} for s in self.seconds}
+        found: dict[str, dict[str, Any]] = {f"{n} steps": {"steps": n} for n in self.steps}
+        found |= {f"{s:g} s": {"seconds": s} for s in self.seconds}
         return found or {"": {}}
 
 

@@ -58,7 +58,7 @@ def _mean_line(axis: Any, points: list[tuple[Any, list[float], list[float]]], st
     if not points:
         return
     points = sorted(points, key=lambda point: float(np.mean(point[1])))
-    summaries = [summarize(np.array(values)) for _, _, values in points]
+    summaries = [summarize(values) for _, _, values in points]
     bars = [0.0 if np.isnan(s.spread) else s.spread for s in summaries]
     x = [float(np.mean(xs)) for _, xs, _ in points]
     axis.errorbar(x, [s.mean for s in summaries], bars, markersize=5, capsize=2, elinewidth=0.8, **style)
