@@ -66,8 +66,8 @@ def row_of(run: Run, failed: dict[str, tuple[int, str, Path]]) -> Row:
     trace = read_trace(targets["train"], train)
     segmentation = figures.get("segmentation") or {}
     for key in ("miou", "macc", "oa", "boundary_miou"):
-        row[key] = segmentation["scene"][key] if segmentation else None
-    if "teacher" in segmentation:
+        row[key] = segmentation.get("scene", {}).get(key)  # a protocol measures some of them
+    if row["miou"] is not None and segmentation.get("teacher", {}).get("miou") is not None:
         row["miou_teacher"] = segmentation["teacher"]["miou"]
         row["miou_gain"] = row["miou"] - row["miou_teacher"]
     counts = summary["by_degree"]

@@ -69,6 +69,7 @@ def run(job: Job) -> None:
     write_table(job.out / "figures.csv", rows)
     write_table(job.out / "trace.csv", [list(gaussians.trace[0]), *(list(row.values()) for row in gaussians.trace)])
     names = parts.label_names(job, figures)
+    colors = {name: "#" + bytes(color).hex() for name, color in zip(names, draw.palette(len(names)), strict=True)}
     pictures, seen = parts.picture_rows(evaluation, names, job.config.report.n_pictures, job.out)
     page = jinja2.Environment(autoescape=True, undefined=jinja2.StrictUndefined).from_string(PAGE)
     text = page.render(
@@ -79,8 +80,8 @@ def run(job: Job) -> None:
         teacher=manifests["features"].facts.get("kind", "given") if "features" in manifests else "",
         rows=rows[1:],
         tiles=parts.tiles(figures, gaussians),
-        legend=[(names["all"][k], names["colors"][k]) for k in seen],
-        classes=parts.class_rows(figures, names),
+        legend=[(name, colors[name]) for name in seen],
+        classes=parts.class_rows(figures, colors),
         pictures=pictures,
         captions=CAPTIONS,
         curves=draw.curves(gaussians.trace, figures["image"]["psnr"]),

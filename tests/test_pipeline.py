@@ -85,7 +85,7 @@ def deep_code(tree):
 
 
 def report_code(tree):
-    edit(tree["stages"] / "page.py", "<h2>Pictures</h2>", "<h2>Views</h2>")
+    edit(tree["stages"] / "page.py", "<h2>Test views</h2>", "<h2>Views</h2>")
 
 
 def descriptor_code(tree):

@@ -12,10 +12,11 @@ import numpy as np
 import pytest
 from shared import run_stage
 
+from chebsplat.errors import InputError
 from chebsplat.formats.artifact import Manifest, publish
 from chebsplat.formats.evaluation import read_evaluation
 from chebsplat.stages import figures as draw
-from chebsplat.stages.report_parts import class_rows, label_names
+from chebsplat.stages.report_parts import class_rows, label_names, picture_rows
 
 pytestmark = pytest.mark.xdist_group("toy")
 BROWSER = shutil.which("chromium") or shutil.which("google-chrome")
@@ -70,21 +71,26 @@ def test_the_page_s_pictures_are_those_of_the_evaluation(toy):
     assert {tuple(color) for color in image(pictures["labels"][0]).reshape(-1, 3).tolist()} <= colors
 
 
-def test_a_label_has_one_colour_whatever_its_place_in_the_teacher_s_list(tmp_path):
-    job = SimpleNamespace(inputs={"scene": tmp_path / "scene"})
+def test_labels_are_named_by_the_capture_and_otherwise_by_the_scene(toy, tmp_path):
     manifest = Manifest("chebsplat.scene/1", "k", "export", {}, {}, 0)
     with publish(tmp_path / "scene", manifest) as out:
-        (out / "labels.json").write_text(json.dumps({"0": "sofa", "1": "lamp", "2": "wall"}))
-    names = label_names(job, {"segmentation": {"classes": ["wall", "sofa"]}})
-    assert names["predicted"] == ["sofa", "lamp", "wall"]
-    assert names["all"] == ["wall", "sofa", "lamp"]
-    assert len(set(names["colors"])) == 3
+        (out / "labels.json").write_text(json.dumps({"0": "sofa", "1": "lamp"}))
+    inputs = {"scene": tmp_path / "scene"}
+    assert label_names(SimpleNamespace(inputs=inputs), {}) == ["sofa", "lamp"]
+    inputs["capture"] = toy["ingest"]
+    classes = read_evaluation(toy["evaluate"]).figures["segmentation"]["classes"]
+    assert label_names(SimpleNamespace(inputs=inputs), {}) == classes
+
+
+def test_a_label_without_a_name_is_an_error_not_a_colour(toy, tmp_path):
+    with pytest.raises(InputError, match="has no name"):
+        picture_rows(read_evaluation(toy["evaluate"]), ["wall"], 1, tmp_path)
 
 
 def test_classes_are_listed_best_first_and_those_that_never_occur_are_not():
     iou = {"wall": 0.2, "sofa": 0.9, "lamp": None}
-    figures = {"segmentation": {"classes": list(iou), "scene": {"iou": iou}, "teacher": {"iou": {"wall": 0.5}}}}
-    rows = class_rows(figures, {"colors": ["#1", "#2", "#3"]})
+    figures = {"segmentation": {"scene": {"iou": iou}, "teacher": {"iou": {"wall": 0.5}}}}
+    rows = class_rows(figures, {"wall": "#1", "sofa": "#2"})
     assert rows == [("sofa", "#2", 0.9, None), ("wall", "#1", 0.2, 0.5)]
 
 
