@@ -175,14 +175,20 @@ def _knowledge(run: Run) -> list[Step]:
 def execute(name: str, runs: list[Run], cores: int, threads: int) -> Outcome:
     """Compute what is outstanding, cores // threads jobs at once; links in `work/study-NAME` keep its artifacts.
 
-    A step that fails costs the runs that need it, and no other.
+    A scene (or sequence) and seed is finished, and measured, before the next begins: a study cut short has compared
+    something. A step that fails costs the runs that need it, and no other.
     """
-    waiting = outstanding(runs)
     outcome = Outcome()
-    if waiting:
-        say(f"  {describe(waiting)}; {cores // threads} at once, {threads} threads each")
-        outcome = snakemake(waiting, cores, threads)
-    store.link(f"study-{name}", {run.name: run.plan.targets[LAST] for run in runs})
+    parts: dict[tuple, list[Run]] = {}
+    for run in runs:
+        parts.setdefault((run.sequence or run.scene, run.seed), []).append(run)
+    for (scene, seed), part in parts.items():
+        waiting = outstanding(part)
+        if waiting:
+            say(f"  {scene}, seed {seed}: {describe(waiting)}; {cores // threads} at once, {threads} threads each")
+            found = snakemake(waiting, cores, threads)
+            outcome = Outcome(max(outcome.code, found.code), outcome.failed | found.failed)
+        store.link(f"study-{name}", {run.name: run.plan.targets[LAST] for run in runs})
     return outcome
 
 

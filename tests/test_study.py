@@ -248,7 +248,7 @@ lr_means = 1e30
     ):
         done = subprocess.run(command, capture_output=True, text=True, cwd=ROOT, env=os.environ)
         assert done.returncode == 4, done.stderr
-        assert f"to run: {to_run}; 2 at once, 1 threads each" in done.stderr
+        assert f"toy, seed 0: to run: {to_run}; 2 at once, 1 threads each" in done.stderr
         assert done.stdout.strip() == str(tmp_path / "out/study.html")
         with (tmp_path / "out/results.csv").open() as handle:
             states = {row["variant"]: row["state"] for row in csv.DictReader(handle)}
