@@ -8,15 +8,18 @@ CHEBSPLAT := .venv/bin/chebsplat
 CHOICE := $(if $(scene),--scene '$(scene)') $(if $(sequence),--sequence '$(sequence)') $(if $(set),--set '$(set)') \
   $(if $(ablation),--ablation '$(ablation)')
 
-# `make scene=office0` needs no target: naming a scene or a sequence means running it.
-.DEFAULT_GOAL := $(if $(scene)$(sequence),run,help)
-.PHONY: help run plan verify clean-stale setup test test-all stability bench-raster bench-train bench-descriptor bench-refresh bench-shapes bench-store nouns teacher teacher-quality lint lock
+# `make scene=office0` needs no target: naming a scene, a sequence or a study means running it.
+.DEFAULT_GOAL := $(if $(study),study,$(if $(scene)$(sequence),run,help))
+.PHONY: help run study plan verify clean-stale setup test test-all stability bench-raster bench-train bench-descriptor bench-refresh bench-shapes bench-store nouns teacher teacher-quality lint lock
 
 run: $(READY)  ## make scene=NAME|FOLDER [stage=] [set=a.b=c,...] [ablation=] [cores=]; or sequence=NAME
 	@$(CHEBSPLAT) run $(CHOICE) $(if $(stage),--stage '$(stage)') $(if $(cores),--cores '$(cores)')
 
-plan: $(READY)  ## make plan scene=NAME: what would run, what is fresh, what the scene leaves out, and why
-	@$(CHEBSPLAT) plan $(CHOICE)
+study: $(READY)  ## make study=NAME [cores=] [threads=] [args=--no-run]: its runs, then table, figure, page in build/studies
+	@$(CHEBSPLAT) study '$(study)' $(if $(cores),--cores '$(cores)') $(if $(threads),--threads '$(threads)') $(args)
+
+plan: $(READY)  ## make plan scene=NAME (or study=NAME): what would run, what is fresh, what is left out, and why
+	@$(CHEBSPLAT) $(if $(study),study '$(study)' --plan,plan $(CHOICE))
 
 verify: $(READY)  ## make verify dir=FOLDER: recompute every digest of an artifact
 	@$(CHEBSPLAT) verify $(dir)

@@ -99,11 +99,12 @@ def read_gaussians(path: Path) -> Gaussians:
         read_cameras(path, manifest),
         optional["modules"],
         optional["optimizer"],
-        _read_trace(path, manifest),
+        read_trace(path, manifest),
         read_document(path, manifest, "notes.json"),
     )
 
 
-def _read_trace(path: Path, manifest: Manifest) -> list[dict[str, float]]:
+def read_trace(path: Path, manifest: Manifest) -> list[dict[str, float]]:
+    """The trace alone, without the parameters. Raises InputError naming file and remedy."""
     with artifact.checked(path, manifest, "trace.csv").open(newline="") as handle:
         return [{name: float(value) for name, value in row.items()} for row in csv.DictReader(handle)]

@@ -1,4 +1,4 @@
-"""The `chebsplat` command: runs, plans, queries, checks and listings, and every stage as a plain command."""
+"""The `chebsplat` command: runs, plans, studies, queries, checks and listings, and every stage as a plain command."""
 
 from __future__ import annotations
 
@@ -177,6 +177,38 @@ def query(scene: str, text: str, against: str, out: Path | None, top: int) -> No
 
 
 @main.command()
+@click.argument("name")
+@click.option("--cores", type=click.IntRange(1), default=os.cpu_count(), help="shared by the jobs that run at once")
+@click.option("--threads", type=click.IntRange(1), default=2, show_default=True, help="of each job")
+@click.option("--out", type=click.Path(path_type=Path), help="default: build/studies/NAME")
+@click.option("--plan", "only_plan", is_flag=True, help="say what would run, and stop")
+@click.option("--no-run", is_flag=True, help="write the tables of what is there, and run nothing")
+def study(name: str, cores: int, threads: int, out: Path | None, only_plan: bool, no_run: bool) -> None:
+    """Run a study (of pipelines/configs/studies, or a .toml): its table, figure and page; goes on where it stopped."""
+
+    def action() -> int:
+        from chebsplat.pipelines import results, study_page
+        from chebsplat.pipelines import study as studies
+        from chebsplat.pipelines.run import Outcome, say
+
+        asked = studies.read_study(name)
+        runs = studies.expand(asked)
+        say(f"{name}: {len(runs)} runs, {sum(run.plan.targets['evaluate'].is_dir() for run in runs)} of them done")
+        if only_plan:
+            print(studies.describe(studies.outstanding(runs)))
+            return 0
+        used = min(threads, cores)
+        folder = out or Path("build/studies") / Path(name).stem
+        outcome = Outcome() if no_run else studies.execute(Path(name).stem, runs, cores, used)
+        rows = [results.row_of(run, outcome.failed) for run in runs]
+        command = f"make study={name} cores={cores} threads={used}"
+        print(study_page.write(folder, asked, runs, rows, command).absolute())
+        return outcome.code
+
+    guarded(action)
+
+
+@main.command()
 @click.argument("folders", nargs=-1, required=True, type=click.Path(path_type=Path))
 def verify(folders: tuple[Path, ...]) -> None:
     """Recompute every digest of artifacts."""
@@ -234,10 +266,10 @@ def check_teacher(model: Path, photo: Path | None, labels: str | None) -> None:
 
 @main.command()
 def scenes() -> None:
-    """List the scenes, ablations and sequences that have a name."""
+    """List the scenes, ablations, sequences and studies that have a name."""
     from chebsplat.pipelines.plan import names
 
-    for kind in ("scenes", "ablations", "sequences"):
+    for kind in ("scenes", "ablations", "sequences", "studies"):
         print(f"{kind}: {' '.join(names(kind))}")
 
 

@@ -36,9 +36,15 @@ class Code:
         self.folders, self.memo = folders, memo
         self.read_now = 0  # files parsed in this process
         self._versions: dict[str, str | None] = {}
+        self._stages: dict[str, dict[str, object]] = {}
 
     def stage(self, name: str) -> dict[str, object]:
-        """{"hash": ..., "packages": {name: version}} of stage `name`."""
+        """{"hash": ..., "packages": {name: version}} of stage `name`; read once in this object's life."""
+        if name not in self._stages:
+            self._stages[name] = self._identity(name)
+        return self._stages[name]
+
+    def _identity(self, name: str) -> dict[str, object]:
         seen: dict[str, str] = {}
         packages: set[str] = set()
         waiting = [f"stages.{name}"]

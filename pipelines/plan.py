@@ -145,16 +145,19 @@ class Planner:
         ablation: str = "",
         basis: Path | None = None,
         keep_knowledge: bool = False,
+        values: dict[str, Any] | None = None,
     ) -> Plan:
         """The steps of one scene.
 
-        Args: settings: `set=`; basis: an earlier scene's basis to train on; keep_knowledge: end with a cks step.
+        Args: settings: `set=`; basis: an earlier scene's basis to train on; keep_knowledge: end with a cks step;
+              values: config sections that replace the scene's own, before ablation and settings (a study's).
         Raises: ConfigError, InputError.
         """
         from chebsplat.stages import config as configs
         from chebsplat.stages import ingest
 
-        name, values = scene_values(scene)
+        name, own = scene_values(scene)
+        values = merged(own, values or {})
         title = name
         if ablation:
             values = merged(values, read_toml("ablations", ablation))

@@ -12,6 +12,7 @@ import sys
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -21,6 +22,14 @@ from chebsplat.pipelines.plan import Plan, Step, git_state
 HERE = Path(__file__).parent
 # Snakemake's own words go to a file; its jobs inherit the real stderr, which may be a terminal.
 SNAKEMAKE = "import sys; sys.stderr = open(sys.argv.pop(1), 'w', 1); from snakemake.cli import main; main()"
+
+
+@dataclass
+class Outcome:
+    """Exit code of a run (the highest of its steps'), and which steps failed: key -> (exit code, last word, log)."""
+
+    code: int = 0
+    failed: dict[str, tuple[int, str, Path]] = field(default_factory=dict)
 
 
 def say(text: str) -> None:
@@ -39,7 +48,7 @@ def execute(plans: list[Plan], stage: str | None, cores: int) -> int:
     code = 0
     if stale:
         say(f"  to run: {' '.join(step.stage for step in stale)}   fresh: {len(steps) - len(stale)}")
-        code = snakemake(stale, cores)
+        code = snakemake(stale, cores).code
     for plan in plans:
         store.link(plan.title, plan.targets)
     if code:
@@ -65,11 +74,17 @@ def wanted_steps(plan: Plan, stage: str | None) -> list[Step]:
     return [step for step in plan.steps if step.key in needed]
 
 
-def snakemake(steps: list[Step], cores: int) -> int:
-    """Run these steps. Returns 0, or the exit code of the stage that failed; its log stays in `work/.plans`."""
+def snakemake(steps: list[Step], cores: int, threads: int | None = None) -> Outcome:
+    """Run these steps; logs of those that fail stay in `work/.plans`.
+
+    Args: threads: of one job, so that cores // threads run at once; `evaluate`, which measures frames per second, then
+          runs alone. None: every job may use all cores.
+    """
     work = store.work()
     state = git_state(HERE)
     entries = [entry(step, state) for step in steps]
+    for item in entries:
+        item["threads"] = 1 if threads is None else cores if item["stage"] == "evaluate" else threads
     text = json.dumps({"steps": entries}, indent=1)
     folder = work / ".plans" / f"{hashlib.sha256(text.encode()).hexdigest()[:16]}-{os.getpid()}"
     shutil.rmtree(folder, ignore_errors=True)
@@ -82,27 +97,33 @@ def snakemake(steps: list[Step], cores: int) -> int:
     command = [sys.executable, "-c", SNAKEMAKE, str(words), "--workflow-profile", "none"]
     command += ["--snakefile", str(HERE / "Snakefile"), "--directory", str(work)]
     command += ["--profile", str(HERE / "profiles/default"), "--cores", str(cores), "--config", f"plan={plan}"]
-    done = subprocess.run(command, stdout=subprocess.DEVNULL, env=os.environ | {"CHEBSPLAT_THREADS": str(cores)})
+    environment = os.environ | {"CHEBSPLAT_THREADS": str(threads or cores)}
+    done = subprocess.run(command, stdout=subprocess.DEVNULL, env=environment)
     if done.returncode == 0:
         shutil.rmtree(folder, ignore_errors=True)
-        return 0
+        return Outcome()
     return failures(steps, folder, words)
 
 
-def failures(steps: list[Step], folder: Path, words: Path) -> int:
-    """Say which steps failed, and where their log is; the highest of their exit codes."""
-    codes = []
+def failures(steps: list[Step], folder: Path, words: Path) -> Outcome:
+    """Say which steps failed, and where their log is."""
+    failed = {}
     for step in steps:
         log, exit_file = (folder / f"{step.stage}-{step.key}.{kind}" for kind in ("log", "exit"))
         if exit_file.is_file():
-            codes.append(int(exit_file.read_text()))
-            say(f"{step.stage} failed with exit code {codes[-1]}; log: {log}")
+            failed[step.key] = (int(exit_file.read_text()), last_word(log), log)
+            say(f"{step.stage} failed with exit code {failed[step.key][0]}; log: {log}")
         elif log.is_file() and not step.fresh:
-            codes.append(1)
+            failed[step.key] = (1, "killed before it could report", log)
             say(f"{step.stage} was killed before it could report; log: {log}")
-    if not codes:
+    if not failed:
         say(f"the run stopped before a stage began; log: {words}")
-    return max(codes, default=1)
+    return Outcome(max((code for code, *_ in failed.values()), default=1), failed)
+
+
+def last_word(log: Path) -> str:
+    lines = log.read_text().strip().splitlines() if log.is_file() else []
+    return lines[-1] if lines else "no message"
 
 
 def entry(step: Step, state: dict[str, Any]) -> dict[str, Any]:

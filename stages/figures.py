@@ -1,4 +1,4 @@
-"""Pictures of the report, as self-contained data URIs."""
+"""Pictures of the report, as self-contained data URIs and inline SVG."""
 
 from __future__ import annotations
 
@@ -8,6 +8,13 @@ import io
 from typing import Any
 
 import numpy as np
+
+IGNORE = -1
+CURVES = (
+    (("psnr",), "PSNR on watched training views, dB"),
+    (("loss_color", "loss_features"), "loss: colour, disagreement with the teacher"),
+    (("n",), "Gaussians"),
+)
 
 
 def palette(n: int) -> np.ndarray:
@@ -51,12 +58,32 @@ def _warm(warmth: np.ndarray) -> np.ndarray:
     return 255 * colormaps["turbo"](0.3 + 0.58 * warmth[..., 0])[..., :3]
 
 
-def data_uri(image: np.ndarray) -> str:
+def error_map(image: np.ndarray, truth: np.ndarray, gain: float = 4.0) -> np.ndarray:
+    """Mean absolute colour error of u8 images, `gain` times as strong, as an image."""
+    import matplotlib
+
+    error = np.abs(image.astype(np.float32) - truth).mean(-1) * (gain / 255)
+    return (matplotlib.colormaps["inferno"](error.clip(0, 1))[..., :3] * 255).astype(np.uint8)
+
+
+def wrong_map(predicted: np.ndarray, truth: np.ndarray) -> np.ndarray:
+    """Red, u8 [H, W, 4], where predicted classes are wrong; clear where they are right or nothing is known."""
+    wrong = (predicted != truth) & (truth != IGNORE)
+    return np.where(wrong[..., None], np.array([230, 20, 40, 255], np.uint8), np.uint8(0))
+
+
+def data_uri(image: np.ndarray, photo: bool = False) -> str:
+    """WebP for photos, lossless PNG for anything with sharp edges and few colours."""
     from PIL import Image
 
-    buffer = io.BytesIO()
-    Image.fromarray(image).save(buffer, "PNG", optimize=True)
-    return "data:image/png;base64," + base64.b64encode(buffer.getvalue()).decode()
+    picture, buffer = Image.fromarray(image), io.BytesIO()
+    if photo:
+        picture.save(buffer, "WEBP", quality=90)
+    else:
+        if image.shape[-1] == 3:
+            picture = picture.quantize(256, dither=Image.Dither.NONE)
+        picture.save(buffer, "PNG", optimize=True)
+    return f"data:image/{'webp' if photo else 'png'};base64," + base64.b64encode(buffer.getvalue()).decode()
 
 
 def png(image: np.ndarray, path: Any) -> None:
@@ -65,26 +92,38 @@ def png(image: np.ndarray, path: Any) -> None:
     Image.fromarray(image).save(path, "PNG")
 
 
-def curve(trace: list[dict[str, float]]) -> str:
-    """Error against run time: held-in PSNR, loss and number of Gaussians over seconds, as inline SVG."""
+def curves(trace: list[dict[str, float]], test_psnr: float) -> list[str]:
+    """Error against run time as inline SVG: PSNR with the test views' at the end, losses, number of Gaussians."""
     import matplotlib
 
     matplotlib.use("Agg")
     import matplotlib.pyplot as plt
 
     seconds = [row["seconds"] for row in trace]
-    figure, axes = plt.subplots(1, 3, figsize=(11, 3), layout="constrained")
-    for axis, column, title in zip(
-        axes, ("psnr", "loss", "n"), ("held-in PSNR, dB", "total loss", "Gaussians"), strict=True
-    ):
-        axis.plot(seconds, [row[column] for row in trace], color="#2b6cb0", marker=".", markersize=3)
-        axis.set_xlabel("training seconds")
-        axis.set_title(title, fontsize=10)
-        axis.grid(alpha=0.3)
-    axes[1].set_yscale("log")
-    buffer = io.StringIO()
-    with matplotlib.rc_context({"svg.hashsalt": "chebsplat"}):
-        figure.savefig(buffer, format="svg", metadata={"Date": None})
-    plt.close(figure)
-    text = buffer.getvalue()
-    return text[text.index("<svg") :]
+    drawn = []
+    for columns, title in CURVES:
+        with matplotlib.rc_context({"svg.hashsalt": title, "svg.fonttype": "none", "font.family": "sans-serif"}):
+            figure, axis = plt.subplots(figsize=(4.2, 2.9), layout="constrained")
+            for color, column in zip(("#1f6feb", "#e36209"), columns, strict=False):
+                if any(row.get(column) for row in trace):
+                    values = [row[column] or np.nan for row in trace]
+                    axis.plot(
+                        seconds, values, color=color, marker=".", markersize=4, label=column.removeprefix("loss_")
+                    )
+            if columns == ("psnr",):
+                axis.plot(seconds[-1:], [test_psnr], "*", color="#e36209", markersize=11, label="test views")
+            if columns != ("n",):
+                axis.legend(fontsize=8, frameon=False)
+            if columns[0].startswith("loss"):
+                axis.set_yscale("log")
+            if columns == ("n",):
+                axis.set_ylim(bottom=0)
+            axis.set_xlabel("training seconds")
+            axis.set_title(title, fontsize=10)
+            axis.grid(alpha=0.3)
+            buffer = io.StringIO()
+            figure.savefig(buffer, format="svg", metadata={"Date": None}, transparent=True)
+            plt.close(figure)
+        text = buffer.getvalue()
+        drawn.append(text[text.index("<svg") :])
+    return drawn

@@ -11,9 +11,9 @@ from chebsplat.stages.command import Job, command
 if TYPE_CHECKING:
     from pathlib import Path
 
-    from chebsplat.formats.evaluation import Evaluation
     from chebsplat.formats.gaussians import Gaussians
 
+LARGEST = 20_000_000  # bytes of the page
 STAGE_OF = {
     "capture": "ingest",
     "points": "sfm",
@@ -27,14 +27,28 @@ STAGE_OF = {
 }
 
 
+CAPTIONS = {
+    "truth": "photo",
+    "renders": "render",
+    "labels": "true labels",
+    "teacher": "2D teacher's labels",
+    "predicted": "scene's labels",
+    "error": "colour error",
+    "wrong": "wrong labels",
+}
+
+
 def run(job: Job) -> None:
+    import json
+
     import jinja2
 
     from chebsplat.formats.artifact import read_manifest
     from chebsplat.formats.evaluation import read_evaluation
     from chebsplat.formats.gaussians import read_gaussians
     from chebsplat.stages import figures as draw
-    from chebsplat.stages.page import PAGE
+    from chebsplat.stages import report_parts as parts
+    from chebsplat.stages.page import PAGE, STYLE
 
     evaluation = read_evaluation(job.inputs["evaluation"])
     gaussians = read_gaussians(job.inputs["gaussians"])
@@ -47,39 +61,45 @@ def run(job: Job) -> None:
         left_out |= manifest.facts.get("left_out", {})
     stages = [(STAGE_OF[role], m.seconds, m.key, m.device, m.threads) for role, m in manifests.items()]
     versions: dict[str, str] = {}
+    settings: dict[str, Any] = {}
     for manifest in manifests.values():
         versions |= manifest.versions
+        settings |= manifest.config
     rows = summary_rows(figures)
     write_table(job.out / "figures.csv", rows)
     write_table(job.out / "trace.csv", [list(gaussians.trace[0]), *(list(row.values()) for row in gaussians.trace)])
-    pictures = picture_rows(evaluation, job.config.report.n_pictures, job.out)
-    segmentation = figures.get("segmentation") or {}
-    classes = segmentation.get("classes", [])
-    legend = [
-        (label, "#" + bytes(color).hex()) for label, color in zip(classes, draw.palette(len(classes)), strict=True)
-    ]
+    names = parts.label_names(job, figures)
+    colors = {name: "#" + bytes(color).hex() for name, color in zip(names, draw.palette(len(names)), strict=True)}
+    pictures, seen = parts.picture_rows(evaluation, names, job.config.report.n_pictures, job.out)
     page = jinja2.Environment(autoescape=True, undefined=jinja2.StrictUndefined).from_string(PAGE)
     text = page.render(
+        style=STYLE,
         name=figures["source"].get("name") or figures["source"].get("kind", "scene"),
         source=figures["source"],
         protocol=figures["protocol"],
         teacher=teacher_words(manifests["features"].facts) if "features" in manifests else None,
         rows=rows[1:],
-        segmentation=segmentation,
-        legend=legend,
+        tiles=parts.tiles(figures, gaussians),
+        legend=[(name, colors[name]) for name in seen],
+        classes=parts.class_rows(figures, colors),
         pictures=pictures,
-        curve=draw.curve(gaussians.trace),
+        captions=CAPTIONS,
+        curves=draw.curves(gaussians.trace, figures["image"]["psnr"]),
         stages=stages,
         total=sum(seconds for _, seconds, *_ in stages),
         left_out=sorted(left_out.items()),
         versions=sorted(versions.items()),
+        code=next((m.code for m in manifests.values() if "commit" in m.code), None),
+        settings=json.dumps(settings, indent=1, sort_keys=True),
     )
+    if len(text) > LARGEST:
+        raise DataFailure(f"the page would have {len(text) / 1e6:.0f} MB; lower report.n_pictures or ingest.max_side")
     (job.out / "report.html").write_text(text)
     job.facts |= {"page": "report.html", "psnr": figures["image"]["psnr"]}
     if "descriptors" in manifests:
         known = manifests["descriptors"].facts
-        names = ("spectrum", "n_cuts", "n_cuts_in_clusters", "n_in_float64")
-        job.facts["descriptors"] = {name: known[name] for name in names if name in known}
+        kept = ("spectrum", "n_cuts", "n_cuts_in_clusters", "n_in_float64")
+        job.facts["descriptors"] = {name: known[name] for name in kept if name in known}
 
 
 def teacher_words(facts: dict[str, Any]) -> tuple[str, str]:
@@ -134,30 +154,6 @@ def summary_rows(figures: dict[str, Any]) -> list[list[str]]:
 def write_table(path: Path, rows: list[list[Any]]) -> None:
     with path.open("w", newline="") as handle:
         csv.writer(handle).writerows(rows)
-
-
-def picture_rows(evaluation: Evaluation, count: int, out: Path) -> list[dict[str, Any]]:
-    """Ground truth, render, label and predicted-label pictures of evenly spaced test views; a PNG of the first."""
-    import numpy as np
-
-    from chebsplat.stages import figures as draw
-
-    names, pictures = evaluation.figures["names"], evaluation.pictures
-    per_view = evaluation.figures["image"]["per_view"]["psnr"]
-    classes = (evaluation.figures.get("segmentation") or {}).get("classes", [])
-    maps = [p for name, p in pictures.items() if name not in ("truth", "renders")]
-    n_labels = max([len(classes), 1, *(int(np.max(p[:], initial=0)) + 1 for p in maps)])
-    rows, sheet = [], []
-    for k in np.unique(np.linspace(0, len(names) - 1, min(count, len(names))).round().astype(int)):
-        images = []
-        for name in ("truth", "renders", "labels", "teacher", "predicted"):
-            if name in pictures:
-                picture = pictures[name][k]
-                images.append((name, picture if picture.ndim == 3 else draw.colored(picture, n_labels)))
-        rows.append({"name": names[k], "psnr": per_view[k], "images": [(n, draw.data_uri(i)) for n, i in images]})
-        sheet.append(np.concatenate([image for _, image in images], 1))
-    draw.png(np.concatenate(sheet[:2], 0), out / "pictures.png")
-    return rows
 
 
 main = command("report", run)

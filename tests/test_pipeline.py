@@ -85,7 +85,7 @@ def deep_code(tree):
 
 
 def report_code(tree):
-    edit(tree["stages"] / "page.py", "<h2>Pictures</h2>", "<h2>Views</h2>")
+    edit(tree["stages"] / "page.py", "<h2>Test views</h2>", "<h2>Views</h2>")
 
 
 def descriptor_code(tree):
@@ -412,11 +412,13 @@ def test_a_failed_run_tells_a_stage_that_failed_from_one_that_was_killed(tmp_pat
     for stage in ("onnx", "train"):
         (tmp_path / f"{stage}-{steps[stage].key}.log").touch()
     (tmp_path / f"onnx-{steps['onnx'].key}.exit").write_text("4")
-    assert failures(list(steps.values()), tmp_path, tmp_path / "snakemake.log") == 4
+    outcome = failures(list(steps.values()), tmp_path, tmp_path / "snakemake.log")
+    assert outcome.code == 4
+    assert set(outcome.failed) == {steps["onnx"].key, steps["train"].key}
     told = capfd.readouterr().err
     assert "onnx failed with exit code 4" in told
     assert "train was killed" in told
-    assert failures([steps["report"]], tmp_path, tmp_path / "snakemake.log") == 1
+    assert failures([steps["report"]], tmp_path, tmp_path / "snakemake.log").code == 1
     assert "snakemake.log" in capfd.readouterr().err
 
 

@@ -1,0 +1,160 @@
+"""What a study found: one row a run, read from the artifacts, and the comparison of its variants."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from chebsplat.formats import artifact
+from chebsplat.formats.documents import read_document
+from chebsplat.formats.gaussians import read_trace
+from chebsplat.pipelines.study import Run
+from chebsplat.statistics import Difference, Summary, paired_difference, summarize
+
+Row = dict[str, Any]
+
+
+@dataclass(frozen=True)
+class Figure:
+    """A column: its key in a row, its heading, how a value is shown, and whether variants compare by ratio."""
+
+    key: str
+    heading: str
+    digits: int
+    scale: float = 1.0
+    ratio: bool = False
+
+
+FIGURES = (
+    Figure("miou", "mIoU, %", 1, 100),
+    Figure("miou_gain", "mIoU − its 2D teacher's, points", 1, 100),
+    Figure("macc", "mAcc, %", 1, 100),
+    Figure("oa", "OA, %", 1, 100),
+    Figure("boundary_miou", "boundary mIoU, %", 1, 100),
+    Figure("psnr", "PSNR, dB", 2),
+    Figure("ssim", "SSIM", 4),
+    Figure("n_gaussians", "Gaussians", 0, 1, True),
+    Figure("sh_kept", "SH coefficients kept, %", 1, 100),
+    Figure("bytes_ply", "PLY, MB", 2, 1e-6, True),
+    Figure("bytes_ragged", "ragged, MB", 2, 1e-6, True),
+    Figure("frames_per_second", "frames/s", 1, 1, True),
+    Figure("train_seconds", "training, s", 1, 1, True),
+)
+OTHERS = ("miou_teacher", "held_in_psnr", "steps", "threads", "device", "train_key", "evaluate_key")
+IDENTITY = ("condition", "variant", "budget", "sequence", "place", "scene", "seed", "state")
+COLUMNS = (*IDENTITY, *(figure.key for figure in FIGURES), *OTHERS)
+
+
+def row_of(run: Run, failed: dict[str, tuple[int, str, Path]]) -> Row:
+    """One run's figures; None where a thing was not measured. `state` is `done`, or why there are none.
+
+    Args: failed: of `Outcome`. Raises: InputError naming a damaged artifact.
+    """
+    row: Row = dict.fromkeys(COLUMNS) | {name: getattr(run, name) for name in IDENTITY[:-1]}
+    targets = run.plan.targets
+    row |= {"train_key": targets["train"].name, "evaluate_key": targets["evaluate"].name}
+    if not targets["evaluate"].joinpath("artifact.json").is_file():
+        broken = [(step.stage, failed[step.key]) for step in run.steps if step.key in failed]
+        if not broken:
+            return row | {"state": "not run yet"}
+        stage, (code, message, _) = broken[0]
+        return row | {"state": f"{stage} failed with exit code {code}: {message}"}
+    evaluation, train, scene = (artifact.read_manifest(targets[stage]) for stage in ("evaluate", "train", "export"))
+    figures = read_document(targets["evaluate"], evaluation, "figures.json")
+    summary = read_document(targets["export"], scene, "summary.json")
+    trace = read_trace(targets["train"], train)
+    segmentation = figures.get("segmentation") or {}
+    for key in ("miou", "macc", "oa", "boundary_miou"):
+        row[key] = segmentation.get("scene", {}).get(key)  # a protocol measures some of them
+    if row["miou"] is not None and segmentation.get("teacher", {}).get("miou") is not None:
+        row["miou_teacher"] = segmentation["teacher"]["miou"]
+        row["miou_gain"] = row["miou"] - row["miou_teacher"]
+    counts = summary["by_degree"]
+    kept = sum(n * (degree + 1) ** 2 for degree, n in enumerate(counts))
+    return row | {
+        "state": "done",
+        "psnr": figures["image"]["psnr"],
+        "ssim": figures["image"]["ssim"],
+        "n_gaussians": figures["n_gaussians"],
+        "sh_kept": kept / (16 * sum(counts)),
+        "bytes_ply": figures["bytes"]["ply"],
+        "bytes_ragged": figures["bytes"]["ragged"],
+        "frames_per_second": figures["frames_per_second"]["color"],
+        "train_seconds": trace[-1]["seconds"],
+        "held_in_psnr": trace[-1]["psnr"],
+        "steps": int(trace[-1]["step"]),
+        "threads": train.threads,
+        "device": train.device,
+    }
+
+
+def traces(runs: list[Run], rows: list[Row]) -> list[tuple[Row, list[dict[str, float]]]]:
+    """The trace of every finished run, with its row."""
+    found = []
+    for run, row in zip(runs, rows, strict=True):
+        if row["state"] == "done":
+            path = run.plan.targets["train"]
+            found.append((row, read_trace(path, artifact.read_manifest(path))))
+    return found
+
+
+@dataclass(frozen=True)
+class Line:
+    """A line of the table: one variant under one condition and budget."""
+
+    condition: str
+    budget: str
+    variant: str
+    n_done: int
+    n_runs: int
+    summaries: dict[str, Summary]
+    differences: dict[str, Difference]  # against the baseline; empty for the baseline itself
+
+
+def groups(rows: list[Row], *names: str) -> dict[tuple, list[Row]]:
+    """Rows by the values of these columns, in order of appearance."""
+    found: dict[tuple, list[Row]] = {}
+    for row in rows:
+        found.setdefault(tuple(row[name] for name in names), []).append(row)
+    return found
+
+
+def compare(rows: list[Row], baseline: str) -> list[Line]:
+    """Mean ± spread over scenes and seeds, and paired differences against the baseline.
+
+    Choices: the first scene of a sequence has no earlier knowledge: it counts in no mean, though its row is written.
+      A pair needs both runs: what failed on either side drops out of the difference, and the line counts its runs.
+    """
+    counted = [row for row in rows if row["place"] != 1]
+    by_line = groups(counted, "condition", "budget", "variant")
+    lines = []
+    for (condition, budget, variant), members in by_line.items():
+        done = [row for row in members if row["state"] == "done"]
+        against = by_line.get((condition, budget, baseline), [])
+        summaries, differences = {}, {}
+        for figure in FIGURES:
+            values = [row[figure.key] for row in done if row[figure.key] is not None]
+            if values:
+                summaries[figure.key] = summarize(values)
+            pairs = _pairs(done, against, figure.key) if variant != baseline else []
+            if pairs:
+                scenes, mine, other = zip(*pairs, strict=True)
+                found = paired_difference(mine, other, list(scenes), figure.ratio)
+                differences[figure.key] = found
+        lines.append(Line(condition, budget, variant, len(done), len(members), summaries, differences))
+    return lines
+
+
+def _pairs(done: list[Row], against: list[Row], key: str) -> list[tuple[str, float, float]]:
+    """(scene, value, the baseline's) of the same scene, seed and place in a sequence."""
+
+    def place(row: Row) -> tuple:
+        return row["sequence"], row["place"], row["scene"], row["seed"]
+
+    other = {place(row): row[key] for row in against if row[key] is not None}
+    return [
+        (f"{row['sequence']}/{row['scene']}", row[key], other[place(row)])
+        for row in done
+        if row[key] is not None and place(row) in other
+    ]

@@ -1,0 +1,200 @@
+"""Studies: scenes (or sequences) × conditions × variants × budgets × seeds, through the planner and the store."""
+
+from __future__ import annotations
+
+import tomllib
+from collections.abc import Iterator
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+from pydantic import BaseModel, ConfigDict, Field, ValidationError
+
+from chebsplat.errors import ConfigError
+from chebsplat.pipelines import plan as planning
+from chebsplat.pipelines import store
+from chebsplat.pipelines.plan import Plan, Planner, Step, merged
+from chebsplat.pipelines.run import Outcome, say, snakemake, wanted_steps
+
+LAST = "evaluate"  # a study measures; a page and an ONNX file for each of its runs would be waste
+
+
+class _Strict(BaseModel):
+    model_config = ConfigDict(extra="forbid", frozen=True)
+
+
+class Budgets(_Strict):
+    """What a run may spend. Every budget is a whole training with its own schedule, never a cut of a longer one."""
+
+    steps: list[int] = []
+    seconds: list[float] = []
+
+    def settings(self) -> dict[str, dict[str, Any]]:
+        """train settings by the budget's name; one unnamed budget, the scene's own, where none is given."""
+        found: dict[str, dict[str, Any]] = {f"{n} steps": {"steps": n} for n in self.steps}
+        found |= {f"{s:g} s": {"seconds": s} for s in self.seconds}
+        return found or {"": {}}
+
+
+class Study(_Strict):
+    """A file of `configs/studies`. `settings`, conditions and variants hold config sections.
+
+    Conditions are what results are averaged within (a teacher, a noise level); variants are compared, each with
+    `baseline`, under the same condition, budget, scene and seed. A variant may also name an `ablation`, and, in a study
+    of sequences, `knowledge = false`: every scene from nothing.
+    """
+
+    title: str
+    about: str
+    scenes: list[str] = []
+    sequences: list[str] = []
+    seeds: list[int] = Field([0], min_length=1)
+    budgets: Budgets = Budgets()
+    baseline: str
+    settings: dict[str, dict[str, Any]] = {}
+    conditions: dict[str, dict[str, Any]] = {"": {}}
+    variants: dict[str, dict[str, Any]] = Field(min_length=1)
+    against: str = ""  # section.key whose value is the figure's horizontal axis, instead of run time
+
+
+@dataclass(frozen=True)
+class Run:
+    """One point of a study. `place` counts from 1 within a sequence; 0 outside one."""
+
+    condition: str
+    variant: str
+    budget: str
+    scene: str
+    seed: int
+    sequence: str
+    place: int
+    plan: Plan = field(compare=False)
+
+    @property
+    def steps(self) -> list[Step]:
+        return wanted_steps(self.plan, LAST)
+
+    @property
+    def name(self) -> str:
+        """For its link, and for people."""
+        parts = (self.condition, self.variant, self.budget, self.sequence, self.place or "", self.scene)
+        return planning.suffix("-".join(str(p) for p in parts if p).replace(" ", "")) + f"-seed{self.seed}"
+
+
+def read_study(name: str) -> Study:
+    """A study of ours by name, or a file of the user's that ends in .toml.
+
+    Raises ConfigError naming the first bad key, or the nearest study's name.
+    """
+    if not name.endswith(".toml"):
+        return checked_study(planning.read_toml("studies", name), f"study {name}")
+    try:
+        return checked_study(tomllib.loads(Path(name).read_text()), name)
+    except (OSError, tomllib.TOMLDecodeError) as error:
+        raise ConfigError(f"{name}: {error}") from None
+
+
+def checked_study(values: dict[str, Any], origin: str) -> Study:
+    try:
+        study = Study.model_validate(values)
+    except ValidationError as error:
+        first = error.errors()[0]
+        raise ConfigError(f"{origin}: {'.'.join(str(p) for p in first['loc'])}: {first['msg']}") from None
+    if bool(study.scenes) == bool(study.sequences):
+        raise ConfigError(f"{origin}: name scenes or sequences, one of them")
+    if study.baseline not in study.variants:
+        raise ConfigError(f"{origin}: baseline {study.baseline} is none of its variants: {', '.join(study.variants)}")
+    return study
+
+
+def expand(study: Study) -> list[Run]:
+    """Every run, planned; scenes vary slowest and variants fastest, so that a study cut short has compared something.
+
+    Raises: ConfigError, InputError.
+    """
+    planner = Planner()
+    chains = [("", study.scenes)] if study.scenes else []
+    chains += [(name, planning.read_toml("sequences", name)["scenes"]) for name in study.sequences]
+    try:
+        return [
+            run
+            for sequence, scenes in chains
+            for chain in ([[scene] for scene in scenes] if not sequence else [scenes])
+            for seed in study.seeds
+            for condition in study.conditions
+            for budget in study.budgets.settings()
+            for variant in study.variants
+            for run in _chain(planner, study, condition, variant, budget, seed, sequence, chain)
+        ]
+    finally:
+        planner.save()
+
+
+def _chain(
+    planner: Planner,
+    study: Study,
+    condition: str,
+    variant: str,
+    budget: str,
+    seed: int,
+    sequence: str,
+    chain: list[str],
+) -> Iterator[Run]:
+    """The runs of scenes that follow one another; the chain of a scene on its own has one link."""
+    own = dict(study.variants[variant])
+    ablation = own.pop("ablation", None)
+    knowledge = bool(own.pop("knowledge", True)) and bool(sequence)
+    basis: Path | None = None
+    for place, scene in enumerate(chain, start=1):
+        values = merged(study.settings, study.conditions[condition])
+        values = merged(values, planning.read_toml("ablations", ablation) if ablation else {})
+        values = merged(merged(values, own), {"train": study.budgets.settings()[budget]})
+        values = merged(values, seeded(scene, values, seed))
+        found = planner.plan(scene, basis=basis, keep_knowledge=knowledge, values=values)
+        basis = found.targets.get("cks", basis)
+        yield Run(condition, variant, budget, found.title, seed, sequence, place if sequence else 0, found)
+
+
+def seeded(scene: str, values: dict[str, Any], seed: int) -> dict[str, Any]:
+    """A seed's settings: training's, and the noise of pseudo labels. A teacher that draws nothing is computed once."""
+    kind = merged(planning.scene_values(scene)[1], values).get("teacher", {}).get("kind")
+    return {"train": {"seed": seed}} | ({"teacher": {"seed": seed}} if kind == "labels" else {})
+
+
+def outstanding(runs: list[Run]) -> list[Step]:
+    """Steps that are not there yet, each once, in an order that fits."""
+    steps = {step.key: step for run in runs for step in (*run.steps, *_knowledge(run))}
+    return [step for step in steps.values() if not step.fresh]
+
+
+def _knowledge(run: Run) -> list[Step]:
+    """The basis that the next scene of a sequence trains on."""
+    return [step for step in run.plan.steps if step.stage == "cks"]
+
+
+def execute(name: str, runs: list[Run], cores: int, threads: int) -> Outcome:
+    """Compute what is outstanding, cores // threads jobs at once; links in `work/study-NAME` keep its artifacts.
+
+    A scene (or sequence) and seed is finished, and measured, before the next begins: a study cut short has compared
+    something. A step that fails costs the runs that need it, and no other.
+    """
+    outcome = Outcome()
+    parts: dict[tuple, list[Run]] = {}
+    for run in runs:
+        parts.setdefault((run.sequence or run.scene, run.seed), []).append(run)
+    for (scene, seed), part in parts.items():
+        waiting = outstanding(part)
+        if waiting:
+            say(f"  {scene}, seed {seed}: {describe(waiting)}; {cores // threads} at once, {threads} threads each")
+            found = snakemake(waiting, cores, threads)
+            outcome = Outcome(max(outcome.code, found.code), outcome.failed | found.failed)
+        store.link(f"study-{name}", {run.name: run.plan.targets[LAST] for run in runs})
+    return outcome
+
+
+def describe(steps: list[Step]) -> str:
+    """How many steps of each stage are to run."""
+    counts: dict[str, int] = {}
+    for step in steps:
+        counts[step.stage] = counts.get(step.stage, 0) + 1
+    return "to run: " + ", ".join(f"{n} {stage}" for stage, n in counts.items()) if counts else "nothing to run"

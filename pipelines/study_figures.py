@@ -1,0 +1,105 @@
+"""The picture of a study: error against run time, or against a setting."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from chebsplat.pipelines.results import Row, groups
+from chebsplat.statistics import summarize
+
+MARKERS = "osD^vP*X<>"
+Traces = list[tuple[Row, list[dict[str, float]]]]
+
+
+def draw(path: Path, rows: list[Row], traces: Traces, settings: dict[str, float] | None, label: str) -> None:
+    """Write the picture as PNG.
+
+    Args: settings: the value of the horizontal axis by condition; None: run time. label: of that axis.
+    """
+    import matplotlib
+
+    matplotlib.use("Agg")
+    import matplotlib.pyplot as plt
+
+    done = [row for row in rows if row["state"] == "done" and row["place"] != 1]
+    variants = list(dict.fromkeys(row["variant"] for row in rows))
+    style = {
+        name: {"color": f"C{k % 10}", "marker": MARKERS[k % len(MARKERS)], "label": name}
+        for k, name in enumerate(variants)
+    }
+    conditions = [""] if settings is not None else list(dict.fromkeys(row["condition"] for row in rows))
+    height = 3.4 * len(conditions) + 0.3 * -(-len(variants) // 5)
+    figure, axes = plt.subplots(len(conditions), 3, figsize=(12, height), layout="constrained", squeeze=False)
+    for line, condition in zip(axes, conditions, strict=True):
+        if settings is not None:
+            _over_setting(line, done, settings, style, label)
+        else:
+            chosen = [row for row in done if row["condition"] == condition]
+            _over_time(line, chosen, [t for t in traces if t[0]["condition"] == condition], style)
+            line[0].set_ylabel(condition)
+        for axis in line:
+            axis.grid(alpha=0.3)
+    handles = {
+        text: handle
+        for axis in axes.flat
+        for handle, text in zip(*axis.get_legend_handles_labels(), strict=True)
+    }  # fmt: skip
+    if handles:
+        figure.legend(handles.values(), handles.keys(), loc="outside lower center", ncols=5, fontsize=9)
+    figure.savefig(path, dpi=130)
+    plt.close(figure)
+
+
+def _mean_line(axis: Any, points: list[tuple[Any, list[float], list[float]]], style: dict[str, Any]) -> None:
+    """A line through means, with the spread of the values as bars. points: (order, x values, y values)."""
+    if not points:
+        return
+    points = sorted(points, key=lambda point: float(np.mean(point[1])))
+    summaries = [summarize(values) for _, _, values in points]
+    bars = [0.0 if np.isnan(s.spread) else s.spread for s in summaries]
+    x = [float(np.mean(xs)) for _, xs, _ in points]
+    axis.errorbar(x, [s.mean for s in summaries], bars, markersize=5, capsize=2, elinewidth=0.8, **style)
+
+
+def _over_time(line: Any, rows: list[Row], traces: Traces, style: dict[str, dict[str, Any]]) -> None:
+    """Test PSNR and mIoU over training seconds, a point a budget; held-in PSNR along the longest trainings."""
+    titles = (("psnr", "test PSNR, dB", 1), ("miou", "test mIoU, %", 100))
+    for axis, (key, title, scale) in zip(line, titles, strict=False):
+        for (variant,), members in groups([row for row in rows if row[key] is not None], "variant").items():
+            budgets = groups(members, "budget")
+            points = [
+                (name, [row["train_seconds"] for row in some], [scale * row[key] for row in some])
+                for name, some in budgets.items()
+            ]
+            _mean_line(axis, points, style[variant])
+        axis.set_title(title, fontsize=10)
+        axis.set_xlabel("training seconds of whole runs")
+    longest: dict[str, int] = {}
+    for row, _ in traces:
+        longest[row["variant"]] = max(longest.get(row["variant"], 0), row["steps"])
+    for row, trace in traces:
+        if row["steps"] == longest[row["variant"]]:
+            seconds, values = ([entry[name] for entry in trace] for name in ("seconds", "psnr"))
+            line[2].plot(seconds, values, color=style[row["variant"]]["color"], linewidth=0.7, alpha=0.7)
+    line[2].set_title("PSNR on watched training views, dB; a line a run", fontsize=10)
+    line[2].set_xlabel("training seconds")
+
+
+def _over_setting(line: Any, rows: list[Row], settings: dict[str, float], style: dict[str, Any], label: str) -> None:
+    """mIoU of the scene and of its teacher, their difference, and PSNR, over a setting."""
+    titles = (("miou", "test mIoU, %", 100), ("miou_gain", "mIoU − its 2D teacher's, points", 100),
+              ("psnr", "test PSNR, dB", 1))  # fmt: skip
+    for axis, (key, title, scale) in zip(line, titles, strict=True):
+        for (variant,), members in groups([row for row in rows if row[key] is not None], "variant").items():
+            at = groups(members, "condition")
+            points = [(name, [settings[name]], [scale * row[key] for row in some]) for (name,), some in at.items()]
+            _mean_line(axis, points, style[variant])
+        axis.set_title(title, fontsize=10)
+        axis.set_xlabel(label)
+    known = groups([row for row in rows if row["miou_teacher"] is not None], "condition")
+    points = [(name, [settings[name]], [100 * row["miou_teacher"] for row in some]) for (name,), some in known.items()]
+    _mean_line(line[0], points, {"color": "0.4", "linestyle": "--", "marker": ".", "label": "its 2D teacher"})
+    line[1].axhline(0, color="0.4", linewidth=0.8)

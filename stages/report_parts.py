@@ -1,0 +1,88 @@
+"""Parts of the report's page: names and colours of labels, the headline, classes, pictures of test views."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any
+
+from chebsplat.errors import InputError
+
+if TYPE_CHECKING:
+    from pathlib import Path
+
+    from chebsplat.formats.evaluation import Evaluation
+    from chebsplat.formats.gaussians import Gaussians
+    from chebsplat.stages.command import Job
+
+
+def label_names(job: Job, figures: dict[str, Any]) -> list[str]:
+    """Names of the labels in the pictures: the capture's classes, or the scene's own labels where it has none."""
+    from chebsplat.formats.artifact import read_manifest
+    from chebsplat.formats.capture import read_capture
+    from chebsplat.formats.documents import read_document
+
+    classes = read_capture(job.inputs["capture"]).class_names if "capture" in job.inputs else None
+    classes = classes or (figures.get("segmentation") or {}).get("classes")
+    if classes is None and "scene" in job.inputs:
+        path = job.inputs["scene"]
+        classes = list(read_document(path, read_manifest(path), "labels.json").values())
+    return classes or []
+
+
+def tiles(figures: dict[str, Any], gaussians: Gaussians) -> list[tuple[str, str, str]]:
+    """The headline: (value, what, aside)."""
+    image, segmentation = figures["image"], figures.get("segmentation") or {}
+    found = [(f"{image['psnr']:.1f} dB", "PSNR", f"SSIM {image['ssim']:.3f}")]
+    if segmentation and segmentation["scene"]["miou"] is not None:
+        of_teacher = segmentation.get("teacher", {}).get("miou")
+        aside = "" if of_teacher is None else f"its 2D teacher: {of_teacher:.1%}"
+        found.append((f"{segmentation['scene']['miou']:.1%}", "mIoU", aside))
+    if segmentation and segmentation["scene"].get("oa") is not None:
+        found.append((f"{segmentation['scene']['oa']:.1%}", "pixels right", "overall accuracy"))
+    found.append((f"{figures['n_gaussians']:,}", "Gaussians", f"PLY {figures['bytes']['ply'] / 1e6:.1f} MB"))
+    for name, value in list(figures["frames_per_second"].items())[:1]:
+        found.append((f"{value:.0f}", "frames a second", name.replace("_", " ")))
+    last = gaussians.trace[-1]
+    return [*found, (f"{last['seconds']:.0f} s", "training", f"{last['step']:.0f} steps")]
+
+
+def class_rows(figures: dict[str, Any], colors: dict[str, str]) -> list[tuple[str, str, float, float | None]]:
+    """(class, colour, IoU, its teacher's IoU), best first; classes that occur nowhere are not listed."""
+    segmentation = figures.get("segmentation") or {}
+    of_teacher = segmentation.get("teacher", {}).get("iou", {})
+    of_scene = segmentation.get("scene", {}).get("iou", {})
+    rows = [
+        (name, colors.get(name, "#999"), iou, of_teacher.get(name)) for name, iou in of_scene.items() if iou is not None
+    ]
+    return sorted(rows, key=lambda row: -row[2])
+
+
+def picture_rows(
+    evaluation: Evaluation, names: list[str], count: int, out: Path
+) -> tuple[list[dict[str, Any]], list[str]]:
+    """Pictures of evenly spaced test views, and the names of the labels in them; a PNG of the first.
+
+    Raises: InputError if a picture holds a label that has no name.
+    """
+    import numpy as np
+
+    from chebsplat.stages import figures as draw
+
+    views, pictures = evaluation.figures["names"], evaluation.pictures
+    per_view = evaluation.figures["image"]["per_view"]["psnr"]
+    rows, sheet, seen = [], [], {-1}
+    for k in np.unique(np.linspace(0, len(views) - 1, min(count, len(views))).round().astype(int)):
+        truth, render = pictures["truth"][k], pictures["renders"][k]
+        maps = {kind: pictures[kind][k] for kind in ("labels", "teacher", "predicted") if kind in pictures}
+        seen |= {int(value) for labels in maps.values() for value in np.unique(labels)}
+        if max(seen) >= len(names):
+            raise InputError(f"label {max(seen)} in the pictures has no name; pass --in-capture, or evaluate again")
+        images = [("truth", draw.data_uri(truth, photo=True)), ("renders", draw.data_uri(render, photo=True))]
+        images.append(("error", draw.data_uri(draw.error_map(render, truth), photo=True)))
+        colored = {kind: draw.colored(labels, len(names)) for kind, labels in maps.items()}
+        images += [(kind, draw.data_uri(image)) for kind, image in colored.items()]
+        if {"labels", "predicted"} <= maps.keys():
+            images.append(("wrong", draw.data_uri(draw.wrong_map(maps["predicted"], maps["labels"]))))
+        rows.append({"name": views[k], "psnr": per_view[k], "images": images})
+        sheet.append(np.concatenate([truth, render, *colored.values()], 1))
+    draw.png(np.concatenate(sheet[:2], 0), out / "pictures.png")
+    return rows, [names[k] for k in sorted(seen - {-1})]

@@ -1,0 +1,164 @@
+"""The pages: self-contained, small, and what they show is what was measured."""
+
+import base64
+import io
+import json
+import shutil
+import subprocess
+from html.parser import HTMLParser
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+from shared import run_stage
+
+from chebsplat.errors import InputError
+from chebsplat.formats.artifact import Manifest, publish
+from chebsplat.formats.evaluation import read_evaluation
+from chebsplat.stages import figures as draw
+from chebsplat.stages.report_parts import class_rows, label_names, picture_rows
+
+pytestmark = pytest.mark.xdist_group("toy")
+BROWSER = shutil.which("chromium") or shutil.which("google-chrome")
+
+
+class Fetches(HTMLParser):
+    """What a page would fetch, and the pictures it holds."""
+
+    def __init__(self, text):
+        super().__init__()
+        self.fetched, self.pictures = [], {}
+        self.feed(text)
+
+    def handle_starttag(self, tag, attributes):
+        values = dict(attributes)
+        self.fetched += [
+            v for k, v in attributes if k in ("src", "href", "xlink:href") and not v.startswith(("data:", "#"))
+        ]
+        if tag == "img" and "data-of" in values:
+            self.pictures.setdefault(values["data-of"], []).append(values["src"])
+
+
+def image(uri):
+    from PIL import Image
+
+    return np.asarray(Image.open(io.BytesIO(base64.b64decode(uri.split(",", 1)[1]))).convert("RGB"))
+
+
+def test_the_report_is_one_page_that_fetches_nothing(toy):
+    text = (toy["report"] / "report.html").read_text()
+    page = Fetches(text)
+    assert page.fetched == []
+    assert "@import" not in text
+    assert "url(" not in text.replace("url(#", "")
+    assert len(text) < 20_000_000
+    assert text.count("<svg") == 3
+    for told in ("LPIPS", "no sequence is named", "IoU by class", "Every setting"):
+        assert told in text
+    assert (toy["report"] / "figures.csv").read_text().startswith("figure,")
+    assert (toy["report"] / "trace.csv").read_text().startswith("step,seconds,")
+
+
+def test_the_page_s_pictures_are_those_of_the_evaluation(toy):
+    pictures = Fetches((toy["report"] / "report.html").read_text()).pictures
+    truth = read_evaluation(toy["evaluate"]).pictures["truth"]
+    assert set(pictures) == {"truth", "renders", "error", "labels", "teacher", "predicted", "wrong"}
+    assert {len(of_kind) for of_kind in pictures.values()} == {min(4, len(truth))}
+    difference = image(pictures["truth"][0]).astype(float) - truth[0]
+    assert np.abs(difference).mean() < 4  # WebP at quality 90; another view lies 30 away
+    classes = read_evaluation(toy["evaluate"]).figures["segmentation"]["classes"]
+    colors = {tuple(color) for color in draw.palette(len(classes)).tolist()} | {(0, 0, 0)}
+    assert {tuple(color) for color in image(pictures["labels"][0]).reshape(-1, 3).tolist()} <= colors
+
+
+def test_labels_are_named_by_the_capture_and_otherwise_by_the_scene(toy, tmp_path):
+    manifest = Manifest("chebsplat.scene/1", "k", "export", {}, {}, 0)
+    with publish(tmp_path / "scene", manifest) as out:
+        (out / "labels.json").write_text(json.dumps({"0": "sofa", "1": "lamp"}))
+    inputs = {"scene": tmp_path / "scene"}
+    assert label_names(SimpleNamespace(inputs=inputs), {}) == ["sofa", "lamp"]
+    inputs["capture"] = toy["ingest"]
+    classes = read_evaluation(toy["evaluate"]).figures["segmentation"]["classes"]
+    assert label_names(SimpleNamespace(inputs=inputs), {}) == classes
+
+
+def test_a_label_without_a_name_is_an_error_not_a_colour(toy, tmp_path):
+    with pytest.raises(InputError, match="has no name"):
+        picture_rows(read_evaluation(toy["evaluate"]), ["wall"], 1, tmp_path)
+
+
+def test_classes_are_listed_best_first_and_those_that_never_occur_are_not():
+    iou = {"wall": 0.2, "sofa": 0.9, "lamp": None}
+    figures = {"segmentation": {"scene": {"iou": iou}, "teacher": {"iou": {"wall": 0.5}}}}
+    rows = class_rows(figures, {"wall": "#1", "sofa": "#2"})
+    assert rows == [("sofa", "#2", 0.9, None), ("wall", "#1", 0.2, 0.5)]
+
+
+def test_error_pictures_show_where_it_is_wrong_and_nowhere_else():
+    truth = np.full((2, 2, 3), 100, np.uint8)
+    render = truth.copy()
+    render[0, 0] = 160
+    shown = draw.error_map(render, truth).sum(-1)
+    assert shown[0, 0] > shown[0, 1] == shown[1, 1]
+    wrong = draw.wrong_map(np.array([[1, 2], [0, 0]]), np.array([[1, 1], [-1, 0]]))
+    assert wrong[..., 3].tolist() == [[0, 255], [0, 0]]
+
+
+def test_a_page_that_would_be_too_large_is_refused(toy, tmp_path, monkeypatch):
+    from chebsplat.stages import report
+
+    monkeypatch.setattr(report, "LARGEST", 1000)
+    inputs = {"evaluation": toy["evaluate"], "gaussians": toy["train"]}
+    assert run_stage("report", tmp_path / "report", inputs) == 4
+    assert not (tmp_path / "report").exists()
+
+
+WATCH = """<script>
+const problems = []; onerror = (...all) => problems.push(String(all));
+addEventListener("load", () => {
+  document.querySelectorAll(".modes button").forEach(button => button.click());
+  parent.postMessage({ wide: document.documentElement.scrollWidth, problems,
+    shown: [...document.querySelectorAll(".stage img:not([hidden])")].map(image => image.naturalWidth) }, "*");
+});</script>"""
+FRAME = """<body><pre></pre><script>
+addEventListener("message", event => document.querySelector("pre").textContent = JSON.stringify(event.data));
+</script><iframe src="page.html" style="border: 0; width: WIDEpx; height: 900px"></iframe></body>"""
+
+
+def browsed(folder, text, wide):
+    """What a browser makes of a page in a frame `wide` pixels across: (its report, console lines, its requests)."""
+    (folder / "page.html").write_text(text.replace("<head>", "<head>" + WATCH))
+    (folder / "frame.html").write_text(FRAME.replace("WIDE", str(wide)))
+    command = [BROWSER, "--headless", "--no-sandbox", "--disable-gpu", "--enable-logging=stderr", "--dump-dom"]
+    command += [f"--user-data-dir={folder}/profile", f"--log-net-log={folder}/net.json", "--window-size=1500,1000"]
+    command += ["--virtual-time-budget=5000", "--host-resolver-rules=MAP * ~NOTFOUND"]
+    done = subprocess.run([*command, (folder / "frame.html").as_uri()], capture_output=True, text=True, timeout=120)
+    seen = json.loads(done.stdout.split("<pre>")[1].split("</pre>")[0])
+    console = [line for line in done.stderr.splitlines() if "CONSOLE" in line]
+    log = (folder / "net.json").read_text().splitlines()  # the browser's own requests have another site
+    return seen, console, [line for line in log if "site=file://" in line and '"url":"http' in line]
+
+
+in_a_browser = pytest.mark.skipif(BROWSER is None, reason="neither chromium nor google-chrome is installed")
+
+
+@pytest.mark.slow
+@in_a_browser
+@pytest.mark.parametrize("wide", [1440, 390])
+def test_in_a_browser_the_page_fits_its_width_without_an_error_or_a_request(toy, tmp_path, wide):
+    seen, console, requests = browsed(tmp_path, (toy["report"] / "report.html").read_text(), wide)
+    assert seen["problems"] == console == requests == []
+    assert seen["wide"] <= wide
+    assert len(seen["shown"]) > 1
+    assert all(seen["shown"])
+
+
+@pytest.mark.slow
+@in_a_browser
+def test_a_browser_would_notice_an_error_a_request_and_a_page_too_wide(tmp_path):
+    page = '<html><head></head><img src="http://a.invalid/x.png" style="width: 500px"><script>nothing()</script></html>'
+    seen, console, requests = browsed(tmp_path, page, 390)
+    assert seen["problems"]
+    assert console
+    assert requests
+    assert seen["wide"] > 390

@@ -1,0 +1,257 @@
+"""Studies: what they expand to, what they compute again (nothing), and the tables they make."""
+
+import csv
+import json
+import os
+import subprocess
+import sys
+
+import pytest
+from shared import ROOT
+
+from chebsplat.errors import ConfigError
+from chebsplat.formats.artifact import Manifest, publish
+from chebsplat.pipelines.plan import names
+from chebsplat.pipelines.results import compare, row_of
+from chebsplat.pipelines.study import Study, checked_study, execute, expand, outstanding, read_study
+from chebsplat.pipelines.study_page import stability, write
+from chebsplat.stages.registry import STAGES
+
+
+@pytest.fixture(autouse=True)
+def work(tmp_path, monkeypatch):
+    monkeypatch.setenv("CHEBSPLAT_WORK", str(tmp_path / "work"))
+    monkeypatch.delenv("REPLICA_ROOT", raising=False)
+    return tmp_path / "work"
+
+
+def study(**changes):
+    values = {"title": "T", "about": "A", "scenes": ["toy"], "seeds": [0, 1], "baseline": "less"}
+    values |= {"variants": {"full": {}, "less": {"ablation": "features-only"}}}
+    return checked_study(values | changes, "study")
+
+
+def publish_stage(run, stage, documents):
+    """An artifact of a run, without running it."""
+    step = next(step for step in run.steps if step.stage == stage)
+    if step.fresh:
+        return
+    code = {"commit": "c" * 40, "dirty": False}
+    manifest = Manifest(STAGES[stage].schema, step.key, stage, {}, step.sections, 0, threads=2, code=code)
+    step.path.parent.mkdir(parents=True, exist_ok=True)
+    with publish(step.path, manifest) as tmp:
+        for name, text in documents.items():
+            (tmp / name).write_text(text)
+
+
+def finish(run, miou=0.5, psnr=30.0, n=100, seconds=10.0):
+    """Pretend that a run was made and found these figures."""
+    figures = {"image": {"psnr": psnr, "ssim": 0.9}, "n_gaussians": n, "bytes": {"ply": 10 * n, "ragged": 5 * n}}
+    figures |= {"frames_per_second": {"color": 50.0}}
+    whole = {"miou": miou, "macc": miou, "oa": miou, "boundary_miou": miou}
+    figures["segmentation"] = {"scene": whole, "teacher": whole | {"miou": 0.25}}
+    for step in run.steps:
+        if step.stage not in ("train", "export", "evaluate"):
+            publish_stage(run, step.stage, {"empty.json": "{}"})
+    publish_stage(run, "train", {"trace.csv": f"step,seconds,psnr\n5,{seconds / 2},20\n10,{seconds},25\n"})
+    # 10 Gaussians keep degree 3 (16 coefficients) and 30 degree 0 (1): 190 of 640.
+    publish_stage(run, "export", {"summary.json": json.dumps({"by_degree": [30, 0, 0, 10]})})
+    publish_stage(run, "evaluate", {"figures.json": json.dumps(figures)})
+
+
+def test_a_study_is_every_combination_and_each_step_once():
+    conditions = {"a": {"teacher": {"kind": "labels"}}, "b": {"teacher": {"kind": "labels", "confusion": 0.1}}}
+    runs = expand(study(conditions=conditions, budgets={"steps": [10, 20]}))
+    assert len(runs) == 2 * 2 * 2 * 2
+    assert len({run.name for run in runs}) == len({run.plan.targets["evaluate"] for run in runs}) == 16
+    counts = [step.stage for step in outstanding(runs)]
+    assert {stage: counts.count(stage) for stage in counts} == {
+        "ingest": 1, "sfm": 1, "describe": 1, "teacher": 4, "train": 16, "export": 16, "evaluate": 16
+    }  # fmt: skip
+    settings = [step.sections["train"] for step in outstanding(runs) if step.stage == "train"]
+    assert {(s["steps"], s["seed"], s["encoder"]) for s in settings} == {
+        (steps, seed, encoder) for steps in (10, 20) for seed in (0, 1) for encoder in ("transformer", "off")
+    }
+
+
+def test_only_a_teacher_that_draws_is_computed_for_every_seed(tmp_path):
+    for name in ("model.onnx", "labels.npz"):
+        (tmp_path / name).write_bytes(b"x")
+    onnx = {"kind": "onnx", "model": str(tmp_path / "model.onnx"), "labels": str(tmp_path / "labels.npz")}
+    for teacher, count in ((onnx, 1), ({"kind": "labels"}, 2)):
+        steps = outstanding(expand(study(settings={"teacher": teacher})))
+        assert [step.stage for step in steps].count("teacher") == count
+
+
+def test_what_is_there_is_not_computed_again_and_is_kept(work):
+    first = expand(study(seeds=[0]))
+    for run in first:
+        finish(run)
+    assert outstanding(first) == []
+    assert execute("s", first, 1, 1).code == 0
+    assert len(list((work / "study-s").iterdir())) == 2
+    more = outstanding(expand(study(seeds=[0, 1], settings={"teacher": {"kind": "labels"}})))
+    assert {step.sections["train"]["seed"] for step in more if step.stage == "train"} == {1}
+    assert "ingest" not in {step.stage for step in more}
+
+
+def test_figures_are_read_from_the_artifacts():
+    (run,) = expand(study(seeds=[3], variants={"less": {}}))
+    finish(run, miou=0.75, psnr=31.5, n=40, seconds=8.0)
+    row = row_of(run, {})
+    expected = {"state": "done", "seed": 3, "miou": 0.75, "miou_gain": 0.5, "psnr": 31.5, "n_gaussians": 40}
+    expected |= {"sh_kept": 190 / 640, "bytes_ply": 400, "bytes_ragged": 200, "frames_per_second": 50.0}
+    expected |= {"train_seconds": 8.0, "held_in_psnr": 25.0, "steps": 10, "threads": 2}
+    assert {key: row[key] for key in expected} == expected
+
+
+def compared(runs, rows, baseline="less"):
+    return {line.variant: line for line in compare(rows, baseline)}
+
+
+def test_the_table_says_what_a_hand_works_out():
+    runs = expand(study(scenes=["toy", "office0"]))
+    miou = {("toy", 0): 0.50, ("toy", 1): 0.54, ("office0", 0): 0.60, ("office0", 1): 0.60}
+    for run in runs:
+        full = run.variant == "full"
+        finish(run, miou[run.scene, run.seed] + (0.02 if full else 0), n=50 if full else 100)
+    lines = compared(runs, [row_of(run, {}) for run in runs])
+    assert lines["less"].summaries["miou"].mean == pytest.approx(0.56)
+    assert lines["less"].summaries["miou"].spread == pytest.approx((0.0072 / 3) ** 0.5)  # .06² + .02² + 2 × .04²
+    assert lines["less"].differences == {}
+    gain = lines["full"].differences["miou"]
+    assert (gain.mean, gain.n_pairs, gain.n_units) == (pytest.approx(0.02), 4, 2)
+    assert gain.excluded
+    assert lines["full"].differences["n_gaussians"].mean == pytest.approx(0.5)
+    assert not lines["full"].differences["psnr"].excluded
+
+
+def test_a_run_that_failed_is_named_and_counts_in_no_mean(tmp_path):
+    toys = study()
+    runs = expand(toys)
+    broken = next(run for run in runs if (run.variant, run.seed) == ("full", 1))
+    waiting = next(run for run in runs if (run.variant, run.seed) == ("less", 0))
+    for run in runs:
+        if run not in (broken, waiting):
+            finish(run, miou=0.4)
+    failed = {broken.plan.targets["train"].name: (4, "step 7: loss color is not finite", tmp_path)}
+    rows = [row_of(run, failed) for run in runs]
+    lines = compared(runs, rows)
+    assert [(lines[v].n_done, lines[v].n_runs) for v in ("full", "less")] == [(1, 2), (1, 2)]
+    assert lines["full"].differences == {}  # no seed has both
+    page = write(tmp_path / "out", toys, runs, rows, "make study=toys")
+    for text in (page.read_text(), (tmp_path / "out/results.md").read_text()):
+        assert "train failed with exit code 4: step 7: loss color is not finite" in text
+        assert "seed 0: not run yet" in text
+        assert "make study=toys" in text
+    with (tmp_path / "out/results.csv").open() as handle:
+        states = [row["state"] for row in csv.DictReader(handle)]
+    assert states.count("done") == 2
+
+
+def test_without_a_single_result_the_page_says_so(tmp_path):
+    runs = expand(study(seeds=[0]))
+    page = write(tmp_path, study(seeds=[0]), runs, [row_of(run, {}) for run in runs], "c")
+    assert page.read_text().count("not run yet") == 2
+
+
+def test_the_page_sums_up_the_extreme_cases_by_part(tmp_path):
+    rows = ["module,case,error,tolerance,passed", "fusion,a,1e-7,1e-6,True", "fusion,b,0,0,True", "pruning,c,2,1,False"]
+    (tmp_path / "stability.csv").write_text("\n".join(rows))
+    assert stability(tmp_path / "stability.csv") == [("fusion", 2, 0, pytest.approx(0.1)), ("pruning", 1, 1, 2.0)]
+    assert stability(tmp_path / "none.csv") == []
+
+
+def test_a_figure_may_be_drawn_against_a_setting(tmp_path):
+    conditions = {f"p{p}": {"teacher": {"kind": "labels", "confusion": p}} for p in (0.0, 0.5)}
+    noise = study(seeds=[0], conditions=conditions, against="teacher.confusion")
+    runs = expand(noise)
+    for run in runs:
+        finish(run)
+    write(tmp_path, noise, runs, [row_of(run, {}) for run in runs], "c")
+    assert (tmp_path / "error-against-time.png").stat().st_size > 10_000
+
+
+def test_a_sequence_carries_knowledge_and_scratch_does_not():
+    variants = {"scratch": {"knowledge": False}, "both": {}, "warm": {"train": {"weight_basis": 0.0}}}
+    runs = expand(study(scenes=[], sequences=["toys"], seeds=[0], baseline="scratch", variants=variants))
+    assert len(runs) == 6
+    for run in runs:
+        (train,) = (step for step in run.steps if step.stage == "train")
+        assert ("basis" in train.inputs) == (run.place == 2 and run.variant != "scratch")
+        finish(run, miou=0.1 * run.place)
+    lines = compared(runs, [row_of(run, {}) for run in runs], "scratch")
+    assert lines["both"].n_runs == 1
+    assert lines["both"].summaries["miou"].mean == pytest.approx(0.2)
+    assert any(step.stage == "cks" for step in outstanding(runs))
+
+
+@pytest.mark.parametrize("name", names("studies"))
+def test_every_study_of_ours_can_be_planned(name):
+    found = read_study(name)
+    generated = [scene for scene in found.scenes if not scene.startswith("house")]
+    few = found.model_copy(update={"scenes": generated[:1], "seeds": found.seeds[:1]})
+    runs = expand(few)
+    assert {run.variant for run in runs} == set(found.variants)
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"scenes": []}, "scenes or sequences"),
+        ({"sequences": ["toys"]}, "scenes or sequences"),
+        ({"baseline": "nothing"}, "full, less"),
+        ({"seeds": []}, "seeds"),
+        ({"sead": [1]}, "sead"),
+        ({"variants": {"less": {"train": {"stps": 1}}}}, r"train\.steps"),
+        ({"variants": {"less": {"ablation": "no-tel"}}}, "no-tle"),
+    ],
+)
+def test_a_wrong_study_is_an_error_that_names_what_is_wrong(changes, message):
+    with pytest.raises(ConfigError, match=message):
+        expand(study(**changes))
+
+
+def test_a_study_may_be_a_file_of_the_user_s(tmp_path):
+    (tmp_path / "mine.toml").write_text(
+        'title = "M"\nabout = ""\nscenes = ["toy"]\nbaseline = "a"\n[variants.a]\n[variants.b.train]\nsteps = 5\n'
+    )
+    assert isinstance(read_study(str(tmp_path / "mine.toml")), Study)
+    with pytest.raises(ConfigError, match=r"none\.toml"):
+        read_study(str(tmp_path / "none.toml"))
+    with pytest.raises(ConfigError, match="method"):
+        read_study("metod")
+
+
+@pytest.mark.slow
+@pytest.mark.xdist_group("cli")
+def test_a_study_goes_on_after_a_failure_and_a_second_call_computes_only_what_failed(tmp_path, work):
+    (tmp_path / "mine.toml").write_text("""
+title = "Mine"
+about = "Two trainings, of which one breaks."
+scenes = ["toy"]
+baseline = "whole"
+[settings]
+teacher = { kind = "labels" }
+sfm = { max_points = 200 }
+describe = { n_regions = 12 }
+train = { steps = 12, n_densify = 1, report_every = 6 }
+[variants.whole]
+[variants.breaks.train]
+lr_means = 1e30
+""")
+    command = [sys.executable, "-m", "chebsplat.pipelines.cli", "study", str(tmp_path / "mine.toml")]
+    command += ["--cores", "2", "--threads", "1", "--out", str(tmp_path / "out")]
+    for to_run in (
+        "1 ingest, 1 sfm, 1 teacher, 1 describe, 2 train, 2 export, 2 evaluate",
+        "1 train, 1 export, 1 evaluate",
+    ):
+        done = subprocess.run(command, capture_output=True, text=True, cwd=ROOT, env=os.environ)
+        assert done.returncode == 4, done.stderr
+        assert f"toy, seed 0: to run: {to_run}; 2 at once, 1 threads each" in done.stderr
+        assert done.stdout.strip() == str(tmp_path / "out/study.html")
+        with (tmp_path / "out/results.csv").open() as handle:
+            states = {row["variant"]: row["state"] for row in csv.DictReader(handle)}
+        assert states["whole"] == "done"
+        assert states["breaks"].startswith("train failed with exit code 4: step ")
+    assert len(list(work.glob("store/train/*/artifact.json"))) == 1
