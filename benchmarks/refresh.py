@@ -27,7 +27,7 @@ from chebsplat.formats.points import read_points
 from chebsplat.gaussians import initial_gaussians
 from chebsplat.model import SceneModel
 from chebsplat.stages.config import Config
-from chebsplat.stages.train import training_views
+from chebsplat.stages.train_inputs import training_views
 from chebsplat.trainer import Trainer
 
 INTERVALS = (25, 50, 100, 200, 400)

@@ -167,7 +167,7 @@ def memory(what: str, folder: Path, n_views: int) -> int:
     else:
         import torch
 
-        from chebsplat.stages.train import FEATURE_BYTES
+        from chebsplat.stages.train_inputs import FEATURE_BYTES
         from chebsplat.views import remembered
 
         stored = read_features(folder / "features").features

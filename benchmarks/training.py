@@ -30,7 +30,7 @@ from chebsplat.gaussians import initial_gaussians
 from chebsplat.model import SceneModel
 from chebsplat.rasterize import rasterize
 from chebsplat.stages.config import Config
-from chebsplat.stages.train import training_views
+from chebsplat.stages.train_inputs import training_views
 from chebsplat.trainer import Trainer
 from chebsplat.views import Views
 

@@ -1,0 +1,95 @@
+"""What a training reads of its input artifacts: views, an earlier scene's knowledge, the first regions."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any
+
+from chebsplat.errors import DataFailure, InputError
+from chebsplat.stages.command import Job
+
+if TYPE_CHECKING:
+    from chebsplat.formats.capture import Capture
+    from chebsplat.formats.features import Features
+    from chebsplat.formats.points import Points
+    from chebsplat.trainer import Trainer
+    from chebsplat.views import Views
+
+FEATURE_BYTES = 64 << 20  # of features that are kept in memory; what is beyond is read when its view is looked at
+
+
+def training_views(capture: Capture, points: Points, features: Features | None) -> Views:
+    """The registered training views, joined by name. Raises InputError if artifacts do not belong together."""
+    import torch
+
+    from chebsplat.views import Views, remembered
+
+    row = {name: view for view, name in enumerate(capture.names)}
+    unknown = [name for name in points.names if name not in row]
+    if unknown:
+        raise InputError(f"the points know a view {unknown[0]} that the capture does not; pass artifacts of one scene")
+    used = [k for k, name in enumerate(points.names) if not capture.is_test[row[name]]]
+    if not used:
+        raise DataFailure("no training view is registered")
+    names = [points.names[k] for k in used]
+    images, masks = capture.images[:], capture.loss_mask
+    chosen = [row[name] for name in names]
+    of = None
+    if features is not None:
+        source = {name: view for view, name in enumerate(features.names)}
+        absent = [name for name in names if name not in source]
+        if absent:
+            raise InputError(f"the features have no view {absent[0]}; run the teacher stage on this capture")
+        stored = features.features
+        read = remembered(lambda index: torch.from_numpy(stored[source[names[index]]]), FEATURE_BYTES)
+
+        def of(index: int) -> torch.Tensor:
+            return read(index).float()
+
+    return Views(
+        names,
+        torch.from_numpy(images[chosen]),
+        torch.from_numpy(points.Ks[used]).float(),
+        torch.from_numpy(points.cam_from_world[used]).float(),
+        None if masks is None else torch.from_numpy(masks[:][chosen]),
+        of,
+    )
+
+
+def knowledge(job: Job, model: Any, train: dict[str, Any]) -> dict[str, Any]:
+    """Bases of earlier scenes; with `train.warm_start` the encoder also starts from their weights."""
+    if "basis" not in job.inputs or model.shape is None:
+        return {}
+    import torch
+
+    from chebsplat.formats.basis import read_basis
+
+    basis, projections = read_basis(job.inputs["basis"]), model.shape.encoder.projections()
+    wrong = [n for n, w in projections.items() if n not in basis.bases or len(basis.bases[n]) != len(w)]
+    if wrong:
+        raise InputError(f"{job.inputs['basis']} does not fit the encoder at {wrong[0]}; start another sequence")
+    if train["warm_start"]:
+        state = model.shape.encoder.state_dict()
+        fitting = {k: torch.from_numpy(v) for k, v in basis.weights.items() if k in state and state[k].shape == v.shape}
+        model.shape.encoder.load_state_dict(state | fitting)
+        job.facts["warm_started"] = len(fitting)
+    return {name: torch.from_numpy(basis.bases[name]) for name in projections} if train["weight_basis"] > 0 else {}
+
+
+def first_regions(job: Job, trainer: Trainer, n_points: int) -> None:
+    """Start from the describe stage's regions where there are any."""
+    import torch
+
+    from chebsplat.formats.descriptors import read_descriptors
+    from chebsplat.regions import Regions
+
+    if "descriptors" not in job.inputs:
+        trainer.refresh()
+        return
+    found = read_descriptors(job.inputs["descriptors"])
+    if found.members.max(initial=-1) >= n_points:
+        raise InputError(f"{job.inputs['descriptors']} describes other points; run the describe stage on these points")
+    wrong = [f"describe.{k}" for k, value in trainer.describe.items() if found.settings.get(k) != value]
+    if wrong:
+        raise InputError(f"{job.inputs['descriptors']} has another {wrong[0]}; run the describe stage with this config")
+    regions = Regions(found.centers, found.members, found.settings["radius"], found.settings["share"])
+    trainer.refresh(regions, torch.from_numpy(found.values))
