@@ -81,10 +81,10 @@ def test_a_training_killed_at_any_moment_ends_in_the_same_bytes(toy, tmp_path):
     began = time.perf_counter()
     train(tmp_path / "whole")
     whole, rng, killed = time.perf_counter() - began, random.Random(0), 0
-    while not train(tmp_path / "killed", rng.uniform(0.5, 0.9) * whole if killed < 8 else None):
+    while not train(tmp_path / "killed", rng.uniform(0.4, 0.8) * whole if killed < 3 else None):
         killed += 1
     facts = artifact.read_manifest(tmp_path / "killed").facts
-    assert killed >= 2 and facts["resumed_at"]
+    assert killed >= 1 and facts["resumed_at"]
     for name in ("parameters", "modules", "optimizer"):
         file = f"{name}.safetensors"
         assert (tmp_path / "killed" / file).read_bytes() == (tmp_path / "whole" / file).read_bytes(), facts
