@@ -12,7 +12,7 @@ from typing import Any
 from chebsplat.stages.registry import Stage
 
 # Settings that say where raw files lie. Their content is hashed instead: where it lies is no matter.
-PLACES = (("source", "path"), ("teacher", "model"), ("teacher", "labels"))
+PLACES = (("source", "path"), ("teacher", "model"), ("teacher", "labels"), ("evaluate", "lpips_weights"))
 
 
 def step_key(

@@ -174,6 +174,8 @@ class Planner:
         raw = {"ingest": content_hash(files, root, self.file_memo.values)}
         if kind == "onnx":
             raw["teacher"] = self._hash_named(teacher.model, teacher.labels)
+        if config.evaluate.lpips_weights:
+            raw["evaluate"] = self._hash_named(config.evaluate.lpips_weights)
         for stage in STAGES.values():
             if stage.name in left_out or (stage.name == "cks" and not keep_knowledge):
                 continue
@@ -202,7 +204,7 @@ class Planner:
         files = [Path(path) for path in paths if path]
         for file in files:
             if not file.is_file():
-                raise InputError(f"{file} is missing; correct teacher.model or teacher.labels")
+                raise InputError(f"{file} is missing; correct the setting that names it")
         return content_hash(files, None, self.file_memo.values)
 
 
