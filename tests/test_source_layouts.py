@@ -273,7 +273,9 @@ def test_the_red_kitchens_depth_agrees_between_views():
     folder = data("redkitchen")
     assert common.detect(folder) == "seven_scenes"
     assert len(seven_scenes.files(folder)) == 3 * 120 + 1
-    fields = seven_scenes.read(folder, IngestSection(max_side=160, max_views=10))
+    fields = seven_scenes.read(folder, IngestSection(max_side=80, max_views=60))
     fields["labels"] = np.zeros(fields["depth"].shape, int)
-    shares = [agreement(fields, k, k + 1)[0] for k in range(9)]
-    assert min(shares) > 0.3  # 2 % of the depth; what remains lies outside, behind something, or has no depth
+    shares = [agreement(fields, k, k + 1)[0] for k in range(0, 59, 6)]
+    assert min(shares) > 0.4  # 0.47 where the camera turns; within 2 % of depth, and the rest lies mostly outside
+    fields["cam_from_world"] = np.linalg.inv(fields["cam_from_world"])
+    assert np.median([agreement(fields, k, k + 1)[0] for k in range(0, 59, 6)]) < np.median(shares) - 0.1
