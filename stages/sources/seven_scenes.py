@@ -23,8 +23,8 @@ def read(folder: Path, settings: Any, class_names: tuple[str, ...] | None = None
 
 def probe(folder: Path) -> dict[str, bool]:
     """Light: reads names only. What some frame has, every frame must have: `read` fails otherwise."""
-    return {"poses": True, "depth": any(f"{name}.depth.png" in found for name, _, found in _frames(folder)),
-            "labels": False}  # fmt: skip
+    depth = any(name.endswith(".depth.png") for place in _places(folder) for name in os.listdir(folder / place))
+    return {"poses": True, "depth": depth, "labels": False}
 
 
 def files(folder: Path) -> list[Path]:
@@ -41,12 +41,18 @@ def _intrinsics(folder: Path) -> Path | None:
     return next((p / "camera-intrinsics.txt" for p in places if (p / "camera-intrinsics.txt").is_file()), None)
 
 
+def _places(folder: Path) -> list[str]:
+    """The folder itself and its sequences, as they precede the names of what they hold."""
+    return [
+        "",
+        *sorted(f"{entry.name}/" for entry in os.scandir(folder) if entry.is_dir() and entry.name[:4] == "seq-"),
+    ]
+
+
 def _frames(folder: Path) -> list[tuple[str, str, set[str]]]:
     """(name, colour image, files of its folder) of each frame, as POSIX paths below the folder, in natural order."""
     frames = []
-    for place in ("", *sorted(entry.name + "/" for entry in os.scandir(folder) if entry.is_dir())):
-        if place and not place.startswith("seq-"):
-            continue
+    for place in _places(folder):
         found = {place + name for name in os.listdir(folder / place)}
         for image in found:
             name = common.stem(image)
