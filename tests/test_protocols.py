@@ -240,13 +240,14 @@ def test_scannet_closed_on_paper():
     assert found["miou"] == pytest.approx((0 + 899 / 906 + 80 / 88 + 2 / 6) / 4)
 
 
-@pytest.mark.parametrize("classes", [scannet_open.CLASSES, scannet_closed.CLASSES])
+@pytest.mark.parametrize("classes", [scannet_open.CLASSES, scannet_closed.CLASSES, ("void", *scannet_closed.CLASSES)])
 def test_scannet_closed_masks_void_joins_names_and_ignores_the_aspect(classes):
     # truth     counter shelves wall   void      counter 1/2 (one pixel right, one shelves taken for it)
     # predicted counter counter wall   shelves   shelves 0/1; wall 1; the last pixel does not count: mean 1/2
     names = list(reversed(scannet_closed.CLASSES))
     predicted = np.array([[names.index(name) for name in ("counter", "counter", "wall", "shelves")]])
-    truth = np.array([[*(classes.index(name) for name in ("counter", "shelves", "wall")), -1]])
+    nothing = classes.index("void") if "void" in classes else -1
+    truth = np.array([[*(classes.index(name) for name in ("counter", "shelves", "wall")), nothing]])
     task = Task(names, np.eye(21), list(classes))
     found = scannet_closed.measure([view(predicted, 21, truth=truth)], task)["scene"]
     assert found["miou"] == pytest.approx((1 / 2 + 0 + 1) / 3)

@@ -80,6 +80,8 @@ def test_deep_blending_or_any_colmap_folder(scene, tmp_path):
 
 @pytest.mark.parametrize("unknown", [0, 65_535])
 def test_seven_scenes(scene, tmp_path, unknown):
+    """The layout has no file for the colour camera: its focal length is 525 of 640 pixels."""
+    scene = scene | {"Ks": np.tile([[78.75, 0, 48], [0, 78.75, 36], [0, 0, 1]], (16, 1, 1))}
     layouts.write_seven_scenes(tmp_path / "seq-01", scene, unknown=unknown)
     compare(read(tmp_path / "seq-01", "seven_scenes"), scene, labels=False)
     shutil.move(tmp_path / "seq-01/camera-intrinsics.txt", tmp_path)
@@ -256,12 +258,18 @@ def test_a_lost_part_of_seven_scenes_is_named(scene, tmp_path, lost, message):
         seven_scenes.read(tmp_path, SETTINGS)
 
 
-def test_seven_scenes_without_intrinsics_take_the_data_sets_own_and_say_so(scene, tmp_path):
+def test_depth_of_seven_scenes_has_a_narrower_field_of_view_than_colour(scene, tmp_path):
     layouts.write_seven_scenes(tmp_path, scene)
     (tmp_path / "camera-intrinsics.txt").unlink()
+    columns = np.tile(np.arange(96, dtype=np.uint16) + 1000, (72, 1))
+    for k in range(16):
+        save(tmp_path / f"frame-{k:06d}.depth.png", columns)
     found = seven_scenes.read(tmp_path, SETTINGS)
-    assert np.allclose(found["Ks"][0], [[585 * 96 / 640, 0, 48], [0, 585 * 96 / 640, 36], [0, 0, 1]])
-    assert "no camera-intrinsics.txt" in found["source"]["notes"][0]
+    at = (np.arange(96) + 0.5 - 48) * 585 / 525 + 48
+    wanted = np.where((at >= 0) & (at <= 96), (np.floor(at) + 1000) / 1000, np.nan)
+    assert np.allclose(found["depth"][0, 30], wanted, equal_nan=True)
+    assert np.isnan(wanted).sum() == 10
+    assert "78.75 pixels" in found["source"]["notes"][0]
     with pytest.raises(InputError, match="no frame"):
         seven_scenes.read(tmp_path / "..", SETTINGS)
 
@@ -276,6 +284,6 @@ def test_the_red_kitchens_depth_agrees_between_views():
     fields = seven_scenes.read(folder, IngestSection(max_side=80, max_views=60))
     fields["labels"] = np.zeros(fields["depth"].shape, int)
     shares = [agreement(fields, k, k + 1)[0] for k in range(0, 59, 6)]
-    assert min(shares) > 0.4  # 0.47 where the camera turns; within 2 % of depth, and the rest lies mostly outside
+    assert min(shares) > 0.3  # of all pixels, 80 % of which have depth; 0.38 where the camera turns fastest
     fields["cam_from_world"] = np.linalg.inv(fields["cam_from_world"])
     assert np.median([agreement(fields, k, k + 1)[0] for k in range(0, 59, 6)]) < np.median(shares) - 0.1
