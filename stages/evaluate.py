@@ -109,7 +109,13 @@ def seen(
 
     from chebsplat.formats.features import read_features
     from chebsplat.noisy_teacher import decode
-    from chebsplat.protocols.task import Named, Seen, resized
+    from chebsplat.protocols.task import Named, Seen, resized, translated
+
+    def as_classes(labels: np.ndarray) -> np.ndarray:
+        """A picture whose labels are numbered as the truth's, -1 where the truth has no such class."""
+        if scene.label_names is None or capture.class_names is None:
+            return labels
+        return translated(labels, scene.label_names, capture.class_names, -1)
 
     truths = None if capture.labels is None else Named(capture.names, capture.labels, "labels")
     teachers = None
@@ -124,12 +130,12 @@ def seen(
         if features is None or scene.label_embeddings is None:
             continue
         view = Seen(name, features, decode(features, scene.label_embeddings)[0])
-        shown.setdefault("predicted", []).append(view.labels)
+        shown.setdefault("predicted", []).append(as_classes(view.labels))
         if teachers is not None:
             view.teacher = teachers[name].astype(np.float32)
             small = decode(view.teacher, scene.label_embeddings)[0]
             view.teacher_labels = resized(small, view.labels.shape)
-            shown.setdefault("teacher", []).append(view.teacher_labels)
+            shown.setdefault("teacher", []).append(as_classes(view.teacher_labels))
         if truths is not None:
             view.truth = truths[name]
             shown.setdefault("labels", []).append(view.truth)

@@ -204,3 +204,37 @@ def test_a_scannet_scene_runs_from_its_folder_to_the_figures_of_scannet_open(tmp
     assert matrix.shape == (20, 20) and matrix.sum() == 16 * 484 * 648
     assert figures["segmentation"]["teacher"]["miou"] > 0.3
     assert figures["segmentation"]["scene"] == scannet_open.summed([matrix])
+
+
+def test_the_content_of_the_weights_is_part_of_what_an_evaluation_is(tmp_path, monkeypatch):
+    from chebsplat.pipelines.plan import Planner
+
+    monkeypatch.chdir(tmp_path)
+    plans = []
+    for content in (b"one", b"other"):
+        (tmp_path / "vgg.pth").write_bytes(content)
+        plans.append(Planner().plan("toy", "evaluate.lpips_weights=vgg.pth"))
+    changed = [a.stage for a, b in zip(plans[0].steps, plans[1].steps, strict=True) if a.key != b.key]
+    assert changed == ["evaluate", "report"]
+    with pytest.raises(InputError, match=r"gone\.pth is missing"):
+        Planner().plan("toy", "evaluate.lpips_weights=gone.pth")
+
+
+def test_a_scannet_folder_is_planned_without_the_stages_it_does_not_need(tmp_path, monkeypatch):
+    import layouts
+
+    from chebsplat.pipelines.plan import Planner
+    from chebsplat.protocols import scannet_closed
+
+    monkeypatch.chdir(tmp_path)
+    fields = {"images": np.zeros((5, 6, 8, 3), np.uint8), "depth": np.ones((5, 6, 8), np.float32),
+              "labels": np.zeros((5, 6, 8), np.int16), "class_names": list(scannet_closed.CLASSES),
+              "Ks": np.tile([[8.0, 0, 4], [0, 8, 3], [0, 0, 1]], (5, 1, 1)),
+              "cam_from_world": np.tile(np.eye(4), (5, 1, 1))}  # fmt: skip
+    layouts.write_scannet_pl(tmp_path / "scene0000_00", fields)
+    plan = Planner().plan("./scene0000_00", "ingest.protocol=scannet-closed")
+    assert plan.steps[0].sections["source"]["kind"] == "scannet"
+    assert "sfm: matching" in plan.left_out
+    (tmp_path / "scene0000_00/splits.json").write_text('{"train": ["0"], "test": ["10"]}')
+    again = Planner().plan("./scene0000_00", "ingest.protocol=scannet-closed")
+    assert plan.steps[0].key != again.steps[0].key

@@ -6,10 +6,15 @@ import shutil
 import layouts
 import numpy as np
 import pytest
-from shared import data
+from shared import data, run_stage
 from source_folders import SETTINGS, image, save
 
+from chebsplat.cameras import centers, unproject
 from chebsplat.errors import InputError
+from chebsplat.formats import artifact
+from chebsplat.formats.artifact import Manifest
+from chebsplat.formats.capture import Capture, write_capture
+from chebsplat.formats.points import read_points
 from chebsplat.protocols import scannet_closed, scannet_open
 from chebsplat.stages.config import IngestSection
 from chebsplat.stages.sources import colmap, common, generated, replica, scannet, scannet_labels, seven_scenes
@@ -272,6 +277,31 @@ def test_depth_of_seven_scenes_has_a_narrower_field_of_view_than_colour(scene, t
     assert "78.75 pixels" in found["source"]["notes"][0]
     with pytest.raises(InputError, match="no frame"):
         seven_scenes.read(tmp_path / "..", SETTINGS)
+
+
+@pytest.mark.parametrize("colored", [True, False])
+def test_a_sources_own_points_become_the_scenes(scene, tmp_path, colored):
+    """All but five lie on what the views show."""
+    pixels = np.argwhere(np.ones((72, 96), bool))[::23]
+    parts = [unproject(scene["depth"][k], scene["Ks"][k], scene["cam_from_world"][k], pixels) for k in range(0, 16, 4)]
+    points = np.concatenate([*parts, np.full((5, 3), 50.0)]).astype(np.float32)
+    points = points[np.isfinite(points).all(1)]
+    colors = np.full((len(points), 3), 7, np.uint8) if colored else None
+    fields = {key: scene[key] for key in ("names", "images", "Ks", "cam_from_world")}
+    record = Capture(**fields, is_test=np.arange(16) % 8 == 0, points=points, point_colors=colors)
+    with artifact.publish(tmp_path / "c", Manifest("chebsplat.capture/1", "k", "test")) as tmp:
+        write_capture(tmp, record)
+    config = {"sfm": {"max_points": 100_000}}
+    assert run_stage("sfm", tmp_path / "out", {"capture": tmp_path / "c"}, config) == 0
+    found = read_points(tmp_path / "out")
+    facts = artifact.read_manifest(tmp_path / "out").facts
+    assert facts["how"] == "source" and facts["n_candidates"] == len(points)
+    assert facts["n_unseen"] >= 5 and len(found.means) == len(points) - facts["n_unseen"]
+    assert np.isin(found.means[:, 0], points[:, 0]).all()
+    assert (found.colors == 7).all() == colored
+    to_eyes = centers(scene["cam_from_world"])[None] - found.means[:, None]
+    facing = (np.einsum("ni,nvi->nv", found.normals, to_eyes) > 0).mean()
+    assert facing > 0.8  # most points of a convex room are turned towards most cameras
 
 
 @pytest.mark.data

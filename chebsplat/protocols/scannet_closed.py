@@ -44,7 +44,7 @@ def measure(views: Iterable[Seen], task: Task) -> dict[str, Any]:
             if labels is not None:
                 found = resized(translated(labels, task.names, classes, 0), SIZE, centred=True)
                 sums[side] = sums.get(side, 0) + confusion(found, np.where(truth == 0, -1, truth), len(classes))
-    return {"classes": classes} | {side: figures(matrix) for side, matrix in sums.items()}
+    return {"classes": list(CLASSES)} | {side: figures(matrix) for side, matrix in sums.items()}
 
 
 def figures(matrix: np.ndarray) -> dict[str, Any]:

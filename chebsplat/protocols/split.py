@@ -15,7 +15,10 @@ def natural(name: str) -> tuple[Any, ...]:
 
 
 def every(names: list[str], step: int, offset: int) -> np.ndarray:
-    """bool [V]: names whose place in natural order is `offset` modulo `step`, whatever order they are given in."""
+    """bool [V]: names whose place in natural order is `offset` modulo `step`, whatever order they are given in.
+
+    Choices: natural order, which is that of text where numbers are padded; of unpadded names text makes another split.
+    """
     order = sorted(range(len(names)), key=lambda k: natural(names[k]))
     chosen = np.zeros(len(names), bool)
     chosen[order[offset % step :: step]] = True
