@@ -21,7 +21,7 @@ BLOCKS = (
     {24: 512, 26: 512, 28: 512},
 )
 CONV = re.compile(r"(?:net\.slice\d\.|net\.layers\.|features\.)(\d+)\.(weight|bias)$")
-TAP = re.compile(r"(?:lin|lins\.|)(\d)\.(?:model\.)?1\.weight$")
+TAP = re.compile(r"lins?\.?(\d)\.(?:model\.)?1\.weight$")
 
 
 class Lpips:

@@ -57,18 +57,23 @@ def test_lpips_is_0_for_equal_images_symmetric_and_positive(weights):
     assert lpips.distance(a, nearer) < lpips.distance(a, c)
 
 
-def test_lpips_of_weights_that_pass_colours_on_is_the_distance_of_their_directions():
+@pytest.mark.parametrize(
+    "names",
+    [("features.{}", "lin{}.model.1"), ("net.slice1.{}", "lins.{}.model.1"), ("net.layers.{}", "lin.{}.1")],
+)
+def test_lpips_of_weights_that_pass_colours_on_is_the_distance_of_their_directions(names):
     """Every layer keeps the first three channels; so each tap compares the unit vectors of the scaled colours."""
     layers, taps = widths()
     state = {}
     for layer, inputs, outputs in layers:
         kernel = torch.zeros(outputs, inputs, 3, 3)
         kernel[[0, 1, 2], [0, 1, 2], 1, 1] = 1
-        state |= {f"net.slice1.{layer}.weight": kernel, f"net.slice1.{layer}.bias": torch.zeros(outputs)}
+        place = names[0].format(layer)
+        state |= {f"{place}.weight": kernel, f"{place}.bias": torch.zeros(outputs)}
     for k, channels in taps:
         tap = torch.zeros(1, channels, 1, 1)
         tap[0, :3, 0, 0] = torch.tensor([1.0, 2.0, 3.0]) * (k + 1)
-        state[f"lins.{k}.model.1.weight"] = tap
+        state[f"{names[1].format(k)}.weight"] = tap
     a, b = (np.full((32, 32, 3), color, np.uint8) for color in ((200, 10, 60), (30, 90, 255)))
     units = []
     for image in (a, b):
@@ -210,6 +215,7 @@ def test_the_content_of_the_weights_is_part_of_what_an_evaluation_is(tmp_path, m
     from chebsplat.pipelines.plan import Planner
 
     monkeypatch.chdir(tmp_path)
+    monkeypatch.setenv("CHEBSPLAT_WORK", str(tmp_path / "work"))
     plans = []
     for content in (b"one", b"other"):
         (tmp_path / "vgg.pth").write_bytes(content)
@@ -227,6 +233,7 @@ def test_a_scannet_folder_is_planned_without_the_stages_it_does_not_need(tmp_pat
     from chebsplat.protocols import scannet_closed
 
     monkeypatch.chdir(tmp_path)
+    monkeypatch.setenv("CHEBSPLAT_WORK", str(tmp_path / "work"))
     fields = {"images": np.zeros((5, 6, 8, 3), np.uint8), "depth": np.ones((5, 6, 8), np.float32),
               "labels": np.zeros((5, 6, 8), np.int16), "class_names": list(scannet_closed.CLASSES),
               "Ks": np.tile([[8.0, 0, 4], [0, 8, 3], [0, 0, 1]], (5, 1, 1)),

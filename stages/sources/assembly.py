@@ -239,4 +239,7 @@ def indexed(
         table[value + 1] = result.index(name) if name in result else -1
     if (table < 0).all():
         raise DataFailure(f"no label has a name (ids {present[:8]}); give names, or take the labels away")
-    return table[raw + 1], result, notes
+    labels = np.empty(raw.shape, np.int16)
+    for k, view in enumerate(raw):  # one by one: a copy of all would be the largest thing in memory
+        labels[k] = table[view + 1]
+    return labels, result, notes
