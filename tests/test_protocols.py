@@ -1,6 +1,7 @@
 """Every protocol gives the figures that a person works out on paper, joins views by name, and tests the right ones."""
 
 import itertools
+from typing import get_args
 
 import numpy as np
 import pytest
@@ -56,6 +57,10 @@ def test_each_protocol_has_its_own_test_views(protocol, tests):
     found, record = split(names, None, IngestSection(protocol=protocol))
     assert {int(name) for name, test in zip(names, found, strict=True) if test} == tests
     assert record["name"] == protocol and record["split"]
+
+
+def test_a_config_knows_every_protocol_and_no_other():
+    assert set(get_args(IngestSection.model_fields["protocol"].annotation)) == set(protocols.ALL)
 
 
 def test_only_labels_and_scannet_closed_follow_a_sources_own_split():
