@@ -33,6 +33,7 @@ class Capture:
     cam_from_world: f64 [V, 4, 4] OpenCV axes, or None where poses are unknown.
     is_test:        bool [V]; test views are never trained on.
     depth, labels, loss_mask: as in OPTIONAL, or None. class_names[labels] names a pixel.
+    points:         f32 [N, 3] in the world, where the source has its own, with point_colors u8 [N, 3] or None.
     source:         which source, and notes about what was dropped or changed; protocol: name and parameters.
     """
 
@@ -47,6 +48,8 @@ class Capture:
     class_names: list[str] | None = None
     source: dict[str, Any] = field(default_factory=dict)
     protocol: dict[str, Any] = field(default_factory=dict)
+    points: np.ndarray | None = None
+    point_colors: np.ndarray | None = None
 
     @property
     def size(self) -> tuple[int, int]:
@@ -66,6 +69,9 @@ def write_capture(out: Path, capture: Capture) -> None:
     if capture.cam_from_world is not None:
         cameras["cam_from_world"] = capture.cam_from_world
     write_tensors(out / "cameras.safetensors", cameras)
+    if capture.points is not None:
+        colors = {} if capture.point_colors is None else {"colors": capture.point_colors}
+        write_tensors(out / "points.safetensors", {"points": capture.points} | colors)
     write_document(
         out / "capture.json",
         {
@@ -88,6 +94,9 @@ def read_capture(path: Path) -> Capture:
         name: open_array(path, manifest, name, images.shape[:3], dtype) if has_array(manifest, name) else None
         for name, (dtype, _, _) in OPTIONAL.items()
     }
+    cloud = {}
+    if "points.safetensors" in manifest.files:
+        cloud = read_tensors(path, manifest, "points.safetensors", {"points": ("n", 3)})
     capture = Capture(
         document["names"],
         images,
@@ -96,6 +105,8 @@ def read_capture(path: Path) -> Capture:
         cameras["is_test"].astype(bool),
         **optional,
         class_names=document["class_names"],
+        points=cloud.get("points"),
+        point_colors=cloud.get("colors"),
         source=document["source"],
         protocol=document["protocol"],
     )

@@ -18,6 +18,7 @@ PLACES = (
     ("projection", "reference"),
     ("teacher", "model"),
     ("teacher", "labels"),
+    ("evaluate", "lpips_weights"),
 )
 
 

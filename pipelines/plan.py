@@ -186,6 +186,8 @@ class Planner:
         if model is not None:
             raw["teacher"] = self._hash_teacher(model, teacher)
             raw["projection"] = self._hash_projection(model, projection)
+        if config.evaluate.lpips_weights:
+            raw["evaluate"] = self._hash_files([Path(config.evaluate.lpips_weights)], "evaluate.lpips_weights")
         for stage in STAGES.values():
             if stage.name in left_out or (stage.name == "cks" and not keep_knowledge):
                 continue
@@ -219,11 +221,13 @@ class Planner:
 
     def _hash_teacher(self, model: TeacherModel, teacher: Any) -> str:
         """Of the model's files, and of the file of labels."""
-        files = model.files()
-        if teacher.labels:
-            files.append(Path(teacher.labels))
-            if not files[-1].is_file():
-                raise InputError(f"{files[-1]} is missing; correct teacher.labels")
+        named = [Path(teacher.labels)] if teacher.labels else []
+        return self._hash_files([*model.files(), *named], "teacher.labels")
+
+    def _hash_files(self, files: list[Path], setting: str) -> str:
+        for file in files:
+            if not file.is_file():
+                raise InputError(f"{file} is missing; correct {setting}")
         return content_hash(files, None, self.file_memo.values)
 
 

@@ -24,16 +24,20 @@ class SceneSection(_Section):
 class SourceSection(_Section):
     """Where the photos come from. `named` is Replica's scene when REPLICA_ROOT has it, else the generated one."""
 
-    kind: Literal["named", "generated", "colmap", "transforms", "photos", "replica", "scannet"] = "named"
+    kind: Literal["named", "generated", "colmap", "transforms", "photos", "replica", "scannet", "seven_scenes"] = (
+        "named"
+    )
     path: str | None = None
     seed: int = 0  # of a generated scene
     preset: Literal["office", "room", "toy"] = "office"
 
 
 class IngestSection(_Section):
-    protocol: str = "labels"
-    test_every: int = Field(8, ge=2)
-    test_offset: int = Field(0, ge=0)
+    protocol: Literal["labels", "replica-f3", "replica-gt", "scannet-open", "scannet-closed", "deep-blending"] = (
+        "labels"
+    )
+    test_every: int | None = Field(None, ge=2)  # None: the protocol's own
+    test_offset: int | None = Field(None, ge=0)
     max_side: int = Field(640, ge=16)  # images are reduced to this; never enlarged
     max_views: int | None = Field(None, ge=2)
     min_views: int = Field(3, ge=1)
@@ -177,6 +181,7 @@ class CksSection(_Section):
 class EvaluateSection(_Section):
     boundary: int = Field(5, ge=1)  # pixels, half width of the boundary band
     timing_repeats: int = Field(3, ge=1)
+    lpips_weights: str | None = None  # .safetensors or .pth with VGG-16 and LPIPS' taps; None: not measured
 
 
 class ReportSection(_Section):

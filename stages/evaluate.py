@@ -1,65 +1,81 @@
-"""evaluate: measure the exported scene on the test views."""
+"""evaluate: measure the exported scene on the views of its protocol."""
 
 from __future__ import annotations
 
-import time
+from collections.abc import Iterator
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from chebsplat.errors import DataFailure
+from chebsplat.errors import ConfigError, DataFailure, InputError
 from chebsplat.stages.command import Job, command
 
 if TYPE_CHECKING:
     import numpy as np
 
     from chebsplat.formats.capture import Capture
-    from chebsplat.formats.features import Features
     from chebsplat.formats.scene import Scene
+    from chebsplat.protocols.task import Seen
+    from chebsplat.render import SceneRenderer
     from chebsplat.views import View
 
 
 def run(job: Job) -> None:
     import numpy as np
 
+    from chebsplat import protocols
     from chebsplat.formats.capture import read_capture
     from chebsplat.formats.evaluation import Evaluation, write_evaluation
-    from chebsplat.formats.features import read_features
     from chebsplat.formats.scene import read_scene
+    from chebsplat.lpips import NET, NORMALIZE
     from chebsplat.render import SceneRenderer
+    from chebsplat.stages.fidelity import frame_split, image_figures, perceptual, timing
 
     settings = job.config.evaluate
     capture, scene = read_capture(job.inputs["capture"]), read_scene(job.inputs["scene"])
+    protocol = protocols.ALL.get(capture.protocol["name"])
+    if protocol is None:
+        raise ConfigError(f"the capture's protocol {capture.protocol['name']} is unknown; ingest it again")
+    lpips = perceptual(Path(settings.lpips_weights).expanduser()) if settings.lpips_weights else None
     row = {name: view for view, name in enumerate(capture.names)}
-    tests = [k for k, name in enumerate(scene.cameras.names) if name in row and capture.is_test[row[name]]]
-    if not tests:
-        raise DataFailure("no test view has a camera; lower ingest.test_every")
-    views = [row[scene.cameras.names[k]] for k in tests]
-    names = [capture.names[v] for v in views]
+    chosen = capture.is_test if not protocol.ON_TRAINING else ~capture.is_test
+    places = [k for k, name in enumerate(scene.cameras.names) if name in row and chosen[row[name]]]
+    if not places:
+        raise DataFailure("no view to evaluate has a camera; lower ingest.test_every")
+    names = [scene.cameras.names[k] for k in places]
     renderer = SceneRenderer(scene.parameters)
-    cameras = [camera(scene, k) for k in tests]
-    renders, features = [], []
-    for view, _ in job.progress.track(cameras, len(cameras), "evaluate"):
-        image, feature = renderer.render(view, with_features=scene.labels is not None)
-        renders.append(image)
-        features.append(feature)
-    truth = np.stack([capture.images[v] for v in views])
-    pictures: dict[str, Any] = {"truth": truth, "renders": np.stack(renders)}
-    masks = None if capture.loss_mask is None else [capture.loss_mask[v] for v in views]
+    cameras = [camera(scene, k) for k in places]
+    pictures: dict[str, Any] = {"truth": np.stack([capture.images[row[name]] for name in names])}
     figures: dict[str, Any] = {"names": names, "protocol": capture.protocol, "source": capture.source}
-    figures["image"] = image_figures(pictures["renders"], truth, masks)
+    shown: dict[str, list[np.ndarray]] = {"renders": []}
+    views = seen(job, renderer, dict(zip(names, cameras, strict=True)), capture, scene, shown)
+    segmentation = None
+    if scene.labels is None:
+        job.left_out("segmentation", "the scene has no semantics")
+    elif protocol.TRUTH == "labels" and (capture.labels is None or capture.class_names is None):
+        job.left_out("mIoU", "the capture has no labels to compare with")
+        segmentation = {}
+    else:
+        segmentation = protocol.measure(views, task(job, capture, scene))
+    for _ in views:  # whatever the protocol did not look at
+        pass
+    pictures |= {name: np.stack(maps) for name, maps in shown.items()}
+    masks = None if capture.loss_mask is None else [capture.loss_mask[row[name]] for name in names]
+    figures["image"] = image_figures(pictures["renders"], pictures["truth"], masks, lpips)
     figures["n_gaussians"] = len(scene.parameters["means"])
     figures["bytes"] = scene.summary["bytes"]
     figures["frames_per_second"] = timing(renderer, cameras, settings.timing_repeats, scene.labels is not None)
-    figures["lpips"] = None
-    job.left_out("LPIPS", "no backbone weights are given: not measured")
-    if scene.labels is None:
-        job.left_out("segmentation", "the scene has no semantics")
+    figures["milliseconds"] = frame_split(renderer, cameras, settings.timing_repeats)
+    figures["lpips"] = figures["image"]["lpips"]
+    if lpips is None:
+        job.left_out("LPIPS", "evaluate.lpips_weights names no file: not measured")
     else:
-        teacher = read_features(job.inputs["features"]) if "features" in job.inputs else None
-        figures["segmentation"] = label_figures(job, capture, scene, views, features, teacher, pictures)
+        figures["lpips_net"] = {"net": NET, "normalize": NORMALIZE}
+    if segmentation is not None:
+        figures["segmentation"] = segmentation
     figures["left_out"] = scene.summary["left_out"] | job.facts.get("left_out", {})
-    job.facts |= {"psnr": figures["image"]["psnr"], "n_test": len(tests)}
-    if figures.get("segmentation"):
-        job.facts["miou"] = figures["segmentation"]["scene"]["miou"]
+    job.facts |= {"psnr": figures["image"]["psnr"], "n_test": len(names)}
+    if segmentation:
+        job.facts["miou"] = segmentation["scene"]["miou"]
     write_evaluation(job.out, Evaluation(figures, pictures))
 
 
@@ -73,118 +89,59 @@ def camera(scene: Scene, index: int) -> View:
     return View(K, pose, cameras.width, cameras.height)
 
 
-def image_figures(renders: np.ndarray, truth: np.ndarray, masks: list[np.ndarray] | None) -> dict[str, Any]:
-    """PSNR and SSIM by view and in the mean. Masked pixels do not count; for SSIM they take the true colour."""
-    import numpy as np
-
-    from chebsplat.losses import ssim
-    from chebsplat.metrics import psnr
-
-    rows = []
-    for k, (render, true) in enumerate(zip(renders, truth, strict=True)):
-        counted = np.ones(true.shape[:2], bool) if masks is None else masks[k]
-        filled = np.where(counted[..., None], render, true)
-        rows.append((min(psnr(render[counted], true[counted]), 100.0), ssim(filled, true)))
-    table = np.array(rows)
-    per_view = {"psnr": table[:, 0].tolist(), "ssim": table[:, 1].tolist()}
-    return {"psnr": float(table[:, 0].mean()), "ssim": float(table[:, 1].mean()), "per_view": per_view}
-
-
-def timing(renderer: Any, cameras: list[View], repeats: int, semantic: bool) -> dict[str, float]:
-    """Frames a second over all test views, the best of `repeats`: colour alone, and with features."""
-    figures = {}
-    for name, with_features in (("color", False), ("color_and_features", True)):
-        if with_features and not semantic:
-            continue
-        best = float("inf")
-        for _ in range(repeats):
-            began = time.perf_counter()
-            for view in cameras:
-                renderer.render(view, with_features)
-            best = min(best, time.perf_counter() - began)
-        figures[name] = len(cameras) / best
-    return figures
-
-
-def label_figures(
-    job: Job,
-    capture: Capture,
-    scene: Scene,
-    views: list[int],
-    features: list[Any],
-    teacher: Features | None,
-    pictures: dict[str, Any],
-) -> dict[str, Any]:
-    """mIoU, mAcc, OA, IoU by class and within the boundary band: of the scene, and of its teacher on the same views."""
-    import numpy as np
-
-    from chebsplat.noisy_teacher import decode
+def task(job: Job, capture: Capture, scene: Scene) -> Any:
+    from chebsplat.protocols.task import Task
 
     assert scene.label_embeddings is not None and scene.label_names is not None
-    predicted = np.stack([decode(f, scene.label_embeddings)[0] for f in features])
-    pictures["predicted"] = predicted
-    of_teacher = None
-    if teacher is not None:
-        row = {name: k for k, name in enumerate(teacher.names)}
-        size = predicted.shape[1:]
-        found = (labels_of(teacher, row[capture.names[v]]) for v in views)  # one view's features at a time
-        of_teacher = pictures["teacher"] = np.stack([enlarged(labels, size) for labels in found])
-    if capture.labels is None or capture.class_names is None:
-        job.left_out("mIoU", "the capture has no labels to compare with")
-        return {}
-    truth = pictures["labels"] = np.stack([capture.labels[v] for v in views])
-    classes = capture.class_names
-    result = {"classes": classes, "scene": measured(predicted, scene.label_names, truth, classes, job)}
-    if of_teacher is not None and teacher is not None:
-        result["teacher"] = measured(of_teacher, teacher.label_names, truth, classes, job)
-    return result
+    return Task(scene.label_names, scene.label_embeddings, capture.class_names or [], job.config.evaluate.boundary)
 
 
-def labels_of(teacher: Features, view: int) -> np.ndarray:
-    """What a teacher says of a view, [h, w]: its own labels where it told them, before any projection."""
+def seen(
+    job: Job,
+    renderer: SceneRenderer,
+    cameras: dict[str, View],
+    capture: Capture,
+    scene: Scene,
+    shown: dict[str, list[np.ndarray]],
+) -> Iterator[Seen]:
+    """Render one view after another; `shown` collects the pictures. Everything is joined on the view's name."""
     import numpy as np
 
+    from chebsplat.formats.features import read_features
     from chebsplat.noisy_teacher import decode
+    from chebsplat.protocols.task import Named, Seen, resized, translated
 
-    if teacher.pseudo_labels is not None:
-        return np.asarray(teacher.pseudo_labels[view])
-    return decode(teacher.features[view].astype(np.float32), teacher.label_embeddings)[0]
+    def as_classes(labels: np.ndarray) -> np.ndarray:
+        """A picture whose labels are numbered as the truth's, -1 where the truth has no such class."""
+        if scene.label_names is None or capture.class_names is None:
+            return labels
+        return translated(labels, scene.label_names, capture.class_names, -1)
 
-
-def enlarged(labels: np.ndarray, size: tuple[int, int]) -> np.ndarray:
-    """Nearest-neighbour enlargement of labels [h, w] to a size (H, W)."""
-    import numpy as np
-
-    rows = np.minimum(np.arange(size[0]) * labels.shape[0] // size[0], labels.shape[0] - 1)
-    columns = np.minimum(np.arange(size[1]) * labels.shape[1] // size[1], labels.shape[1] - 1)
-    return labels[rows[:, None], columns]
-
-
-def measured(
-    predicted: np.ndarray, names: list[str], truth: np.ndarray, classes: list[str], job: Job
-) -> dict[str, Any]:
-    """Figures of one confusion matrix over all test views. A label whose name is no class counts as wrong."""
-    import numpy as np
-
-    from chebsplat.metrics import IGNORE, boundary_band, confusion, segmentation
-
-    n = len(classes)
-    to_class = np.array([classes.index(name) if name in classes else n for name in names])
-    mapped = to_class[predicted]
-    band = np.stack([boundary_band(t, job.config.evaluate.boundary) for t in truth])
-    whole = segmentation(confusion(mapped, truth, n + 1))
-    edges = segmentation(confusion(mapped, np.where(band, truth, IGNORE), n + 1))
-
-    def mean(values: np.ndarray) -> float | None:
-        return None if np.isnan(values[:n]).all() else float(np.nanmean(values[:n]))
-
-    return {
-        "miou": mean(whole.iou),
-        "macc": whole.macc,
-        "oa": whole.oa,
-        "boundary_miou": mean(edges.iou),
-        "iou": {name: None if np.isnan(v) else float(v) for name, v in zip(classes, whole.iou, strict=False)},
-    }
+    truths = None if capture.labels is None else Named(capture.names, capture.labels, "labels")
+    teachers = told = None
+    if "features" in job.inputs and scene.labels is not None:
+        teacher = read_features(job.inputs["features"])
+        if teacher.label_names != scene.label_names:
+            raise InputError(f"{job.inputs['features']} has other labels than the scene; export the scene again")
+        teachers = Named(teacher.names, teacher.features, "features of a teacher")
+        if teacher.pseudo_labels is not None:  # its own, before any projection
+            told = Named(teacher.names, teacher.pseudo_labels, "labels of a teacher")
+    for name, _ in job.progress.track(list(cameras), len(cameras), "evaluate"):
+        image, features = renderer.render(cameras[name], with_features=scene.labels is not None)
+        shown["renders"].append(image)
+        if features is None or scene.label_embeddings is None:
+            continue
+        view = Seen(name, features, decode(features, scene.label_embeddings)[0])
+        shown.setdefault("predicted", []).append(as_classes(view.labels))
+        if teachers is not None:
+            view.teacher = teachers[name].astype(np.float32)
+            small = decode(view.teacher, scene.label_embeddings)[0] if told is None else told[name]
+            view.teacher_labels = resized(small, view.labels.shape)
+            shown.setdefault("teacher", []).append(as_classes(view.teacher_labels))
+        if truths is not None:
+            view.truth = truths[name]
+            shown.setdefault("labels", []).append(view.truth)
+        yield view
 
 
 main = command("evaluate", run)

@@ -16,8 +16,6 @@ def resolve(name: str, source: SourceSection) -> SourceSection:
 
     The result, not `named`, enters an artifact's key, so the two can never be mistaken for each other.
     """
-    if source.kind == "scannet":
-        raise ConfigError("source.kind = scannet: not yet; export the scene to COLMAP and use source.kind = colmap")
     if source.kind == "named":
         root = os.environ.get("REPLICA_ROOT")
         spellings = (name, name.rstrip("0123456789") + "_" + name[len(name.rstrip("0123456789")) :])
@@ -35,13 +33,47 @@ def read(name: str, source: SourceSection, settings: IngestSection) -> dict[str,
         from chebsplat.stages.sources import generated
 
         return generated.capture(name, source.seed, source.preset)
-    from chebsplat.stages.sources import colmap, photos, replica, transforms
+    from chebsplat.stages.sources import colmap, photos, replica, scannet, seven_scenes, transforms
 
     folder = Path(str(source.path)).expanduser()
     if not folder.is_dir():
         raise InputError(f"{folder} is not a folder; correct source.path")
-    modules = {"colmap": colmap, "transforms": transforms, "photos": photos, "replica": replica}
+    modules = {
+        "colmap": colmap,
+        "transforms": transforms,
+        "photos": photos,
+        "replica": replica,
+        "scannet": scannet,
+        "seven_scenes": seven_scenes,
+    }
     return modules[source.kind].read(folder, settings)
+
+
+def split(names: list[str], own: Any, settings: IngestSection) -> tuple[Any, dict[str, Any]]:
+    """Test views by the protocol's rule, bool [V], and the protocol with its parameters, for the record.
+
+    Args: own: bool [V], the source's own split, or None.
+    Raises: ConfigError if the config changes a rule that is part of a protocol's name.
+    """
+    import numpy as np
+
+    from chebsplat import protocols
+    from chebsplat.protocols.split import every
+
+    rule = protocols.ALL[settings.protocol]
+    given = {"test_every": settings.test_every, "test_offset": settings.test_offset}
+    fixed = {"test_every": rule.TEST_EVERY, "test_offset": rule.TEST_OFFSET}
+    used = {key: fixed[key] if value is None else value for key, value in given.items()}
+    if used != fixed and not rule.ADJUSTABLE:
+        raise ConfigError(f"ingest.protocol {rule.NAME} tests other views; leave test_every and test_offset away")
+    record: dict[str, Any] = {"name": rule.NAME}
+    if rule.ON_TRAINING:
+        return np.zeros(len(names), bool), record | {"split": "no view is held out; all are evaluated"}
+    if own is not None and rule.OWN_SPLIT:
+        return own, record | {"split": "the source's own"}
+    step, offset = used["test_every"], used["test_offset"] % used["test_every"]
+    said = {"split": f"view index % {step} == {offset} is test", "test_every": step, "test_offset": offset}
+    return every(names, step, offset), record | said
 
 
 def run(job: Job) -> None:
@@ -54,11 +86,7 @@ def run(job: Job) -> None:
     fields = read(name, source, settings)
     fields["source"] = {"name": name} | fields["source"]
     n_views = len(fields["names"])
-    protocol = {"name": settings.protocol, "split": "the source's own"}
-    if "is_test" not in fields:
-        offset = settings.test_offset % settings.test_every
-        fields["is_test"] = np.arange(n_views) % settings.test_every == offset
-        protocol |= {"split": f"view index % {settings.test_every} == {offset} is test"}
+    fields["is_test"], protocol = split(fields["names"], fields.pop("is_test", None), settings)
     optional: dict[str, Any] = {"depth": None, "labels": None, "loss_mask": None, "class_names": None}
     capture = Capture(**(optional | fields), protocol=protocol)
     for what in ("depth", "labels"):

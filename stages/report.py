@@ -136,7 +136,7 @@ def summary_rows(figures: dict[str, Any]) -> list[list[str]]:
         ["figure", "scene", "2D teacher"],
         ["PSNR, dB (8-bit, mean over views)", f"{image['psnr']:.2f}", ""],
         ["SSIM (window 11, σ 1.5)", f"{image['ssim']:.4f}", ""],
-        ["LPIPS", shown(figures["lpips"], "{:.3f}"), ""],
+        ["LPIPS (vgg, images in [0, 1])", shown(figures["lpips"], "{:.3f}"), ""],
     ]
     segmentation = figures.get("segmentation") or {}
     names = {"miou": "mIoU", "macc": "mAcc", "oa": "OA", "boundary_miou": "mIoU in the boundary band"}
@@ -148,6 +148,10 @@ def summary_rows(figures: dict[str, Any]) -> list[list[str]]:
     rows.append(["Gaussians", f"{figures['n_gaussians']:,}", ""])
     rows += [[f"bytes, {name}", f"{size:,}", ""] for name, size in figures["bytes"].items()]
     rows += [[f"frames/s, {n.replace('_', ' ')}", f"{v:.1f}", ""] for n, v in figures["frames_per_second"].items()]
+    split = figures["milliseconds"]
+    under = f"{split['width']}x{split['height']}, {split['threads']} threads, {split['device']}"
+    parts = ("projection", "sh", "sort", "blend")
+    rows += [[f"ms a frame, {part} ({under})", f"{split[part]:.2f}", ""] for part in parts]
     return rows
 
 

@@ -23,7 +23,10 @@ def run(job: Job) -> None:
     from chebsplat.gaussians import local_shape
 
     settings, capture = job.config.sfm, read_capture(job.inputs["capture"])
-    if capture.cam_from_world is not None and capture.depth is not None:
+    if capture.cam_from_world is not None and capture.points is not None:
+        job.left_out("feature matching", "poses are given, and points by the source")
+        found = from_source(capture, settings)
+    elif capture.cam_from_world is not None and capture.depth is not None:
         job.left_out("feature matching", "poses and depth are given: points come from depth")
         found = from_depth(job, capture, settings)
     else:
@@ -95,6 +98,45 @@ def from_depth(job: Job, capture: Capture, settings: SfmSection) -> dict[str, An
         "seen_from": np.concatenate(seen)[kept],
         "tracks": np.zeros((0, 2), np.int32),
         "notes": {"how": "depth", "n_candidates": len(points)},
+    }
+
+
+def from_source(capture: Capture, settings: SfmSection) -> dict[str, Any]:
+    """The source's own points that a training view has in its image, thinned to one a voxel.
+
+    Choices: a point is taken as seen from the nearest such view, which turns its normal; walls in between are not
+    looked for. A point without a colour takes the pixel's.
+    """
+    import numpy as np
+
+    from chebsplat.cameras import centers
+
+    assert capture.cam_from_world is not None and capture.points is not None
+    kept = thin(capture.points, settings.max_points)
+    points, (width, height) = capture.points[kept].astype(np.float64), capture.size
+    distance, seen = np.full(len(points), np.inf), np.full(len(points), -1)
+    colors = np.zeros((len(points), 3), np.uint8)
+    for view in np.flatnonzero(~capture.is_test):
+        pose = capture.cam_from_world[view]
+        camera = points @ pose[:3, :3].T + pose[:3, 3]
+        u, v = ((camera / np.maximum(camera[:, 2:], 1e-6)) @ capture.Ks[view].T)[:, :2].T
+        away = np.linalg.norm(points - centers(pose[None])[0], axis=1)
+        nearer = (camera[:, 2] > 0.01) & (u >= 0) & (u < width) & (v >= 0) & (v < height) & (away < distance)
+        distance[nearer], seen[nearer] = away[nearer], view
+        if capture.point_colors is None:
+            colors[nearer] = capture.images[view][v[nearer].astype(int), u[nearer].astype(int)]
+    if capture.point_colors is not None:
+        colors = capture.point_colors[kept]
+    inside = seen >= 0
+    return {
+        "names": list(capture.names),
+        "Ks": capture.Ks,
+        "cam_from_world": capture.cam_from_world,
+        "means": capture.points[kept][inside],
+        "colors": colors[inside],
+        "seen_from": seen[inside],
+        "tracks": np.zeros((0, 2), np.int32),
+        "notes": {"how": "source", "n_candidates": len(capture.points), "n_unseen": int((~inside).sum())},
     }
 
 

@@ -40,6 +40,8 @@ def make_capture():
         ["wall", "floor"],
         {"kind": "test"},
         {"name": "labels"},
+        rng.random((7, 3), dtype=np.float32),
+        rng.integers(0, 255, (7, 3), dtype=np.uint8),
     )
 
 

@@ -11,7 +11,7 @@ from source_folders import SETTINGS, SMALL, change_frame, image, write_transform
 from chebsplat.cameras import unproject
 from chebsplat.errors import DataFailure, InputError
 from chebsplat.stages.config import IngestSection
-from chebsplat.stages.sources import colmap, common, photos, replica, transforms
+from chebsplat.stages.sources import colmap, common, photos, replica, scannet, seven_scenes, transforms
 
 
 def agreement(fields, a, b):
@@ -182,19 +182,22 @@ def test_a_folder_without_photos_is_no_source(tmp_path):
 
 
 def test_probes_take_under_20_ms_for_a_thousand_frames(tmp_path):
-    folders = {n: tmp_path / n for n in ("slam", "nerf", "colmap", "transforms", "photos")}
+    folders = {n: tmp_path / n for n in ("slam", "nerf", "colmap", "transforms", "photos", "scannet", "seven")}
     pixels = image(tmp_path / "x.png").read_bytes()
     (tmp_path / "x.png").unlink()
     for part in ("slam/results/frame{:06d}.jpg", "slam/results/depth{:06d}.png", "nerf/Sequence_1/rgb/rgb_{}.png",
                  "nerf/Sequence_1/depth/depth_{}.png", "nerf/Sequence_1/semantic_class/semantic_class_{}.png",
                  "colmap/images/{}.png", "colmap/depth/{}.png", "colmap/semantic/{}.png", "photos/{}.png",
-                 "transforms/images/{}.png"):  # fmt: skip
+                 "transforms/images/{}.png", "scannet/color/{}.png", "scannet/label-filt/{}.png",
+                 "scannet/depth/{}.png", "seven/frame-{:06d}.color.png", "seven/frame-{:06d}.depth.png",
+                 "seven/frame-{:06d}.pose.txt"):  # fmt: skip
         (tmp_path / part).parent.mkdir(parents=True, exist_ok=True)
         for k in range(1000):
             (tmp_path / part.format(k)).write_bytes(pixels)
     frames = [{"file_path": f"images/{k}.png", "transform_matrix": np.eye(4).tolist()} for k in range(1000)]
     (folders["transforms"] / "transforms.json").write_text(json.dumps({"fl_x": 1.0, "frames": frames}))
-    modules = {"slam": replica, "nerf": replica, "colmap": colmap, "transforms": transforms, "photos": photos}
+    modules = {"slam": replica, "nerf": replica, "colmap": colmap, "transforms": transforms, "photos": photos,
+               "scannet": scannet, "seven": seven_scenes}  # fmt: skip
     for kind, module in modules.items():
         seconds = []
         for _ in range(5):

@@ -86,11 +86,6 @@ def test_ingest_of_a_folder_that_is_not_there_is_exit_3(tmp_path, capsys):
     assert "nowhere" in capsys.readouterr().err
 
 
-def test_scannet_is_not_there_yet_and_says_so(tmp_path, capsys):
-    assert run_stage("ingest", tmp_path / "out", config={"source": {"kind": "scannet", "path": "."}}) == 2
-    assert "not yet" in capsys.readouterr().err
-
-
 def one_photo(toy, tmp):
     from PIL import Image
 

@@ -11,17 +11,13 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from chebsplat.errors import DataFailure, InputError
-from chebsplat.stages.sources.common import DISTORTED, Camera, Frame, Listing, natural, open_image
+from chebsplat.stages.sources.common import DISTORTED, Camera, Frame, Listing, natural
+from chebsplat.stages.sources.pictures import DEEP, GREY, companion, nearest, open_photo
 
 if TYPE_CHECKING:
-    from pathlib import Path
-
     from chebsplat.stages.config import IngestSection
 
 IGNORED = {"void", "ignore", "ignored", "unlabeled", "unlabelled", "undefined", "unknown"}
-EIGHT_BIT = {"1", "L", "LA", "P", "PA", "RGB", "RGBA", "CMYK", "YCbCr"}  # PIL's modes of photos
-DEEP = {"I", "I;16", "I;16B"}  # 16-bit
-GREY = DEEP | {"L", "P"}
 MAX_ID, WORKERS = 65_535, 4
 
 
@@ -58,7 +54,8 @@ def assemble(listing: Listing, settings: IngestSection, class_names: tuple[str, 
     if "depth" in stacks:
         fields["depth"] = stacks["depth"]
     if "labels" in stacks:
-        fields["labels"], fields["class_names"], said = indexed(stacks["labels"], listing.label_names, class_names)
+        wanted = class_names or listing.class_names
+        fields["labels"], fields["class_names"], said = indexed(stacks["labels"], listing.label_names, wanted)
         notes += said
     if not stacks["loss_mask"].all():
         fields["loss_mask"] = stacks["loss_mask"]
@@ -68,6 +65,16 @@ def assemble(listing: Listing, settings: IngestSection, class_names: tuple[str, 
     if models := sorted({frame.camera.model for frame in frames} & set(DISTORTED)):
         notes.append(f"Images are undistorted ({', '.join(models)}).")
     return fields | {"source": {"kind": listing.kind, "notes": notes}}
+
+
+def give_split(fields: dict[str, Any], tests: set[str], origin: str) -> None:
+    """Set `is_test` by name, or note that the views that are used leave one side of the split empty."""
+    is_test = np.array([name in tests for name in fields["names"]])
+    if is_test.any() and not is_test.all():
+        fields["is_test"] = is_test
+        fields["source"]["notes"].append(f"{is_test.sum()} test views are those of {origin}.")
+    else:
+        fields["source"]["notes"].append(f"{origin}'s split leaves no test or no training view; it is not used.")
 
 
 def chosen(listing: Listing, settings: IngestSection) -> tuple[list[Frame], list[str]]:
@@ -144,23 +151,49 @@ def read_view(
 ) -> dict[str, np.ndarray]:
     """images u8 [H, W, 3] and loss_mask bool [H, W]; where `wanted`, depth f32 and labels i32 [H, W]."""
     camera, size = frame.camera, (frame.camera.width, frame.camera.height)
-    limit = np.array(size)[:, None, None]
-    column, row = np.clip(np.floor(at).astype(int), 0, limit - 1)
-    inside = np.asarray(((at >= 0) & (at <= limit)).all(0))
+    inside = within(at, size)
     image, opaque = open_photo(frame.image, size, listing.upright)
-    counts = inside.copy() if opaque is None else inside & opaque[row, column]
+    counts = inside.copy() if opaque is None else inside & nearest(opaque, at, size)
     if frame.mask is not None:
-        counts &= companion(frame.mask, size)[row, column] > 0
+        counts &= nearest(companion(frame.mask, size), at, size) > 0
     fields = {"images": resampled(image, camera, view, at), "loss_mask": counts}
     if "depth" in wanted and frame.depth is not None:
-        stored = companion(frame.depth, size, DEEP, "16-bit depth")[row, column].astype(np.float32)
-        fields["depth"] = np.where(inside & (stored > 0), stored / np.float32(listing.depth_scale), np.float32(np.nan))
+        place, field = at, size
+        if listing.depth_camera is not None:
+            place, field = moved(at, camera, listing.depth_camera)
+        stored = companion(frame.depth, field, DEEP, "16-bit depth")
+        stored = nearest(stored, place, field).astype(np.float32)
+        known = within(place, field) & inside & ~np.isin(stored, listing.no_depth)
+        fields["depth"] = np.where(known, stored / np.float32(listing.depth_scale), np.float32(np.nan))
     if "labels" in wanted and frame.labels is not None:
-        ids = companion(frame.labels, size, GREY, "8- or 16-bit ids")[row, column].astype(np.int32)
-        if ids.max() > MAX_ID:
-            raise InputError(f"{frame.labels} holds id {ids.max()}; ids up to {MAX_ID} are supported")
-        fields["labels"] = np.where(inside, ids, np.int32(-1))
+        ids = label_ids(frame, listing, size)
+        fields["labels"] = np.where(inside, nearest(ids, at, size), np.int32(-1))
     return fields
+
+
+def within(at: np.ndarray, size: tuple[int, int]) -> np.ndarray:
+    """Where positions [2, H, W] lie in an image of (width, height)."""
+    return np.asarray(((at >= 0) & (at <= np.array(size)[:, None, None])).all(0))
+
+
+def moved(at: np.ndarray, camera: Camera, other: Camera) -> tuple[np.ndarray, tuple[int, int]]:
+    """Positions [2, H, W] of a pinhole camera in another at the same place, and the other's (width, height)."""
+    (fx, fy, cx, cy), (gx, gy, dx, dy) = camera.pinhole, other.pinhole
+    place = np.stack([(at[0] - cx) * (gx / fx) + dx, (at[1] - cy) * (gy / fy) + dy])
+    return place, (other.width, other.height)
+
+
+def label_ids(frame: Frame, listing: Listing, size: tuple[int, int]) -> np.ndarray:
+    """Raw ids i32 [h, w] of a frame's label image, its corrected objects replaced. InputError beyond MAX_ID."""
+    assert frame.labels is not None
+    ids = companion(frame.labels, size, GREY, "8- or 16-bit ids", listing.any_label_size).astype(np.int32)
+    if ids.max() > MAX_ID:
+        raise InputError(f"{frame.labels} holds id {ids.max()}; ids up to {MAX_ID} are supported")
+    if frame.objects is not None and listing.corrections:
+        objects = companion(frame.objects, ids.shape[::-1], GREY, "8- or 16-bit ids")
+        for which, value in listing.corrections.items():
+            ids[objects == which] = value
+    return ids
 
 
 def resampled(image: Any, camera: Camera, view: Geometry, at: np.ndarray) -> np.ndarray:
@@ -178,41 +211,6 @@ def resampled(image: Any, camera: Camera, view: Geometry, at: np.ndarray) -> np.
 
     x, y = at[0] * size[0] / camera.width - 0.5, at[1] * size[1] / camera.height - 0.5
     return np.stack([map_coordinates(small[..., c], [y, x], order=1, mode="nearest") for c in range(3)], -1)
-
-
-def open_photo(path: Path, size: tuple[int, int], upright: bool) -> tuple[Any, np.ndarray | None]:
-    """An RGB image of (width, height) `size`, and where it is opaque (None: everywhere).
-
-    Choices: a model's own photos are turned by EXIF only if they fit its camera no other way, since COLMAP counts
-      pixels as they are stored; alpha under one half is transparent.
-    """
-    from PIL import ImageOps
-
-    image = open_image(path)
-    if image.mode not in EIGHT_BIT:
-        raise InputError(f"{path} is no 8-bit photo (mode {image.mode}); convert it to 8 bits")
-    if upright or image.size != size:
-        image = ImageOps.exif_transpose(image)
-    if image.size != size:
-        raise InputError(f"{path} is {_by(image.size)}, its camera {_by(size)}; restore the image or its camera")
-    if "A" not in image.mode and "transparency" not in image.info:
-        return image.convert("RGB"), None
-    opaque = np.asarray(image.convert("RGBA"))[..., 3] >= 128
-    return image.convert("RGBA").convert("RGB"), None if opaque.all() else opaque
-
-
-def companion(path: Path, size: tuple[int, int], modes: set[str] | None = None, wanted: str = "") -> np.ndarray:
-    """A one-channel image [H, W] that must be as large as its photo; without `modes`, as grey values. InputError."""
-    image = open_image(path, "add it, or take its folder away to do without")
-    if modes is not None and image.mode not in modes:
-        raise InputError(f"{path} has mode {image.mode}, not {wanted} in one channel; convert it")
-    if image.size != size:
-        raise InputError(f"{path} is {_by(image.size)}, its photo {_by(size)}; restore it")
-    return np.asarray(image if modes is not None or image.mode in DEEP else image.convert("L"))
-
-
-def _by(size: tuple[int, int]) -> str:
-    return f"{size[0]}x{size[1]}"
 
 
 def indexed(
@@ -241,4 +239,7 @@ def indexed(
         table[value + 1] = result.index(name) if name in result else -1
     if (table < 0).all():
         raise DataFailure(f"no label has a name (ids {present[:8]}); give names, or take the labels away")
-    return table[raw + 1], result, notes
+    labels = np.empty(raw.shape, np.int16)
+    for k, view in enumerate(raw):  # one by one: a copy of all would be the largest thing in memory
+        labels[k] = table[view + 1]
+    return labels, result, notes

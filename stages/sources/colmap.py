@@ -27,12 +27,7 @@ def read(folder: Path, settings: Any, class_names: tuple[str, ...] | None = None
     fields = assembly.assemble(listing, settings, class_names)
     split = _split(folder, [frame.name for frame in listing.frames])
     if split is not None:
-        is_test = np.array([name in split for name in fields["names"]])
-        if is_test.any() and not is_test.all():
-            fields["is_test"] = is_test
-            fields["source"]["notes"].append(f"{is_test.sum()} test views are those of scene.json.")
-        else:
-            fields["source"]["notes"].append("scene.json's split leaves no test or no training view; it is not used.")
+        assembly.give_split(fields, split, "scene.json")
     return fields
 
 

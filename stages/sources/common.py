@@ -5,7 +5,6 @@ from __future__ import annotations
 import json
 import math
 import os
-import re
 from collections.abc import Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -14,6 +13,7 @@ from typing import Any
 import numpy as np
 
 from chebsplat.errors import InputError
+from chebsplat.protocols.split import natural
 
 IMAGE_TYPES = (".jpg", ".jpeg", ".png")
 PINHOLES = {"SIMPLE_PINHOLE": 3, "PINHOLE": 4}  # model: number of parameters
@@ -48,22 +48,36 @@ class Frame:
     depth: Path | None = None
     labels: Path | None = None
     mask: Path | None = None
+    objects: Path | None = None  # ids of objects, as large as the labels
 
 
 @dataclass
 class Listing:
-    """All frames of a source. label_names: by raw id; depth_scale: stored units in one scene unit."""
+    """All frames of a source.
+
+    label_names:  by raw id. class_names: all classes in order; None: those that occur.
+    corrections:  object id -> raw id of the label that its pixels take instead.
+    any_label_size: label images may have another resolution than their photos.
+    depth_scale:  stored units in one scene unit; no_depth: stored values that mean "unknown".
+    depth_camera: a pinhole camera of the depth images, at the photo's place; None: the photo's own.
+    """
 
     kind: str
     frames: list[Frame]
     label_names: dict[int, str] | None = None
+    class_names: tuple[str, ...] | None = None
+    corrections: dict[int, int] = field(default_factory=dict)
+    any_label_size: bool = False
     depth_scale: float = 1000.0
+    no_depth: tuple[int, ...] = (0,)
+    depth_camera: Camera | None = None
     notes: list[str] = field(default_factory=list)
     upright: bool = False  # turn every image by its EXIF orientation; otherwise only where its camera asks for it
 
     def files(self) -> list[Path]:
         """Every image file that a capture depends on."""
-        of = (path for f in self.frames for path in (f.image, f.depth, f.labels, f.mask) if path is not None)
+        parts = ((f.image, f.depth, f.labels, f.mask, f.objects) for f in self.frames)
+        of = (path for paths in parts for path in paths if path is not None)
         return sorted(of)
 
     def has(self, what: str) -> bool:
@@ -115,12 +129,6 @@ def cam_from_world(origin: Path, world_from_cam: np.ndarray, names: list[str]) -
     return poses
 
 
-def natural(name: str) -> tuple[Any, ...]:
-    """Sort key under which frame_2 precedes frame_10; equal numbers are told apart by their spelling."""
-    parts = re.split(r"(\d+)", name)
-    return tuple(int(part) if k % 2 else part for k, part in enumerate(parts)), name
-
-
 def stem(name: str) -> str:
     """A relative POSIX path without the suffix of an image; other dots are part of the name."""
     base, end = os.path.splitext(name)
@@ -140,20 +148,46 @@ def read_json(path: Path) -> dict[str, Any]:
     return document
 
 
+def read_matrix(path: Path) -> np.ndarray:
+    """A 4x4 matrix in a text file of 3 or 4 rows, as float64; a 3x3 matrix or 3x4 rows are completed. InputError."""
+    try:
+        rows = [[float(v) for v in line.split()] for line in path.read_text().splitlines() if line.strip()]
+    except OSError as error:
+        raise InputError(f"{path}: {error.strerror}; the source is incomplete") from None
+    except ValueError as error:
+        raise InputError(f"{path} does not hold numbers ({error}); restore the file") from None
+    if len(rows) not in (3, 4) or {len(row) for row in rows} not in ({3}, {4}):
+        raise InputError(f"{path} does not hold a 3x3 or 4x4 matrix; restore the file")
+    matrix = np.eye(4)
+    matrix[: len(rows), : len(rows[0])] = rows
+    return matrix
+
+
+def nearest_file(folder: Path, name: str) -> Path | None:
+    """A file that many scenes share: in the scene's folder or in one of the two above it."""
+    places = (folder, *folder.absolute().parents[:2])
+    return next((place / name for place in places if (place / name).is_file()), None)
+
+
 def detect(folder: Path) -> str:
     """The kind of source a folder is. Raises InputError naming what was looked for."""
     if (folder / "transforms.json").is_file():
         return "transforms"
     if any((folder / part).exists() for part in ("traj.txt", "Sequence_1", "results")):
         return "replica"
+    if all((folder / part).is_dir() for part in ("color", "pose", "intrinsic")):
+        return "scannet"
     if (folder / "sparse").is_dir():
         return "colmap"
+    if any(path.is_file() for place in ("", "seq-*/") for path in folder.glob(f"{place}frame-*.color.*")):
+        return "seven_scenes"
     if folder.is_dir() and any(is_image(path.name) for path in folder.iterdir()):
         return "photos"
     hint = f"; {folder / 'images'} may be meant" if (folder / "images").is_dir() else ""
     raise InputError(
         f"{folder} is no source: it holds neither transforms.json, traj.txt, results/, Sequence_1/, "
-        f"sparse/0/cameras.bin or .txt, nor a .jpg or .png photo{hint}"
+        f"color/ with pose/ and intrinsic/, frame-*.color.jpg or .png, sparse/0/cameras.bin or .txt, "
+        f"nor a .jpg or .png photo{hint}"
     )
 
 

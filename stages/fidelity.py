@@ -1,0 +1,94 @@
+"""Image figures of rendered views: PSNR, SSIM, LPIPS where its weights are given, and frames per second."""
+
+from __future__ import annotations
+
+import time
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from chebsplat.errors import InputError
+
+if TYPE_CHECKING:
+    import numpy as np
+
+    from chebsplat.lpips import Lpips
+    from chebsplat.render import SceneRenderer
+    from chebsplat.views import View
+
+LEAST_SIDE = 16  # pixels, of LPIPS
+
+
+def image_figures(
+    renders: np.ndarray, truth: np.ndarray, masks: list[np.ndarray] | None, lpips: Lpips | None = None
+) -> dict[str, Any]:
+    """PSNR, SSIM and LPIPS of 8-bit images, by view and in the mean; `lpips` is None where not measured.
+
+    Choices: masked pixels do not count; for SSIM and LPIPS they take the true colour.
+    """
+    import numpy as np
+
+    from chebsplat.losses import ssim
+    from chebsplat.metrics import psnr
+
+    per_view: dict[str, list[float]] = {name: [] for name in ("psnr", "ssim", *(["lpips"] if lpips else []))}
+    for k, (render, true) in enumerate(zip(renders, truth, strict=True)):
+        counted = np.ones(true.shape[:2], bool) if masks is None else masks[k]
+        filled = np.where(counted[..., None], render, true)
+        per_view["psnr"].append(min(psnr(render[counted], true[counted]), 100.0))
+        per_view["ssim"].append(ssim(filled, true))
+        if lpips is not None:
+            per_view["lpips"].append(lpips.distance(filled, true))
+    means = {name: float(np.array(values).mean()) for name, values in per_view.items()}
+    return {"lpips": None} | means | {"per_view": per_view}
+
+
+def perceptual(path: Path) -> Lpips:
+    """LPIPS of a weights file, .safetensors or a .pth of tensors alone. Raises InputError naming file and remedy."""
+    import pickle
+
+    import torch
+    from safetensors import SafetensorError
+    from safetensors.torch import load_file
+
+    from chebsplat.lpips import Lpips
+
+    if not path.is_file():
+        raise InputError(f"{path} is missing; correct evaluate.lpips_weights")
+    help_ = "one file with VGG-16's features.N and LPIPS' linK.model.1.weight is needed"
+    try:
+        state = load_file(path) if path.suffix == ".safetensors" else torch.load(path, "cpu", weights_only=True)
+        return Lpips(state)
+    except (SafetensorError, pickle.UnpicklingError, RuntimeError, EOFError, ValueError, AttributeError) as error:
+        first = str(error).splitlines()[0] if str(error) else type(error).__name__
+        raise InputError(f"{path} holds no weights of LPIPS ({first}); {help_}") from None
+
+
+def timing(renderer: SceneRenderer, cameras: list[View], repeats: int, semantic: bool) -> dict[str, float]:
+    """Frames a second over all views, the best of `repeats`: colour alone, and with features."""
+    figures = {}
+    for name, with_features in (("color", False), ("color_and_features", True)):
+        if with_features and not semantic:
+            continue
+        best = float("inf")
+        for _ in range(repeats):
+            began = time.perf_counter()
+            for view in cameras:
+                renderer.render(view, with_features)
+            best = min(best, time.perf_counter() - began)
+        figures[name] = len(cameras) / best
+    return figures
+
+
+def frame_split(renderer: SceneRenderer, cameras: list[View], repeats: int) -> dict[str, Any]:
+    """Milliseconds of a frame in colour by part, the best sweep of `repeats` over all views, and under what."""
+    import numba
+
+    from chebsplat.frame_parts import PARTS, frame_parts
+
+    sweeps = []
+    for _ in range(repeats):
+        found = [frame_parts(renderer, view)[0] for view in cameras]
+        sweeps.append({part: 1000 * sum(parts[part] for parts in found) / len(cameras) for part in PARTS})
+    size = {"width": cameras[0].width, "height": cameras[0].height}
+    return min(sweeps, key=lambda sweep: sum(sweep.values())) | size | {
+        "threads": numba.get_num_threads(), "device": "cpu"}  # fmt: skip

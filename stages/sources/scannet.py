@@ -1,0 +1,150 @@
+"""ScanNet as two groups lay it out: Semantic Gaussians (SG: points3d.ply) and Panoptic Lifting (PL: splits.json)."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from chebsplat.errors import InputError
+from chebsplat.protocols import scannet_closed, scannet_open
+from chebsplat.stages.sources import assembly, common, scannet_labels
+from chebsplat.stages.sources.common import Camera, Frame, Listing
+
+SENSOR = 1296  # width of the colour sensor, which intrinsics refer to even where images are reduced
+OFF_CENTRE = 0.1  # of the width, by which a principal point may lie off the middle
+POINTS = "points3d.ply"
+OF_PL = ("splits.json", "segmentation_data.pkl", "rs_semantics", "m2f_semantics")  # never in an SG folder
+
+
+def read(folder: Path, settings: Any, class_names: tuple[str, ...] | None = None) -> dict[str, Any]:
+    """The fields of a capture; SG's `points` and `point_colors`, PL's `is_test`.
+
+    Raises:  InputError where points3d.ply is missing: random points in its place would be another experiment.
+    """
+    listing = _listing(folder)
+    reduced = _is_reduced(folder)
+    split = _split(folder / "splits.json") if reduced else None
+    if split is not None:
+        known = split[0] | split[1]
+        outside = [frame for frame in listing.frames if frame.name not in known]
+        listing.frames = [frame for frame in listing.frames if frame.name in known]
+        if outside:
+            listing.notes.append(f"{len(outside)} frames are in neither list of splits.json and are left out.")
+    fields = assembly.assemble(listing, settings, class_names)
+    if split is not None:
+        assembly.give_split(fields, split[1], "splits.json")
+    if not reduced:
+        from chebsplat.formats.clouds import read_cloud
+
+        fields["points"], fields["point_colors"] = read_cloud(folder / POINTS)
+    return fields
+
+
+def probe(folder: Path) -> dict[str, bool]:
+    """Light: reads names only. What some frame has, every frame must have: `read` fails otherwise."""
+    return {"poses": True, "depth": any(common.names_below(folder / "depth")),
+            "labels": _labels_folder(folder) is not None}  # fmt: skip
+
+
+def files(folder: Path) -> list[Path]:
+    """Poses, intrinsics, points, split, label table, and every image, depth, label and object image."""
+    labels, table = _labels_folder(folder), _table(folder)
+    places = ["color", "depth", *([labels] if labels else []), *(["instance"] if labels == "semantics" else [])]
+    data = [folder / place / name for place in places for name in common.names_below(folder / place)]
+    texts = [path for place in ("pose", "intrinsic") for path in (folder / place).glob("*.txt")]
+    single = [folder / name for name in (POINTS, "splits.json") if (folder / name).is_file()]
+    return sorted([*data, *texts, *single, *([table] if table is not None and table.is_file() else [])])
+
+
+def _is_reduced(folder: Path) -> bool:
+    """Whether the folder is PL's."""
+    return any((folder / name).exists() for name in OF_PL)
+
+
+def _labels_folder(folder: Path) -> str | None:
+    wanted = ("rs_semantics", "semantics") if _is_reduced(folder) else ("label-filt",)
+    return next((place for place in wanted if any(common.names_below(folder / place))), None)
+
+
+def _table(folder: Path) -> Path | None:
+    """The table of ScanNet's ids that the labels need; where it is missing, the place where it should be."""
+    place = _labels_folder(folder)
+    if place in (None, "rs_semantics"):
+        return None
+    name = scannet_labels.COMBINED if place == "semantics" else scannet_labels.MODIFIED
+    return common.nearest_file(folder, name) or folder / name
+
+
+def _camera(folder: Path, kind: str, size: tuple[int, int], sensor: int) -> Camera:
+    """The camera of the colour or depth images.
+
+    Choices: intrinsics are those of the images as they are or of the whole sensor, whichever has its principal point
+      nearer to the middle; they count from the centre of the first pixel, as depth's 319.5 of 640 shows.
+    """
+    path = folder / f"intrinsic/intrinsic_{kind}.txt"
+    K = common.read_matrix(path)
+    whole = min((size[0], sensor), key=lambda width: abs(2 * K[0, 2] - width))
+    if abs(2 * K[0, 2] - whole) > OFF_CENTRE * whole:
+        raise InputError(f"{path}: a principal point at {K[0, 2]:g} fits no width of {size[0]}; restore the file")
+    factor = size[0] / whole
+    params = (K[0, 0] * factor, K[1, 1] * factor, (K[0, 2] + 0.5) * factor, (K[1, 2] + 0.5) * factor)
+    return common.camera_of(path, "PINHOLE", params, *size)
+
+
+def _split(path: Path) -> tuple[set[str], set[str]] | None:
+    """(training, test) names of splits.json, None without one."""
+    if not path.is_file():
+        return None
+    document = common.read_json(path)
+    try:
+        sides = [{str(name) for name in document[side]} for side in ("train", "test")]
+    except (KeyError, TypeError) as error:
+        raise InputError(f"{path} lacks lists of train and test names ({error}); restore the file") from None
+    if both := sides[0] & sides[1]:
+        raise InputError(f"{path}: {min(both)} is both a training and a test view; restore the file")
+    return sides[0], sides[1]
+
+
+def _listing(folder: Path) -> Listing:
+    images = common.images_in(folder / "color")
+    names = [common.stem(name) for name in images]
+    matrices = np.array([common.read_matrix(folder / f"pose/{name}.txt") for name in names])
+    poses = common.cam_from_world(folder / "pose", matrices, names)
+    size, _ = common.header(folder / "color" / images[0])
+    camera = _camera(folder, "color", size, SENSOR)
+    has, place = probe(folder), _labels_folder(folder)
+    frames = [
+        Frame(
+            name,
+            folder / "color" / image,
+            camera,
+            pose,
+            folder / f"depth/{name}.png" if has["depth"] else None,
+            folder / f"{place}/{name}.png" if place else None,
+            objects=folder / f"instance/{name}.png" if place == "semantics" else None,
+        )
+        for name, image, pose in zip(names, images, poses, strict=True)
+    ]
+    reduced = _is_reduced(folder)
+    protocol = scannet_closed if reduced else scannet_open
+    listing = Listing("scannet", frames, class_names=protocol.CLASSES if place else None, any_label_size=True)
+    listing.notes.append(f"ScanNet as {'Panoptic Lifting' if reduced else 'Semantic Gaussians'} lays it out.")
+    if extra := sum(path.stem not in set(names) for path in (folder / "pose").glob("*.txt")):
+        listing.notes.append(f"{extra} poses have no image in color/ and are left out.")
+    if has["depth"] and (folder / "intrinsic/intrinsic_depth.txt").is_file():
+        depth_size, _ = common.header(folder / f"depth/{names[0]}.png")
+        listing.depth_camera = _camera(folder, "depth", depth_size, depth_size[0])
+    if place == "rs_semantics":
+        listing.label_names = dict(enumerate(("void", *scannet_closed.CLASSES)))
+    elif place == "semantics":
+        listing.label_names, listing.corrections = scannet_labels.reduced(_table(folder), folder.resolve().name)
+        if listing.corrections:
+            listing.notes.append(f"{len(listing.corrections)} objects take the hand-corrected labels of this scene.")
+    elif place == "label-filt":
+        listing.label_names = scannet_labels.mapped(_table(folder))
+    if unused := [name for name in ("segmentation_data.pkl", "m2f_semantics", "m2f_probabilities", "m2f_invalid")
+                  if (folder / name).exists()]:  # fmt: skip
+        listing.notes.append(f"Not read: {', '.join(unused)}.")
+    return listing

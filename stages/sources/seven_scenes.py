@@ -1,0 +1,92 @@
+"""7-Scenes: frame-N.color, .depth and .pose side by side, in one folder or in several seq-*/ of it.
+
+Poses are the depth camera's, and depth is not registered to colour: it is looked up through both cameras, whose
+distance of some 25 mm is not known for these recordings and is left out.
+"""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from chebsplat.errors import InputError
+from chebsplat.stages.sources import assembly, common
+from chebsplat.stages.sources.common import Frame, Listing
+
+# Focal lengths in pixels of a 640 wide image. The data set states the depth camera's alone; 525 is a Kinect's colour
+# camera: in the red kitchen, 520 carries colours over to neighbouring views best, and 585 much worse than 525.
+COLOR, DEPTH = 525.0, 585.0
+UNKNOWN = (0, 65_535)  # stored depths that mean "none": of the copies with cleaned depth, and of the authors' own
+
+
+def read(folder: Path, settings: Any, class_names: tuple[str, ...] | None = None) -> dict[str, Any]:
+    """The fields of a capture. `class_names` is of no use here: the data set has no labels."""
+    return assembly.assemble(_listing(folder), settings, class_names)
+
+
+def probe(folder: Path) -> dict[str, bool]:
+    """Light: reads names only. What some frame has, every frame must have: `read` fails otherwise."""
+    depth = any(name.endswith(".depth.png") for place in _places(folder) for name in os.listdir(folder / place))
+    return {"poses": True, "depth": depth, "labels": False}
+
+
+def files(folder: Path) -> list[Path]:
+    """The depth camera's intrinsics, and every image, depth and pose."""
+    found = [_intrinsics(folder)]
+    for name, image, beside in _frames(folder):
+        parts = (image, f"{name}.depth.png", f"{name}.pose.txt")
+        found += [folder / part for part in parts if part in beside]
+    return sorted(path for path in found if path is not None)
+
+
+def _intrinsics(folder: Path) -> Path | None:
+    places = (folder, folder.absolute().parent)
+    return next((p / "camera-intrinsics.txt" for p in places if (p / "camera-intrinsics.txt").is_file()), None)
+
+
+def _places(folder: Path) -> list[str]:
+    """The folder itself and its sequences, as they precede the names of what they hold."""
+    return [
+        "",
+        *sorted(f"{entry.name}/" for entry in os.scandir(folder) if entry.is_dir() and entry.name[:4] == "seq-"),
+    ]
+
+
+def _frames(folder: Path) -> list[tuple[str, str, set[str]]]:
+    """(name, colour image, files of its folder) of each frame, as POSIX paths below the folder, in natural order."""
+    frames = []
+    for place in _places(folder):
+        found = {place + name for name in os.listdir(folder / place)}
+        for image in found:
+            name = common.stem(image)
+            if common.is_image(image) and name.endswith(".color") and name[len(place) :].startswith("frame-"):
+                frames.append((name.removesuffix(".color"), image, found))
+    return sorted(frames, key=lambda frame: common.natural(frame[0]))
+
+
+def _listing(folder: Path) -> Listing:
+    frames = _frames(folder)
+    if not frames:
+        raise InputError(f"{folder} holds no frame-*.color.jpg or .png, nor does a seq-*/ in it; correct source.path")
+    (width, height), _ = common.header(folder / frames[0][1])
+    path, image = _intrinsics(folder), folder / frames[0][1]
+    focal = COLOR * width / 640
+    camera = common.camera_of(image, "PINHOLE", (focal, focal, width / 2, height / 2), width, height)
+    K = np.diag([DEPTH * width / 640, DEPTH * width / 640, 1.0, 1.0])
+    K[:2, 2] = width / 2, height / 2
+    if path is not None:
+        K = common.read_matrix(path)
+    depth_camera = common.camera_of(path or image, "PINHOLE", (K[0, 0], K[1, 1], K[0, 2], K[1, 2]), width, height)
+    notes = [f"The colour camera's focal length is taken to be {focal:g} pixels, at the depth camera's place."]
+    names = [name for name, _, _ in frames]
+    matrices = np.array([common.read_matrix(folder / f"{name}.pose.txt") for name in names])
+    poses = common.cam_from_world(folder, matrices, [f"{name}.pose.txt" for name in names])
+    has_depth = probe(folder)["depth"]
+    listed = [
+        Frame(name, folder / image, camera, pose, folder / f"{name}.depth.png" if has_depth else None)
+        for (name, image, _), pose in zip(frames, poses, strict=True)
+    ]
+    return Listing("seven_scenes", listed, no_depth=UNKNOWN, depth_camera=depth_camera, notes=notes)

@@ -1,0 +1,247 @@
+"""What evaluate measures: joined by name, LPIPS from weights, the time of a frame by part."""
+
+import numpy as np
+import pytest
+import torch
+from safetensors.torch import save_file
+from shared import INPUTS, run_stage
+from test_stages import changed, inputs_of, published
+
+from chebsplat.errors import InputError
+from chebsplat.formats import artifact
+from chebsplat.formats.capture import read_capture, write_capture
+from chebsplat.formats.evaluation import read_evaluation
+from chebsplat.formats.features import read_features, write_features
+from chebsplat.formats.scene import read_scene
+from chebsplat.lpips import BLOCKS, SCALE, SHIFT, Lpips
+from chebsplat.stages.fidelity import image_figures, perceptual
+
+
+def widths():
+    """(layer, inputs, outputs) of the convolutions; (tap, channels)."""
+    before, layers, taps = 3, [], []
+    for k, block in enumerate(BLOCKS):
+        for layer, channels in block.items():
+            layers.append((layer, before, channels))
+            before = channels
+        taps.append((k, before))
+    return layers, taps
+
+
+@pytest.fixture(scope="module")
+def weights():
+    generator = torch.Generator().manual_seed(0)
+    layers, taps = widths()
+    state = {}
+    for layer, inputs, outputs in layers:
+        state[f"features.{layer}.weight"] = (
+            torch.randn(outputs, inputs, 3, 3, generator=generator) * (2 / 9 / inputs) ** 0.5
+        )
+        state[f"features.{layer}.bias"] = 0.1 * torch.randn(outputs, generator=generator)
+    for k, channels in taps:
+        state[f"lin{k}.model.1.weight"] = torch.rand(1, channels, 1, 1, generator=generator)
+    return state
+
+
+def pictures(count=3, side=24):
+    return np.random.default_rng(1).integers(0, 255, (count, side, side + 8, 3)).astype(np.uint8)
+
+
+def test_lpips_is_0_for_equal_images_symmetric_and_positive(weights):
+    lpips = Lpips(weights)
+    a, b, c = pictures()
+    assert lpips.distance(a, a) == 0
+    assert lpips.distance(a, b) == pytest.approx(lpips.distance(b, a), rel=1e-5)
+    assert lpips.distance(a, b) > 0
+    nearer = (0.9 * a + 0.1 * c).astype(np.uint8)
+    assert lpips.distance(a, nearer) < lpips.distance(a, c)
+
+
+@pytest.mark.parametrize(
+    "names",
+    [("features.{}", "lin{}.model.1"), ("net.slice1.{}", "lins.{}.model.1"), ("net.layers.{}", "lin.{}.1")],
+)
+def test_lpips_of_weights_that_pass_colours_on_is_the_distance_of_their_directions(names):
+    """Every layer keeps the first three channels; so each tap compares the unit vectors of the scaled colours."""
+    layers, taps = widths()
+    state = {}
+    for layer, inputs, outputs in layers:
+        kernel = torch.zeros(outputs, inputs, 3, 3)
+        kernel[[0, 1, 2], [0, 1, 2], 1, 1] = 1
+        place = names[0].format(layer)
+        state |= {f"{place}.weight": kernel, f"{place}.bias": torch.zeros(outputs)}
+    for k, channels in taps:
+        tap = torch.zeros(1, channels, 1, 1)
+        tap[0, :3, 0, 0] = torch.tensor([1.0, 2.0, 3.0]) * (k + 1)
+        state[f"{names[1].format(k)}.weight"] = tap
+    a, b = (np.full((32, 32, 3), color, np.uint8) for color in ((200, 10, 60), (30, 90, 255)))
+    units = []
+    for image in (a, b):
+        color = np.maximum((image[0, 0] / 255 - SHIFT) / SCALE, 0)  # in [0, 1]: not scaled to [-1, 1]
+        units.append(color / np.linalg.norm(color))
+    wanted = (1 + 2 + 3 + 4 + 5) * (np.array([1, 2, 3]) * (units[0] - units[1]) ** 2).sum()
+    assert Lpips(state).distance(a, b) == pytest.approx(wanted, rel=1e-4)
+
+
+def test_weights_of_lpips_are_read_from_both_kinds_of_file_and_wrong_ones_are_named(weights, tmp_path):
+    a, b, _ = pictures()
+    save_file(weights, tmp_path / "vgg.safetensors")
+    torch.save(weights, tmp_path / "vgg.pth")
+    found = [perceptual(tmp_path / name).distance(a, b) for name in ("vgg.safetensors", "vgg.pth")]
+    assert found[0] == found[1] == Lpips(weights).distance(a, b)
+    damaged = {
+        "no tensor lin3": {name: t for name, t in weights.items() if not name.startswith("lin3")},
+        r"features.5.bias is \(64,\), not \(128,\)": weights | {"features.5.bias": torch.zeros(64)},
+        "features.0.weight is not finite": weights | {"features.0.weight": torch.full((64, 3, 3, 3), torch.nan)},
+        "no tensor features.0.weight": {"a": torch.zeros(1)},
+    }
+    for message, state in damaged.items():
+        torch.save(state, tmp_path / "bad.pth")
+        with pytest.raises(InputError, match=rf"bad\.pth holds no weights of LPIPS \({message}"):
+            perceptual(tmp_path / "bad.pth")
+    (tmp_path / "bad.pth").write_bytes(b"no pickle")
+    (tmp_path / "bad.safetensors").write_bytes(b"no header")
+    torch.save(torch.nn.Linear(1, 1), tmp_path / "module.pth")
+    for name in ("bad.pth", "bad.safetensors", "module.pth"):
+        with pytest.raises(InputError, match=f"{name} holds no weights"):
+            perceptual(tmp_path / name)
+    with pytest.raises(InputError, match=r"evaluate\.lpips_weights"):
+        perceptual(tmp_path / "nowhere.pth")
+
+
+def test_what_is_masked_counts_in_no_image_figure_and_no_lpips_is_none(weights):
+    truth = pictures(2)
+    renders, masks = truth.copy(), [np.ones(truth.shape[1:3], bool) for _ in truth]
+    renders[:, :5], masks[0][:5], masks[1][:5] = 0, False, False
+    found = image_figures(renders, truth, masks, Lpips(weights))
+    assert (found["psnr"], found["ssim"], found["lpips"]) == (100, pytest.approx(1), 0)
+    assert len(found["per_view"]["lpips"]) == 2
+    assert image_figures(renders, truth, masks)["lpips"] is None
+
+
+@pytest.mark.xdist_group("toy")
+def test_lpips_given_weights_and_the_time_by_part_are_in_the_evaluation(toy, weights, tmp_path):
+    save_file(weights, tmp_path / "vgg.safetensors")
+    config = changed(evaluate={"lpips_weights": str(tmp_path / "vgg.safetensors"), "timing_repeats": 1})
+    assert run_stage("evaluate", tmp_path / "out", inputs_of(toy, "evaluate"), config) == 0
+    figures = read_evaluation(tmp_path / "out").figures
+    assert figures["lpips"] > 0 and figures["lpips_net"] == {"net": "vgg", "normalize": False}
+    assert "LPIPS" not in figures["left_out"]
+    split = figures["milliseconds"]
+    assert all(split[part] > 0 for part in ("projection", "sh", "sort", "blend"))
+    assert (split["width"], split["height"], split["device"]) == (96, 72, "cpu") and split["threads"] >= 1
+    without = read_evaluation(toy["evaluate"]).figures
+    assert without["lpips"] is None and "not measured" in without["left_out"]["LPIPS"]
+
+
+@pytest.mark.xdist_group("toy")
+def test_the_clocked_steps_render_the_same_frame(toy):
+    from chebsplat.frame_parts import frame_parts
+    from chebsplat.render import SceneRenderer
+    from chebsplat.stages.evaluate import camera
+
+    scene = read_scene(toy["export"])
+    renderer = SceneRenderer(scene.parameters)
+    for k in range(3):
+        view = camera(scene, k)
+        assert np.array_equal(frame_parts(renderer, view)[1], renderer.render(view)[0])
+
+
+@pytest.mark.xdist_group("toy")
+def test_views_of_capture_and_teacher_in_another_order_change_no_figure(toy, tmp_path):
+    rng = np.random.default_rng(0)
+    capture, features = read_capture(toy["ingest"]), read_features(toy["teacher"])
+    for record, parts in ((capture, ("images", "depth", "labels", "Ks", "cam_from_world", "is_test")),
+                          (features, ("features", "pseudo_labels", "confidence"))):  # fmt: skip
+        order = rng.permutation(len(record.names))
+        for part in parts:
+            setattr(record, part, np.asarray(getattr(record, part)[:])[order])
+        record.names = [record.names[k] for k in order]
+    inputs = inputs_of(toy, "evaluate") | {
+        "capture": published(tmp_path / "c", "chebsplat.capture/1", write_capture, capture),
+        "features": published(tmp_path / "f", "chebsplat.features/1", write_features, features),
+    }
+    assert run_stage("evaluate", tmp_path / "out", inputs) == 0
+    found, wanted = (read_evaluation(path).figures for path in (tmp_path / "out", toy["evaluate"]))
+    for part in ("names", "image", "segmentation"):
+        assert found[part] == wanted[part]
+
+
+@pytest.mark.xdist_group("toy")
+@pytest.mark.parametrize("protocol", ["replica-f3", "deep-blending", "scannet-open", "scannet-closed"])
+def test_a_teacher_of_other_labels_than_the_protocols_is_exit_4(toy, protocol, tmp_path, capsys):
+    record = read_capture(toy["ingest"])
+    record.protocol = {"name": protocol}
+    inputs = inputs_of(toy, "evaluate")
+    inputs["capture"] = published(tmp_path / "c", "chebsplat.capture/1", write_capture, record)
+    assert run_stage("evaluate", tmp_path / "out", inputs) == 4
+    assert "teacher" in capsys.readouterr().err
+
+
+@pytest.mark.slow
+def test_a_scannet_scene_runs_from_its_folder_to_the_figures_of_scannet_open(tmp_path):
+    """All 16 views are trained on and evaluated; points come from the scene's own file."""
+    import layouts
+
+    from chebsplat.cameras import unproject
+    from chebsplat.protocols import scannet_open
+    from chebsplat.stages.sources import generated
+
+    fields = generated.capture("toy", 1, "toy")
+    fields["labels"], fields["class_names"] = (fields["labels"] + 7) % 20, list(scannet_open.CLASSES)
+    pixels = np.argwhere(np.ones((72, 96), bool))[::17]
+    parts = [unproject(fields["depth"][k], fields["Ks"][k], fields["cam_from_world"][k], pixels) for k in range(16)]
+    fields["points"] = np.concatenate(parts).astype(np.float32)
+    fields["point_colors"] = np.concatenate([image[pixels[:, 0], pixels[:, 1]] for image in fields["images"]])
+    folder = tmp_path / "scene0000_00"
+    layouts.write_scannet_sg(folder, fields)
+    config = changed(source={"kind": "scannet", "path": str(folder)}, ingest={"protocol": "scannet-open"},
+                     scene={"name": "scene0000_00"})  # fmt: skip
+    made = {}
+    for stage in ("ingest", "sfm", "teacher", "describe", "train", "export", "evaluate", "report"):
+        roles = {role: made[of] for role, of in INPUTS[stage].items() if of in made}
+        made[stage] = tmp_path / stage
+        assert run_stage(stage, made[stage], roles, config) == 0, stage
+    assert artifact.read_manifest(made["sfm"]).facts["how"] == "source"
+    figures = read_evaluation(made["evaluate"]).figures
+    assert len(figures["names"]) == 16
+    matrix = np.array(figures["segmentation"]["scene"]["confusion"])
+    assert matrix.shape == (20, 20) and matrix.sum() == 16 * 484 * 648
+    assert figures["segmentation"]["teacher"]["miou"] > 0.3
+    assert figures["segmentation"]["scene"] == scannet_open.summed([matrix])
+
+
+def test_the_content_of_the_weights_is_part_of_what_an_evaluation_is(tmp_path, monkeypatch):
+    from chebsplat.pipelines.plan import Planner
+
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setenv("CHEBSPLAT_WORK", str(tmp_path / "work"))
+    plans = []
+    for content in (b"one", b"other"):
+        (tmp_path / "vgg.pth").write_bytes(content)
+        plans.append(Planner().plan("toy", "evaluate.lpips_weights=vgg.pth"))
+    changed = [a.stage for a, b in zip(plans[0].steps, plans[1].steps, strict=True) if a.key != b.key]
+    assert changed == ["evaluate", "report"]
+    with pytest.raises(InputError, match=r"gone\.pth is missing"):
+        Planner().plan("toy", "evaluate.lpips_weights=gone.pth")
+
+
+def test_a_scannet_folder_is_planned_without_the_stages_it_does_not_need(tmp_path, monkeypatch):
+    import layouts
+
+    from chebsplat.pipelines.plan import Planner
+    from chebsplat.protocols import scannet_closed
+
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setenv("CHEBSPLAT_WORK", str(tmp_path / "work"))
+    fields = {"images": np.zeros((5, 6, 8, 3), np.uint8), "depth": np.ones((5, 6, 8), np.float32),
+              "labels": np.zeros((5, 6, 8), np.int16), "class_names": list(scannet_closed.CLASSES),
+              "Ks": np.tile([[8.0, 0, 4], [0, 8, 3], [0, 0, 1]], (5, 1, 1)),
+              "cam_from_world": np.tile(np.eye(4), (5, 1, 1))}  # fmt: skip
+    layouts.write_scannet_pl(tmp_path / "scene0000_00", fields)
+    plan = Planner().plan("./scene0000_00", "ingest.protocol=scannet-closed")
+    assert plan.steps[0].sections["source"]["kind"] == "scannet"
+    assert "sfm: matching" in plan.left_out
+    (tmp_path / "scene0000_00/splits.json").write_text('{"train": ["0"], "test": ["10"]}')
+    again = Planner().plan("./scene0000_00", "ingest.protocol=scannet-closed")
+    assert plan.steps[0].key != again.steps[0].key

@@ -1,0 +1,319 @@
+"""A generated scene laid out as each data set lays out its own comes back as the same capture."""
+
+import json
+import shutil
+
+import layouts
+import numpy as np
+import pytest
+from shared import data, run_stage
+from source_folders import SETTINGS, image, save
+
+from chebsplat.cameras import centers, unproject
+from chebsplat.errors import InputError
+from chebsplat.formats import artifact
+from chebsplat.formats.artifact import Manifest
+from chebsplat.formats.capture import Capture, write_capture
+from chebsplat.formats.points import read_points
+from chebsplat.protocols import scannet_closed, scannet_open
+from chebsplat.stages.config import IngestSection
+from chebsplat.stages.sources import colmap, common, generated, replica, scannet, scannet_labels, seven_scenes
+
+KINDS = {"replica": replica, "colmap": colmap, "scannet": scannet, "seven_scenes": seven_scenes}
+
+
+@pytest.fixture(scope="module")
+def scene():
+    """A toy room; unknown depth and labels in a corner; some points."""
+    fields = generated.capture("toy", 1, "toy")
+    fields["depth"][:, :9, :7], fields["labels"][:, :9, :7] = np.nan, -1
+    fields["depth"] = layouts.stored_depth(fields["depth"]).astype(np.float32) / np.float32(1000)
+    fields["depth"][fields["depth"] == 0] = np.nan
+    rng = np.random.default_rng(0)
+    fields["points"] = rng.uniform(0, 3, (200, 3)).astype(np.float32)
+    fields["point_colors"] = rng.integers(0, 255, (200, 3)).astype(np.uint8)
+    return fields
+
+
+def with_classes(scene, names):
+    """The scene with its k-th class called by the (k + 7)-th of `names`, so that shelves and counter are among them."""
+    return scene | {"labels": np.where(scene["labels"] < 0, -1, (scene["labels"] + 7) % len(names)).astype(np.int16),
+                    "class_names": list(names)}  # fmt: skip
+
+
+def compare(found, scene, labels=True, depth=True, exact_Ks=True):
+    assert np.array_equal(found["images"], scene["images"])
+    assert np.abs(found["cam_from_world"] - scene["cam_from_world"]).max() < 1e-6
+    assert "loss_mask" not in found
+    if exact_Ks:
+        assert np.abs(found["Ks"] - scene["Ks"]).max() < 1e-6
+    if labels:
+        names = [*found["class_names"], None]
+        wanted = [*scene["class_names"], None]
+        assert (np.array(names)[found["labels"]] == np.array(wanted)[scene["labels"]]).all()
+    if depth:
+        assert np.array_equal(np.isnan(found["depth"]), np.isnan(scene["depth"]))
+        assert np.nanmax(np.abs(found["depth"] - scene["depth"])) < 5e-4  # half a stored millimetre
+
+
+def read(folder, kind, **settings):
+    assert common.detect(folder) == kind
+    module = KINDS[kind]
+    fields = module.read(folder, IngestSection(min_views=2, **settings))
+    probe = module.probe(folder)
+    assert probe == {"poses": True, "depth": "depth" in fields, "labels": "labels" in fields}
+    assert all(path.is_file() for path in module.files(folder))
+    return fields
+
+
+def test_replica_as_nice_slam_renders_it(scene, tmp_path):
+    layouts.write_nice_slam(tmp_path, scene)
+    compare(read(tmp_path, "replica"), scene, labels=False)
+
+
+def test_replica_as_semantic_nerf_renders_it(scene, tmp_path):
+    layouts.write_semantic_nerf(tmp_path, scene)
+    found = read(tmp_path, "replica")
+    compare(found, scene, exact_Ks=False)  # the layout has no camera file: f is half the width
+    assert np.allclose(found["Ks"], [[48, 0, 48], [0, 48, 36], [0, 0, 1]])
+
+
+def test_deep_blending_or_any_colmap_folder(scene, tmp_path):
+    layouts.write_colmap(tmp_path, scene)
+    compare(read(tmp_path, "colmap"), scene)
+
+
+@pytest.mark.parametrize("unknown", [0, 65_535])
+def test_seven_scenes(scene, tmp_path, unknown):
+    """The layout has no file for the colour camera: its focal length is 525 of 640 pixels."""
+    scene = scene | {"Ks": np.tile([[78.75, 0, 48], [0, 78.75, 36], [0, 0, 1]], (16, 1, 1))}
+    layouts.write_seven_scenes(tmp_path / "seq-01", scene, unknown=unknown)
+    compare(read(tmp_path / "seq-01", "seven_scenes"), scene, labels=False)
+    shutil.move(tmp_path / "seq-01/camera-intrinsics.txt", tmp_path)
+    found = read(tmp_path, "seven_scenes")
+    compare(found, scene, labels=False)
+    assert found["names"][:2] == ["seq-01/frame-000000", "seq-01/frame-000001"]
+
+
+def test_scannet_as_semantic_gaussians_lays_it_out(scene, tmp_path):
+    scene = with_classes(scene, scannet_open.CLASSES)
+    layouts.write_scannet_sg(tmp_path / "scene0000_00", scene)
+    found = read(tmp_path / "scene0000_00", "scannet")
+    compare(found, scene, depth=False)
+    assert found["names"][:3] == ["0", "10", "20"]
+    assert np.array_equal(found["points"], scene["points"])
+    assert np.array_equal(found["point_colors"], scene["point_colors"])
+    assert "is_test" not in found
+
+
+def test_scannet_as_panoptic_lifting_lays_it_out(scene, tmp_path):
+    scene = with_classes(scene, scannet_closed.CLASSES)
+    layouts.write_scannet_pl(tmp_path / "scene0000_00", scene)
+    found = read(tmp_path / "scene0000_00", "scannet")
+    compare(found, scene)
+    assert np.flatnonzero(found["is_test"]).tolist() == [0, 5, 10, 15]
+    assert "segmentation_data.pkl" in found["source"]["notes"][1]
+    assert "points" not in found
+
+
+def test_scannets_own_labels_are_reduced_and_corrected_by_object(scene, tmp_path):
+    scene = with_classes(scene, scannet_closed.CLASSES)
+    objects = np.where(scene["labels"] == 7, 6, 9)  # doors are object 6, which this scene's correction makes a table
+    layouts.write_scannet_pl(tmp_path / "scene0423_02", scene, folded=False, objects=objects)
+    shutil.copytree(tmp_path / "scene0423_02", tmp_path / "scene0000_00")
+    compare(read(tmp_path / "scene0000_00", "scannet"), scene)
+    corrected = scene | {"labels": np.where(scene["labels"] == 7, 6, scene["labels"])}
+    found = read(tmp_path / "scene0423_02", "scannet")
+    compare(found, corrected)
+    assert any("1 objects" in note for note in found["source"]["notes"])
+
+
+def test_shelves_and_counter_have_swapped_ids_in_the_two_layouts(tmp_path):
+    layouts.write_table(tmp_path / "t.tsv", "cocomapid", layouts.COCO_IDS)
+    names = scannet_labels.mapped(tmp_path / "t.tsv")
+    assert (names[8], names[35]) == ("shelves", "counter")  # ids 10 and 11
+    assert scannet_open.CLASSES[9:11] == ("shelves", "counter")
+    assert scannet_closed.CLASSES[9:11] == ("counter", "shelves")
+    assert scannet_closed.REDUCED[10] == scannet_closed.REDUCED[15] == "shelves"
+    assert scannet_closed.REDUCED[12] == "counter"
+    assert set(scannet_closed.REDUCED) == {"void", *scannet_closed.CLASSES}
+
+
+@pytest.mark.parametrize(
+    ("write", "kind"),
+    [(layouts.write_nice_slam, "replica"), (layouts.write_seven_scenes, "seven_scenes"),
+     (layouts.write_scannet_sg, "scannet")],
+)  # fmt: skip
+def test_jpegs_lose_only_what_jpeg_loses(scene, tmp_path, write, kind):
+    write(tmp_path, with_classes(scene, scannet_open.CLASSES), suffix="jpg")
+    found = read(tmp_path, kind)
+    assert 0 < np.abs(found["images"].astype(int) - scene["images"]).mean() < 4  # quality 75
+
+
+def test_only_the_chosen_views_are_read(scene, tmp_path):
+    layouts.write_seven_scenes(tmp_path, scene)
+    for k in range(1, 15):
+        (tmp_path / f"frame-{k:06d}.color.png").write_bytes(b"damaged")
+    assert len(read(tmp_path, "seven_scenes", max_views=2)["names"]) == 2
+
+
+def test_frames_without_a_pose_are_left_out_and_counted(scene, tmp_path):
+    layouts.write_scannet_sg(tmp_path, with_classes(scene, scannet_open.CLASSES))
+    (tmp_path / "pose/30.txt").write_text(("-inf " * 4 + "\n") * 4)
+    (tmp_path / "color/50.png").unlink()
+    found = read(tmp_path, "scannet")
+    assert found["names"][:5] == ["0", "10", "20", "40", "60"]
+    assert "1 poses have no image" in found["source"]["notes"][1]
+    assert any("1 of 15 frames have a pose that is not finite" in note for note in found["source"]["notes"])
+
+
+def test_intrinsics_of_the_whole_sensor_and_labels_of_its_size_fit_reduced_images(tmp_path):
+    for k in range(2):
+        image(tmp_path / f"color/{k}.jpg", (648, 484))
+        (tmp_path / "pose").mkdir(exist_ok=True)
+        (tmp_path / f"pose/{k}.txt").write_text(layouts.matrix_text(np.eye(4)))
+        ids = np.full((968, 1296), 2, np.uint16)
+        ids[:, 649:] = 8  # left of it, what lies under 324.5 of the reduced pixels
+        save(tmp_path / f"label-filt/{k}.png", ids)
+    K = np.array([[1170.0, 0, 647.5, 0], [0, 1170, 483.5, 0], [0, 0, 1, 0], [0, 0, 0, 1]])
+    layouts.write_text(tmp_path / "intrinsic/intrinsic_color.txt", layouts.matrix_text(K))
+    layouts.write_table(tmp_path / "scannetv2-labels.modified.tsv", "cocomapid", layouts.COCO_IDS)
+    write_points(tmp_path)
+    found = scannet.read(tmp_path, IngestSection(max_side=648, min_views=2))
+    assert np.allclose(found["Ks"][0], [[585, 0, 324], [0, 585, 242], [0, 0, 1]])
+    row = [found["class_names"][k] for k in found["labels"][0, 100]]
+    assert row == ["chair"] * 324 + ["shelves"] * 324
+    image(tmp_path / "label-filt/1.png", (640, 640), mode="L")
+    with pytest.raises(InputError, match=r"label-filt/1\.png is 640x640"):
+        scannet.read(tmp_path, IngestSection(max_side=648, min_views=2))
+
+
+def write_points(folder, text="0 0 1\n1 0 1\n"):
+    head = f"ply\nformat ascii 1.0\nelement vertex {text.count(chr(10))}\n"
+    (folder / "points3d.ply").write_text(head + "".join(f"property float {a}\n" for a in "xyz") + "end_header\n" + text)
+
+
+def test_depth_of_another_camera_is_looked_up_through_both_cameras(scene, tmp_path):
+    """A depth camera of half the resolution and two thirds of the focal length sees more than the photo."""
+    layouts.write_scannet_pl(tmp_path, with_classes(scene, scannet_closed.CLASSES))
+    K = np.eye(4)
+    K[:2, :3] = [[44.0, 0, 47.5], [0, 44.0, 35.5]]
+    layouts.write_text(tmp_path / "intrinsic/intrinsic_depth.txt", layouts.matrix_text(K))
+    columns = np.tile(np.arange(96, dtype=np.uint16) + 1000, (72, 1))
+    for path in (tmp_path / "depth").iterdir():
+        save(path, columns)
+    found = scannet.read(tmp_path, SETTINGS)
+    f = scene["Ks"][0, 0, 0]
+    wanted = np.floor((np.arange(96) + 0.5 - 48) * 44 / f + 48)
+    assert np.allclose(found["depth"][0, 30], (wanted + 1000) / 1000)
+
+
+@pytest.mark.parametrize(
+    ("path", "content", "message"),
+    [
+        ("points3d.ply", None, r"points3d\.ply is missing.*no other points"),
+        ("points3d.ply", "ply", r"points3d\.ply is not a readable PLY"),
+        ("points3d.ply", "nan", r"1 points that are not finite"),
+        ("pose/20.txt", None, r"pose/20\.txt"),
+        ("pose/20.txt", "1 2\n", r"20\.txt does not hold a 3x3 or 4x4"),
+        ("pose/20.txt", "a b\n", r"20\.txt does not hold numbers"),
+        ("pose/20.txt", "2 0 0 0\n0 2 0 0\n0 0 2 0\n0 0 0 1\n", "20 is not a rotation"),
+        ("intrinsic/intrinsic_color.txt", None, "intrinsic_color"),
+        ("intrinsic/intrinsic_color.txt", "9 0 500\n0 9 3\n0 0 1\n", "principal point"),
+        ("label-filt/20.png", None, r"label-filt/20\.png is missing"),
+        ("scannetv2-labels.modified.tsv", None, r"modified\.tsv is missing; put"),
+        ("scannetv2-labels.modified.tsv", "id\tnyu40id\n1\t1\n", "cocomapid"),
+        ("scannetv2-labels.modified.tsv", "id\tcocomapid\n1\t21\n", r"0\.\.\.20"),
+    ],
+)
+def test_a_damaged_scannet_folder_is_named(scene, tmp_path, path, content, message):
+    layouts.write_scannet_sg(tmp_path, with_classes(scene, scannet_open.CLASSES))
+    (tmp_path / path).unlink()
+    if content == "nan":
+        write_points(tmp_path, "0 0 nan\n")
+    elif content is not None:
+        (tmp_path / path).write_text(content)
+    with pytest.raises(InputError, match=message):
+        scannet.read(tmp_path, SETTINGS)
+
+
+@pytest.mark.parametrize(
+    ("split", "message"),
+    [({"train": ["0"]}, "lacks lists"), ({"train": ["0", "10"], "test": ["10"]}, "10 is both")],
+)
+def test_a_damaged_split_is_named(scene, tmp_path, split, message):
+    layouts.write_scannet_pl(tmp_path, with_classes(scene, scannet_closed.CLASSES))
+    (tmp_path / "splits.json").write_text(json.dumps(split))
+    with pytest.raises(InputError, match=rf"splits\.json.*{message}"):
+        scannet.read(tmp_path, SETTINGS)
+    (tmp_path / "splits.json").write_text(json.dumps({"train": ["0", "20"], "test": ["40"]}))
+    found = scannet.read(tmp_path, SETTINGS)
+    assert found["names"] == ["0", "20", "40"] and found["is_test"].tolist() == [False, False, True]
+    assert any("13 frames are in neither list" in note for note in found["source"]["notes"])
+
+
+@pytest.mark.parametrize(
+    ("lost", "message"),
+    [("frame-000003.pose.txt", r"000003\.pose"), ("frame-000003.depth.png", r"000003\.depth\.png is missing")],
+)
+def test_a_lost_part_of_seven_scenes_is_named(scene, tmp_path, lost, message):
+    layouts.write_seven_scenes(tmp_path, scene)
+    (tmp_path / lost).unlink()
+    with pytest.raises(InputError, match=message):
+        seven_scenes.read(tmp_path, SETTINGS)
+
+
+def test_depth_of_seven_scenes_has_a_narrower_field_of_view_than_colour(scene, tmp_path):
+    layouts.write_seven_scenes(tmp_path, scene)
+    (tmp_path / "camera-intrinsics.txt").unlink()
+    columns = np.tile(np.arange(96, dtype=np.uint16) + 1000, (72, 1))
+    for k in range(16):
+        save(tmp_path / f"frame-{k:06d}.depth.png", columns)
+    found = seven_scenes.read(tmp_path, SETTINGS)
+    at = (np.arange(96) + 0.5 - 48) * 585 / 525 + 48
+    wanted = np.where((at >= 0) & (at <= 96), (np.floor(at) + 1000) / 1000, np.nan)
+    assert np.allclose(found["depth"][0, 30], wanted, equal_nan=True)
+    assert np.isnan(wanted).sum() == 10
+    assert "78.75 pixels" in found["source"]["notes"][0]
+    with pytest.raises(InputError, match="no frame"):
+        seven_scenes.read(tmp_path / "..", SETTINGS)
+
+
+@pytest.mark.parametrize("colored", [True, False])
+def test_a_sources_own_points_become_the_scenes(scene, tmp_path, colored):
+    """All but five lie on what the views show."""
+    pixels = np.argwhere(np.ones((72, 96), bool))[::23]
+    parts = [unproject(scene["depth"][k], scene["Ks"][k], scene["cam_from_world"][k], pixels) for k in range(0, 16, 4)]
+    points = np.concatenate([*parts, np.full((5, 3), 50.0)]).astype(np.float32)
+    points = points[np.isfinite(points).all(1)]
+    colors = np.full((len(points), 3), 7, np.uint8) if colored else None
+    fields = {key: scene[key] for key in ("names", "images", "Ks", "cam_from_world")}
+    record = Capture(**fields, is_test=np.arange(16) % 8 == 0, points=points, point_colors=colors)
+    with artifact.publish(tmp_path / "c", Manifest("chebsplat.capture/1", "k", "test")) as tmp:
+        write_capture(tmp, record)
+    config = {"sfm": {"max_points": 100_000}}
+    assert run_stage("sfm", tmp_path / "out", {"capture": tmp_path / "c"}, config) == 0
+    found = read_points(tmp_path / "out")
+    facts = artifact.read_manifest(tmp_path / "out").facts
+    assert facts["how"] == "source" and facts["n_candidates"] == len(points)
+    assert facts["n_unseen"] >= 5 and len(found.means) == len(points) - facts["n_unseen"]
+    assert np.isin(found.means[:, 0], points[:, 0]).all()
+    assert (found.colors == 7).all() == colored
+    to_eyes = centers(scene["cam_from_world"])[None] - found.means[:, None]
+    facing = (np.einsum("ni,nvi->nv", found.normals, to_eyes) > 0).mean()
+    assert facing > 0.8  # most points of a convex room are turned towards most cameras
+
+
+@pytest.mark.data
+def test_the_red_kitchens_depth_agrees_between_views():
+    from test_sources import agreement
+
+    folder = data("redkitchen")
+    assert common.detect(folder) == "seven_scenes"
+    assert len(seven_scenes.files(folder)) == 3 * 120 + 1
+    fields = seven_scenes.read(folder, IngestSection(max_side=80, max_views=60))
+    fields["labels"] = np.zeros(fields["depth"].shape, int)
+    shares = [agreement(fields, k, k + 1)[0] for k in range(0, 59, 6)]
+    assert min(shares) > 0.3  # of all pixels, 80 % of which have depth; 0.38 where the camera turns fastest
+    fields["cam_from_world"] = np.linalg.inv(fields["cam_from_world"])
+    assert np.median([agreement(fields, k, k + 1)[0] for k in range(0, 59, 6)]) < np.median(shares) - 0.1
