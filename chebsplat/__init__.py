@@ -7,5 +7,8 @@ import os
 # Must precede torch.
 os.environ.setdefault("OMP_WAIT_POLICY", "passive")
 os.environ.setdefault("GOMP_SPINCOUNT", "1000")
+# One OpenMP serves numba and torch, and numba's first kernel sets the number of threads of both: let it be the same.
+if os.environ.get("OMP_NUM_THREADS", "").isdigit():
+    os.environ.setdefault("NUMBA_NUM_THREADS", os.environ["OMP_NUM_THREADS"])
 
 __version__ = "0.1.0"

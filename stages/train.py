@@ -7,7 +7,7 @@ from functools import partial
 from typing import TYPE_CHECKING, Any
 
 from chebsplat.errors import ConfigError, DataFailure
-from chebsplat.stages.command import Job, command
+from chebsplat.stages.command import Job, command, n_threads
 from chebsplat.stages.resume import Saves
 from chebsplat.stages.train_inputs import first_regions, knowledge, training_views
 
@@ -38,6 +38,9 @@ def run(job: Job) -> None:
     capture, points = read_capture(job.inputs["capture"]), read_points(job.inputs["points"])
     features = read_features(job.inputs["features"]) if "features" in job.inputs and train["semantics"] else None
     note_left_out(job, train, features is not None)
+    torch.set_num_threads(
+        n_threads()
+    )  # sums of torch depend on it, and the same bytes are promised for the same number
     torch.manual_seed(train["seed"])
     raw = initial_gaussians(points.means, points.colors, points.covariances)
     model = SceneModel(raw, describe, train, features.features.shape[-1] if features is not None else None)
