@@ -30,10 +30,11 @@ settings.CACHE_DIR = str(FOLDER)
 # open3d brings a TBB that numba refuses with a warning: OpenMP comes first.
 settings.THREADING_LAYER_PRIORITY = ["omp", "workqueue", "tbb"]
 
-# No fast-math beyond reassociation and contraction: NaN and infinity keep their meaning.
-kernel: Any = numba.njit(cache=True, parallel=True, error_model="numpy", fastmath={"reassoc", "contract", "nsz"})
-inline: Any = numba.njit(cache=True, error_model="numpy", fastmath={"reassoc", "contract", "nsz"}, inline="always")
-# Explicit vectors: reassociation would undo the rounding by x + 1.5·2²³ − 1.5·2²³.
+# No fast-math but contraction: NaN and infinity keep their meaning. Not reassociation either, for kernels just compiled
+# then differ in the last bit from the same ones read from the cache.
+kernel: Any = numba.njit(cache=True, parallel=True, error_model="numpy", fastmath={"contract", "nsz"})
+inline: Any = numba.njit(cache=True, error_model="numpy", fastmath={"contract", "nsz"}, inline="always")
+# Of explicit vectors and their scalars.
 lanes: Any = numba.njit(cache=True, error_model="numpy", fastmath={"contract"})
 serial: Any = numba.njit(cache=True, error_model="numpy")
 prange = numba.prange

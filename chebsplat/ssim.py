@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from chebsplat.jit import kernel, prange
+from chebsplat.jit import inline, kernel, prange
 
 WINDOW, SIGMA = 11, 1.5
 C1, C2 = np.float32(0.01**2), np.float32(0.03**2)
@@ -36,6 +36,15 @@ def _blur_products(a, b):
     return out
 
 
+@inline
+def _sum(terms):
+    """In order, apart from the loop that makes them: that one vectorises then."""
+    total = 0.0
+    for x in range(len(terms)):
+        total += terms[x]
+    return total
+
+
 @kernel
 def _compare(blurred, weight):
     """SSIM summed under a weight [H, L], by row, and its derivatives: to mean, variance and covariance, [H, 3, L]."""
@@ -43,13 +52,12 @@ def _compare(blurred, weight):
     values = np.zeros(height, np.float64)
     slopes = np.zeros((height, 3, length), np.float32)
     for y in prange(height):
-        m = np.zeros((5, length), np.float32)
+        m, terms = np.zeros((5, length), np.float32), np.empty(length, np.float32)
         for t in range(max(0, HALF - y), min(WINDOW, height + HALF - y)):
             tap = TAPS[t]
             for k in range(5):
                 for x in range(length):
                     m[k, x] += tap * blurred[y + t - HALF, k, x]
-        total = 0.0
         for x in range(length):
             mean_a, mean_b = m[0, x], m[1, x]
             squares = mean_a * mean_a + mean_b * mean_b
@@ -58,13 +66,13 @@ def _compare(blurred, weight):
             low_1, low_2 = squares + C1, m[2, x] + m[3, x] - squares + C2
             over = np.float32(1) / (low_1 * low_2)
             value, w = top_1 * top_2 * over, weight[y, x]
-            total += w * value
+            terms[x] = w * value
             by_cov = np.float32(2) * top_1 * over * w
             by_var = -value / low_2 * w
             by_mean = (np.float32(2) * mean_b * top_2 * over - np.float32(2) * mean_a * value / low_1) * w
             slopes[y, 0, x] = by_mean - np.float32(2) * mean_a * by_var - mean_b * by_cov
             slopes[y, 1, x], slopes[y, 2, x] = by_var, by_cov
-        values[y] = total
+        values[y] = _sum(terms)
     return values, slopes
 
 
@@ -91,20 +99,19 @@ def _gather(slopes, a, b, weight, weight_ssim):
     gradient = np.zeros((height, length), np.float32)
     distance = np.zeros(height, np.float64)
     for y in prange(height):
-        m = np.zeros((3, length), np.float32)
+        m, terms = np.zeros((3, length), np.float32), np.empty(length, np.float32)
         for t in range(max(0, HALF - y), min(WINDOW, height + HALF - y)):
             tap = TAPS[t]
             for k in range(3):
                 for x in range(length):
                     m[k, x] += tap * slopes[y + t - HALF, k, x]
-        total = 0.0
         for x in range(length):
             difference, w = a[y, x] - b[y, x], weight[y, x]
-            total += w * abs(difference)
+            terms[x] = w * abs(difference)
             sign = np.float32(difference > 0) - np.float32(difference < 0)
             by_ssim = m[0, x] + np.float32(2) * a[y, x] * m[1, x] + b[y, x] * m[2, x]
             gradient[y, x] = (np.float32(1) - weight_ssim) * sign * w - weight_ssim * by_ssim
-        distance[y] = total
+        distance[y] = _sum(terms)
     return gradient, distance
 
 

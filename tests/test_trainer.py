@@ -1,6 +1,10 @@
 """A training keeps rows, moments and bands together, whatever comes and goes."""
 
 import chebsplat  # noqa: F401  # isort: skip
+import os
+import subprocess
+import sys
+
 import numpy as np
 import pytest
 import torch
@@ -156,3 +160,21 @@ def test_weights_that_break_are_never_published(tiny_trainer):
         made.model.shape.encoder.region_token[0] = torch.inf
     with pytest.raises(DataFailure, match=r"not finite: shape.encoder.region_token"):
         made.finish()
+
+
+PRINT_BITS = """
+import hashlib
+from benchmarks.stability.training import tiny_trainer
+made = tiny_trainer(refresh_every=5)
+list(made.steps())
+print(hashlib.sha256(b"".join(value.tobytes() for value in made.finish().values())).hexdigest())
+"""
+
+
+@pytest.mark.slow
+def test_kernels_just_compiled_and_kernels_from_the_cache_give_the_same_bits(tmp_path):
+    environment = os.environ | {"XDG_CACHE_HOME": str(tmp_path), "PYTHONPATH": str(ROOT)}
+    command = [sys.executable, "-c", PRINT_BITS]
+    first, second = (subprocess.run(command, env=environment, capture_output=True, text=True) for _ in range(2))
+    assert first.returncode == 0, first.stderr
+    assert first.stdout == second.stdout
