@@ -20,9 +20,17 @@ from chebsplat.formats.artifact import Manifest
 
 
 def write_array(
-    path: Path, data: np.ndarray, dimensions: Sequence[str], units: str = "", chunks: tuple[int, ...] | None = None
+    path: Path,
+    data: np.ndarray,
+    dimensions: Sequence[str],
+    units: str = "",
+    chunks: tuple[int, ...] | None = None,
+    scale_factor: float | None = None,
 ) -> None:
-    """Write one array; `chunks` defaults to one entry of the first dimension. Float arrays have nan as fill value."""
+    """Write one array; `chunks` defaults to one entry of the first dimension. Float arrays have nan as fill value.
+
+    scale_factor: what a stored integer counts, by the convention of CF and xarray; kept as an attribute.
+    """
     import zarr
     from zarr.codecs import Crc32cCodec, ZstdCodec
 
@@ -34,7 +42,7 @@ def write_array(
         compressors=[ZstdCodec(level=3), Crc32cCodec()],
         fill_value=float("nan") if data.dtype.kind == "f" else 0,
         dimension_names=list(dimensions),
-        attributes={"units": units},
+        attributes={"units": units} | ({} if scale_factor is None else {"scale_factor": scale_factor}),
         config={"write_empty_chunks": True},
     )
     array[:] = data
@@ -68,6 +76,7 @@ class StoredArray:
                 raise InputError(f"{self.path / chunk} is missing; {artifact.remedy(root)}")
         self.shape: tuple[int, ...] = self._array.shape
         self.dtype: np.dtype = self._array.dtype
+        self.scale_factor = float(self._array.attrs.get("scale_factor", 1.0))
 
     def __len__(self) -> int:
         return self.shape[0]

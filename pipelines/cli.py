@@ -1,4 +1,4 @@
-"""The `chebsplat` command: run, plan, verify, clean-stale, scenes, and every stage as a plain command."""
+"""The `chebsplat` command: run, plan, verify, clean-stale, extract, scenes, and every stage as a plain command."""
 
 from __future__ import annotations
 
@@ -165,6 +165,27 @@ def clean_stale(yes: bool) -> None:
         if yes:
             for path, _ in found:
                 store.remove(path)
+        return 0
+
+    guarded(action)
+
+
+@main.command()
+@click.argument("scene", type=click.Path(path_type=Path))
+@click.option("--out", type=click.Path(path_type=Path), required=True, help="the .ply to write")
+@click.option("--keep-label", "labels", multiple=True, help="a name of labels.json; may be given again")
+@click.option("--min-opacity", type=click.FloatRange(0, 1), default=0.0, help="activated")
+@click.option("--box", help="x0,y0,z0,x1,y1,z1 that centres lie in, scene units")
+def extract(scene: Path, out: Path, labels: tuple[str, ...], min_opacity: float, box: str | None) -> None:
+    """Write part of a finished scene (an export artifact) as one PLY: by label, opacity, box."""
+
+    def action() -> int:
+        from chebsplat.stages.extract import corners
+        from chebsplat.stages.extract import extract as write
+
+        counts = write(scene, out, labels, min_opacity, corners(box))
+        print(", ".join(f"{name} {number:,}" for name, number in counts.items()), file=sys.stderr)
+        print(out)
         return 0
 
     guarded(action)

@@ -36,7 +36,7 @@ STAGES: dict[str, Stage] = {
               (("capture", "ingest"), ("points", "sfm")),
               (("features", "teacher"), ("descriptors", "describe"), ("basis", "cks")),
               help="Train the semantic Gaussian scene (Eqs 7-13)."),
-        Stage("export", "chebsplat.scene/1", ("export",), (("gaussians", "train"),), (("features", "teacher"),),
+        Stage("export", "chebsplat.scene/2", ("export",), (("gaussians", "train"),), (("features", "teacher"),),
               help="Write PLY files, ragged zarr, the label dictionary and the summary."),
         Stage("onnx", "chebsplat.encoder/1", ("onnx",), (("gaussians", "train"),),
               help="Export the local encoder to ONNX and check it against torch."),
