@@ -5,6 +5,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from shared import gaussian_parameters
 
 from chebsplat.errors import InputError
 from chebsplat.formats import artifact, capture, descriptors, evaluation, features, ply, points, scene
@@ -12,16 +13,6 @@ from chebsplat.formats.artifact import Manifest
 from chebsplat.formats.cameras import Cameras
 
 DATA = Path(os.environ.get("CHEBSPLAT_TEST_DATA", Path(__file__).parents[1] / "../shared/data"))
-
-
-def gaussian_parameters(n=6, seed=0):
-    rng = np.random.default_rng(seed)
-    degrees = np.sort(rng.integers(0, 4, n)).astype(np.uint8)
-    shN = rng.normal(size=(n, 15, 3)).astype(np.float32)
-    for row, degree in enumerate(degrees):
-        shN[row, ply.REST[int(degree)] :] = 0
-    shapes = {"means": (n, 3), "log_scales": (n, 3), "quats": (n, 4), "logit_opacities": (n,), "sh0": (n, 1, 3)}
-    return {k: rng.normal(size=s).astype(np.float32) for k, s in shapes.items()} | {"shN": shN, "degrees": degrees}
 
 
 def make_capture():
