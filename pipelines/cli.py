@@ -1,4 +1,4 @@
-"""The `chebsplat` command: run, plan, verify, clean-stale, extract, scenes, and every stage as a plain command."""
+"""The `chebsplat` command: runs, plans, upkeep, uses of a finished scene, and every stage as a plain command."""
 
 from __future__ import annotations
 
@@ -185,6 +185,25 @@ def extract(scene: Path, out: Path, labels: tuple[str, ...], min_opacity: float,
 
         counts = write(scene, out, labels, min_opacity, corners(box))
         print(", ".join(f"{name} {number:,}" for name, number in counts.items()), file=sys.stderr)
+        print(out)
+        return 0
+
+    guarded(action)
+
+
+@main.command()
+@click.argument("scene", type=click.Path(path_type=Path))
+@click.option("--encoder", type=click.Path(path_type=Path), required=True, help="an onnx artifact, or a model in it")
+@click.option("--features", type=click.Path(path_type=Path), help="of a PLY: .npy [N, C], float32, before fusion")
+@click.option("--out", type=click.Path(path_type=Path), required=True, help="the .npz to write")
+def encode(scene: Path, encoder: Path, features: Path | None, out: Path) -> None:
+    """Fused features of a finished scene (an export artifact, or a PLY), by onnxruntime, without torch."""
+
+    def action() -> int:
+        from chebsplat.stages.encode import encode as write
+
+        figures = write(scene, encoder, features, out)
+        print(", ".join(f"{name} {value}" for name, value in figures.items()), file=sys.stderr)
         print(out)
         return 0
 

@@ -38,7 +38,7 @@ STAGES: dict[str, Stage] = {
               help="Train the semantic Gaussian scene (Eqs 7-13)."),
         Stage("export", "chebsplat.scene/2", ("export",), (("gaussians", "train"),), (("features", "teacher"),),
               help="Write PLY files, ragged zarr, the label dictionary and the summary."),
-        Stage("onnx", "chebsplat.encoder/1", ("onnx",), (("gaussians", "train"),),
+        Stage("onnx", "chebsplat.encoder/2", ("onnx",), (("gaussians", "train"),),
               help="Export the local encoder to ONNX and check it against torch."),
         Stage("cks", "chebsplat.basis/1", ("cks",), (("gaussians", "train"),), (("basis", "cks"),),
               help="Update the core knowledge space with a trained scene (Eqs 14-15)."),
