@@ -165,8 +165,8 @@ def describe_members(
     sizes: dict[str, Any] = {"n_angles": n_angles, "max_degree": max_degree}
     sizes |= {"anisotropy": anisotropy, "bandwidth": bandwidth}
     if spectrum == "full":
-        given = (v.numpy() for v in (means, quats, scales, members))
-        full = arrays.describe_members(*given, **sizes, chunk=chunk)
+        plain = (v.numpy() for v in (means, quats, scales, members))
+        full = arrays.describe_members(*plain, **sizes, chunk=chunk)
         return Described(torch.from_numpy(full.values), n_exact=full.n_exact)
     values = [torch.zeros(0, members.shape[1], n_angles, n_degrees(spectrum, max_degree))]
     counts = np.zeros(3, np.int64)

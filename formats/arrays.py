@@ -76,7 +76,8 @@ class StoredArray:
                 raise InputError(f"{self.path / chunk} is missing; {artifact.remedy(root)}")
         self.shape: tuple[int, ...] = self._array.shape
         self.dtype: np.dtype = self._array.dtype
-        self.scale_factor = float(self._array.attrs.get("scale_factor", 1.0))
+        attributes: Any = self._array.attrs
+        self.scale_factor: float = attributes.get("scale_factor", 1.0)
 
     def __len__(self) -> int:
         return self.shape[0]

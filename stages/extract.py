@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from chebsplat.errors import ConfigError, DataFailure
 
@@ -40,7 +40,7 @@ def extract(
     if out.exists():
         raise ConfigError(f"{out} exists; remove it, or choose another --out")
     scene = read_scene(path)
-    filters: dict[str, np.ndarray] = {}
+    filters: dict[str, Any] = {}
     if labels:
         filters["label"] = has_label(scene, path, labels)
     if min_opacity > 0:
