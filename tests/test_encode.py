@@ -23,6 +23,11 @@ def run(*arguments):
     return CliRunner().invoke(main, ["encode", *map(str, arguments)])
 
 
+def loaded(path):
+    with np.load(path) as file:
+        return dict(file)
+
+
 def session_of(path):
     import onnxruntime
 
@@ -103,7 +108,7 @@ def test_encode_gives_the_scene_s_fused_features_without_torch(toy, mixed, tmp_p
     )
     done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True)
     assert (done.returncode, done.stdout) == (0, f"{tmp_path / 'a.npz'}\n"), done.stderr
-    found = np.load(tmp_path / "a.npz")
+    found = loaded(tmp_path / "a.npz")
     shape = checkpoint.parameters["fused"] - checkpoint.parameters["features"]
     assert np.abs(shape).max() > 0.1  # fusion does something
     assert np.abs(found["fused"] - scene.parameters["features"]).max() < 1e-4
@@ -119,7 +124,7 @@ def test_encode_gives_the_scene_s_fused_features_without_torch(toy, mixed, tmp_p
 def test_the_quantised_model_is_chosen_by_naming_it(toy, tmp_path):
     for name in (FLOAT, DYNAMIC):
         assert run(toy["export"], "--encoder", toy["onnx"] / name, "--out", tmp_path / f"{name}.npz").exit_code == 0
-    exact, rough = (np.load(tmp_path / f"{name}.npz")["fused"] for name in (FLOAT, DYNAMIC))
+    exact, rough = (loaded(tmp_path / f"{name}.npz")["fused"] for name in (FLOAT, DYNAMIC))
     assert 0 < np.abs(rough - exact).max() < 0.1
 
 
@@ -128,7 +133,7 @@ def test_a_ply_with_features_encodes_like_its_scene(toy, tmp_path):
     np.save(tmp_path / "raw.npy", scene.parameters["raw_features"])
     given = ["--features", tmp_path / "raw.npy", "--encoder", toy["onnx"]]
     assert run(toy["export"] / "scene.ply", *given, "--out", tmp_path / "a.npz").exit_code == 0
-    assert np.abs(np.load(tmp_path / "a.npz")["fused"] - scene.parameters["features"]).max() < 1e-4
+    assert np.abs(loaded(tmp_path / "a.npz")["fused"] - scene.parameters["features"]).max() < 1e-4
 
 
 def test_one_gaussian_is_a_region_of_one(toy, tmp_path):
@@ -138,7 +143,7 @@ def test_one_gaussian_is_a_region_of_one(toy, tmp_path):
     given = ["--features", tmp_path / "one.npy", "--encoder", toy["onnx"]]
     done = run(tmp_path / "one.ply", *given, "--out", tmp_path / "a.npz")
     assert done.exit_code == 0, done.stderr
-    found = np.load(tmp_path / "a.npz")
+    found = loaded(tmp_path / "a.npz")
     assert found["fused"].shape == (1, 13)
     assert np.isfinite(found["fused"]).all()
 
