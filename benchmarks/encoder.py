@@ -25,7 +25,7 @@ from chebsplat.formats.gaussians import read_gaussians
 from chebsplat.formats.scene import read_scene
 from chebsplat.noisy_teacher import decode
 from chebsplat.stages.command import n_threads
-from chebsplat.stages.encode import CHUNK, gaussians, session
+from chebsplat.stages.encode import CHUNK, gaussians, opened
 from chebsplat.stages.onnx import restored_fusion
 
 
@@ -46,7 +46,7 @@ def torch_route(encoder: RegionEncoder, parts: list[dict[str, np.ndarray]], dtyp
 
 
 def onnx_route(path: Path, parts: list[dict[str, np.ndarray]]) -> Any:
-    runner = session(path)
+    runner = opened(path)
     return lambda: np.concatenate([runner.run(None, part)[0] for part in parts])
 
 

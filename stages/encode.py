@@ -53,7 +53,7 @@ def encode(scene: Path, encoder: Path, features: Path | None, out: Path) -> dict
     encodings = encoded(held.models[name], given)
     done = time.perf_counter()
     centers = given.regions.centers
-    fused, gate = session(held.models[FUSED]).run(
+    fused, gate = opened(held.models[FUSED]).run(
         None,
         {
             "features": p["raw_features"],
@@ -116,8 +116,8 @@ def read_features(path: Path, n: int) -> np.ndarray:
     return values.astype(np.float32)
 
 
-def session(path: Path) -> Any:
-    """An onnxruntime session on the CPU, on as many threads as the other kernels."""
+def opened(path: Path) -> Any:
+    """A model in onnxruntime on the CPU, on as many threads as the other kernels."""
     import onnxruntime
 
     from chebsplat.stages.command import n_threads
@@ -131,7 +131,7 @@ def encoded(model: Path, given: Given) -> np.ndarray:
     """Encodings f32 [M, C] of all regions."""
     import numpy as np
 
-    runner = session(model)
+    runner = opened(model)
     feed = {"inputs": given.inputs, "positions": given.positions, "mask": given.mask}
     starts = range(0, len(given.mask), CHUNK)
     return np.concatenate([runner.run(None, {k: v[s : s + CHUNK] for k, v in feed.items()})[0] for s in starts])

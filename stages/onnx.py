@@ -181,8 +181,8 @@ def compare(module: Any, path: Path, given: dict[str, Any]) -> float:
     import onnxruntime
     import torch
 
-    session = onnxruntime.InferenceSession(str(path), providers=["CPUExecutionProvider"])
-    found = session.run(None, {name: value.numpy() for name, value in given.items()})
+    runner = onnxruntime.InferenceSession(str(path), providers=["CPUExecutionProvider"])
+    found = runner.run(None, {name: value.numpy() for name, value in given.items()})
     with torch.no_grad():
         wanted = module(*given.values())
     pairs = zip(found, wanted if isinstance(wanted, tuple) else (wanted,), strict=True)

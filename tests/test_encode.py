@@ -28,7 +28,7 @@ def loaded(path):
         return dict(file)
 
 
-def session_of(path):
+def opened(path):
     import onnxruntime
 
     return onnxruntime.InferenceSession(str(path), providers=["CPUExecutionProvider"])
@@ -49,7 +49,7 @@ def test_encoder_and_fusion_equal_torch_at_50_shapes(toy):
     from chebsplat.stages.onnx import example, fusion_example
 
     encoder, fusion = restored(toy)
-    encode, fuse = (session_of(toy["onnx"] / name) for name in (FLOAT, FUSED))
+    encode, fuse = (opened(toy["onnx"] / name) for name in (FLOAT, FUSED))
     worst = np.zeros(3)
     for seed, shape in enumerate(SHAPES):
         given, behind = example(encoder, *shape, seed), fusion_example(encoder.n_channels, *shape, seed)
@@ -69,7 +69,7 @@ def test_the_quantised_encoder_is_smaller_and_its_error_is_on_record(toy):
 
     encoder, _ = restored(toy)
     given = {k: v.numpy() for k, v in example(encoder, 32, 16).items()}
-    exact, rough = (session_of(toy["onnx"] / name).run(None, given)[0] for name in (FLOAT, DYNAMIC))
+    exact, rough = (opened(toy["onnx"] / name).run(None, given)[0] for name in (FLOAT, DYNAMIC))
     assert 0 < np.abs(rough - exact).max() < 0.1 * np.abs(exact).max()
     assert (toy["onnx"] / DYNAMIC).stat().st_size < (toy["onnx"] / FLOAT).stat().st_size
     parity = read_encoder(toy["onnx"]).parity
@@ -83,15 +83,15 @@ def test_contract_is_what_the_models_take_and_give_and_lies_in_their_metadata(to
     seen = []
     for part in ("encoder", "fusion"):
         for name in contract[part]["files"]:
-            session = session_of(toy["onnx"] / name)
-            for kind, entries in (("inputs", session.get_inputs()), ("outputs", session.get_outputs())):
+            runner = opened(toy["onnx"] / name)
+            for kind, entries in (("inputs", runner.get_inputs()), ("outputs", runner.get_outputs())):
                 said = contract[part][kind]
                 assert [e.name for e in entries] == list(said)
                 for entry in entries:
                     assert types[entry.type] == said[entry.name]["dtype"]
                     assert entry.shape == said[entry.name]["shape"]
                     assert said[entry.name]["meaning"]
-            held = session.get_modelmeta().custom_metadata_map["chebsplat.contract"]
+            held = runner.get_modelmeta().custom_metadata_map["chebsplat.contract"]
             assert json.loads(held) == contract
             seen.append(name)
     assert set(seen) == {FLOAT, DYNAMIC, FUSED}
@@ -201,7 +201,7 @@ def test_every_kind_of_encoder_exports_and_keeps_its_contract(tmp_path, variant)
     quantize(tmp_path / "a.onnx", tmp_path / "b.onnx")
     config = Config().sections(("describe", "train"))
     said = contract(encoder, config)["encoder"]["inputs"]
-    assert [entry.name for entry in session_of(tmp_path / "a.onnx").get_inputs()] == list(said)
+    assert [entry.name for entry in opened(tmp_path / "a.onnx").get_inputs()] == list(said)
     for shape in SHAPES[:10]:
         given = example(encoder, *shape)
         assert compare(encoder, tmp_path / "a.onnx", given) < 1e-5
