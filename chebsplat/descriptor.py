@@ -10,6 +10,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from chebsplat import descriptor_arrays as arrays
 from chebsplat.albo import canonicalize, metric_factors, rotations_about, similarity, tangent_axis
 from chebsplat.rasterize.projection import rotation_matrices
 from chebsplat.spectra import cut_spectrum
@@ -81,7 +82,7 @@ def describe_reference(
     Choices: angles j and J − j are replaced by half their sum and half their absolute difference, so that the sign of
     the axis does not matter; angles j > 0 fade to angle 0 where the axis is ill-defined; the axis has no gradient.
     """
-    _check(means, scales, rotmats, mask, n_angles, max_degree, anisotropy, bandwidth, n_eigs)
+    arrays.check(means, scales, rotmats, mask, n_angles, max_degree, anisotropy, bandwidth, n_eigs)
     region = canonicalize(means, scales, rotmats, mask)
     factors = metric_factors(region, anisotropy)
     axis, certainty = tangent_axis(region)
@@ -118,18 +119,11 @@ def describe_compiled(
     anisotropy: float = 10.0,
     bandwidth: float = 0.7,
 ) -> Described:
-    """`describe_reference` of the full spectrum, compiled: float64 up to the operator, then float32.
-
-    The same bits for any number of threads. Padding costs nothing.
-    """
-    from chebsplat.descriptor_kernel import describe
-
-    _check(means, scales, rotmats, mask, n_angles, max_degree, anisotropy, bandwidth)
-    out = np.zeros((*mask.shape, n_angles, max_degree - 1), np.float32)
-    exact = np.zeros(len(mask), np.bool_)
-    parts = [v.detach().double().contiguous().numpy() for v in (means, scales, rotmats)]
-    describe(*parts, mask.contiguous().numpy(), float(anisotropy), float(bandwidth), out, exact)
-    return Described(torch.from_numpy(out), n_exact=int(exact.sum()))
+    """`describe_reference` of the full spectrum, compiled: `descriptor_arrays.describe_regions`, of tensors."""
+    given = [v.detach().numpy() for v in (means, scales, rotmats, mask)]
+    sizes: dict[str, Any] = {"n_angles": n_angles, "max_degree": max_degree}
+    values, n_exact = arrays.describe_regions(*given, **sizes, anisotropy=anisotropy, bandwidth=bandwidth)
+    return Described(torch.from_numpy(values), n_exact=n_exact)
 
 
 def describe_regions(
@@ -170,33 +164,17 @@ def describe_members(
     """Descriptors of Gaussians [N] gathered by `members` i64 [M, n], -1 where padded; `chunk` bounds memory."""
     sizes: dict[str, Any] = {"n_angles": n_angles, "max_degree": max_degree}
     sizes |= {"anisotropy": anisotropy, "bandwidth": bandwidth}
+    if spectrum == "full":
+        plain = (v.numpy() for v in (means, quats, scales, members))
+        full = arrays.describe_members(*plain, **sizes, chunk=chunk)
+        return Described(torch.from_numpy(full.values), n_exact=full.n_exact)
     values = [torch.zeros(0, members.shape[1], n_angles, n_degrees(spectrum, max_degree))]
     counts = np.zeros(3, np.int64)
-    for part in members.split(chunk if spectrum == "full" else min(chunk, 256)):
+    for part in members.split(min(chunk, 256)):
         index = part.clamp_min(0)
         rotmats = rotation_matrices(quats[index].reshape(-1, 4)).reshape(*index.shape, 3, 3)
         given = (means[index], scales[index], rotmats, part >= 0)
-        if spectrum == "full":
-            found = describe_compiled(*given, **sizes)
-        else:
-            found = describe_reference(*given, **sizes, spectrum=spectrum, n_eigs=n_eigs)
+        found = describe_reference(*given, **sizes, spectrum=spectrum, n_eigs=n_eigs)
         values.append(found.values.float())
         counts += found[1:]
     return Described(torch.cat(values), *(int(count) for count in counts))
-
-
-def _check(
-    means: Tensor,
-    scales: Tensor,
-    rotmats: Tensor,
-    mask: Tensor,
-    n_angles: int,
-    max_degree: int,
-    anisotropy: float,
-    bandwidth: float,
-    n_eigs: int = 1,
-) -> None:
-    if n_angles < 1 or max_degree < 2 or n_eigs < 1 or not bandwidth > 0 or not anisotropy >= 0:
-        raise ValueError("n_angles >= 1, max_degree >= 2, n_eigs >= 1, bandwidth > 0 and anisotropy >= 0 are needed")
-    if means.shape != scales.shape or rotmats.shape != (*means.shape, 3) or mask.shape != means.shape[:2]:
-        raise ValueError(f"shapes disagree: {means.shape}, {scales.shape}, {rotmats.shape}, {mask.shape}")

@@ -5,6 +5,8 @@ from __future__ import annotations
 import torch
 from torch import Tensor, nn
 
+from chebsplat.rasterize.projection import rotation_matrices
+
 
 def propagation_weights(
     means: Tensor,
@@ -12,7 +14,7 @@ def propagation_weights(
     centers: Tensor,
     rotmats: Tensor,
     scales: Tensor,
-    radius: float,
+    radius: float | Tensor,
     *,
     inflation: float = 0.25,
     temperature: float = 1.0,
@@ -62,3 +64,28 @@ class Gate(nn.Module):
         gate = self.linear(torch.cat([shape, features], -1)).sigmoid()
         gate = torch.where(is_covered[:, None], gate, torch.ones_like(gate))
         return gate * features + (1 - gate) * shape, gate
+
+
+class Fusion(nn.Module):
+    """Eqs 8-10 in one: from encodings of regions to fused features of Gaussians, with a trained gate."""
+
+    def __init__(self, gate: Gate):
+        super().__init__()
+        self.gate = gate
+
+    def forward(
+        self,
+        features: Tensor,
+        encodings: Tensor,
+        cover: Tensor,
+        means: Tensor,
+        centers: Tensor,
+        quats: Tensor,
+        scales: Tensor,
+        radius: Tensor,
+    ) -> tuple[Tensor, Tensor]:
+        """features [N, C], encodings [M, C]; cover [N, k], means [N, 3], centers [M, 3], scales [M, 3] and radius [] as
+        of `propagation_weights`; quats [M, 4] of the Gaussians at the centres -> fused [N, C], gate [N, C].
+        """
+        weights = propagation_weights(means, cover, centers, rotation_matrices(quats), scales, radius)
+        return self.gate(features, propagate(encodings, cover, weights), cover[:, 0] >= 0)

@@ -27,10 +27,12 @@ def create_array(
     units: str = "",
     chunks: Sequence[int] | None = None,
     shards: Sequence[int] | None = None,
+    scale_factor: float | None = None,
 ) -> Any:
     """An empty zarr array; `chunks` defaults to one entry of the first dimension. Float arrays have nan as fill value.
 
-    Args: shards: what one file holds, whole chunks of it in every dimension; None: a chunk a file.
+    Args: shards: what one file holds, whole chunks of it in every dimension; None: a chunk a file;
+      scale_factor: what a stored integer counts, by the convention of CF and xarray, kept as an attribute.
     """
     import zarr
     from zarr.codecs import Crc32cCodec, ZstdCodec
@@ -44,7 +46,7 @@ def create_array(
         compressors=[ZstdCodec(level=3), Crc32cCodec()],
         fill_value=float("nan") if np.dtype(dtype).kind == "f" else 0,
         dimension_names=list(dimensions),
-        attributes={"units": units},
+        attributes={"units": units} | ({} if scale_factor is None else {"scale_factor": scale_factor}),
         config={"write_empty_chunks": True},
     )
 
@@ -56,9 +58,10 @@ def write_array(
     units: str = "",
     chunks: Sequence[int] | None = None,
     shards: Sequence[int] | None = None,
+    scale_factor: float | None = None,
 ) -> None:
     """Write one array whole; see `create_array`. Raises OSError if a chunk is not on disk afterwards."""
-    array = create_array(path, data.shape, data.dtype, dimensions, units, chunks, shards)
+    array = create_array(path, data.shape, data.dtype, dimensions, units, chunks, shards, scale_factor)
     array[:] = data
     absent = [name for name in chunk_names(array) if not (path / name).is_file()]
     if absent:
@@ -96,6 +99,8 @@ class StoredArray:
                 raise InputError(f"{self.path / chunk} is missing; {artifact.remedy(root)}")
         self.shape: tuple[int, ...] = self._array.shape
         self.dtype: np.dtype = self._array.dtype
+        attributes: Any = self._array.attrs
+        self.scale_factor: float = attributes.get("scale_factor", 1.0)
 
     def __len__(self) -> int:
         return self.shape[0]

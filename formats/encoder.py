@@ -1,4 +1,4 @@
-"""`encoder/1`: the local encoder in ONNX, the contract of its inputs, and the record of its parity with torch."""
+"""`encoder/2`: the local encoder and the fusion behind it in ONNX, their contract, and their parity with torch."""
 
 from __future__ import annotations
 
@@ -9,20 +9,23 @@ from typing import Any
 from chebsplat.formats import artifact
 from chebsplat.formats.documents import read_document, write_document
 
-SCHEMA = "chebsplat.encoder/1"
+SCHEMA = "chebsplat.encoder/2"
+FLOAT, DYNAMIC, FUSED = "encoder.onnx", "encoder.int8.onnx", "fusion.onnx"
 
 
 @dataclass
 class Encoder:
-    """model: path of `encoder.onnx`; contract: inputs and outputs; parity: largest difference by (regions, size)."""
+    """models: paths by name, FLOAT, DYNAMIC (quantised to 8 bits) and FUSED; contract: see `stages.contract`; parity:
+    by model, sizes and largest difference from torch.
+    """
 
-    model: Path
+    models: dict[str, Path]
     contract: dict[str, Any]
-    parity: list[dict[str, float]]
+    parity: dict[str, list[dict[str, Any]]]
 
 
-def write_encoder(out: Path, contract: dict[str, Any], parity: list[dict[str, float]]) -> None:
-    """Write the documents beside `encoder.onnx`, which the exporter itself writes into `out`."""
+def write_encoder(out: Path, contract: dict[str, Any], parity: dict[str, list[dict[str, Any]]]) -> None:
+    """Write the documents beside the models, which the exporter itself writes into `out`."""
     write_document(out / "contract.json", contract)
     write_document(out / "parity.json", parity)
 
@@ -31,6 +34,6 @@ def read_encoder(path: Path) -> Encoder:
     """Raises: InputError naming the damaged file and the remedy."""
     path = Path(path)
     manifest = artifact.read_manifest(path, SCHEMA)
-    model = artifact.checked(path, manifest, "encoder.onnx")
-    contract = read_document(path, manifest, "contract.json", ("inputs", "outputs"))
-    return Encoder(model, contract, read_document(path, manifest, "parity.json"))
+    models = {name: artifact.checked(path, manifest, name) for name in (FLOAT, DYNAMIC, FUSED)}
+    contract = read_document(path, manifest, "contract.json", ("encoder", "fusion", "settings"))
+    return Encoder(models, contract, read_document(path, manifest, "parity.json", (FLOAT, DYNAMIC, FUSED)))

@@ -13,41 +13,52 @@ _FIXED = ["x", "y", "z", "nx", "ny", "nz", "f_dc_0", "f_dc_1", "f_dc_2"]
 _TAIL = ["opacity", "scale_0", "scale_1", "scale_2", "rot_0", "rot_1", "rot_2", "rot_3"]
 
 
-def write_ply(path: Path, parameters: dict[str, np.ndarray], degree: int, labels: np.ndarray | None = None) -> None:
+def write_ply(
+    path: Path,
+    parameters: dict[str, np.ndarray],
+    degree: int,
+    labels: np.ndarray | None = None,
+    label_names: list[str] | None = None,
+) -> None:
     """Write raw parameters (`formats.gaussians.Gaussians.parameters`) as a binary little-endian 3DGS PLY.
 
     Args:
-      degree: highest band to write; `f_rest` is channel-major and shorter below 3.
-      labels: [N] class ids, appended as `ushort label` (65535 = none) after `rot_3`.
-    Choices: normals are written as zeros, since some loaders hard-code their presence.
+      parameters: where `degrees` [N] are given, `sh_degree` follows `rot_3`.
+      degree:     highest band to write; `f_rest` is channel-major and shorter below 3.
+      labels:     [N] class ids, -1 none; `label` is then the last property.
+      label_names: by id, written as comments `label ID NAME` of those that occur.
+    Choices: normals are written as zeros, since some loaders hard-code their presence. Tags are floats like all else:
+      Open3D skips a `ushort`, and gsply 0.4 and spz-js 1.2 take any other type, or a second element, for the data.
     """
     from plyfile import PlyData, PlyElement
 
     n, n_rest = len(parameters["means"]), REST[degree]
-    columns = [(name, "<f4") for name in (*_FIXED, *(f"f_rest_{i}" for i in range(3 * n_rest)), *_TAIL)]
-    extra = [("label", "<u2")] if labels is not None else []
-    rows = np.zeros(n, dtype=columns + extra)
-    values = np.concatenate(
-        [
-            parameters["means"],
-            np.zeros((n, 3), np.float32),
-            parameters["sh0"][:, 0],
-            parameters["shN"][:, :n_rest].transpose(0, 2, 1).reshape(n, -1),
-            parameters["logit_opacities"][:, None],
-            parameters["log_scales"],
-            parameters["quats"],
-        ],
-        axis=1,
-    )
-    for index, (name, _) in enumerate(columns):
-        rows[name] = values[:, index]
-    if labels is not None:
-        rows["label"] = np.where(labels < 0, 65535, labels)
-    PlyData([PlyElement.describe(rows, "vertex")], byte_order="<").write(str(path))
+    names = [*_FIXED, *(f"f_rest_{i}" for i in range(3 * n_rest)), *_TAIL]
+    blocks = [
+        parameters["means"],
+        np.zeros((n, 3), np.float32),
+        parameters["sh0"][:, 0],
+        parameters["shN"][:, :n_rest].transpose(0, 2, 1).reshape(n, -1),
+        parameters["logit_opacities"][:, None],
+        parameters["log_scales"],
+        parameters["quats"],
+    ]
+    degrees = parameters.get("degrees")
+    tags = {"sh_degree": None if degrees is None else np.minimum(degrees, degree), "label": labels}
+    for name, values in tags.items():
+        if values is not None:
+            names.append(name)
+            blocks.append(values[:, None])
+    rows = np.concatenate(blocks, 1, dtype="<f4", casting="same_kind")
+    vertex = PlyElement.describe(rows.view([(name, "<f4") for name in names])[:, 0], "vertex")
+    comments = []
+    if labels is not None and label_names is not None:
+        comments = [f"label {index} {label_names[index]}" for index in np.unique(labels[labels >= 0])]
+    PlyData([vertex], byte_order="<", comments=comments).write(str(path))
 
 
 def read_ply(path: Path) -> tuple[dict[str, np.ndarray], int, np.ndarray | None]:
-    """Raw parameters, file degree, and labels where the file has them. Normals are optional.
+    """Raw parameters, file degree, and labels where the file has them. Normals and tags are optional.
 
     Raises: InputError naming the file: not a PLY, truncated, not a 3DGS layout, or non-finite values.
     """
@@ -87,7 +98,9 @@ def read_ply(path: Path) -> tuple[dict[str, np.ndarray], int, np.ndarray | None]
     for name, values in parameters.items():
         if not np.isfinite(values).all():
             raise InputError(f"{path}: {name} holds non-finite values; export the scene again")
+    if "sh_degree" in names:
+        parameters["degrees"] = np.asarray(vertex["sh_degree"]).astype(np.uint8)
+        if n and parameters["degrees"].max() > degree:
+            raise InputError(f"{path}: a sh_degree exceeds the file's degree {degree}; export the scene again")
     labels = np.asarray(vertex["label"]).astype(np.int32) if "label" in names else None
-    if labels is not None:
-        labels = np.where(labels == 65535, -1, labels)
     return parameters, degree, labels

@@ -1,4 +1,4 @@
-"""`scene/1`: the exported scene: PLY for viewers, ragged arrays for us, a label dictionary and a summary."""
+"""`scene/2`: the exported scene: PLY for viewers, ragged arrays for us, a label dictionary and a summary."""
 
 from __future__ import annotations
 
@@ -16,23 +16,27 @@ from chebsplat.formats.documents import read_document, write_document
 from chebsplat.formats.ply import REST, write_ply
 from chebsplat.formats.tensors import read_tensors, write_tensors
 
-SCHEMA = "chebsplat.scene/1"
+SCHEMA = "chebsplat.scene/2"
+FEATURES = {"features", "raw_features"}
 _FLAT = {"means": 3, "log_scales": 3, "quats": 4, "sh0": 3}
 
 
 @dataclass
 class Scene:
-    """N Gaussians sorted by SH degree, raw float32 parameters as in `gaussians/1`.
+    """N Gaussians sorted by SH degree, stably; raw float32 parameters as in `gaussians/1`.
 
     parameters: `means`, `log_scales`, `quats`, `logit_opacities`, `sh0` [N,1,3], `shN` [N,15,3] (zero above a
-                Gaussian's degree), `degrees` u8 [N] ascending, and `features` [N,C] where there are semantics.
+                Gaussian's degree), `degrees` u8 [N] ascending; where there are semantics `features` [N,C], fused if
+                the scene has an encoder; where it has one, `raw_features` [N,C] that encoder and gate see.
     cameras:    of the views it can be evaluated on.
+    order:      i64 [N], place of each Gaussian in the checkpoint, on which the regions depend.
     labels:     i32 [N] class index, -1 none; None without semantics. label_names, label_embeddings f32 [L, C].
     summary:    counts, bytes, and what was left out and why.
     """
 
     parameters: dict[str, np.ndarray]
     cameras: Cameras
+    order: np.ndarray
     labels: np.ndarray | None = None
     label_names: list[str] | None = None
     label_embeddings: np.ndarray | None = None
@@ -43,36 +47,45 @@ def write_scene(out: Path, scene: Scene, split_by_degree: bool = True) -> dict[s
     """Fill the directory that `artifact.publish` yields; returns bytes by part.
 
     Choices: `scene.ply` is trimmed to the highest degree in use; `scene_d<k>.ply` hold each degree apart, each valid
-    on its own; `ragged/` holds SH by bands, so a Gaussian pays only for the bands it keeps.
+    on its own; `ragged/` holds SH by bands, so a Gaussian pays only for the bands it keeps. Features are 16-bit fixed
+    point: as small as halves, 20 times as exact. Degrees are stored in the checkpoint's order, which they then tell.
     """
     p, degrees = scene.parameters, scene.parameters["degrees"]
-    if np.any(np.diff(degrees.astype(int)) < 0):
-        raise ValueError("Gaussians are not sorted by degree")
+    unsorted = np.empty_like(degrees)
+    unsorted[scene.order] = degrees
+    if not np.array_equal(np.argsort(unsorted, kind="stable"), scene.order):
+        raise ValueError("Gaussians are not sorted by degree, stably")
     top = int(degrees.max(initial=0))
-    write_ply(out / "scene.ply", p, top, scene.labels)
+    write_ply(out / "scene.ply", p, top, scene.labels, scene.label_names)
     if split_by_degree and len(np.unique(degrees)) > 1:
         for degree in np.unique(degrees):
             chosen = degrees == degree
             part = {name: values[chosen] for name, values in p.items()}
             labels = None if scene.labels is None else scene.labels[chosen]
-            write_ply(out / f"scene_d{degree}.ply", part, int(degree), labels)
+            write_ply(out / f"scene_d{degree}.ply", part, int(degree), labels, scene.label_names)
     for name, width in _FLAT.items():
         _write_flat(out / "ragged" / name, p[name].reshape(-1, width))
     _write_flat(out / "ragged/logit_opacities", p["logit_opacities"][:, None])
     for band in range(1, top + 1):
         rows = p["shN"][degrees >= band, REST[band - 1] : REST[band]]
         _write_flat(out / f"ragged/sh{band}", rows.reshape(len(rows), -1))
-    if "features" in p:
-        _write_flat(out / "ragged/features", p["features"].astype(np.float16))
-    write_tensors(out / "degrees.safetensors", {"degrees": degrees.astype(np.uint8)})
+    for name in FEATURES & set(p):
+        step = float(np.abs(p[name]).max(initial=0)) / 32767 or 1.0
+        _write_flat(out / "semantic" / name, np.round(p[name] / step).astype(np.int16), step)
+    write_tensors(out / "degrees.safetensors", {"degrees": unsorted.astype(np.uint8)})
     write_cameras(out, scene.cameras)
     if scene.labels is not None and scene.label_embeddings is not None:
         labelled = {"labels": scene.labels.astype(np.int32), "embeddings": scene.label_embeddings.astype(np.float32)}
         write_tensors(out / "labels.safetensors", labelled)
     write_document(out / "labels.json", dict(enumerate(scene.label_names or [])))
     sizes = {
+        "unpruned_ply": 62 * 4 * len(degrees),
         "ply": (out / "scene.ply").stat().st_size,
-        "ragged": sum(f.stat().st_size for f in (out / "ragged").rglob("*") if f.is_file()),
+        "split": sum(f.stat().st_size for f in out.glob("scene_d*.ply")),
+        **{
+            part: sum(f.stat().st_size for f in (out / part).rglob("*") if f.is_file())
+            for part in ("ragged", "semantic")
+        },
     }
     write_document(out / "summary.json", scene.summary | {"bytes": sizes, "max_degree": top, "n": len(degrees)})
     return sizes
@@ -82,14 +95,13 @@ def read_scene(path: Path) -> Scene:
     """Raises: InputError naming the damaged file and the remedy."""
     path = Path(path)
     manifest = artifact.read_manifest(path, SCHEMA)
-    degrees = read_tensors(path, manifest, "degrees.safetensors", {"degrees": ("n",)})["degrees"]
-    n = len(degrees)
+    unsorted = read_tensors(path, manifest, "degrees.safetensors", {"degrees": ("n",)})["degrees"]
+    order = np.argsort(unsorted, kind="stable")
+    n, degrees = len(order), unsorted[order]
 
-    def flat(name: str, rows: int, width: int | None) -> np.ndarray:
-        array: StoredArray = open_array(
-            path, manifest, f"ragged/{name}", (rows, width), "float16" if name == "features" else "float32"
-        )
-        values = array[:].astype(np.float32)
+    def flat(name: str, rows: int, width: int) -> np.ndarray:
+        array: StoredArray = open_array(path, manifest, f"ragged/{name}", (rows, width), "float32")
+        values = array[:]
         if not np.isfinite(values).all():
             raise InputError(f"{array.path} holds non-finite values; {artifact.remedy(path)}")
         return values
@@ -106,15 +118,18 @@ def read_scene(path: Path) -> Scene:
     parameters["degrees"] = degrees
     cameras = read_cameras(path, manifest)
     summary = read_document(path, manifest, "summary.json", ("bytes", "max_degree", "n"))
-    if not has_array(manifest, "ragged/features"):
-        return Scene(parameters, cameras, summary=summary)
-    parameters["features"] = flat("features", n, None)
+    for name in FEATURES:
+        if has_array(manifest, f"semantic/{name}"):
+            array = open_array(path, manifest, f"semantic/{name}", (n, None), "int16")
+            parameters[name] = array[:] * np.float32(array.scale_factor)
+    if "features" not in parameters:
+        return Scene(parameters, cameras, order, summary=summary)
     names = list(read_document(path, manifest, "labels.json").values())
     shapes = {"labels": (n,), "embeddings": (len(names), parameters["features"].shape[1])}
     found = read_tensors(path, manifest, "labels.safetensors", shapes)
-    return Scene(parameters, cameras, found["labels"], names, found["embeddings"], summary)
+    return Scene(parameters, cameras, order, found["labels"], names, found["embeddings"], summary)
 
 
-def _write_flat(path: Path, rows: np.ndarray) -> None:
+def _write_flat(path: Path, rows: np.ndarray, scale_factor: float | None = None) -> None:
     chunk = (max(min(len(rows), 65_536), 1), max(rows.shape[1], 1))
-    write_array(path, np.ascontiguousarray(rows), ("gaussian", "value"), chunks=chunk)
+    write_array(path, np.ascontiguousarray(rows), ("gaussian", "value"), chunks=chunk, scale_factor=scale_factor)

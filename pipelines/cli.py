@@ -1,4 +1,4 @@
-"""The `chebsplat` command: runs, plans, studies, queries, checks and listings, and every stage as a plain command."""
+"""The `chebsplat` command: runs, plans, studies, upkeep, uses of a finished scene, and every stage as a command."""
 
 from __future__ import annotations
 
@@ -259,6 +259,46 @@ def check_teacher(model: Path, photo: Path | None, labels: str | None) -> None:
 
         for what, finding in check(model, photo, labels):
             print(f"{what:9s}{finding}")
+        return 0
+
+    guarded(action)
+
+
+@main.command()
+@click.argument("scene", type=click.Path(path_type=Path))
+@click.option("--out", type=click.Path(path_type=Path), required=True, help="the .ply to write")
+@click.option("--keep-label", "labels", multiple=True, help="a name of labels.json; may be given again")
+@click.option("--min-opacity", type=click.FloatRange(0, 1), default=0.0, help="activated")
+@click.option("--box", help="x0,y0,z0,x1,y1,z1 that centres lie in, scene units")
+def extract(scene: Path, out: Path, labels: tuple[str, ...], min_opacity: float, box: str | None) -> None:
+    """Write part of a finished scene (an export artifact) as one PLY: by label, opacity, box."""
+
+    def action() -> int:
+        from chebsplat.stages.extract import corners
+        from chebsplat.stages.extract import extract as write
+
+        counts = write(scene, out, labels, min_opacity, corners(box))
+        print(", ".join(f"{name} {number:,}" for name, number in counts.items()), file=sys.stderr)
+        print(out)
+        return 0
+
+    guarded(action)
+
+
+@main.command()
+@click.argument("scene", type=click.Path(path_type=Path))
+@click.option("--encoder", type=click.Path(path_type=Path), required=True, help="an onnx artifact, or a model in it")
+@click.option("--features", type=click.Path(path_type=Path), help="of a PLY: .npy [N, C], float32, before fusion")
+@click.option("--out", type=click.Path(path_type=Path), required=True, help="the .npz to write")
+def encode(scene: Path, encoder: Path, features: Path | None, out: Path) -> None:
+    """Fused features of a finished scene (an export artifact, or a PLY), by onnxruntime, without torch."""
+
+    def action() -> int:
+        from chebsplat.stages.encode import encode as write
+
+        figures = write(scene, encoder, features, out)
+        print(", ".join(f"{name} {value}" for name, value in figures.items()), file=sys.stderr)
+        print(out)
         return 0
 
     guarded(action)

@@ -23,6 +23,8 @@ def run(job: Job) -> None:
     wanted = ("means", "log_scales", "quats", "logit_opacities", "sh0", "shN", "degrees")
     parameters = {name: gaussians.parameters[name][order] for name in wanted}
     semantic = gaussians.parameters.get("fused", gaussians.parameters.get("features"))
+    if "fused" in gaussians.parameters:
+        parameters["raw_features"] = gaussians.parameters["features"][order]
     labelled: dict[str, Any] = {}
     if semantic is None:
         job.left_out("labels", "the scene was trained without semantics")
@@ -30,7 +32,7 @@ def run(job: Job) -> None:
         job.left_out("labels", "no --in-features: the label embeddings are unknown")
     else:
         teacher = read_features(job.inputs["features"])
-        parameters["features"] = semantic[order].astype(np.float16).astype(np.float32)
+        parameters["features"] = semantic[order]
         labels, _ = decode(parameters["features"], teacher.label_embeddings)
         labelled = {
             "labels": labels.astype(np.int32),
@@ -44,10 +46,9 @@ def run(job: Job) -> None:
         job.left_out("split PLY files", "export.split_by_degree is false")
     left_out = gaussians.notes.get("left_out", {}) | job.facts.get("left_out", {})
     summary = {"left_out": left_out, "by_degree": counts, "n_initial": gaussians.notes.get("n_initial")}
-    scene = Scene(parameters, gaussians.cameras, **labelled, summary=summary)
+    scene = Scene(parameters, gaussians.cameras, order, **labelled, summary=summary)
     sizes = write_scene(job.out, scene, job.config.export.split_by_degree)
-    dense = len(order) * 62 * 4
-    job.facts |= {"n_gaussians": len(order), "by_degree": counts, "bytes": sizes, "bytes_untrimmed_ply": dense}
+    job.facts |= {"n_gaussians": len(order), "by_degree": counts, "bytes": sizes}
 
 
 main = command("export", run)

@@ -1,46 +1,126 @@
-"""onnx: export the local encoder, and check it against torch at several region counts and sizes."""
+"""onnx: export the local encoder and the fusion behind it, and check both against torch at many counts and sizes."""
 
 from __future__ import annotations
 
 from pathlib import Path
 from typing import Any
 
-from chebsplat.errors import DataFailure
+from chebsplat.errors import DataFailure, InputError
 from chebsplat.stages.command import Job, command
+from chebsplat.stages.contract import contract
 
-SIZES = ((1, 1), (3, 8), (16, 32), (5, 64))  # (regions, members) that parity is measured at
+SIZES = (
+    (1, 1),
+    (1, 8),
+    (3, 1),
+    (16, 32),
+    (5, 64),
+    (300, 16),
+)  # (regions, members or Gaussians) that parity is measured at
+ENCODER = ("inputs", "positions", "mask")
+FUSION = ("features", "encodings", "cover", "means", "centers", "quats", "scales", "radius")
 
 
 def run(job: Job) -> None:
     from chebsplat.encoder import RegionEncoder
-    from chebsplat.formats.encoder import write_encoder
+    from chebsplat.formats.encoder import DYNAMIC, FLOAT, FUSED, write_encoder
     from chebsplat.formats.gaussians import read_gaussians
 
-    encoder = RegionEncoder.restored(*read_gaussians(job.inputs["gaussians"]).encoder())
-    export(encoder, job.out / "encoder.onnx", job.config.onnx.opset)
-    parity = compare(encoder, job.out / "encoder.onnx")
-    worst = max(row["difference"] for row in parity)
+    gaussians = read_gaussians(job.inputs["gaussians"])
+    encoder = RegionEncoder.restored(*gaussians.encoder())
+    fusion = restored_fusion(gaussians, encoder.n_channels)
+    agreed = contract(encoder, trained_with(job.inputs["gaussians"]))
+    export_encoder(encoder, job.out / FLOAT, job.config.onnx.opset)
+    export_fusion(fusion, encoder.n_channels, job.out / FUSED, job.config.onnx.opset)
+    quantize(job.out / FLOAT, job.out / DYNAMIC)
+    for name in (FLOAT, FUSED, DYNAMIC):
+        annotate(job.out / name, agreed)
+    parity: dict[str, list[dict[str, Any]]] = {FLOAT: [], FUSED: [], DYNAMIC: []}
+    for size in SIZES:
+        given, behind = example(encoder, *size), fusion_example(encoder.n_channels, *size)
+        for name, module, values in ((FLOAT, encoder, given), (FUSED, fusion, behind), (DYNAMIC, encoder, given)):
+            parity[name].append({"sizes": size, "difference": compare(module, job.out / name, values)})
+    worst = max(row["difference"] for name in (FLOAT, FUSED) for row in parity[name])
     if not worst <= job.config.onnx.tolerance:
         raise DataFailure(f"ONNX differs from torch by {worst:.1e}; onnx.tolerance is {job.config.onnx.tolerance:.1e}")
-    job.facts |= {"largest_difference": worst}
-    write_encoder(job.out, contract(encoder), parity)
+    job.facts |= {
+        "largest_difference": worst,
+        "largest_difference_int8": max(row["difference"] for row in parity[DYNAMIC]),
+    }
+    write_encoder(job.out, agreed, parity)
 
 
-def example(encoder: Any, n_regions: int, n_members: int, seed: int = 0) -> tuple[Any, Any, Any]:
+def trained_with(path: Path) -> dict[str, Any]:
+    """The sections `describe` and `train` that the checkpoint was made with. Raises InputError if it names none."""
+    from chebsplat.formats.artifact import read_manifest
+
+    config = read_manifest(path).config
+    if not {"describe", "train"} <= set(config):
+        raise InputError(f"{path / 'artifact.json'} does not say how the scene was trained; train it again")
+    return config
+
+
+def restored_fusion(gaussians: Any, n_channels: int) -> Any:
+    """`fusion.Fusion` with the checkpoint's gate."""
+    import torch
+
+    from chebsplat.fusion import Fusion, Gate
+
+    prefix, gate = "shape.gate.", Gate(n_channels)
+    gate.load_state_dict(
+        {k.removeprefix(prefix): torch.from_numpy(v) for k, v in gaussians.modules.items() if k.startswith(prefix)}
+    )
+    return Fusion(gate).eval()
+
+
+def example(encoder: Any, n_regions: int, n_members: int, seed: int = 0) -> dict[str, Any]:
     """Random inputs of a size; the last member of every second region is padding."""
     import torch
 
     generator = torch.Generator().manual_seed(seed)
-    inputs = torch.randn(n_regions, n_members, encoder.n_inputs, generator=generator)
-    positions = 2 * torch.rand(n_regions, n_members, 3, generator=generator) - 1
     mask = torch.ones(n_regions, n_members, dtype=torch.bool)
     if n_members > 1:
         mask[::2, -1] = False
-    return inputs, positions, mask
+    return {
+        "inputs": torch.randn(n_regions, n_members, encoder.n_inputs, generator=generator),
+        "positions": 2 * torch.rand(n_regions, n_members, 3, generator=generator) - 1,
+        "mask": mask,
+    }
 
 
-def export(encoder: Any, path: Path, opset: int) -> None:
+def fusion_example(n_channels: int, n_regions: int, n_gaussians: int, seed: int = 0) -> dict[str, Any]:
+    """Random inputs of a size; every third Gaussian is covered by nothing, every second by fewer regions than fit."""
+    import torch
+
+    generator = torch.Generator().manual_seed(seed)
+
+    def normal(*shape: int) -> torch.Tensor:
+        return torch.randn(*shape, generator=generator)
+
+    cover = torch.randint(n_regions, (n_gaussians, 4), generator=generator)
+    cover[1::2, 2:] = -1
+    cover[2::3] = -1
+    n, m = n_gaussians, n_regions
+    values = (normal(n, n_channels), normal(m, n_channels), cover, normal(n, 3), normal(m, 3), normal(m, 4))
+    return dict(zip(FUSION, (*values, normal(m, 3).exp(), torch.tensor(1.5)), strict=True))
+
+
+def export_encoder(encoder: Any, path: Path, opset: int) -> None:
     """One self-contained file with dynamic region count and size."""
+    export(encoder, example(encoder, 4, 6), dict.fromkeys(ENCODER, ("regions", "members")), "encodings", path, opset)
+
+
+def export_fusion(fusion: Any, n_channels: int, path: Path, opset: int) -> None:
+    """One self-contained file with dynamic counts of regions, of Gaussians, and of regions that reach one."""
+    dynamic: dict[str, tuple[str, ...]] = dict.fromkeys(FUSION, ("regions",))
+    dynamic |= {"features": ("gaussians",), "means": ("gaussians",), "cover": ("gaussians", "covers"), "radius": ()}
+    export(fusion, fusion_example(n_channels, 5, 7), dynamic, "fused gate", path, opset)
+
+
+def export(
+    module: Any, given: dict[str, Any], dynamic: dict[str, tuple[str, ...]], outputs: str, path: Path, opset: int
+) -> None:
+    """Write a module; `dynamic` names the leading dimensions of each input that may be of any size."""
     import io
     import logging
     import warnings
@@ -51,54 +131,62 @@ def export(encoder: Any, path: Path, opset: int) -> None:
     import torch
 
     logging.getLogger("torch.onnx._internal.exporter._registration").setLevel("ERROR")  # "torchvision is absent"
-    regions, members = torch.export.Dim("regions", min=1), torch.export.Dim("members", min=1)
-    shape = {0: regions, 1: members}
+    sizes = {name: torch.export.Dim(name, min=1) for names in dynamic.values() for name in names}
+    shapes = tuple({k: sizes[name] for k, name in enumerate(dynamic[argument])} for argument in given)
     with warnings.catch_warnings(), redirect_stdout(io.StringIO()):
         warnings.simplefilter("ignore")  # the exporter warns about its own internals
         torch.onnx.export(
-            encoder,
-            example(encoder, 4, 6),
+            module,
+            tuple(given.values()),
             path,
-            input_names=["inputs", "positions", "mask"],
-            output_names=["encodings"],
+            input_names=list(given),
+            output_names=outputs.split(),
             opset_version=opset,
             dynamo=True,
-            dynamic_shapes=(shape, shape, shape),
+            dynamic_shapes=shapes,
             external_data=False,
             verbose=False,
         )
 
 
-def compare(encoder: Any, path: Path) -> list[dict[str, float]]:
-    """Largest absolute difference between onnxruntime and torch at each of SIZES."""
+def quantize(source: Path, target: Path) -> None:
+    """Weights in 8 bits, activations quantised as they come."""
+    import logging
+
+    import onnx
+    from onnxruntime.quantization import QuantType, quantize_dynamic
+
+    model = onnx.load(source)
+    del model.graph.value_info[:]  # shapes of before: the quantiser transposes weights and then finds them wrong
+    logging.disable(logging.WARNING)  # "please consider pre-processing", by the root logger
+    try:
+        quantize_dynamic(model, target, weight_type=QuantType.QInt8, per_channel=True)
+    finally:
+        logging.disable(logging.NOTSET)
+
+
+def annotate(path: Path, agreed: dict[str, Any]) -> None:
+    """Put the contract into the model's own metadata."""
+    import json
+
+    import onnx
+
+    model = onnx.load(path)
+    onnx.helper.set_model_props(model, {"chebsplat.contract": json.dumps(agreed)})
+    onnx.save(model, path)
+
+
+def compare(module: Any, path: Path, given: dict[str, Any]) -> float:
+    """Largest absolute difference between onnxruntime and torch."""
     import onnxruntime
     import torch
 
-    session = onnxruntime.InferenceSession(str(path), providers=["CPUExecutionProvider"])
-    known = {entry.name for entry in session.get_inputs()}
-    rows = []
-    for n_regions, n_members in SIZES:
-        values = example(encoder, n_regions, n_members, seed=n_members)
-        feed = {k: v.numpy() for k, v in zip(("inputs", "positions", "mask"), values, strict=True) if k in known}
-        found = torch.from_numpy(session.run(None, feed)[0])
-        with torch.no_grad():
-            difference = float((found - encoder(*values)).abs().max())
-        rows.append({"regions": n_regions, "members": n_members, "difference": difference})
-    return rows
-
-
-def contract(encoder: Any) -> dict[str, Any]:
-    """What a caller has to feed, in words."""
-    return {
-        "inputs": {
-            "inputs": f"float32 [regions, members, {encoder.n_inputs}]: flattened descriptor [J, D-1], then the "
-            "Gaussian's semantic features where the scene was trained with them; absent if its width is 0",
-            "positions": "float32 [regions, members, 3]: (mean - centre) / region radius",
-            "mask": "bool [regions, members]: true where a member exists",
-        },
-        "outputs": {"encodings": f"float32 [regions, {encoder.n_channels}]"},
-        "settings": encoder.settings | {"n_inputs": encoder.n_inputs, "n_channels": encoder.n_channels},
-    }
+    runner = onnxruntime.InferenceSession(str(path), providers=["CPUExecutionProvider"])
+    found = runner.run(None, {name: value.numpy() for name, value in given.items()})
+    with torch.no_grad():
+        wanted = module(*given.values())
+    pairs = zip(found, wanted if isinstance(wanted, tuple) else (wanted,), strict=True)
+    return max(float((torch.from_numpy(a) - b).abs().max()) for a, b in pairs)
 
 
 main = command("onnx", run)

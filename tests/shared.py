@@ -38,6 +38,21 @@ INPUTS = {
 }
 
 
+def gaussian_parameters(n=6, seed=0):
+    """Random raw parameters, sorted by degree, zero above it."""
+    import numpy as np
+
+    from chebsplat.formats.ply import REST
+
+    rng = np.random.default_rng(seed)
+    degrees = np.sort(rng.integers(0, 4, n)).astype(np.uint8)
+    shN = rng.normal(size=(n, 15, 3)).astype(np.float32)
+    for row, degree in enumerate(degrees):
+        shN[row, REST[int(degree)] :] = 0
+    shapes = {"means": (n, 3), "log_scales": (n, 3), "quats": (n, 4), "logit_opacities": (n,), "sh0": (n, 1, 3)}
+    return {k: rng.normal(size=s).astype(np.float32) for k, s in shapes.items()} | {"shN": shN, "degrees": degrees}
+
+
 def data(name):
     """A folder of third-party data, or a skip that names it."""
     if not (DATA / name).is_dir():

@@ -5,6 +5,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from shared import gaussian_parameters
 
 from chebsplat.errors import InputError
 from chebsplat.formats import artifact, capture, descriptors, evaluation, features, ply, points, scene
@@ -12,16 +13,6 @@ from chebsplat.formats.artifact import Manifest
 from chebsplat.formats.cameras import Cameras
 
 DATA = Path(os.environ.get("CHEBSPLAT_TEST_DATA", Path(__file__).parents[1] / "../shared/data"))
-
-
-def gaussian_parameters(n=6, seed=0):
-    rng = np.random.default_rng(seed)
-    degrees = np.sort(rng.integers(0, 4, n)).astype(np.uint8)
-    shN = rng.normal(size=(n, 15, 3)).astype(np.float32)
-    for row, degree in enumerate(degrees):
-        shN[row, ply.REST[int(degree)] :] = 0
-    shapes = {"means": (n, 3), "log_scales": (n, 3), "quats": (n, 4), "logit_opacities": (n,), "sh0": (n, 1, 3)}
-    return {k: rng.normal(size=s).astype(np.float32) for k, s in shapes.items()} | {"shN": shN, "degrees": degrees}
 
 
 def make_capture():
@@ -89,10 +80,20 @@ def make_cameras():
 
 def make_scene():
     p = gaussian_parameters()
-    p["features"] = np.random.default_rng(5).normal(size=(6, 4)).astype(np.float16).astype(np.float32)
+    for name in ("features", "raw_features"):
+        codes = np.random.default_rng(5).integers(-32767, 32768, (6, 4))
+        codes[0, 0] = 32767
+        p[name] = (codes / 2**15).astype(np.float32)  # what 16-bit fixed point holds exactly
+    order = np.argsort(np.random.default_rng(6).permutation(p["degrees"]), kind="stable")
     labels = np.array([0, 1, -1, 0, 1, 1], np.int32)
     return scene.Scene(
-        p, make_cameras(), labels, ["wall", "floor"], np.eye(2, 4, dtype=np.float32), {"left_out": {"cks": "none"}}
+        p,
+        make_cameras(),
+        order,
+        labels,
+        ["wall", "floor"],
+        np.eye(2, 4, dtype=np.float32),
+        {"left_out": {"cks": "none"}},
     )
 
 
@@ -203,24 +204,51 @@ def test_a_capture_with_a_repeated_name_is_refused(tmp_path):
 def test_ply_reads_back(tmp_path, degree):
     p = gaussian_parameters()
     p["shN"][:, ply.REST[degree] :] = 0
+    p["degrees"] = np.minimum(p["degrees"], degree).astype(np.uint8)
     labels = np.array([0, 5, -1, 2, 2, 1])
     ply.write_ply(tmp_path / "a.ply", p, degree, labels)
     found, file_degree, found_labels = ply.read_ply(tmp_path / "a.ply")
     assert file_degree == degree
     assert np.array_equal(found_labels, labels)
+    assert set(found) == set(p)
     assert all(np.array_equal(found[name], p[name]) for name in found)
 
 
 def test_full_ply_has_the_62_float_header(tmp_path):
     from plyfile import PlyData
 
-    ply.write_ply(tmp_path / "a.ply", gaussian_parameters(), 3)
+    bare = {name: values for name, values in gaussian_parameters().items() if name != "degrees"}
+    ply.write_ply(tmp_path / "a.ply", bare, 3)
     vertex = PlyData.read(str(tmp_path / "a.ply"))["vertex"]
     rest = [f"f_rest_{i}" for i in range(45)]
     names = ["x", "y", "z", "nx", "ny", "nz", "f_dc_0", "f_dc_1", "f_dc_2", *rest, "opacity"]
     names += ["scale_0", "scale_1", "scale_2", "rot_0", "rot_1", "rot_2", "rot_3"]
     assert [p.name for p in vertex.properties] == names
     assert vertex.data.dtype.itemsize == 62 * 4
+
+
+def test_tags_follow_the_62_floats_as_floats_and_names_are_comments(tmp_path):
+    from plyfile import PlyData
+
+    labels = np.array([0, 2, -1, 2, 2, 0])
+    ply.write_ply(tmp_path / "a.ply", gaussian_parameters(), 3, labels, ["wall", "lamp", "round table"])
+    found = PlyData.read(str(tmp_path / "a.ply"))
+    assert [(p.name, p.val_dtype) for p in found["vertex"].properties][-3:] == [
+        ("rot_3", "f4"),
+        ("sh_degree", "f4"),
+        ("label", "f4"),
+    ]
+    assert list(found.comments) == ["label 0 wall", "label 2 round table"]
+
+
+def test_fixed_point_features_are_within_half_a_step(tmp_path):
+    record = make_scene()
+    record.parameters["features"] = np.random.default_rng(0).normal(size=(6, 4)).astype(np.float32)
+    with artifact.publish(tmp_path / "s", Manifest(scene.SCHEMA, "k", "s")) as tmp:
+        scene.write_scene(tmp, record)
+    wanted = record.parameters["features"]
+    found = scene.read_scene(tmp_path / "s").parameters["features"]
+    assert np.abs(found - wanted).max() <= 0.51 * np.abs(wanted).max() / 32767  # half a step, and float32's own
 
 
 def test_split_ply_files_hold_the_same_gaussians(tmp_path):

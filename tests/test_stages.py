@@ -181,26 +181,6 @@ def test_data_that_cannot_be_worked_with_is_exit_4(toy, stage, tmp_path):
     assert not (tmp_path / "out").exists()
 
 
-def test_onnx_equals_torch_for_several_counts_and_sizes(toy):
-    import onnxruntime
-    import torch
-
-    from chebsplat.encoder import RegionEncoder
-
-    encoder = RegionEncoder.restored(*read_gaussians(toy["train"]).encoder())
-    session = onnxruntime.InferenceSession(str(toy["onnx"] / "encoder.onnx"))
-    for n_regions, n_members in [(1, 1), (2, 3), (7, 16), (31, 33), (64, 64)]:
-        generator = torch.Generator().manual_seed(n_regions)
-        inputs = torch.randn(n_regions, n_members, encoder.n_inputs, generator=generator)
-        positions = torch.rand(n_regions, n_members, 3, generator=generator) * 2 - 1
-        mask = torch.rand(n_regions, n_members, generator=generator) < 0.7
-        feed = {"inputs": inputs.numpy(), "positions": positions.numpy(), "mask": mask.numpy()}
-        with torch.no_grad():
-            expected = encoder(inputs, positions, mask)
-        found = torch.from_numpy(session.run(None, feed)[0])
-        assert (found - expected).abs().max() < 1e-5
-
-
 def test_rendering_only_scenes_leave_the_semantic_branch_out(toy, tmp_path):
     def made(stage, inputs):
         assert run_stage(stage, tmp_path / stage, inputs) == 0

@@ -1,0 +1,150 @@
+"""Fused features of a finished scene, by onnxruntime: the encoder's contract, kept without torch."""
+
+from __future__ import annotations
+
+import os
+import time
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from chebsplat.errors import ConfigError, InputError
+
+if TYPE_CHECKING:
+    import numpy as np
+
+    from chebsplat.encoding import Given
+
+CHUNK = 256  # regions that the encoder sees at once
+
+
+def encode(scene: Path, encoder: Path, features: Path | None, out: Path) -> dict[str, Any]:
+    """Describe the regions of a scene, encode them, fuse, and write a .npz.
+
+    Args:
+      scene:    a `scene` artifact, or a 3DGS PLY.
+      encoder:  an `encoder` artifact, or the float or quantised model in one.
+      features: .npy [N, C] that encoder and gate see, for a PLY, which holds none.
+      out:      holds fused, gate f32 [N, C], encodings f32 [M, C], centers i64 [M], members i64 [M, n] (-1: padding)
+                and radius; Gaussians are numbered as in the scene's files.
+    Returns: counts, and seconds of each part.
+    Raises:  ConfigError, InputError: arguments that do not fit one another, each named with the remedy.
+    """
+    import numpy as np
+
+    from chebsplat.encoding import prepare
+    from chebsplat.formats.encoder import DYNAMIC, FLOAT, FUSED, read_encoder
+
+    if out.suffix != ".npz":
+        raise ConfigError(f"{out}: the result is a .npz; name it so")
+    if out.exists():
+        raise ConfigError(f"{out} exists; remove it, or choose another --out")
+    name = FLOAT if encoder.is_dir() else encoder.name
+    if name not in (FLOAT, DYNAMIC):
+        raise ConfigError(f"{encoder} is neither an onnx artifact nor its {FLOAT} or {DYNAMIC}; pass one of these")
+    held = read_encoder(encoder if encoder.is_dir() else encoder.parent)
+    settings = held.contract["settings"]
+    p, order = gaussians(scene, features, settings["n_channels"])
+    began = time.perf_counter()
+    try:
+        given = prepare(p["means"], p["quats"], p["log_scales"], p["raw_features"], settings)
+    except ValueError as error:
+        raise InputError(f"{scene} cannot be encoded: {error}") from None
+    described = time.perf_counter()
+    encodings = encoded(held.models[name], given)
+    done = time.perf_counter()
+    centers = given.regions.centers
+    fused, gate = opened(held.models[FUSED]).run(
+        None,
+        {
+            "features": p["raw_features"],
+            "encodings": encodings,
+            "cover": given.cover,
+            "means": p["means"],
+            "centers": p["means"][centers],
+            "quats": p["quats"][centers],
+            "scales": np.exp(p["log_scales"][centers]),
+            "radius": np.array(given.regions.radius, np.float32),
+        },
+    )
+    finished = time.perf_counter()
+    place = np.argsort(order)  # of each Gaussian in the scene's files
+    members = given.regions.members
+    result = {"fused": fused[order], "gate": gate[order], "encodings": encodings, "centers": place[centers]}
+    result |= {"members": np.where(members >= 0, place[members], -1), "radius": np.float64(given.regions.radius)}
+    write(out, result)
+    seconds = {"describing": described - began, "encoding": done - described, "fusing": finished - done}
+    return {"gaussians": len(order), "regions": len(centers)} | {f"{k} s": round(v, 3) for k, v in seconds.items()}
+
+
+def gaussians(scene: Path, features: Path | None, n_channels: int) -> tuple[dict[str, np.ndarray], np.ndarray]:
+    """Raw parameters and `raw_features` in the order of training, and each one's place there by place in the file."""
+    import numpy as np
+
+    from chebsplat.formats.ply import read_ply
+    from chebsplat.formats.scene import read_scene
+
+    if scene.is_dir():
+        if features is not None:
+            raise ConfigError(f"{scene} holds its own features; --features is for a PLY")
+        held = read_scene(scene)
+        if "raw_features" not in held.parameters:
+            raise InputError(f"{scene} was trained without an encoder; train it with train.encoder = transformer")
+        back = np.argsort(held.order)
+        p, order = {name: values[back] for name, values in held.parameters.items()}, held.order
+    else:
+        p = read_ply(scene)[0]
+        order = np.arange(len(p["means"]))
+        if features is None:
+            raise ConfigError(f"{scene} is a PLY, which holds no features; add --features FILE.npy, or pass a scene")
+        p["raw_features"] = read_features(features, len(order))
+    found = p["raw_features"].shape[1]
+    if found != n_channels:
+        raise InputError(f"{features or scene} has {found} feature channels, the encoder {n_channels}; pass its own")
+    return p, order
+
+
+def read_features(path: Path, n: int) -> np.ndarray:
+    """Features f32 [N, C]. Raises InputError if the file holds anything else."""
+    import numpy as np
+
+    try:
+        values = np.load(path, allow_pickle=False)
+    except (OSError, ValueError) as error:
+        raise InputError(f"{path} is not a readable .npy ({error}); save a float32 array [{n}, C]") from None
+    if not isinstance(values, np.ndarray) or values.ndim != 2 or len(values) != n or not np.isfinite(values).all():
+        raise InputError(f"{path} is not a finite array [{n}, C], one row a Gaussian; save one")
+    return values.astype(np.float32)
+
+
+def opened(path: Path) -> Any:
+    """A model in onnxruntime on the CPU, on as many threads as the other kernels."""
+    import onnxruntime
+
+    from chebsplat.stages.command import n_threads
+
+    options = onnxruntime.SessionOptions()
+    options.intra_op_num_threads = n_threads()
+    return onnxruntime.InferenceSession(str(path), options, providers=["CPUExecutionProvider"])
+
+
+def encoded(model: Path, given: Given) -> np.ndarray:
+    """Encodings f32 [M, C] of all regions."""
+    import numpy as np
+
+    runner = opened(model)
+    feed = {"inputs": given.inputs, "positions": given.positions, "mask": given.mask}
+    starts = range(0, len(given.mask), CHUNK)
+    return np.concatenate([runner.run(None, {k: v[s : s + CHUNK] for k, v in feed.items()})[0] for s in starts])
+
+
+def write(out: Path, arrays: dict[str, Any]) -> None:
+    """A .npz that is there whole or not at all."""
+    import numpy as np
+
+    out.parent.mkdir(parents=True, exist_ok=True)
+    tmp = out.with_name(f".tmp-{os.getpid()}-{out.name}")
+    try:
+        np.savez(tmp, **arrays)
+        os.replace(tmp, out)
+    finally:
+        tmp.unlink(missing_ok=True)

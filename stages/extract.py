@@ -1,0 +1,97 @@
+"""Part of a finished scene as one 3DGS PLY: chosen by label, opacity and box."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from chebsplat.errors import ConfigError, DataFailure
+
+if TYPE_CHECKING:
+    import numpy as np
+
+    from chebsplat.formats.scene import Scene
+
+CONVERT = "npx @playcanvas/splat-transform@2.7.1 scene.ply scene.compressed.ply"  # or scene.spz --spz-version 3
+
+
+def extract(
+    path: Path, out: Path, labels: tuple[str, ...], min_opacity: float, box: tuple[float, ...] | None
+) -> dict[str, int]:
+    """Write the Gaussians that pass every filter, trimmed to the highest SH degree among them.
+
+    Args:
+      path:        a `scene` artifact.
+      out:         the PLY to write; never overwritten.
+      labels:      names to keep; all where there are none.
+      min_opacity: activated, in [0, 1]; box: x0, y0, z0, x1, y1, z1 of centres, scene units.
+    Returns: how many Gaussians were kept, and how many each filter alone would leave out.
+    Raises:  ConfigError on a filter that the scene cannot answer, DataFailure if nothing is left.
+    """
+    import numpy as np
+    from scipy.special import expit
+
+    from chebsplat.formats.ply import write_ply
+    from chebsplat.formats.scene import read_scene
+
+    if out.suffix != ".ply" or out.name.endswith(".compressed.ply"):
+        raise ConfigError(f"{out}: only a plain .ply is written; convert that, for instance: {CONVERT}")
+    if out.exists():
+        raise ConfigError(f"{out} exists; remove it, or choose another --out")
+    scene = read_scene(path)
+    filters: dict[str, Any] = {}
+    if labels:
+        filters["label"] = has_label(scene, path, labels)
+    if min_opacity > 0:
+        filters["opacity"] = expit(scene.parameters["logit_opacities"]) >= min_opacity
+    if box is not None:
+        means = scene.parameters["means"]
+        filters["box"] = ((means >= box[:3]) & (means <= box[3:])).all(1)
+    n = len(scene.parameters["means"])
+    left_out = {name: int(n - keep.sum()) for name, keep in filters.items()}
+    kept = np.logical_and.reduce([np.ones(n, bool), *filters.values()])
+    if not kept.any():
+        why = ", ".join(f"{name} {number}" for name, number in left_out.items())
+        raise DataFailure(f"no Gaussian of {n} is left ({why}); choose wider filters")
+    part = {name: values[kept] for name, values in scene.parameters.items()}
+    held = None if scene.labels is None else scene.labels[kept]
+    out.parent.mkdir(parents=True, exist_ok=True)
+    tmp = out.with_name(f".tmp-{os.getpid()}-{out.name}")
+    try:
+        write_ply(tmp, part, int(part["degrees"].max()), held, scene.label_names)
+        os.replace(tmp, out)
+    finally:
+        tmp.unlink(missing_ok=True)
+    return {"kept": int(kept.sum()), "of": n} | {f"left out by {name}": number for name, number in left_out.items()}
+
+
+def has_label(scene: Scene, path: Path, names: tuple[str, ...]) -> np.ndarray:
+    """Which Gaussians bear one of the names. Raises ConfigError, with the nearest name, for one that is unknown."""
+    import difflib
+
+    import numpy as np
+
+    if scene.labels is None or scene.label_names is None:
+        raise ConfigError(f"{path} has no labels: {scene.summary['left_out'].get('labels', 'it has no semantics')}")
+    for name in names:
+        if name not in scene.label_names:
+            near = difflib.get_close_matches(name, scene.label_names, 1)
+            advice = f"did you mean {near[0]}?" if near else f"there are: {', '.join(scene.label_names)}"
+            raise ConfigError(f"no label is called {name}; {advice}")
+    return np.isin(scene.labels, [scene.label_names.index(name) for name in names])
+
+
+def corners(text: str | None) -> tuple[float, ...] | None:
+    """Six numbers from "x0,y0,z0,x1,y1,z1". Raises ConfigError if they are no box."""
+    import math
+
+    if text is None:
+        return None
+    try:
+        box = tuple(float(part) for part in text.split(","))
+    except ValueError:
+        box = ()
+    if len(box) != 6 or not all(math.isfinite(v) for v in box) or any(box[k] >= box[k + 3] for k in range(3)):
+        raise ConfigError(f"--box {text}: six numbers x0,y0,z0,x1,y1,z1 with x0 < x1 and so on are needed")
+    return box

@@ -1,0 +1,157 @@
+"""What is exported renders as the checkpoint does, and a part of a scene is chosen as asked."""
+
+import json
+
+import numpy as np
+import pytest
+from click.testing import CliRunner
+from shared import data
+
+from chebsplat.formats.ply import read_ply, write_ply
+from chebsplat.formats.scene import read_scene
+from chebsplat.pipelines.cli import main
+
+pytestmark = pytest.mark.xdist_group("toy")
+
+
+def rendered(parameters, cameras, index):
+    """Float image of raw parameters, every band of every Gaussian evaluated."""
+    import torch
+
+    from chebsplat.gaussians import activated
+    from chebsplat.rasterize import rasterize
+    from chebsplat.sh import eval_sh
+
+    raw = {name: torch.from_numpy(np.ascontiguousarray(values)) for name, values in parameters.items()}
+    means, quats, scales, opacities = activated(raw)
+    viewmat = torch.from_numpy(cameras.cam_from_world[index]).float()
+    eye = -viewmat[:3, :3].T @ viewmat[:3, 3]
+    colors = eval_sh(raw["sh0"], raw["shN"], means - eye, 3)
+    K = torch.from_numpy(cameras.Ks[index]).float()
+    return rasterize(means, quats, scales, opacities, colors, viewmat[None], K[None], cameras.width, cameras.height)[0]
+
+
+def test_the_exported_scene_renders_as_the_checkpoint_does(mixed):
+    checkpoint, path = mixed
+    parts = [read_ply(file)[0] for file in sorted(path.glob("scene_d*.ply"))]
+    assert len(parts) == 4
+    together = {name: np.concatenate([part[name] for part in parts]) for name in parts[0]}
+    for index in range(0, len(checkpoint.cameras.names), 3):
+        wanted = rendered(checkpoint.parameters, checkpoint.cameras, index)
+        assert wanted.max() > 0.3
+        for found in (read_scene(path).parameters, read_ply(path / "scene.ply")[0], together):
+            image = rendered(found, checkpoint.cameras, index)
+            assert (image - wanted).abs().max() < 1e-4  # only the order of equal depths may differ
+
+
+def test_the_renderer_that_evaluates_by_degree_agrees(mixed):
+    import torch
+
+    from chebsplat.render import SceneRenderer
+    from chebsplat.views import View
+
+    checkpoint, path = mixed
+    scene = read_scene(path)
+    cameras = scene.cameras
+    view = View(
+        torch.from_numpy(cameras.Ks[0]).float(), torch.from_numpy(cameras.cam_from_world[0]).float(), cameras.width,
+        cameras.height,
+    )  # fmt: skip
+    image = SceneRenderer(scene.parameters).render(view)[0].astype(np.float32) / 255
+    wanted = rendered(checkpoint.parameters, cameras, 0)[0].clamp(0, 1).numpy()
+    assert np.abs(image - wanted).max() <= 0.5 / 255 + 1e-4
+
+
+def test_a_quarter_of_each_degree_costs_at_most_what_the_bar_allows(mixed):
+    scene = read_scene(mixed[1])
+    n, counts = len(scene.order), np.bincount(scene.parameters["degrees"])
+    split = sum(file.stat().st_size for file in mixed[1].glob("scene_d*.ply"))
+    floats = sum(count * (17 + 3 * ((degree + 1) ** 2 - 1) + 2) for degree, count in enumerate(counts))
+    assert scene.summary["bytes"]["split"] == split
+    assert floats * 4 < split < floats * 4 + 4 * 2500  # headers
+    assert scene.summary["bytes"]["unpruned_ply"] == n * 62 * 4
+
+
+def run(*arguments):
+    return CliRunner().invoke(main, ["extract", *map(str, arguments)])
+
+
+def test_filters_keep_what_they_name_and_nothing_else(mixed, tmp_path):
+    scene = read_scene(mixed[1])
+    p, names = scene.parameters, scene.label_names
+    wanted = names[np.bincount(scene.labels[scene.labels >= 0]).argmax()]
+    low, high = np.quantile(p["means"], [0.1, 0.9], axis=0).round(3)
+    box = ",".join(map(str, [*low, *high]))
+    done = run(mixed[1], "--out", tmp_path / "a.ply", "--keep-label", wanted, "--min-opacity", 0.1, f"--box={box}")
+    assert done.exit_code == 0, done.stderr
+    assert done.stdout == f"{tmp_path / 'a.ply'}\n"
+    keep = scene.labels == names.index(wanted)
+    keep &= 1 / (1 + np.exp(-p["logit_opacities"].astype(float))) >= 0.1
+    keep &= ((p["means"] >= low) & (p["means"] <= high)).all(1)
+    found, degree, labels = read_ply(tmp_path / "a.ply")
+    assert 0 < keep.sum() < len(keep)
+    assert f"kept {keep.sum():,}, of {len(keep):,}, left out by label" in done.stderr
+    assert all(np.array_equal(found[name], p[name][keep]) for name in found)
+    assert np.array_equal(labels, scene.labels[keep])
+    assert degree == p["degrees"][keep].max()
+
+
+def test_an_extract_is_trimmed_to_the_degrees_it_holds(mixed, tmp_path):
+    scene = read_scene(mixed[1])
+    keep = scene.parameters["degrees"] == 1
+    corner = scene.parameters["means"][keep][0]
+    box = ",".join(map(str, [*(corner - 1e-4), *(corner + 1e-4)]))
+    assert run(mixed[1], "--out", tmp_path / "a.ply", f"--box={box}").exit_code == 0
+    assert read_ply(tmp_path / "a.ply")[1] == 1
+
+
+def test_without_filters_everything_is_kept(mixed, tmp_path):
+    assert run(mixed[1], "--out", tmp_path / "a.ply").exit_code == 0
+    assert (tmp_path / "a.ply").read_bytes() == (mixed[1] / "scene.ply").read_bytes()
+
+
+@pytest.mark.parametrize(
+    ("arguments", "code", "message"),
+    [
+        (["--keep-label", "flor"], 2, "did you mean floor?"),
+        (["--box", "0,0,0,1,1"], 2, "six numbers"),
+        (["--box", "0,0,0,1,0,1"], 2, "x0 < x1"),
+        (["--box", "0,0,0,1,nan,1"], 2, "six numbers"),
+        (["--box", "500,500,500,501,501,501"], 4, "no Gaussian"),
+        (["--min-opacity", "2"], 2, "range"),
+    ],
+)
+def test_a_filter_that_makes_no_sense_is_an_error(mixed, tmp_path, arguments, code, message):
+    done = run(mixed[1], "--out", tmp_path / "a.ply", *arguments)
+    assert (done.exit_code, list(tmp_path.iterdir())) == (code, [])
+    assert message in done.stderr
+
+
+def test_nothing_of_the_user_s_is_overwritten_and_other_formats_name_their_tool(mixed, tmp_path):
+    (tmp_path / "a.ply").write_text("mine")
+    assert run(mixed[1], "--out", tmp_path / "a.ply").exit_code == 2
+    assert (tmp_path / "a.ply").read_text() == "mine"
+    for name in ("a.spz", "a.compressed.ply"):
+        done = run(mixed[1], "--out", tmp_path / name)
+        assert done.exit_code == 2
+        assert "splat-transform" in done.stderr
+    assert run(tmp_path, "--out", tmp_path / "b.ply").exit_code == 3
+
+
+@pytest.mark.data
+@pytest.mark.parametrize("name", ["graphdeco_sh3_100.ply", "guitar_decoded_sh0.ply"])
+def test_files_of_others_come_back_unchanged(tmp_path, name):
+    from plyfile import PlyData
+
+    p, degree, labels = read_ply(data("gs_ply") / name)
+    assert labels is None
+    write_ply(tmp_path / "a.ply", p, degree)
+    theirs, ours = (PlyData.read(str(f))["vertex"].data for f in (data("gs_ply") / name, tmp_path / "a.ply"))
+    for field in set(theirs.dtype.names) - {"nx", "ny", "nz"}:
+        assert np.array_equal(theirs[field], ours[field]), field
+
+
+def test_what_was_left_out_is_listed(toy):
+    summary = json.loads((toy["export"] / "summary.json").read_text())
+    assert summary["left_out"]["knowledge basis"].startswith("no sequence")
+    assert set(summary["bytes"]) == {"unpruned_ply", "ply", "split", "ragged", "semantic"}
