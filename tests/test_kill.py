@@ -70,19 +70,28 @@ def test_a_training_killed_at_any_moment_ends_in_the_same_bytes(toy, tmp_path):
     command = [sys.executable, "-c", TRAIN, "--config", tmp_path / "config.json", "--no-progress"]
     command += [part for role, of in INPUTS["train"].items() for part in (f"--in-{role}", toy[of])]
 
-    def train(out, timeout=None):
+    def train(out, kill_after=None):
+        """Exit code; None if it was killed, so many seconds after it first saved its state."""
+        running = subprocess.Popen(
+            [*command, "--out", out], stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, text=True
+        )
+        saved = out.parent / f".part-{out.name}/training.pt"
+        while kill_after is not None and running.poll() is None and not saved.is_file():
+            time.sleep(0.01)
         try:
-            done = subprocess.run([*command, "--out", out], capture_output=True, timeout=timeout, text=True)
-        except subprocess.TimeoutExpired:  # kills it with SIGKILL
-            return False
-        assert done.returncode == 0, done.stderr
-        return True
+            _, error = running.communicate(timeout=kill_after)
+        except subprocess.TimeoutExpired:
+            running.kill()
+            running.communicate()
+            return None
+        assert running.returncode == 0, error
+        return 0
 
-    began = time.perf_counter()
     train(tmp_path / "whole")
-    whole, rng, killed = time.perf_counter() - began, random.Random(0), 0
-    while not train(tmp_path / "killed", rng.uniform(0.4, 0.8) * whole if killed < 3 else None):
+    rng, killed = random.Random(0), 0
+    while killed < 3 and train(tmp_path / "killed", kill_after=rng.uniform(0.05, 0.6)) is None:
         killed += 1
+    train(tmp_path / "killed")
     facts = artifact.read_manifest(tmp_path / "killed").facts
     assert killed >= 1 and facts["resumed_at"]
     for name in ("parameters", "modules", "optimizer"):
