@@ -27,7 +27,7 @@ import numpy as np
 import torch
 from raster_memory import camera, measured, scene
 
-from chebsplat.losses import feature_l1, photometric
+from chebsplat.losses import feature_distance, photometric
 from chebsplat.rasterize import binning, ellipses, rasterize, reference, tiles
 
 SIZE, N, CHANNELS = (320, 240), 20_000, 19
@@ -121,7 +121,7 @@ def loss() -> Callable[[], None]:
     def run() -> None:
         image.grad = None
         (color, features), (wanted_color, wanted) = (v.split([3, CHANNELS - 3], -1) for v in (image, target))
-        (photometric(color, wanted_color, None, 0.2) + feature_l1(features, wanted)).backward()
+        (photometric(color, wanted_color, None, 0.2) + feature_distance(features, wanted)).backward()
 
     return run
 

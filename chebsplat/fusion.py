@@ -53,7 +53,7 @@ class Gate(nn.Module):
     is; a point that no region covers keeps its features.
     """
 
-    def __init__(self, n_channels: int, start: float = 1.0):
+    def __init__(self, n_channels: int, start: float = 3.0):
         super().__init__()
         self.linear = nn.Linear(2 * n_channels, n_channels)
         nn.init.zeros_(self.linear.weight)

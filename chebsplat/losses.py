@@ -86,21 +86,22 @@ def photometric_reference(render: Tensor, target: Tensor, mask: Tensor | None, w
     return (1 - weight_ssim) * distance + weight_ssim * (weight * (1 - ssim_map(render, target))).sum()
 
 
-class _FeatureL1(torch.autograd.Function):
+class _FeatureDistance(torch.autograd.Function):
     """The fused loss: its gradient is computed with its value."""
 
     @staticmethod
-    def forward(ctx: Any, render: Tensor, target: Tensor, share: Tensor) -> Tensor:  # type: ignore[override]
-        from chebsplat.pooling import feature_l1
+    def forward(ctx: Any, render: Tensor, target: Tensor, share: Tensor, by_channel: bool) -> Tensor:  # type: ignore[override]
+        from chebsplat.pooling import feature_distance
 
-        values, gradient = feature_l1(*(t.detach().contiguous().numpy() for t in (render, target, share)))
+        arrays = (t.detach().contiguous().numpy() for t in (render, target, share))
+        values, gradient = feature_distance(*arrays, by_channel)
         ctx.save_for_backward(torch.from_numpy(gradient))
         return render.new_tensor(values.sum())
 
     @staticmethod
     def backward(ctx: Any, grad: Tensor):  # type: ignore[no-untyped-def, override]
         (gradient,) = ctx.saved_tensors
-        return grad * gradient, None, None
+        return grad * gradient, None, None, None
 
 
 def _cell_shares(mask: Tensor | None, size: tuple[int, int], kind: torch.dtype) -> Tensor:
@@ -111,19 +112,25 @@ def _cell_shares(mask: Tensor | None, size: tuple[int, int], kind: torch.dtype) 
     return share / share.sum().clamp_min(1e-6)
 
 
-def feature_l1(render: Tensor, target: Tensor, mask: Tensor | None = None) -> Tensor:
-    """Mean |difference| at the teacher's resolution.
+def feature_distance(render: Tensor, target: Tensor, mask: Tensor | None = None, kind: str = "length") -> Tensor:
+    """Mean distance to the teacher's features at the teacher's resolution.
 
     Args: render [H, W, C]; target [h, w, C], h ≤ H; mask [H, W] bool, true where a pixel counts, or float ≥ 0, how
-      much it does. float32.
+      much it does; float32. kind: `length` of the difference over √C, or `l1`, its mean magnitude by channel.
     Choices: the render is averaged over each cell of the target; a cell counts by the mean of its pixels' mask.
+      Where views disagree about a Gaussian the shortest total length is at their geometric median, which lies near the
+      most common vector; the median channel by channel, where L1 is least, may be near none of them.
     """
     share = _cell_shares(mask, (target.shape[0], target.shape[1]), render.dtype)
-    return _FeatureL1.apply(render, target.to(render.dtype), share)
+    return _FeatureDistance.apply(render, target.to(render.dtype), share, kind == "l1")
 
 
-def feature_l1_reference(render: Tensor, target: Tensor, mask: Tensor | None = None) -> Tensor:
-    """As `feature_l1`, in plain torch and any float type: the oracle of the fused loss."""
+def feature_distance_reference(
+    render: Tensor, target: Tensor, mask: Tensor | None = None, kind: str = "length"
+) -> Tensor:
+    """As `feature_distance`, in plain torch and any float type: the oracle of the fused loss."""
     size = (target.shape[0], target.shape[1])
     pooled = torch.nn.functional.adaptive_avg_pool2d(render.permute(2, 0, 1), size).permute(1, 2, 0)
-    return ((pooled - target).abs().mean(-1) * _cell_shares(mask, size, render.dtype)).sum()
+    difference = pooled - target
+    distance = difference.abs().mean(-1) if kind == "l1" else difference.square().mean(-1).clamp_min(1e-30).sqrt()
+    return (distance * _cell_shares(mask, size, render.dtype)).sum()

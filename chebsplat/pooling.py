@@ -1,10 +1,14 @@
-"""The feature loss and its gradient in one sweep, in numba: features averaged down to the teacher's resolution, L1."""
+"""The feature loss and its gradient in one sweep, in numba: features averaged down to the teacher's resolution."""
 
 from __future__ import annotations
+
+import math
 
 import numpy as np
 
 from chebsplat.jit import inline, kernel, prange
+
+TINY = np.float32(1e-12)
 
 
 @inline
@@ -14,10 +18,12 @@ def _span(i, n, size):
 
 
 @kernel
-def feature_l1(render, target, share):
-    """Σ share · mean_c |pooled − target|, by row of cells, and its gradient to `render`.
+def feature_distance(render, target, share, by_channel):
+    """Σ share · distance of pooled to target, by row of cells, and its gradient to `render`.
 
-    Args: render [H, W, C], target [h, w, C], share [h, w] what each cell counts, float32.
+    The distance is mean_c |pooled − target| by channel, else √(mean_c (pooled − target)²).
+
+    Args: render [H, W, C], target [h, w, C], share [h, w] what each cell counts, float32; by_channel bool.
     Returns: values [h] float64; gradient [H, W, C].
     """
     height, width, channels = render.shape
@@ -34,14 +40,21 @@ def feature_l1(render, target, share):
                     for c in range(channels):
                         mean[c] += render[y, x, c]
             area = np.float32((bottom - top) * (right - left))
-            scale, total = share[i, j] / (area * np.float32(channels)), np.float32(0)
+            total = np.float32(0)
             for c in range(channels):
-                difference = mean[c] / area - target[i, j, c]
-                total += abs(difference)
-                sign = np.float32(difference > 0) - np.float32(difference < 0)
-                slopes[i, j, c] = scale * sign if share[i, j] != 0 else np.float32(0)
+                mean[c] = mean[c] / area - target[i, j, c]
+                total += abs(mean[c]) if by_channel else mean[c] * mean[c]
+            distance = (
+                total / np.float32(channels) if by_channel else np.float32(math.sqrt(total / np.float32(channels)))
+            )
+            scale = share[i, j] / (area * np.float32(channels))
+            for c in range(channels):
+                slope = np.float32(mean[c] > 0) - np.float32(mean[c] < 0)
+                if not by_channel:
+                    slope = mean[c] / max(distance, TINY)
+                slopes[i, j, c] = scale * slope if share[i, j] != 0 else np.float32(0)
             if share[i, j] != 0:  # what does not count may be anything
-                values[i] += share[i, j] * total / np.float32(channels)
+                values[i] += share[i, j] * distance
     gradient = np.empty((height, width, channels), np.float32)
     for y in prange(height):
         for x in range(width):

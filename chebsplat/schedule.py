@@ -6,7 +6,7 @@ from typing import Any
 
 from chebsplat.sh import MAX_DEGREE
 
-FASTER = {"means": 0.01, "features": 0.01}  # what a rate has fallen to at the end; 0.1 elsewhere
+FASTER = {"means": 0.01, "features": 0.01, "modules": 0.01}  # what a rate has fallen to at the end; 0.1 elsewhere
 
 
 class Schedule:

@@ -12,7 +12,7 @@ from torch import Tensor
 
 from chebsplat import cks, sh_prune
 from chebsplat.errors import DataFailure
-from chebsplat.losses import feature_l1, photometric
+from chebsplat.losses import feature_distance, photometric
 from chebsplat.metrics import psnr
 from chebsplat.model import SceneModel
 from chebsplat.population import HELD as POPULATION
@@ -193,7 +193,8 @@ class Trainer:
         losses = {"color": photometric(rendered.rgb, target, mask, settings["weight_ssim"])}
         if rendered.features is not None and self.views.features is not None:
             wanted = self.views.features(index)
-            losses["features"] = settings["weight_features"] * feature_l1(rendered.features, wanted, mask)
+            distance = feature_distance(rendered.features, wanted, mask, settings["feature_loss"])
+            losses["features"] = settings["weight_features"] * distance
         if "mask" in aside and pruning:
             losses["mask"] = settings["weight_mask"] * aside["mask"].mean()
         if "bands" in aside:

@@ -143,13 +143,14 @@ class TrainSection(_Section):
     lr_opacities: float = 5e-2
     lr_sh0: float = 2.5e-3
     lr_sh: float = 1.25e-4  # of bands 1 to 3
-    lr_features: float = 3e-3
+    lr_features: float = 1e-2
     lr_encoder: float = 1e-3
     lr_masks: float = 1e-2
     lr_sh_masks: float = 5e-2
     # weights
     weight_ssim: float = Field(0.2, ge=0, le=1)
     weight_features: float = Field(1.0, ge=0)
+    feature_loss: Literal["length", "l1"] = "length"  # l1: the paper's and Feature-3DGS'
     weight_mask: float = Field(5e-4, ge=0)
     weight_sh: float = Field(3.3e-4, ge=0)
     weight_basis: float = Field(1.0, ge=0)

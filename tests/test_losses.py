@@ -4,7 +4,13 @@ import numpy as np
 import pytest
 import torch
 
-from chebsplat.losses import feature_l1, feature_l1_reference, photometric, photometric_reference, ssim
+from chebsplat.losses import (
+    feature_distance,
+    feature_distance_reference,
+    photometric,
+    photometric_reference,
+    ssim,
+)
 
 
 def images(height=40, width=52, seed=0):
@@ -63,22 +69,25 @@ def test_ssim_of_equal_images_is_one():
 def test_feature_distance_is_zero_for_the_pooled_render_and_ignores_masked_pixels():
     render = torch.rand(8, 12, 4, generator=torch.Generator().manual_seed(0))
     pooled = render.reshape(2, 4, 3, 4, 4).mean((1, 3))
-    assert feature_l1(render, pooled).item() < 1e-6
+    for kind in ("length", "l1"):
+        assert feature_distance(render, pooled, None, kind).item() < 1e-6
     mask = torch.ones(8, 12, dtype=torch.bool)
     mask[:4, :4] = False
     pooled[0, 0] = 100
-    assert feature_l1(render, pooled, mask).item() < 1e-6
+    for kind in ("length", "l1"):
+        assert feature_distance(render, pooled, mask, kind).item() < 1e-6
 
 
 @pytest.mark.parametrize(("size", "cells"), [((24, 32), (6, 8)), ((25, 30), (6, 7)), ((9, 11), (9, 11))])
 @pytest.mark.parametrize("counted", ["all alike", "some", "more or less"])
-def test_fused_feature_distance_equals_the_oracle(size, cells, counted):
+@pytest.mark.parametrize("kind", ["length", "l1"])
+def test_fused_feature_distance_equals_the_oracle(size, cells, counted, kind):
     g = torch.Generator().manual_seed(0)
     render, target = torch.rand(*size, 5, generator=g), torch.rand(*cells, 5, generator=g)
     amounts = (torch.rand(size, generator=g) - 0.4).clamp_min(0)
     mask = {"all alike": None, "some": amounts > 0, "more or less": amounts}[counted]
     a, b = render.clone().requires_grad_(True), render.double().requires_grad_(True)
-    value, exact = feature_l1(a, target, mask), feature_l1_reference(b, target.double(), mask)
+    value, exact = feature_distance(a, target, mask, kind), feature_distance_reference(b, target.double(), mask, kind)
     (3 * value).backward()
     (3 * exact).backward()
     assert abs(value.item() - exact.item()) < 1e-6
