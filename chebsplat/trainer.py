@@ -12,6 +12,7 @@ from torch import Tensor
 
 from chebsplat import cks, sh_prune
 from chebsplat.errors import DataFailure
+from chebsplat.laps import Laps
 from chebsplat.losses import feature_distance, photometric
 from chebsplat.metrics import psnr
 from chebsplat.model import SceneModel
@@ -67,6 +68,7 @@ class Trainer:
         self.step = 0
         self.seconds = self.refresh_seconds = 0.0  # of the steps
         self.population = Population(model, settings, extent)
+        self.laps = Laps()  # of the steps since this object was made, a resumed training's from there on
 
     @property
     def share(self) -> float:
@@ -87,6 +89,7 @@ class Trainer:
         """Train until the budget is spent; yields each step's figures."""
         while self.share < 1:
             began = time.perf_counter()
+            self.laps.start()
             self.step += 1
             share = self.share  # of a budget in steps, with this one; of one in seconds, what was spent before
             for group in self.optimizer.param_groups:
@@ -94,6 +97,7 @@ class Trainer:
             self.order = self.order or self.order_generator.permutation(len(self.views.names)).tolist()
             figures = self._step(self.order.pop(), share)
             self._adapt(share)
+            self.laps.mark("growth, pruning, refresh")
             self.seconds += time.perf_counter() - began
             yield figures | {"n": len(self.model)}
 
@@ -190,6 +194,7 @@ class Trainer:
             fused=self._encodes(share),
             generator=self.generator,
         )
+        self.laps.mark("render")
         losses = {"color": photometric(rendered.rgb, target, mask, settings["weight_ssim"])}
         if rendered.features is not None and self.views.features is not None:
             wanted = self.views.features(index)
@@ -210,10 +215,18 @@ class Trainer:
             why = f"not finite: {names}" if names else "all parameters are finite: look at the view itself"
             where = f"step {self.step}, view {self.views.names[index]}"
             raise DataFailure(f"{where}: loss {', '.join(bad)} is not finite; {why}")
+        self.laps.mark("losses")
         self.optimizer.zero_grad(set_to_none=True)
-        loss.backward()
-        self.population.note_gradients(rendered)
+        if settings["densify_semantic"]:
+            loss.backward()
+            self.population.note_gradients(rendered)
+        else:
+            losses["color"].backward(retain_graph=True)
+            self.population.note_gradients(rendered)
+            (loss - losses["color"]).backward()
+        self.laps.mark("backward")
         self.optimizer.step()
+        self.laps.mark("optimizer")
         return {"loss": float(loss.detach())} | {f"loss_{k}": float(v.detach()) for k, v in losses.items()}
 
     @torch.no_grad()

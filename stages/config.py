@@ -111,7 +111,8 @@ class TrainSection(_Section):
     albo: bool = True  # false: the paper's "no AGCD"
     prune: bool = True
     prune_semantic: bool = True  # false: "no semantic guidance"
-    densify: Literal["region", "classic", "off"] = "region"
+    densify: Literal["mixed", "region", "classic", "off"] = "mixed"  # mixed: region and classic by turns
+    densify_semantic: bool = True  # false: the rendering loss alone says where
     grow_threshold: float = Field(1e-4, gt=0)  # gradient to the 2D means, half image widths
     sh_prune: bool = True
     sh_guided: bool = True  # false: the paper's "no semantic guidance" of SH pruning
@@ -122,7 +123,7 @@ class TrainSection(_Section):
     width: int = Field(32, ge=4)
     n_layers: int = Field(2, ge=1)
     n_heads: int = Field(4, ge=1)
-    regions_per_step: int = Field(64, ge=1)  # encoded anew in a step; the others come from the cache
+    regions_per_step: int = Field(16, ge=1)  # encoded anew in a step; the others come from the cache
     n_covers: int = Field(4, ge=1)  # regions that reach a Gaussian, at most
     context: Literal["features", "none"] = "features"  # what tokens hold beside the descriptor
     # schedule, as fractions of the budget
@@ -145,14 +146,14 @@ class TrainSection(_Section):
     lr_sh: float = 1.25e-4  # of bands 1 to 3
     lr_features: float = 1e-2
     lr_encoder: float = 1e-3
-    lr_masks: float = 1e-2
+    lr_masks: float = 5e-2
     lr_sh_masks: float = 5e-2
     # weights
     weight_ssim: float = Field(0.2, ge=0, le=1)
     weight_features: float = Field(1.0, ge=0)
     feature_loss: Literal["length", "l1"] = "length"  # l1: the paper's and Feature-3DGS'
-    weight_mask: float = Field(5e-4, ge=0)
-    weight_sh: float = Field(3.3e-4, ge=0)
+    weight_mask: float = Field(1e-2, ge=0)
+    weight_sh: float = Field(1e-4, ge=0)
     weight_basis: float = Field(1.0, ge=0)
     warm_start: bool = True  # start the encoder from the basis' stored weights
 

@@ -67,6 +67,7 @@ def run(job: Job) -> None:
         job.facts["described_anew"] = model.shape.described.share_described
     seconds = trace[-1]["seconds"]
     job.facts |= {"n_gaussians": left, "steps": trainer.step, "seconds_per_step": seconds / trainer.step}
+    job.facts["milliseconds"] = {part: 1e3 * s / trainer.step for part, s in trainer.laps.seconds.items()}
     job.facts["refresh_share"] = trainer.refresh_seconds / seconds
     write_gaussians(job.out, Gaussians(parameters, cameras, modules, optimizer_state(trainer), trace, notes))
 

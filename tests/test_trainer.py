@@ -95,7 +95,7 @@ def bits(made):
     return {name: value.clone() for name, value in parts.items()}
 
 
-@pytest.mark.parametrize("densify", ["region", "classic"])
+@pytest.mark.parametrize("densify", ["mixed", "region", "classic"])
 def test_a_resumed_training_takes_the_same_steps_to_the_bit(tiny_trainer, tmp_path, densify):
     """Saved after every step, through a file; over growth, removal, refreshes and the freeze."""
     settings = {"steps": 24, "refresh_every": 5, "densify": densify, "grow_threshold": 1e-6}
@@ -116,6 +116,20 @@ def test_a_resumed_training_takes_the_same_steps_to_the_bit(tiny_trainer, tmp_pa
         assert not [name for name, value in wanted.items() if not torch.equal(found[name], value)], step
         for name, value in resumed.finish().items():
             assert np.array_equal(value, parameters[name]), name
+
+
+def test_growth_without_semantic_guidance_takes_the_same_steps_and_other_places(tiny_trainer):
+    """The loss is split into two backward passes; their sum moves parameters as one does."""
+    guided, alone = (
+        tiny_trainer(steps=20, densify_from=0.8, densify_until=0.8, densify_semantic=k) for k in (True, False)
+    )
+    for made in (guided, alone):
+        with torch.no_grad():  # features of zero would not move geometry
+            made.model.raw["features"].normal_(generator=torch.Generator().manual_seed(0))
+        next(iter(made.steps()))
+    assert not torch.equal(guided.population.gradient_sum, alone.population.gradient_sum)
+    for name, value in guided.model.raw.items():
+        torch.testing.assert_close(alone.model.raw[name], value, rtol=1e-4, atol=1e-6)
 
 
 def test_a_budget_of_seconds_runs_the_whole_schedule(tiny_trainer):
