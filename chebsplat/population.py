@@ -120,4 +120,4 @@ def broken(model: SceneModel) -> str:
     parts = [f"{name} of {len(bad)} Gaussians, first {bad[0]}" for name, bad in rows if len(bad)]
     for name, module in model.modules.items():
         parts += [f"{name}.{k}" for k, value in module.named_parameters() if not value.isfinite().all()]
-    return ", ".join(parts)
+    return "not finite: " + ", ".join(parts) if parts else ""

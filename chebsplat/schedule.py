@@ -1,12 +1,43 @@
-"""What is due when in a training, as a function of the share of its budget that is spent."""
+"""The optimizer's rates, and what is due when in a training, as a function of the share of its budget that is spent."""
 
 from __future__ import annotations
 
 from typing import Any
 
+import torch
+
+from chebsplat.model import SceneModel
 from chebsplat.sh import MAX_DEGREE
 
+RATES = {
+    "means": "lr_means",
+    "log_scales": "lr_scales",
+    "quats": "lr_quats",
+    "logit_opacities": "lr_opacities",
+    "sh0": "lr_sh0",
+    "sh1": "lr_sh",
+    "sh2": "lr_sh",
+    "sh3": "lr_sh",
+    "features": "lr_features",
+    "prune_logits": "lr_masks",
+    "sh_logits": "lr_sh_masks",
+}
 FASTER = {"means": 0.01, "features": 0.01, "modules": 0.01}  # what a rate has fallen to at the end; 0.1 elsewhere
+
+
+def adam(model: SceneModel, settings: dict[str, Any], extent: float) -> torch.optim.Adam:
+    """A group for each raw parameter of the model and one for its modules, with their `rate` before any schedule.
+
+    Args: settings: the train section; extent: scene units, scales the means' rate.
+    """
+    groups = []
+    for name, value in model.raw.items():
+        rate = settings[RATES[name]] * (extent if name == "means" else 1)
+        groups.append({"params": [value], "rate": rate, "name": name})
+    weights = [p for module in model.modules.values() for p in module.parameters()]
+    if weights:
+        groups.append({"params": weights, "rate": settings["lr_encoder"], "name": "modules"})
+    return torch.optim.Adam(groups, eps=1e-15, fused=True)
 
 
 class Schedule:

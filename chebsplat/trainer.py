@@ -19,22 +19,9 @@ from chebsplat.model import SceneModel
 from chebsplat.population import HELD as POPULATION
 from chebsplat.population import Population, broken
 from chebsplat.regions import Regions, build_regions
-from chebsplat.schedule import Schedule
+from chebsplat.schedule import Schedule, adam
 from chebsplat.views import Views
 
-RATES = {
-    "means": "lr_means",
-    "log_scales": "lr_scales",
-    "quats": "lr_quats",
-    "logit_opacities": "lr_opacities",
-    "sh0": "lr_sh0",
-    "sh1": "lr_sh",
-    "sh2": "lr_sh",
-    "sh3": "lr_sh",
-    "features": "lr_features",
-    "prune_logits": "lr_masks",
-    "sh_logits": "lr_sh_masks",
-}
 HELD = ("step", "seconds", "refresh_seconds", "order", "members", "guidance")
 
 
@@ -61,7 +48,7 @@ class Trainer:
         self.basis = basis if model.shape is not None else {}
         self.schedule = Schedule(settings)
         self.guidance: Tensor | None = None
-        self.optimizer = self._optimizer()
+        self.optimizer = adam(self.model, self.settings, self.extent)
         self.order_generator = np.random.default_rng(settings["seed"])
         self.generator = torch.Generator().manual_seed(settings["seed"])
         self.order: list[int] = []  # views still to be seen before any is seen again
@@ -74,16 +61,6 @@ class Trainer:
     def share(self) -> float:
         """Part of the budget that is spent."""
         return self.schedule.share(self.step, self.seconds)
-
-    def _optimizer(self) -> torch.optim.Adam:
-        groups = []
-        for name, value in self.model.raw.items():
-            rate = self.settings[RATES[name]] * (self.extent if name == "means" else 1)
-            groups.append({"params": [value], "rate": rate, "name": name})
-        weights = [p for module in self.model.modules.values() for p in module.parameters()]
-        if weights:
-            groups.append({"params": weights, "rate": self.settings["lr_encoder"], "name": "modules"})
-        return torch.optim.Adam(groups, eps=1e-15, fused=True)
 
     def steps(self) -> Iterator[dict[str, float]]:
         """Train until the budget is spent; yields each step's figures."""
@@ -121,7 +98,7 @@ class Trainer:
         if self.population.drop_broken(self.optimizer):
             self.refresh()
         elif names := broken(self.model):
-            raise DataFailure(f"step {self.step}: the training has broken down; not finite: {names}")
+            raise DataFailure(f"step {self.step}: the training has broken down; {names}")
 
     @torch.no_grad()
     def _soft_mask(self, share: float) -> Tensor | None:
@@ -154,7 +131,7 @@ class Trainer:
             module.load_state_dict(state["modules"][name])
         if model.shape is not None:
             model.shape.restore(state["shape"])
-        self.optimizer = self._optimizer()
+        self.optimizer = adam(self.model, self.settings, self.extent)
         self.optimizer.load_state_dict(state["optimizer"])
         self.order_generator.bit_generator.state = state["order_generator"]
         self.generator.set_state(state["generator"])
@@ -211,10 +188,8 @@ class Trainer:
         loss = torch.stack(list(losses.values())).sum()
         if not torch.isfinite(loss):
             bad = [name for name, value in losses.items() if not torch.isfinite(value)]
-            names = broken(self.model)
-            why = f"not finite: {names}" if names else "all parameters are finite: look at the view itself"
-            where = f"step {self.step}, view {self.views.names[index]}"
-            raise DataFailure(f"{where}: loss {', '.join(bad)} is not finite; {why}")
+            where = f"step {self.step}, view {self.views.names[index]}: loss {', '.join(bad)} is not finite"
+            raise DataFailure(f"{where}; {broken(self.model) or 'all parameters are finite: look at the view itself'}")
         self.laps.mark("losses")
         self.optimizer.zero_grad(set_to_none=True)
         if settings["densify_semantic"]:
