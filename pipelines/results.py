@@ -32,6 +32,7 @@ FIGURES = (
     Figure("macc", "mAcc, %", 1, 100),
     Figure("oa", "OA, %", 1, 100),
     Figure("boundary_miou", "boundary mIoU, %", 1, 100),
+    Figure("point_miou", "mIoU of 3D points, %", 1, 100),
     Figure("psnr", "PSNR, dB", 2),
     Figure("ssim", "SSIM", 4),
     Figure("n_gaussians", "Gaussians", 0, 1, True),
@@ -65,7 +66,7 @@ def row_of(run: Run, failed: dict[str, tuple[int, str, Path]]) -> Row:
     summary = read_document(targets["export"], scene, "summary.json")
     trace = read_trace(targets["train"], train)
     segmentation = figures.get("segmentation") or {}
-    for key in ("miou", "macc", "oa", "boundary_miou"):
+    for key in ("miou", "macc", "oa", "boundary_miou", "point_miou"):
         row[key] = segmentation.get("scene", {}).get(key)  # a protocol measures some of them
     if row["miou"] is not None and segmentation.get("teacher", {}).get("miou") is not None:
         row["miou_teacher"] = segmentation["teacher"]["miou"]

@@ -139,9 +139,10 @@ def summary_rows(figures: dict[str, Any]) -> list[list[str]]:
         ["LPIPS (vgg, images in [0, 1])", shown(figures["lpips"], "{:.3f}"), ""],
     ]
     segmentation = figures.get("segmentation") or {}
-    names = {"miou": "mIoU", "macc": "mAcc", "oa": "OA", "boundary_miou": "mIoU in the boundary band"}
+    names = {"miou": "mIoU", "macc": "mAcc", "oa": "OA", "boundary_miou": "mIoU in the boundary band",
+             "point_miou": "mIoU of 3D points"}  # fmt: skip
     for key, name in names.items():
-        if segmentation:
+        if key in segmentation.get("scene", {}):
             teacher = segmentation.get("teacher")
             values = [segmentation["scene"][key], teacher[key] if teacher else None]
             rows.append([name, shown(values[0], "{:.1%}"), shown(values[1], "{:.1%}") if teacher else ""])
