@@ -3,9 +3,6 @@
 from __future__ import annotations
 
 import numpy as np
-from scipy.sparse import coo_matrix
-from scipy.spatial import cKDTree
-from scipy.spatial.transform import Rotation
 
 REACH = 3.0  # standard deviations
 CELLS = 128  # along the longest side of what is measured
@@ -30,6 +27,10 @@ def features_at(
     Choices: a Gaussian ends at 3 standard deviations, as its splat does. Nothing occludes anything: what lies in front
       or behind by more than that has no say.
     """
+    from scipy.sparse import coo_matrix
+    from scipy.spatial import cKDTree
+    from scipy.spatial.transform import Rotation
+
     sums, weights = np.zeros((len(points), features.shape[1])), np.zeros(len(points))
     if not len(points) or not len(means):
         return sums.astype(np.float32), weights.astype(np.float32)

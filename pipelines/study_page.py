@@ -8,6 +8,7 @@ import math
 from pathlib import Path
 from typing import Any
 
+from chebsplat import protocols
 from chebsplat.formats import artifact
 from chebsplat.pipelines import study_figures
 from chebsplat.pipelines.results import COLUMNS, FIGURES, Figure, Line, Row, compare, groups, traces
@@ -23,7 +24,7 @@ def write(out: Path, study: Study, runs: list[Run], rows: list[Row], command: st
     """Fill `out`; returns the page. Runs that failed or have not run are named, and count in no mean."""
     out.mkdir(parents=True, exist_ok=True)
     with (out / "results.csv").open("w", newline="") as handle:
-        writer = csv.DictWriter(handle, COLUMNS)
+        writer = csv.DictWriter(handle, COLUMNS, extrasaction="ignore")
         writer.writeheader()
         writer.writerows(rows)
     settings = settings_of(study) if study.against else None
@@ -152,8 +153,10 @@ def note(study: Study, rows: list[Row]) -> str:
     first = (
         " The first scene of a sequence, which has no earlier knowledge, counts in no mean." if study.sequences else ""
     )
+    if any(hasattr(protocols.ALL[row["protocol"]], "over_scenes") for row in rows):
+        first += " mIoU, mAcc and OA are of all scenes of a seed together, as the protocol has it."
     return (
-        f"Mean ± standard deviation over scenes and seeds, on held-out test views. Below it: the mean difference "
+        f"Mean ± standard deviation over scenes and seeds, on the views of the protocol. Below it: the mean difference "
         f"(× ratio) from {study.baseline} of runs with the same scene, seed, condition and budget, with its "
         f"95 % interval ({unit}); bold where the interval excludes no effect.{first}"
     )  # fmt: skip
@@ -172,6 +175,7 @@ def facts(runs: list[Run], rows: list[Row], command: str) -> list[tuple[str, str
     }
     found = [
         ("command", command),
+        ("protocol", ", ".join(sorted({row["protocol"] for row in rows}))),
         ("runs", f"{len(done)} of {len(rows)} done; {len({m.key for m in manifests})} different trainings"),
         ("device", ", ".join(sorted({m.device for m in manifests})) + f" ({processor()})"),
         ("threads a run", ", ".join(map(str, threads))),

@@ -44,12 +44,12 @@ def publish_stage(run, stage, documents):
             (tmp / name).write_text(text)
 
 
-def finish(run, miou=0.5, psnr=30.0, n=100, seconds=10.0):
+def finish(run, miou=0.5, psnr=30.0, n=100, seconds=10.0, segmentation=None):
     """Pretend that a run was made and found these figures."""
     figures = {"image": {"psnr": psnr, "ssim": 0.9}, "n_gaussians": n, "bytes": {"ply": 10 * n, "ragged": 5 * n}}
     figures |= {"frames_per_second": {"color": 50.0}}
     whole = {"miou": miou, "macc": miou, "oa": miou, "boundary_miou": miou}
-    figures["segmentation"] = {"scene": whole, "teacher": whole | {"miou": 0.25}}
+    figures["segmentation"] = segmentation or {"scene": whole, "teacher": whole | {"miou": 0.25}}
     for step in run.steps:
         if step.stage not in ("train", "export", "evaluate"):
             publish_stage(run, step.stage, {"empty.json": "{}"})
@@ -121,6 +121,51 @@ def test_the_table_says_what_a_hand_works_out():
     assert gain.excluded
     assert lines["full"].differences["n_gaussians"].mean == pytest.approx(0.5)
     assert not lines["full"].differences["psnr"].excluded
+
+
+def test_scannet_opens_scenes_are_summed_and_those_of_scannet_closed_averaged_before_seeds_are_compared(tmp_path):
+    # truth and prediction of wall and floor, in pixels           alone            summed, as scannet-open has it
+    # toy      wall 9 right, 1 taken for floor; floor 1 right     (9/10 + 1/2)/2   wall 9/19, floor 1/11
+    # office0  floor 9, all taken for wall                        0                its mean: (9/19 + 1/11)/2
+    a, b = ([[0] * 20 for _ in range(20)] for _ in range(2))
+    a[0][0], a[0][1], a[1][1], b[1][0] = 9, 1, 1, 9
+    alone, summed = {"toy": (0.7, a), "office0": (0.0, b)}, (9 / 19 + 1 / 11) / 2
+    for protocol, expected in (("scannet-open", summed), ("scannet-closed", 0.35)):
+        asked = study(scenes=list(alone), settings={"ingest": {"protocol": protocol}})
+        runs = expand(asked)
+        for run in runs:
+            miou, matrix = alone[run.scene]
+            if (run.variant, run.seed) == ("full", 1):  # a seed in which every pixel is right
+                miou, matrix = 1.0, [[sum(row) if k == j else 0 for j in range(20)] for k, row in enumerate(matrix)]
+            finish(run, segmentation={"scene": {"miou": miou, "confusion": matrix}})
+        rows = [row_of(run, {}) for run in runs]
+        lines = compared(runs, rows)
+        assert (lines["less"].summaries["miou"].mean, lines["less"].summaries["miou"].n) == (pytest.approx(expected), 2)
+        assert lines["full"].summaries["miou"].mean == pytest.approx((expected + 1) / 2)
+        gain = lines["full"].differences["miou"]
+        assert (gain.mean, gain.n_pairs) == (pytest.approx((1 - expected) / 2), 2)
+        assert lines["full"].differences["psnr"].n_pairs == 4
+        page = write(tmp_path / protocol, asked, runs, rows, "c").read_text()
+        assert "all scenes of a seed together" in page and f"<dd>{protocol}</dd>" in page
+        # without one of its scenes, a seed is no partner of the whole one
+        rows[0] = row_of(runs[0], {}) | {"state": "not run yet"}
+        assert (rows[0]["scene"], rows[0]["seed"], rows[0]["variant"]) == ("toy", 0, "full")
+        assert compared(runs, rows)["full"].differences["miou"].n_pairs == 1
+
+
+def test_scenes_measured_in_two_ways_are_not_compared(tmp_path, monkeypatch):
+    from chebsplat.pipelines import plan
+
+    known = plan.scene_values
+    office = {"ingest": {"protocol": "replica-f3"}}
+
+    def values(scene):
+        title, own, *rest = known(scene)
+        return title, plan.merged(own, office if scene == "office0" else {}), *rest
+
+    monkeypatch.setattr(plan, "scene_values", values)
+    with pytest.raises(ConfigError, match="as labels and as replica-f3 do not compare"):
+        expand(study(scenes=["toy", "office0"]))
 
 
 def test_a_run_that_failed_is_named_and_counts_in_no_mean(tmp_path):

@@ -56,6 +56,11 @@ def figures(matrix: np.ndarray) -> dict[str, Any]:
     return {"miou": averaged(list(iou.values())), "macc": None, "oa": None, "boundary_miou": None, "iou": iou}
 
 
+def over_scenes(scenes: list[dict[str, Any]]) -> dict[str, Any]:
+    """mIoU of several scenes together, from what `measure` says of each."""
+    return {"miou": averaged([scene["miou"] for scene in scenes])}
+
+
 def averaged(values: list[float | None]) -> float | None:
     """Plain mean of what was measured: of classes, and of the scenes' mIoU."""
     known = [value for value in values if value is not None]
