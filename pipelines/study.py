@@ -136,7 +136,7 @@ def expand(study: Study) -> list[Run]:
     for condition in study.conditions:
         found = sorted({run.protocol for run in runs if run.condition == condition})
         if len(found) > 1:
-            raise ConfigError(f"scenes measured as {' and as '.join(found)} do not compare; give ingest.protocol to all")
+            raise ConfigError(f"scenes measured as {' and as '.join(found)} do not compare; set ingest.protocol")
     return runs
 
 
