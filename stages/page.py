@@ -11,11 +11,11 @@ p { max-width: 76ch } .soft { color: var(--soft); font-size: .9rem }
 .tiles { display: grid; grid-template-columns: repeat(auto-fit, minmax(135px, 1fr)); gap: 10px; margin: 14px 0 }
 .tiles b { display: block; font-size: 1.45rem; line-height: 1.25 } .tiles small { color: var(--soft); display: block }
 .wide { overflow-x: auto } table { border-collapse: collapse; font-size: .92rem }
-td, th { padding: .25em 1em .25em 0; text-align: left; vertical-align: top } th { color: var(--soft); font-weight: 600 }
+td, th { padding: .25em 1em .25em 0; text-align: left; vertical-align: top } td:first-child { min-width: 8.5em } th { color: var(--soft); font-weight: 600 }
 td.n, th.n { text-align: right; font-variant-numeric: tabular-nums; white-space: nowrap }
 .stay { white-space: nowrap } tbody tr + tr td { border-top: 1px solid var(--line) }
 code { font-size: .85em; overflow-wrap: anywhere } pre { font-size: .8rem; overflow-x: auto }
-img, svg { max-width: 100%; height: auto; display: block } summary { cursor: pointer }
+img, svg { max-width: 100%; height: auto; display: block } [hidden] { display: none !important } summary { cursor: pointer }
 .curves { display: grid; grid-template-columns: repeat(auto-fit, minmax(290px, 1fr)); gap: 12px }
 """  # noqa: E501
 

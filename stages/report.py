@@ -25,8 +25,14 @@ STAGE_OF = {
     "basis": "cks",
     "evaluation": "evaluate",
 }
-
-
+BYTES = {
+    "unpruned_ply": "PLY with every SH band (unpruned)",
+    "ply": "scene.ply",
+    "split": "PLY split by SH degree",
+    "ragged": "ragged arrays",
+    "semantic": "semantic arrays",
+}
+FRAMES = {"color": "colour", "color_and_features": "colour and features"}
 CAPTIONS = {
     "truth": "photo",
     "renders": "render",
@@ -65,7 +71,7 @@ def run(job: Job) -> None:
     for manifest in manifests.values():
         versions |= manifest.versions
         settings |= manifest.config
-    rows = summary_rows(figures)
+    rows = summary_rows(figures, manifests["scene"].facts["by_degree"] if "scene" in manifests else None)
     write_table(job.out / "figures.csv", rows)
     write_table(job.out / "trace.csv", [list(gaussians.trace[0]), *(list(row.values()) for row in gaussians.trace)])
     names = parts.label_names(job, figures)
@@ -107,8 +113,9 @@ def teacher_words(facts: dict[str, Any]) -> tuple[str, str]:
     convention = facts["convention"]
     if facts["kind"] == "labels":
         return "noisy labels", f"the source's own with {convention['confusion']:.0%} of the segments confused"
-    views = f"{convention['n_scales']} scale(s){', flips' if convention['flips'] else ''}"
-    return convention["teacher"], f"ONNX {convention['output']} of {views}, {facts['n_labels']} labels"
+    scales = "one scale" if convention["n_scales"] == 1 else f"{convention['n_scales']} scales"
+    views = f"{scales}{' and flips' if convention['flips'] else ''}"
+    return convention["teacher"], f"ONNX {convention['output']} at {views}, {facts['n_labels']} labels"
 
 
 def absent_stages(job: Job, gaussians: Gaussians) -> dict[str, str]:
@@ -125,7 +132,7 @@ def absent_stages(job: Job, gaussians: Gaussians) -> dict[str, str]:
     return {f"stage {STAGE_OF[role]}": why or "its artifact was not given" for role, why in absent.items()}
 
 
-def summary_rows(figures: dict[str, Any]) -> list[list[str]]:
+def summary_rows(figures: dict[str, Any], by_degree: list[int] | None) -> list[list[str]]:
     """Header, then (figure, scene, teacher). What was not measured says so."""
 
     def shown(value: float | None, form: str) -> str:
@@ -147,12 +154,18 @@ def summary_rows(figures: dict[str, Any]) -> list[list[str]]:
             values = [segmentation["scene"][key], teacher[key] if teacher else None]
             rows.append([name, shown(values[0], "{:.1%}"), shown(values[1], "{:.1%}") if teacher else ""])
     rows.append(["Gaussians", f"{figures['n_gaussians']:,}", ""])
-    rows += [[f"bytes, {name}", f"{size:,}", ""] for name, size in figures["bytes"].items()]
-    rows += [[f"frames/s, {n.replace('_', ' ')}", f"{v:.1f}", ""] for n, v in figures["frames_per_second"].items()]
+    if by_degree is not None:
+        rows.append(["Gaussians of SH degree 0, 1, 2, 3", " / ".join(f"{n:,}" for n in by_degree), ""])
+    whole = figures["bytes"]["unpruned_ply"]
+    for name, size in figures["bytes"].items():
+        share = "" if name == "unpruned_ply" else f" ({size / whole:.0%} of unpruned)"
+        rows.append([f"bytes, {BYTES[name]}", f"{size:,}{share}", ""])
+    rows += [[f"frames/s, {FRAMES[name]}", f"{v:.1f}", ""] for name, v in figures["frames_per_second"].items()]
     split = figures["milliseconds"]
-    under = f"{split['width']}x{split['height']}, {split['threads']} threads, {split['device']}"
-    parts = ("projection", "sh", "sort", "blend")
-    rows += [[f"ms a frame, {part} ({under})", f"{split[part]:.2f}", ""] for part in parts]
+    threads = "one thread" if split["threads"] == 1 else f"{split['threads']} threads"
+    under = f"{split['width']}x{split['height']}, {threads}, {split['device']}"
+    parts = {"projection": "projection", "sh": "SH", "sort": "sort", "blend": "blend"}
+    rows += [[f"ms a frame, {name} ({under})", f"{split[part]:.2f}", ""] for part, name in parts.items()]
     return rows
 
 

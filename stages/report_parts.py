@@ -40,7 +40,7 @@ def tiles(figures: dict[str, Any], gaussians: Gaussians) -> list[tuple[str, str,
         found.append((f"{segmentation['scene']['oa']:.1%}", "pixels right", "overall accuracy"))
     found.append((f"{figures['n_gaussians']:,}", "Gaussians", f"PLY {figures['bytes']['ply'] / 1e6:.1f} MB"))
     for name, value in list(figures["frames_per_second"].items())[:1]:
-        found.append((f"{value:.0f}", "frames a second", name.replace("_", " ")))
+        found.append((f"{value:.0f}", "frames a second", "colour alone" if name == "color" else "colour and features"))
     last = gaussians.trace[-1]
     return [*found, (f"{last['seconds']:.0f} s", "training", f"{last['step']:.0f} steps")]
 

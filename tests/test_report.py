@@ -116,9 +116,13 @@ def test_a_page_that_would_be_too_large_is_refused(toy, tmp_path, monkeypatch):
 WATCH = """<script>
 const problems = []; onerror = (...all) => problems.push(String(all));
 addEventListener("load", () => {
+  const seen = image => getComputedStyle(image).display != "none";
+  const stage = () => [...document.querySelectorAll(".stage img")].filter(seen);
+  const modes = [...document.querySelectorAll(".modes button")].slice(0, -1).reverse();
+  const layers = Object.fromEntries(modes.map(button => (button.click(), [button.textContent, stage().length])));
   document.querySelectorAll(".modes button").forEach(button => button.click());
-  parent.postMessage({ wide: document.documentElement.scrollWidth, problems,
-    shown: [...document.querySelectorAll(".stage img:not([hidden])")].map(image => image.naturalWidth) }, "*");
+  parent.postMessage({ wide: document.documentElement.scrollWidth, problems, layers,
+    shown: stage().map(image => image.naturalWidth) }, "*");
 });</script>"""
 FRAME = """<body><pre></pre><script>
 addEventListener("message", event => document.querySelector("pre").textContent = JSON.stringify(event.data));
@@ -151,6 +155,8 @@ def test_in_a_browser_the_page_fits_its_width_without_an_error_or_a_request(toy,
     assert seen["wide"] <= wide
     assert len(seen["shown"]) > 1
     assert all(seen["shown"])
+    # one picture a side, and what lies over it; nothing is left over from the mode before
+    assert seen["layers"] == {"photo | render": 2, "true labels | scene": 4, "2D teacher | scene": 4, "errors": 3}
 
 
 @pytest.mark.slow
