@@ -42,14 +42,11 @@ def write(out: Path, study: Study, runs: list[Run], rows: list[Row], command: st
         "stability": stability(STABILITY),
     }
     (out / "results.md").write_text(markdown(parts))
-    import jinja2
-
     from chebsplat.pipelines.study_template import PAGE
-    from chebsplat.stages.page import STYLE
+    from chebsplat.stages.viewer import rendered
 
     picture = "data:image/png;base64," + base64.b64encode((out / PICTURE).read_bytes()).decode()
-    page = jinja2.Environment(autoescape=True, undefined=jinja2.StrictUndefined).from_string(PAGE)
-    (out / "study.html").write_text(page.render(style=STYLE, picture=picture, **parts))
+    (out / "study.html").write_text(rendered(PAGE, picture=picture, **parts))
     return out / "study.html"
 
 

@@ -33,28 +33,18 @@ BYTES = {
     "semantic": "semantic arrays",
 }
 FRAMES = {"color": "colour", "color_and_features": "colour and features"}
-CAPTIONS = {
-    "truth": "photo",
-    "renders": "render",
-    "labels": "true labels",
-    "teacher": "2D teacher's labels",
-    "predicted": "scene's labels",
-    "error": "colour error",
-    "wrong": "wrong labels",
-}
 
 
 def run(job: Job) -> None:
     import json
-
-    import jinja2
 
     from chebsplat.formats.artifact import read_manifest
     from chebsplat.formats.evaluation import read_evaluation
     from chebsplat.formats.gaussians import read_gaussians
     from chebsplat.stages import figures as draw
     from chebsplat.stages import report_parts as parts
-    from chebsplat.stages.page import PAGE, STYLE
+    from chebsplat.stages.page import PAGE
+    from chebsplat.stages.viewer import rendered
 
     evaluation = read_evaluation(job.inputs["evaluation"])
     gaussians = read_gaussians(job.inputs["gaussians"])
@@ -74,12 +64,11 @@ def run(job: Job) -> None:
     rows = summary_rows(figures, manifests["scene"].facts["by_degree"] if "scene" in manifests else None)
     write_table(job.out / "figures.csv", rows)
     write_table(job.out / "trace.csv", [list(gaussians.trace[0]), *(list(row.values()) for row in gaussians.trace)])
-    names = parts.label_names(job, figures)
+    names = parts.label_names(job.inputs, figures)
     colors = {name: "#" + bytes(color).hex() for name, color in zip(names, draw.palette(len(names)), strict=True)}
     pictures, seen = parts.picture_rows(evaluation, names, job.config.report.n_pictures, job.out)
-    page = jinja2.Environment(autoescape=True, undefined=jinja2.StrictUndefined).from_string(PAGE)
-    text = page.render(
-        style=STYLE,
+    text = rendered(
+        PAGE,
         name=figures["source"].get("name") or figures["source"].get("kind", "scene"),
         source=figures["source"],
         protocol=figures["protocol"],
@@ -89,7 +78,7 @@ def run(job: Job) -> None:
         legend=[(name, colors[name]) for name in seen],
         classes=parts.class_rows(figures, colors),
         pictures=pictures,
-        captions=CAPTIONS,
+        modes=parts.modes(pictures),
         curves=draw.curves(gaussians.trace, figures["image"]["psnr"]),
         stages=stages,
         total=sum(seconds for _, seconds, *_ in stages),

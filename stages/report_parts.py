@@ -11,19 +11,52 @@ if TYPE_CHECKING:
 
     from chebsplat.formats.evaluation import Evaluation
     from chebsplat.formats.gaussians import Gaussians
-    from chebsplat.stages.command import Job
 
 
-def label_names(job: Job, figures: dict[str, Any]) -> list[str]:
+CAPTIONS = {
+    "truth": "photo",
+    "renders": "render",
+    "labels": "true labels",
+    "teacher": "2D teacher's labels",
+    "predicted": "scene's labels",
+    "error": "colour error",
+    "wrong": "wrong labels",
+}
+
+
+def side(caption: str, base: str, over: str | None = None) -> dict[str, str | None]:
+    """One side of the slider: a picture and what lies over it, by their keys."""
+    return {"caption": caption, "base": base, "over": over}
+
+
+def modes(pictures: list[dict[str, Any]]) -> list[list[Any]]:
+    """What the slider of a scene's report can compare, of the pictures that there are."""
+    there = {key for key, _, _ in pictures[0]["images"]}
+    errors = side("colour error, 4 times", "error")
+    wrong = side("render, wrong labels in red", "renders", "wrong")
+    found = [
+        ["photo | render", side("photo", "truth"), side("render", "renders")],
+        ["true labels | scene", side("true labels", "truth", "labels"), side("scene's labels", "renders", "predicted")],
+        [
+            "2D teacher | scene",
+            side("2D teacher's labels", "truth", "teacher"),
+            side("scene's labels", "renders", "predicted"),
+        ],
+        ["errors", errors, wrong if "wrong" in there else side("render", "renders")],
+    ]
+    return [mode for mode in found if {s[key] for s in mode[1:] for key in ("base", "over")} <= there | {None}]
+
+
+def label_names(inputs: dict[str, Path], figures: dict[str, Any]) -> list[str]:
     """Names of the labels in the pictures: the capture's classes, or the scene's own labels where it has none."""
     from chebsplat.formats.artifact import read_manifest
     from chebsplat.formats.capture import read_capture
     from chebsplat.formats.documents import read_document
 
-    classes = read_capture(job.inputs["capture"]).class_names if "capture" in job.inputs else None
+    classes = read_capture(inputs["capture"]).class_names if "capture" in inputs else None
     classes = classes or (figures.get("segmentation") or {}).get("classes")
-    if classes is None and "scene" in job.inputs:
-        path = job.inputs["scene"]
+    if classes is None and "scene" in inputs:
+        path = inputs["scene"]
         classes = list(read_document(path, read_manifest(path), "labels.json").values())
     return classes or []
 
@@ -59,7 +92,7 @@ def class_rows(figures: dict[str, Any], colors: dict[str, str]) -> list[tuple[st
 def picture_rows(
     evaluation: Evaluation, names: list[str], count: int, out: Path
 ) -> tuple[list[dict[str, Any]], list[str]]:
-    """Pictures of evenly spaced test views, and the names of the labels in them; a PNG of the first.
+    """Pictures (key, URI, caption) of evenly spaced views, and the names of the labels in them; a PNG of the first.
 
     Raises: InputError if a picture holds a label that has no name.
     """
@@ -82,7 +115,9 @@ def picture_rows(
         images += [(kind, draw.data_uri(image)) for kind, image in colored.items()]
         if {"labels", "predicted"} <= maps.keys():
             images.append(("wrong", draw.data_uri(draw.wrong_map(maps["predicted"], maps["labels"]))))
-        rows.append({"name": views[k], "psnr": per_view[k], "images": images})
+        captions = CAPTIONS | {"renders": f"render, {per_view[k]:.1f} dB"}
+        named = [(key, uri, captions[key]) for key, uri in images]
+        rows.append({"name": f"{views[k]}, {per_view[k]:.1f} dB", "images": named})
         sheet.append(np.concatenate([truth, render, *colored.values()], 1))
     draw.png(np.concatenate(sheet[:2], 0), out / "pictures.png")
     return rows, [names[k] for k in sorted(seen - {-1})]

@@ -6,7 +6,6 @@ import json
 import shutil
 import subprocess
 from html.parser import HTMLParser
-from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -76,10 +75,10 @@ def test_labels_are_named_by_the_capture_and_otherwise_by_the_scene(toy, tmp_pat
     with publish(tmp_path / "scene", manifest) as out:
         (out / "labels.json").write_text(json.dumps({"0": "sofa", "1": "lamp"}))
     inputs = {"scene": tmp_path / "scene"}
-    assert label_names(SimpleNamespace(inputs=inputs), {}) == ["sofa", "lamp"]
+    assert label_names(inputs, {}) == ["sofa", "lamp"]
     inputs["capture"] = toy["ingest"]
     classes = read_evaluation(toy["evaluate"]).figures["segmentation"]["classes"]
-    assert label_names(SimpleNamespace(inputs=inputs), {}) == classes
+    assert label_names(inputs, {}) == classes
 
 
 def test_a_label_without_a_name_is_an_error_not_a_colour(toy, tmp_path):
@@ -118,7 +117,7 @@ const problems = []; onerror = (...all) => problems.push(String(all));
 addEventListener("load", () => {
   const seen = image => getComputedStyle(image).display != "none";
   const stage = () => [...document.querySelectorAll(".stage img")].filter(seen);
-  const modes = [...document.querySelectorAll(".modes button")].slice(0, -1).reverse();
+  const modes = [...document.querySelectorAll(".modes button:not(.next)")].reverse();
   const layers = Object.fromEntries(modes.map(button => (button.click(), [button.textContent, stage().length])));
   document.querySelectorAll(".modes button").forEach(button => button.click());
   parent.postMessage({ wide: document.documentElement.scrollWidth, problems, layers,
