@@ -52,12 +52,13 @@ COLUMNS = (*IDENTITY, *(figure.key for figure in FIGURES), *OTHERS)
 def row_of(run: Run, failed: dict[str, tuple[int, str, Path]]) -> Row:
     """One run's figures; None where a thing was not measured. `state` is `done`, or why there are none.
 
-    Beside the COLUMNS it holds `segmentation`: all that the protocol says of the scene and of its teacher.
+    Beside the COLUMNS it holds `segmentation`, all that the protocol says of the scene and of its teacher, and
+    `left_out`.
 
     Args: failed: of `Outcome`. Raises: InputError naming a damaged artifact.
     """
     row: Row = dict.fromkeys(COLUMNS) | {name: getattr(run, name) for name in IDENTITY[:-1]}
-    row |= {"protocol": run.protocol, "segmentation": {}}
+    row |= {"protocol": run.protocol, "segmentation": {}, "left_out": {}}
     targets = run.plan.targets
     row |= {"train_key": targets["train"].name, "evaluate_key": targets["evaluate"].name}
     if not targets["evaluate"].joinpath("artifact.json").is_file():
@@ -77,6 +78,7 @@ def row_of(run: Run, failed: dict[str, tuple[int, str, Path]]) -> Row:
     return row | {
         "state": "done",
         "segmentation": segmentation,
+        "left_out": figures["left_out"],
         "psnr": figures["image"]["psnr"],
         "ssim": figures["image"]["ssim"],
         "n_gaussians": figures["n_gaussians"],

@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from chebsplat import protocols
+from chebsplat.errors import DataFailure
 from chebsplat.formats import artifact
 from chebsplat.pipelines import study_figures
 from chebsplat.pipelines.results import COLUMNS, FIGURES, Figure, Line, Row, compare, groups, traces
@@ -40,13 +41,19 @@ def write(out: Path, study: Study, runs: list[Run], rows: list[Row], command: st
         "missing": missing(rows),
         "note": note(study, rows),
         "stability": stability(STABILITY),
+        "left_out": left_out(rows),
     }
     (out / "results.md").write_text(markdown(parts))
+    from chebsplat.pipelines.study_pictures import gallery
     from chebsplat.pipelines.study_template import PAGE
+    from chebsplat.stages.report import LARGEST
     from chebsplat.stages.viewer import rendered
 
     picture = "data:image/png;base64," + base64.b64encode((out / PICTURE).read_bytes()).decode()
-    (out / "study.html").write_text(rendered(PAGE, picture=picture, **parts))
+    page = rendered(PAGE, picture=picture, **parts, **gallery(study, runs, rows))
+    if len(page) > LARGEST:
+        raise DataFailure(f"the page would have {len(page) / 1e6:.0f} MB; name fewer scenes or variants in the study")
+    (out / "study.html").write_text(page)
     return out / "study.html"
 
 
@@ -124,6 +131,17 @@ def missing(rows: list[Row]) -> list[tuple[str, str]]:
         for row in rows
         if row["state"] != "done"
     ]
+
+
+def left_out(rows: list[Row]) -> list[tuple[str, str, str]]:
+    """(what, why, by which variants) of all that finished runs left out."""
+    done = [row for row in rows if row["state"] == "done"]
+    every = list(dict.fromkeys(row["variant"] for row in done))
+    found: dict[tuple[str, str], dict[str, None]] = {}
+    for row in done:
+        for entry in row["left_out"].items():
+            found.setdefault(entry, {})[row["variant"]] = None
+    return sorted((*entry, "all" if len(by) == len(every) else ", ".join(by)) for entry, by in found.items())
 
 
 def stability(path: Path) -> list[tuple[str, int, int, float]]:
@@ -210,6 +228,9 @@ def markdown(parts: dict[str, Any]) -> str:
     if parts["stability"]:
         text += ["### Extreme cases (`make stability`)", "", "| part | cases | failed | largest error ÷ tolerance |"]
         text += ["|---|---|---|---|", *(f"| {m} | {n} | {bad} | {e:.2g} |" for m, n, bad, e in parts["stability"]), ""]
+    if parts["left_out"]:
+        text += ["### Left out, and why", ""]
+        text += [*(f"- {what}: {why} ({by})" for what, why, by in parts["left_out"]), ""]
     if parts["missing"]:
         text += ["### Runs without figures", "", *(f"- {run}: {why}" for run, why in parts["missing"]), ""]
     return "\n".join(text)
