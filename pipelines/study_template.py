@@ -10,14 +10,14 @@ main { max-width: 1640px }
 .wide .t { text-align: left }
 .wide small { display: block; color: var(--soft) } .wide small.sure { color: var(--ink); font-weight: 700 }
 .wide tr.base td { background: var(--back) } dl { display: grid; grid-template-columns: max-content 1fr; gap: .2em 1em } dt { color: var(--soft) } dd { margin: 0; overflow-wrap: anywhere }
-.wide td.w { text-align: left; white-space: normal } .failed { border-left: 4px solid #d1242f }
+.wide td.w { text-align: left; white-space: normal } .plot { min-width: 860px } .failed { border-left: 4px solid #d1242f }
 </style></head><body><main>
 <h1>{{ study.title }}</h1>
 <p>{{ study.about }}</p>
 {% if pictures %}{% include "viewer" %}
 <p class="soft">The middle evaluated view of each scene{{ " (" + shown + ")" if shown }}: left of the line and right of it as the buttons say. All of them are further down.</p>{% endif %}
 <h2>Error against {{ study.against or "run time" }}</h2>
-<div class="card"><img src="{{ picture }}" alt="error against run time, a line a variant"></div>
+<div class="card wide"><img class="plot" src="{{ picture }}" alt="error against run time, a line a variant"></div>
 <h2>The comparison</h2>
 <p class="soft">{{ note }}</p>
 <div class="card wide"><table><thead><tr>{% for cell in header %}<th{% if loop.index0 < labels|length %} class="t"{% endif %}>{{ cell }}</th>{% endfor %}</tr></thead><tbody>

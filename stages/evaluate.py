@@ -107,8 +107,9 @@ def task(job: Job, capture: Capture, scene: Scene, renderer: SceneRenderer) -> A
     from chebsplat.surface import features_at
 
     def at(points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        shape = (renderer.means, renderer.quats, renderer.scales, renderer.opacities)
-        return features_at(points, *(part.double().numpy() for part in shape), scene.parameters["features"])
+        parts = (renderer.means, renderer.quats, renderer.scales, renderer.opacities)
+        means, quats, scales, opacities = (part.double().numpy() for part in parts)
+        return features_at(points, means, quats, scales, opacities, scene.parameters["features"])
 
     assert scene.label_embeddings is not None and scene.label_names is not None
     names, boundary = capture.class_names or [], job.config.evaluate.boundary

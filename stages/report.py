@@ -102,6 +102,8 @@ def teacher_words(facts: dict[str, Any]) -> tuple[str, str]:
     convention = facts["convention"]
     if facts["kind"] == "labels":
         return "noisy labels", f"the source's own with {convention['confusion']:.0%} of the segments confused"
+    if facts["kind"] == "given":
+        return "pseudo labels", f"the source's own with a confidence by pixel, {facts['n_labels']} labels"
     scales = "one scale" if convention["n_scales"] == 1 else f"{convention['n_scales']} scales"
     views = f"{scales}{' and flips' if convention['flips'] else ''}"
     return convention["teacher"], f"ONNX {convention['output']} at {views}, {facts['n_labels']} labels"

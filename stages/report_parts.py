@@ -34,7 +34,7 @@ def modes(pictures: list[dict[str, Any]]) -> list[list[Any]]:
     there = {key for key, _, _ in pictures[0]["images"]}
     errors = side("colour error, 4 times", "error")
     wrong = side("render, wrong labels in red", "renders", "wrong")
-    found = [
+    found: list[list[Any]] = [
         ["photo | render", side("photo", "truth"), side("render", "renders")],
         ["true labels | scene", side("true labels", "truth", "labels"), side("scene's labels", "renders", "predicted")],
         [

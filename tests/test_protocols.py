@@ -100,6 +100,12 @@ def test_labels_on_paper():
     assert replica_gt.measure([seen, more], task)["scene"]["miou"] == pytest.approx((3 / 4 + 1 / 3) / 2)
 
 
+def test_where_nothing_is_known_nothing_is_measured():
+    task = Task(["wall"], np.eye(1), ["wall"])
+    found = labels.measure([view([[0, 0]], 1, truth=np.array([[-1, -1]]))], task)["scene"]
+    assert found == dict.fromkeys(("miou", "macc", "oa", "boundary_miou", "point_miou")) | {"iou": {"wall": None}}
+
+
 def test_points_on_paper():
     # One pixel a point: three of the five lie apart, two share a cell, of which the first counts; one is unknown.
     # truth    wall wall floor (floor) ?    the scene there: wall, nothing, floor   wall 1/2, floor 1/1: mean 3/4

@@ -17,7 +17,7 @@ import numpy as np
 
 from chebsplat.metrics import IGNORE, boundary_band, confusion, segmentation
 from chebsplat.noisy_teacher import decode
-from chebsplat.protocols.task import Seen, Task, translated
+from chebsplat.protocols.task import Seen, Task, predicted
 from chebsplat.surface import thinned
 
 NAME = "labels"
@@ -34,7 +34,7 @@ def measure(views: Iterable[Seen], task: Task) -> dict[str, Any]:
         inside = np.where(boundary_band(view.truth, task.boundary), view.truth, IGNORE)
         for side, labels in (("scene", view.labels), ("teacher", view.teacher_labels)):
             if labels is not None:
-                found = translated(labels, task.names, task.classes, n)
+                found = predicted(labels, task.names, task.classes, n)
                 counts = np.stack([confusion(found, truth, n + 1) for truth in (view.truth, inside)])
                 sums[side] = sums.get(side, 0) + counts
         if view.surface is not None:
@@ -42,9 +42,9 @@ def measure(views: Iterable[Seen], task: Task) -> dict[str, Any]:
             maps = (view.surface, view.truth, view.teacher_labels)
             points.append(tuple(of[known] for of in maps if of is not None))
     figures = {side: _figures(whole, edges, task.classes) for side, (whole, edges) in sums.items()}
-    found = _point_mious(points, task) if points and task.at is not None else {}
+    of_points = _point_mious(points, task) if points and task.at is not None else {}
     return {"classes": task.classes} | {
-        side: of_side | {"point_miou": found.get(side)} for side, of_side in figures.items()
+        side: of_side | {"point_miou": of_points.get(side)} for side, of_side in figures.items()
     }
 
 
@@ -54,10 +54,10 @@ def _point_mious(points: list[tuple[np.ndarray, ...]], task: Task) -> dict[str, 
     places, truth, *told = (np.concatenate(parts) for parts in zip(*points, strict=True))
     kept, n = thinned(places), len(task.classes)
     features, weights = task.at(places[kept])
-    labels = translated(decode(features, task.embeddings)[0], task.names, task.classes, n)
+    labels = predicted(decode(features, task.embeddings)[0], task.names, task.classes, n)
     sides = {"scene": np.where(weights > 0, labels, n)}
     if told:
-        sides["teacher"] = translated(told[0][kept], task.names, task.classes, n)
+        sides["teacher"] = predicted(told[0][kept], task.names, task.classes, n)
     return {side: _mean(segmentation(confusion(found, truth[kept], n + 1)).iou[:-1]) for side, found in sides.items()}
 
 
@@ -69,8 +69,8 @@ def _figures(whole: np.ndarray, edges: np.ndarray, classes: list[str]) -> dict[s
     found = segmentation(whole)
     return {
         "miou": _mean(found.iou[:-1]),
-        "macc": found.macc,
-        "oa": found.oa,
+        "macc": _mean(np.array([found.macc])),
+        "oa": _mean(np.array([found.oa])),
         "boundary_miou": _mean(segmentation(edges).iou[:-1]),
         "iou": {name: None if np.isnan(v) else float(v) for name, v in zip(classes, found.iou, strict=False)},
     }

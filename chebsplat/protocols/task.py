@@ -69,6 +69,11 @@ def translated(labels: np.ndarray, names: list[str], classes: list[str], unknown
     return table[labels]
 
 
+def predicted(labels: np.ndarray, names: list[str], classes: list[str], unknown: int) -> np.ndarray:
+    """As `translated`, of a prediction: where there is none, it is `unknown` too, and not left out of the count."""
+    return np.where(labels == IGNORE, unknown, translated(labels, names, classes, unknown))
+
+
 def required(names: list[str], classes: tuple[str, ...], protocol: str, also: tuple[str, ...] = ()) -> None:
     """Raise DataFailure unless `names` are all the `classes`, in any order, and nothing else but some of `also`."""
     if lacking := [name for name in classes if name not in names]:
