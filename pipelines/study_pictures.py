@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from typing import Any
 
 import numpy as np
@@ -10,7 +11,7 @@ from chebsplat.formats.evaluation import Evaluation, read_evaluation
 from chebsplat.pipelines.results import Row
 from chebsplat.pipelines.study import Run, Study
 from chebsplat.stages import figures as draw
-from chebsplat.stages.report_parts import class_rows, label_names, side
+from chebsplat.stages.report_parts import class_rows, counted, label_names, legend, side
 
 LONGEST = 480  # side of a picture, pixels
 
@@ -34,13 +35,13 @@ def gallery(study: Study, runs: list[Run], rows: list[Row]) -> dict[str, Any]:
     names = {where: _names(some) for where, some in scenes.items()}
     union = list(dict.fromkeys(name for own in names.values() for name in own))
     pictures: list[dict[str, Any]] = []
-    seen: set[int] = set()
+    pixels: Counter[int] = Counter()
     for where, some in scenes.items():
         table = np.array([*(union.index(name) for name in names[where]), -1])
         evaluations = {variant: read_evaluation(run.plan.targets["evaluate"]) for variant, run in some.items()}
-        images, labels = _images(evaluations, table, len(union))
+        images, found = _images(evaluations, table, len(union))
         pictures.append({"name": " ".join(part for part in where if part), "images": images})
-        seen |= labels
+        pixels.update(found)
     variants = [v for v in study.variants if v != study.baseline]
     compared = variants[0] if variants else study.baseline
     there = {key for row in pictures for key, _, _ in row["images"]}
@@ -49,7 +50,7 @@ def gallery(study: Study, runs: list[Run], rows: list[Row]) -> dict[str, Any]:
     return {
         "pictures": pictures,
         "modes": [mode for mode in _modes(study.baseline, variants) if _keys(mode) <= there],
-        "legend": [(union[k], colors[union[k]]) for k in sorted(seen)],
+        "legend": legend(pixels, union, colors),
         "classes": _classes(of_interest, compared, study.baseline, colors),
         "compared": compared,
         "shown": ", ".join(part for part in parts if part),
@@ -68,15 +69,16 @@ def _names(runs: dict[str, Run]) -> list[str]:
 
 def _images(
     evaluations: dict[str, Evaluation], table: np.ndarray, n: int
-) -> tuple[list[tuple[str, str, str]], set[int]]:
-    """(key, URI, caption) of a scene's pictures, and which of the n labels are in them. table: its labels -> these."""
+) -> tuple[list[tuple[str, str, str]], Counter[int]]:
+    """(key, URI, caption) of a scene's pictures, pixels of each of n labels in them. table: its labels -> these."""
     first = next(iter(evaluations.values()))
-    view, seen = len(first.figures["names"]) // 2, set()
+    view = len(first.figures["names"]) // 2
+    pixels: Counter[int] = Counter()
     images = [("truth", draw.data_uri(_small(first.pictures["truth"][view]), photo=True), "photo")]
 
     def labels(key: str, stack: Any, caption: str) -> None:
         found = table[_small(stack[view])]
-        seen.update(np.unique(found).tolist())
+        pixels.update(counted(found))
         images.append((key, draw.data_uri(draw.colored(found, n)), caption))
 
     if "labels" in first.pictures:
@@ -87,7 +89,7 @@ def _images(
         images.append((f"render of {variant}", draw.data_uri(render, photo=True), f"{variant}, {psnr:.1f} dB"))
         if "predicted" in evaluation.pictures:
             labels(f"labels of {variant}", evaluation.pictures["predicted"], f"{variant}'s labels")
-    return images, seen - {-1}
+    return images, pixels
 
 
 def _small(image: np.ndarray) -> np.ndarray:

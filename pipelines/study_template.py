@@ -27,11 +27,11 @@ main { max-width: 1640px }
 <div class="card failed"><ul>{% for run, why in missing %}<li>{{ run }}: {{ why }}</li>{% endfor %}</ul></div>{% endif %}
 {% if classes %}<h2>IoU by class</h2>
 <div class="card">{% include "bars" %}<p class="soft">Blue: {{ compared }}, %, mean over scenes and seeds{{ " (" + shown.rsplit(", ", 1)[0] + ")" if ", " in shown }}.{% if compared != study.baseline %} Orange mark, and in brackets: {{ study.baseline }}.{% endif %}</p></div>{% endif %}
-<h2>Each scene</h2>
+{% if scenes|length > 1 %}<h2>Each scene</h2>
 <p class="soft">Mean ± standard deviation over seeds.</p>
 <div class="card wide"><table><thead><tr>{% for cell in scenes[0] %}<th{% if loop.index0 <= labels|length %} class="t"{% endif %}>{{ cell }}</th>{% endfor %}</tr></thead><tbody>
 {% for row in scenes[1:] %}<tr>{% for cell in row %}<td{% if loop.index0 <= labels|length %} class="t"{% endif %}>{{ cell }}</td>{% endfor %}</tr>
-{% endfor %}</tbody></table></div>
+{% endfor %}</tbody></table></div>{% endif %}
 {% if pictures %}<h2>Pictures</h2>
 {% include "sheet" %}{% endif %}
 <h2>Extreme cases</h2>

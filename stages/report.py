@@ -66,7 +66,7 @@ def run(job: Job) -> None:
     write_table(job.out / "trace.csv", [list(gaussians.trace[0]), *(list(row.values()) for row in gaussians.trace)])
     names = parts.label_names(job.inputs, figures)
     colors = {name: "#" + bytes(color).hex() for name, color in zip(names, draw.palette(len(names)), strict=True)}
-    pictures, seen = parts.picture_rows(evaluation, names, job.config.report.n_pictures, job.out)
+    pictures, pixels = parts.picture_rows(evaluation, names, job.config.report.n_pictures, job.out)
     text = rendered(
         PAGE,
         name=figures["source"].get("name") or figures["source"].get("kind", "scene"),
@@ -75,7 +75,7 @@ def run(job: Job) -> None:
         teacher=teacher_words(manifests["features"].facts) if "features" in manifests else None,
         rows=rows[1:],
         tiles=parts.tiles(figures, gaussians),
-        legend=[(name, colors[name]) for name in seen],
+        legend=parts.legend(pixels, names, colors),
         classes=parts.class_rows(figures, colors),
         pictures=pictures,
         modes=parts.modes(pictures),

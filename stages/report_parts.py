@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from typing import TYPE_CHECKING, Any
 
 from chebsplat.errors import InputError
@@ -9,10 +10,13 @@ from chebsplat.errors import InputError
 if TYPE_CHECKING:
     from pathlib import Path
 
+    import numpy as np
+
     from chebsplat.formats.evaluation import Evaluation
     from chebsplat.formats.gaussians import Gaussians
 
 
+IN_LEGEND = 30  # labels; an open vocabulary has hundreds
 CAPTIONS = {
     "truth": "photo",
     "renders": "render",
@@ -89,10 +93,17 @@ def class_rows(figures: dict[str, Any], colors: dict[str, str]) -> list[tuple[st
     return sorted(rows, key=lambda row: -row[2])
 
 
+def legend(pixels: Counter[int], names: list[str], colors: dict[str, str]) -> list[tuple[str, str]]:
+    """(name, colour) of the labels that cover the most pixels, in their order, and how many more there are."""
+    kept = sorted(label for label, _ in pixels.most_common(IN_LEGEND))
+    more = len(pixels) - len(kept)
+    return [(names[k], colors[names[k]]) for k in kept] + ([(f"and {more} more", "transparent")] if more else [])
+
+
 def picture_rows(
     evaluation: Evaluation, names: list[str], count: int, out: Path
-) -> tuple[list[dict[str, Any]], list[str]]:
-    """Pictures (key, URI, caption) of evenly spaced views, and the names of the labels in them; a PNG of the first.
+) -> tuple[list[dict[str, Any]], Counter[int]]:
+    """Pictures (key, URI, caption) of evenly spaced views, and pixels of each label in them; a PNG of the first.
 
     Raises: InputError if a picture holds a label that has no name.
     """
@@ -102,13 +113,15 @@ def picture_rows(
 
     views, pictures = evaluation.figures["names"], evaluation.pictures
     per_view = evaluation.figures["image"]["per_view"]["psnr"]
-    rows, sheet, seen = [], [], {-1}
+    rows, sheet = [], []
+    pixels: Counter[int] = Counter()
     for k in np.unique(np.linspace(0, len(views) - 1, min(count, len(views))).round().astype(int)):
         truth, render = pictures["truth"][k], pictures["renders"][k]
         maps = {kind: pictures[kind][k] for kind in ("labels", "teacher", "predicted") if kind in pictures}
-        seen |= {int(value) for labels in maps.values() for value in np.unique(labels)}
-        if max(seen) >= len(names):
-            raise InputError(f"label {max(seen)} in the pictures has no name; pass --in-capture, or evaluate again")
+        for labels in maps.values():
+            pixels.update(counted(labels))
+        if max(pixels, default=-1) >= len(names):
+            raise InputError(f"label {max(pixels)} in the pictures has no name; pass --in-capture, or evaluate again")
         images = [("truth", draw.data_uri(truth, photo=True)), ("renders", draw.data_uri(render, photo=True))]
         images.append(("error", draw.data_uri(draw.error_map(render, truth), photo=True)))
         colored = {kind: draw.colored(labels, len(names)) for kind, labels in maps.items()}
@@ -120,4 +133,12 @@ def picture_rows(
         rows.append({"name": f"{views[k]}, {per_view[k]:.1f} dB", "images": named})
         sheet.append(np.concatenate([truth, render, *colored.values()], 1))
     draw.png(np.concatenate(sheet[:2], 0), out / "pictures.png")
-    return rows, [names[k] for k in sorted(seen - {-1})]
+    return rows, pixels
+
+
+def counted(labels: np.ndarray) -> dict[int, int]:
+    """Pixels of each label of a map; -1 is none."""
+    import numpy as np
+
+    found, counts = np.unique(labels[labels >= 0], return_counts=True)
+    return dict(zip(found.tolist(), counts.tolist(), strict=True))

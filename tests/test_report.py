@@ -3,6 +3,7 @@
 import base64
 import io
 import json
+from collections import Counter
 from html.parser import HTMLParser
 
 import numpy as np
@@ -14,7 +15,7 @@ from chebsplat.errors import InputError
 from chebsplat.formats.artifact import Manifest, publish
 from chebsplat.formats.evaluation import read_evaluation
 from chebsplat.stages import figures as draw
-from chebsplat.stages.report_parts import class_rows, label_names, picture_rows
+from chebsplat.stages.report_parts import class_rows, label_names, legend, picture_rows
 
 pytestmark = pytest.mark.xdist_group("toy")
 
@@ -82,6 +83,15 @@ def test_labels_are_named_by_the_capture_and_otherwise_by_the_scene(toy, tmp_pat
 def test_a_label_without_a_name_is_an_error_not_a_colour(toy, tmp_path):
     with pytest.raises(InputError, match="has no name"):
         picture_rows(read_evaluation(toy["evaluate"]), ["wall"], 1, tmp_path)
+
+
+def test_a_legend_names_the_labels_that_cover_most_and_how_many_more_there_are():
+    names = [f"label {k}" for k in range(40)]
+    colors = dict.fromkeys(names, "#000")
+    pixels = Counter({k: 100 - k for k in range(40)} | {39: 1000})
+    shown = legend(pixels, names, colors)
+    assert [name for name, _ in shown] == [*names[:29], "label 39", "and 10 more"]
+    assert len(legend(Counter({3: 1}), names, colors)) == 1
 
 
 def test_classes_are_listed_best_first_and_those_that_never_occur_are_not():
