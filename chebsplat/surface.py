@@ -62,5 +62,6 @@ def thinned(points: np.ndarray) -> np.ndarray:
         return np.zeros(0, np.int64)
     low, high = np.quantile(points, [0.01, 0.99], axis=0)
     side = float((high - low).max()) / CELLS or 1.0
-    _, first = np.unique(np.floor((points - low) / side).astype(np.int64), axis=0, return_index=True)
+    cells = np.floor((points - low) / side).clip(-(2.0**20), 2.0**20 - 1).astype(np.int64) + 2**20
+    _, first = np.unique(cells @ np.array([2**42, 2**21, 1]), return_index=True)
     return np.sort(first)

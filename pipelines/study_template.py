@@ -5,7 +5,7 @@ PAGE = """<!doctype html>
 <link rel="icon" href="data:,"><title>{{ study.title }} - chebsplat</title>
 <style>{{ style|safe }}
 main { max-width: 1640px }
-.wide td:first-child { position: sticky; left: 0; background: var(--paper) }
+.wide td:first-child { min-width: 0; position: sticky; left: 0; background: var(--paper) }
 .wide td, .wide th { text-align: right; white-space: nowrap; font-variant-numeric: tabular-nums } .wide th { white-space: normal; min-width: 5em; vertical-align: bottom }
 .wide .t { text-align: left }
 .wide small { display: block; color: var(--soft) } .wide small.sure { color: var(--ink); font-weight: 700 }

@@ -3,9 +3,9 @@
 Split: the source's own, otherwise every 8th view from the first. Classes: the scene's own names; a label whose name is
 no class is wrong wherever it is predicted. One confusion matrix over all test views: mIoU over classes that occur in
 truth or prediction, mAcc over those in the truth, OA; mIoU within 5 pixels of a boundary; the same for the teacher.
-3D point mIoU, where depth and poses say where the pixels lie: over points of the test views' surfaces, one a cell (see
-`surface.thinned`), the scene's label is that of its Gaussians there, without rendering; where it has none, it is wrong.
-The teacher's is the label of the pixel that the point comes from.
+3D point mIoU, where depth and poses say where pixels lie: over points of the test views' surfaces (40,000 pixels a view
+on a regular grid, of which one a cell is kept: `surface.thinned`), the scene's label is that of its Gaussians there,
+without rendering; where it has none, it is wrong. The teacher's is the label of the pixel that the point comes from.
 """
 
 from __future__ import annotations
@@ -23,6 +23,8 @@ from chebsplat.surface import thinned
 NAME = "labels"
 TEST_EVERY, TEST_OFFSET, ADJUSTABLE, OWN_SPLIT, ON_TRAINING, TRUTH = 8, 0, True, True, False, "labels"
 
+PER_VIEW = 40_000  # pixels of a view that become points, about, on a regular grid
+
 
 def measure(views: Iterable[Seen], task: Task) -> dict[str, Any]:
     """mIoU (of pixels, boundary pixels and points), mAcc, OA, IoU by class: of the scene, and of its teacher."""
@@ -38,9 +40,11 @@ def measure(views: Iterable[Seen], task: Task) -> dict[str, Any]:
                 counts = np.stack([confusion(found, truth, n + 1) for truth in (view.truth, inside)])
                 sums[side] = sums.get(side, 0) + counts
         if view.surface is not None:
-            known = (view.truth != IGNORE) & np.isfinite(view.surface).all(-1)
-            maps = (view.surface, view.truth, view.teacher_labels)
-            points.append(tuple(of[known] for of in maps if of is not None))
+            step = max(round((view.truth.size / PER_VIEW) ** 0.5), 1)
+            maps = (view.surface.astype(np.float32), view.truth, view.teacher_labels)
+            place, truth, *told = (of[step // 2 :: step, step // 2 :: step] for of in maps if of is not None)
+            known = (truth != IGNORE) & np.isfinite(place).all(-1)
+            points.append(tuple(of[known] for of in (place, truth, *told)))
     figures = {side: _figures(whole, edges, task.classes) for side, (whole, edges) in sums.items()}
     of_points = _point_mious(points, task) if points and task.at is not None else {}
     return {"classes": task.classes} | {
