@@ -46,14 +46,14 @@ class Capture:
     is_test: np.ndarray
     depth: Stack | None = None
     labels: Stack | None = None
-    pseudo_labels: Stack | None = None
-    confidence: Stack | None = None
     loss_mask: Stack | None = None
     class_names: list[str] | None = None
     source: dict[str, Any] = field(default_factory=dict)
     protocol: dict[str, Any] = field(default_factory=dict)
     points: np.ndarray | None = None
     point_colors: np.ndarray | None = None
+    pseudo_labels: Stack | None = None
+    confidence: Stack | None = None
 
     @property
     def size(self) -> tuple[int, int]:

@@ -33,6 +33,8 @@ def make_capture():
         {"name": "labels"},
         rng.random((7, 3), dtype=np.float32),
         rng.integers(0, 255, (7, 3), dtype=np.uint8),
+        rng.integers(-1, 2, (3, 4, 5)).astype(np.int16),
+        rng.random((3, 4, 5)).astype(np.float16),
     )
 
 
