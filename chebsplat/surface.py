@@ -24,8 +24,8 @@ def features_at(
       means:     [N, 3]; quats [N, 4] wxyz of any length; scales [N, 3] standard deviations; opacities [N] in (0, 1).
       features:  [N, C].
     Returns: features f32 [M, C], zero where no Gaussian reaches; weights f32 [M], their sums.
-    Choices: a Gaussian ends at 3 standard deviations, as its splat does. Nothing occludes anything: what lies in front
-      or behind by more than that has no say.
+    Choices: a Gaussian ends at 3 standard deviations. Nothing occludes anything: what lies in front of a point or
+      behind it by more than that has no say.
     """
     from scipy.sparse import coo_matrix
     from scipy.spatial import cKDTree

@@ -101,7 +101,7 @@ def _small(image: np.ndarray) -> np.ndarray:
 
 
 def _modes(baseline: str, variants: list[str]) -> list[list[Any]]:
-    """What the slider can compare: photo and truth with the first variant, and the baseline with each."""
+    """What the slider can compare: photo and truth with the first variant, and the baseline with photo and each."""
 
     def of(variant: str, what: bool) -> dict[str, str | None]:
         return side(variant, f"render of {variant}", f"labels of {variant}" if what else None)
@@ -109,6 +109,8 @@ def _modes(baseline: str, variants: list[str]) -> list[list[Any]]:
     first = (variants or [baseline])[0]
     found = [[f"photo | {first}", side("photo", "truth"), of(first, False)]]
     found.append([f"true labels | {first}", side("true labels", "truth", "labels"), of(first, True)])
+    if variants:
+        found.append([f"photo | {baseline}", side("photo", "truth"), of(baseline, False)])
     for what, said in ((False, ""), (True, ", labels")):
         found += [[f"{baseline} | {v}{said}", of(baseline, what), of(v, what)] for v in variants]
     return found

@@ -66,9 +66,10 @@ const modes = {{ modes|tojson }}; // [name, left, right]; a side is {caption, ba
 const views = all(document, ".sheet > div").map(row => ({ row, name: row.dataset.name,
   src: Object.fromEntries(all(row, "img").map(image => [image.dataset.of, image.src])) }));
 const fits = ([, ...sides]) => sides.every(s => [s.base, s.over].every(name => !name || name in view.src));
-let view = views[0], mode = modes.find(fits);
+const photo = { caption: "photo", base: "truth" }, alone = ["", photo, photo]; // where nothing else is there
+let view = views[0], mode = modes[0] ?? alone;
 function show() {
-  if (!fits(mode)) mode = modes.find(fits);
+  if (!fits(mode)) mode = modes.find(fits) ?? alone;
   for (const [where, chosen] of [["left", mode[1]], ["right", mode[2]]]) {
     const [base, over] = all(viewer, `.side.${where} img`);
     base.src = view.src[chosen.base]; base.alt = chosen.caption;

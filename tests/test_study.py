@@ -218,10 +218,14 @@ def test_the_page_shows_a_view_of_each_scene_in_one_set_of_colours(tmp_path):
         ("wall", 0.25, None),
     ]
     assert shown["shown"] == "20 steps, seed 0"
-    names = ["photo | full", "true labels | full", "less | full", "less | full, labels"]
+    names = ["photo | full", "true labels | full", "photo | less", "less | full", "less | full, labels"]
     assert [mode[0] for mode in shown["modes"]] == names
     page = write(tmp_path, asked, runs, rows, "c").read_text()
     assert page.count("data-of=") == 6 + 4
+    if BROWSER is not None:  # which ends on the scene that lacks a variant
+        seen, console, _ = browsed(tmp_path, page, 1440)
+        assert seen["problems"] == console == []
+        assert len(seen["shown"]) == 2 and all(seen["shown"])
     assert '<td class="w">LPIPS</td><td class="w">not measured</td><td class="w">all</td>' in page
 
 
