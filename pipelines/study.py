@@ -75,6 +75,10 @@ class Run:
         return wanted_steps(self.plan, LAST)
 
     @property
+    def protocol(self) -> str:
+        return next(step.sections["ingest"]["protocol"] for step in self.plan.steps if step.stage == "ingest")
+
+    @property
     def name(self) -> str:
         """For its link, and for people."""
         parts = (self.condition, self.variant, self.budget, self.sequence, self.place or "", self.scene)
@@ -111,12 +115,13 @@ def expand(study: Study) -> list[Run]:
     """Every run, planned; scenes vary slowest and variants fastest, so that a study cut short has compared something.
 
     Raises: ConfigError, InputError.
+    Choices: all runs of a condition are measured under one protocol, since figures of two must not meet in a mean.
     """
     planner = Planner()
     chains = [("", study.scenes)] if study.scenes else []
     chains += [(name, planning.read_toml("sequences", name)["scenes"]) for name in study.sequences]
     try:
-        return [
+        runs = [
             run
             for sequence, scenes in chains
             for chain in ([[scene] for scene in scenes] if not sequence else [scenes])
@@ -128,6 +133,11 @@ def expand(study: Study) -> list[Run]:
         ]
     finally:
         planner.save()
+    for condition in study.conditions:
+        found = sorted({run.protocol for run in runs if run.condition == condition})
+        if len(found) > 1:
+            raise ConfigError(f"scenes measured as {' and as '.join(found)} do not compare; set ingest.protocol")
+    return runs
 
 
 def _chain(
