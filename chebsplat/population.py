@@ -64,10 +64,10 @@ class Population:
 
     @torch.no_grad()
     def remove(self, optimizer: torch.optim.Optimizer, mask: Tensor | None) -> None:
-        """Hard-prune what the soft mask [N] closes and what is too faint, but never below `min_gaussians`."""
+        """Hard-prune what is faint or, of the first Gaussians, closed by their soft mask; `min_gaussians` stay."""
         strength = self.model.raw["logit_opacities"].sigmoid()
         if mask is not None:
-            strength = strength * adapt.hard_mask(mask)
+            strength[: len(mask)] *= adapt.hard_mask(mask)
         keep = strength >= FAINT
         if keep.sum() < self.settings["min_gaussians"]:
             keep[strength.topk(min(self.settings["min_gaussians"], len(strength))).indices] = True

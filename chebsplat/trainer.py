@@ -22,7 +22,7 @@ from chebsplat.regions import Regions, build_regions
 from chebsplat.schedule import Schedule, adam
 from chebsplat.views import Views
 
-HELD = ("step", "seconds", "refresh_seconds", "order", "members", "guidance")
+HELD = ("step", "seconds", "order", "members", "guidance")
 
 
 class Trainer:
@@ -53,9 +53,9 @@ class Trainer:
         self.generator = torch.Generator().manual_seed(settings["seed"])
         self.order: list[int] = []  # views still to be seen before any is seen again
         self.step = 0
-        self.seconds = self.refresh_seconds = 0.0  # of the steps
+        self.seconds = 0.0  # of the steps but the first
         self.population = Population(model, settings, extent)
-        self.laps = Laps()  # of the steps since this object was made, a resumed training's from there on
+        self.laps = Laps()  # of the same steps; after a resume, from there on
 
     @property
     def share(self) -> float:
@@ -74,8 +74,11 @@ class Trainer:
             self.order = self.order or self.order_generator.permutation(len(self.views.names)).tolist()
             figures = self._step(self.order.pop(), share)
             self._adapt(share)
-            self.laps.mark("growth, pruning, refresh")
-            self.seconds += time.perf_counter() - began
+            self.laps.mark("growth and pruning")
+            if self.step == 1:  # kernels were compiled or loaded
+                self.laps = Laps()
+            else:
+                self.seconds += time.perf_counter() - began
             yield figures | {"n": len(self.model)}
 
     def _adapt(self, share: float) -> None:
@@ -85,10 +88,11 @@ class Trainer:
         removing = growing or (self.schedule.has("densify_until", share) and self.step % 200 == 0)
         if growing or due:
             self._drop_broken()
+        mask = self._soft_mask(share) if removing else None
         if growing:
             self.population.grow(self.optimizer, self.members, self.generator)
         if removing:
-            self.population.remove(self.optimizer, self._soft_mask(share))
+            self.population.remove(self.optimizer, mask)
         if removing or due:
             self.refresh()
         if self.schedule.has("sh_freeze", share) and self.population.freeze_bands(self.optimizer):
@@ -102,12 +106,11 @@ class Trainer:
 
     @torch.no_grad()
     def _soft_mask(self, share: float) -> Tensor | None:
-        """Of all Gaussians, once pruning has begun; their regions are as the last refresh found them."""
+        """Of all Gaussians, once pruning has begun; encodings are as the last refresh or step left them."""
         if not self.schedule.has("prune_from", share):
             return None
         everyone, features, shape = torch.arange(len(self.model)), self.model.raw.get("features"), self.model.shape
         if shape is not None and features is not None and self._encodes(share) and self.model.semantic_gate is not None:
-            self.refresh()
             features = shape.fuse(features, everyone)
         return self.model.soft_mask(everyone, features)
 
@@ -145,7 +148,7 @@ class Trainer:
 
     def refresh(self, regions: Regions | None = None, descriptors: Tensor | None = None) -> None:
         """Regions, descriptors and band guidance of the Gaussians as they are now."""
-        began = time.perf_counter()
+        self.laps.mark("growth and pruning")
         shape, settings = self.model.shape, self.settings
         if shape is not None:
             shape.refresh(self.model.raw, regions, descriptors)
@@ -158,7 +161,7 @@ class Trainer:
         if settings["sh_guided"] and "sh_logits" in self.model.raw:
             shN = sh_prune.dense([band.detach() for band in self.model.bands()[1:]], len(self.model))
             self.guidance = sh_prune.region_guidance(shN, self.members, len(self.model))
-        self.refresh_seconds += time.perf_counter() - began
+        self.laps.mark("refresh")
 
     def _step(self, index: int, share: float) -> dict[str, float]:
         settings, factor = self.settings, self.schedule.factor(share)
@@ -169,7 +172,7 @@ class Trainer:
             self.schedule.degree(share),
             masked=pruning,
             fused=self._encodes(share),
-            generator=self.generator,
+            generator=self.generator if self.step % settings["encode_every"] == 0 else None,
         )
         self.laps.mark("render")
         losses = {"color": photometric(rendered.rgb, target, mask, settings["weight_ssim"])}

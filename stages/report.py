@@ -61,7 +61,8 @@ def run(job: Job) -> None:
     for manifest in manifests.values():
         versions |= manifest.versions
         settings |= manifest.config
-    rows = summary_rows(figures, manifests["scene"].facts["by_degree"] if "scene" in manifests else None)
+    by_degree = manifests["scene"].facts["by_degree"] if "scene" in manifests else None
+    rows = summary_rows(figures, by_degree, manifests["gaussians"].facts["milliseconds"])
     write_table(job.out / "figures.csv", rows)
     write_table(job.out / "trace.csv", [list(gaussians.trace[0]), *(list(row.values()) for row in gaussians.trace)])
     names = parts.label_names(job.inputs, figures)
@@ -123,8 +124,11 @@ def absent_stages(job: Job, gaussians: Gaussians) -> dict[str, str]:
     return {f"stage {STAGE_OF[role]}": why or "its artifact was not given" for role, why in absent.items()}
 
 
-def summary_rows(figures: dict[str, Any], by_degree: list[int] | None) -> list[list[str]]:
-    """Header, then (figure, scene, teacher). What was not measured says so."""
+def summary_rows(figures: dict[str, Any], by_degree: list[int] | None, of_step: dict[str, float]) -> list[list[str]]:
+    """Header, then (figure, scene, teacher). What was not measured says so.
+
+    Args: by_degree: Gaussians by SH degree, None where unknown; of_step: milliseconds of a training step by part.
+    """
 
     def shown(value: float | None, form: str) -> str:
         return "not measured" if value is None else form.format(value)
@@ -157,6 +161,7 @@ def summary_rows(figures: dict[str, Any], by_degree: list[int] | None) -> list[l
     under = f"{split['width']}x{split['height']}, {threads}, {split['device']}"
     parts = {"projection": "projection", "sh": "SH", "sort": "sort", "blend": "blend"}
     rows += [[f"ms a frame, {name} ({under})", f"{split[part]:.2f}", ""] for part, name in parts.items()]
+    rows += [[f"ms a training step, {part}", f"{value:.2f}", ""] for part, value in of_step.items()]
     return rows
 
 

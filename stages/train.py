@@ -65,10 +65,9 @@ def run(job: Job) -> None:
         encoder = model.shape.encoder
         notes["encoder"] = {"n_inputs": encoder.n_inputs, "n_channels": encoder.n_channels} | encoder.settings
         job.facts["described_anew"] = model.shape.described.share_described
-    seconds = trace[-1]["seconds"]
-    job.facts |= {"n_gaussians": left, "steps": trainer.step, "seconds_per_step": seconds / trainer.step}
-    job.facts["milliseconds"] = {part: 1e3 * s / trainer.step for part, s in trainer.laps.seconds.items()}
-    job.facts["refresh_share"] = trainer.refresh_seconds / seconds
+    timed = max(trainer.step - 1, 1)  # all but the first
+    job.facts |= {"n_gaussians": left, "steps": trainer.step, "seconds_per_step": trace[-1]["seconds"] / timed}
+    job.facts["milliseconds"] = {part: 1e3 * seconds / timed for part, seconds in trainer.laps.seconds.items()}
     write_gaussians(job.out, Gaussians(parameters, cameras, modules, optimizer_state(trainer), trace, notes))
 
 
