@@ -223,13 +223,16 @@ def test_regulariser_has_finite_gradients_at_any_size(size):
 
 
 def test_the_gradient_of_the_regulariser_is_that_of_its_formula():
-    weights_of = {"a": weights(16, 24).double().requires_grad_(True), "b": weights(8, 8, 3).double().requires_grad_(True)}
+    weights_of = {
+        "a": weights(16, 24).double().requires_grad_(True),
+        "b": weights(8, 8, 3).double().requires_grad_(True),
+    }
     bases = {"a": torch.linalg.qr(weights(16, 5).double())[0], "b": torch.linalg.qr(weights(8, 2, seed=1).double())[0]}
     terms = [((W - B @ (B.T @ W)) ** 2).sum() / (W.detach() ** 2).sum()
-             for W, B in zip(weights_of.values(), bases.values(), strict=True)]  # fmt: skip
+             for W, B in zip(given.values(), bases.values(), strict=True)]  # fmt: skip
     alphas = {"a": torch.tensor(2.0), "b": 0.5}
-    expected = torch.autograd.grad((2 * terms[0] + 0.5 * terms[1]) / 2, list(weights_of.values()))
-    found = torch.autograd.grad(basis_loss(weights_of, bases, alphas), list(weights_of.values()))
+    expected = torch.autograd.grad((2 * terms[0] + 0.5 * terms[1]) / 2, list(given.values()))
+    found = torch.autograd.grad(basis_loss(given, bases, alphas), list(given.values()))
     for mine, exact in zip(found, expected, strict=True):
         assert torch.allclose(mine, exact, rtol=1e-12, atol=1e-15)
 
