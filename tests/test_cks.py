@@ -223,7 +223,7 @@ def test_regulariser_has_finite_gradients_at_any_size(size):
 
 
 def test_the_gradient_of_the_regulariser_is_that_of_its_formula():
-    weights_of = {
+    given = {
         "a": weights(16, 24).double().requires_grad_(True),
         "b": weights(8, 8, 3).double().requires_grad_(True),
     }
