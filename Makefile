@@ -6,13 +6,13 @@ unexport PYTHONDONTWRITEBYTECODE
 
 CHEBSPLAT := .venv/bin/chebsplat
 CHOICE := $(if $(scene),--scene '$(scene)') $(if $(sequence),--sequence '$(sequence)') $(if $(set),--set '$(set)') \
-  $(if $(ablation),--ablation '$(ablation)')
+  $(if $(ablation),--ablation '$(ablation)') $(if $(basis),--basis '$(basis)')
 
 # `make scene=office0` needs no target: naming a scene, a sequence or a study means running it.
 .DEFAULT_GOAL := $(if $(study),study,$(if $(scene)$(sequence),run,help))
 .PHONY: help run study plan verify clean-stale setup test test-all stability bench-raster bench-train bench-descriptor bench-encoder bench-refresh bench-shapes bench-store nouns teacher teacher-quality lint lock
 
-run: $(READY)  ## make scene=NAME|FOLDER [stage=] [set=a.b=c,...] [ablation=] [cores=]; or sequence=NAME
+run: $(READY)  ## make scene=NAME|FOLDER [stage=] [set=a.b=c,...] [ablation=] [basis=NAME@REVISION] [cores=]; or sequence=NAME
 	@$(CHEBSPLAT) run $(CHOICE) $(if $(stage),--stage '$(stage)') $(if $(cores),--cores '$(cores)')
 
 study: $(READY)  ## make study=NAME [cores=] [threads=] [args=--no-run]: its runs, then table, figure, page in build/studies
