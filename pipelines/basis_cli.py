@@ -44,9 +44,10 @@ def log(name: str, out: Path | None) -> None:
     """Revisions: the scene, ranks, ρ before and after, energy; means over projections."""
 
     def action() -> int:
+        from chebsplat.formats.artifact import read_manifest
         from chebsplat.pipelines import lineage
 
-        _, one = found(name)
+        path, one = found(name)
         show_rows(lineage.log_table(one))
         if out is not None:
             out.mkdir(parents=True, exist_ok=True)
@@ -55,7 +56,7 @@ def log(name: str, out: Path | None) -> None:
                 writer = csv.DictWriter(handle, list(rows[0]))
                 writer.writeheader()
                 writer.writerows(rows)
-            lineage.draw(out / "lineage.png", one)
+            lineage.draw(out / "lineage.png", one, read_manifest(path).config["cks"]["max_rank"])
             print(f"{out}: lineage.csv, lineage.png", file=sys.stderr)
         return 0
 
@@ -94,6 +95,7 @@ def diff(first: str, second: str) -> None:
             own = [entry["scene"] for entry in which.lineage[count:]]
             print(f"{name} alone: {', '.join(own) or 'none'}")
         show_rows(lineage.diff_table(one, other))
+        print(f"weights: {lineage.change_of_weights(one, other)}")
         return 0
 
     guarded(action)
@@ -155,7 +157,7 @@ def extend(name: str, scene: str) -> None:
         gaussians = next((place.resolve() for place in places if is_published(place)), None)
         if gaussians is None:
             raise ConfigError(f"{scene} is no trained scene in {store.work()}, and no folder of one; run it first")
-        made = bases.extend(name, gaussians, Path(scene).name)
+        made = bases.extend(name, gaussians, Path(scene).name.partition("@")[0])
         print(f"{name}@{len(made)}", file=sys.stderr)
         print(made[-1])
         return 0

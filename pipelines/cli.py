@@ -90,7 +90,7 @@ OPTIONS = [
     click.option("--set", "settings", default="", help="section.key=value,..."),
     click.option("--ablation", default="", help="a named set of settings"),
     click.option(
-        "--basis", default="", help="knowledge to start from: NAME[@REVISION] of a sequence or HEAD, or FOLDER/"
+        "--basis", default="", help="start from this knowledge: NAME[@REVISION] of a sequence or HEAD, FOLDER/"
     ),
 ]
 

@@ -76,21 +76,21 @@ def common(a: Basis, b: Basis) -> int:
 
 
 def diff_table(a: Basis, b: Basis) -> Table:
-    """A row a projection: ranks, columns that are the same, how far each span lies outside the other, change of W.
+    """A row a projection: ranks, columns that are the same, how far each span lies outside the other.
 
     `outside` is the largest sine of an angle between a vector of the one span and the other span.
     """
-    table = [["projection", "r", "same columns", "first outside second", "second outside first", "change of W"]]
+    table = [["projection", "r", "same columns", "first outside second", "second outside first"]]
     for name in sorted(a.bases.keys() | b.bases.keys()):
         if name not in a.bases or name not in b.bases or len(a.bases[name]) != len(b.bases[name]):
-            table.append([name, "of one alone, or of another width", "", "", "", ""])
+            table.append([name, "of one alone, or of another width", "", "", ""])
             continue
         one, other = (basis.bases[name].astype(np.float64) for basis in (a, b))
         low = min(one.shape[1], other.shape[1])
         same = np.append((one[:, :low] == other[:, :low]).all(0), False).argmin()
         sines = [_outside(one, other), _outside(other, one)]
-        table.append([name, f"{one.shape[1]} → {other.shape[1]}", f"1-{same}" if same else "none",
-                      *(f"{sine:.3f}" for sine in sines), _change(a, b, name)])  # fmt: skip
+        ranks = f"{one.shape[1]} → {other.shape[1]}"
+        table.append([name, ranks, f"1-{same}" if same else "none", *(f"{sine:.3f}" for sine in sines)])
     return table
 
 
@@ -99,12 +99,14 @@ def _outside(inner: np.ndarray, outer: np.ndarray) -> float:
     return float(np.linalg.norm(rest, 2)) if rest.size else 0.0
 
 
-def _change(a: Basis, b: Basis, name: str) -> str:
-    """Relative Frobenius distance of the stored projections."""
-    first, second = (basis.weights.get(f"{name}.weight") for basis in (a, b))
-    if first is None or second is None or first.shape != second.shape:
-        return "-"
-    return f"{np.linalg.norm(second - first) / max(np.linalg.norm(first), 1e-30):.3f}"
+def change_of_weights(a: Basis, b: Basis) -> str:
+    """How far the stored encoders lie apart, relative to the first one's norm."""
+    shared = [name for name in a.weights if name in b.weights and a.weights[name].shape == b.weights[name].shape]
+    if not shared:
+        return "none in common"
+    first, second = (np.concatenate([basis.weights[name].ravel() for name in shared]) for basis in (a, b))
+    change = np.linalg.norm(second - first) / max(np.linalg.norm(first), 1e-30)
+    return f"{len(shared)} arrays of {len(a.weights)} and {len(b.weights)} in common, relative change {change:.3f}"
 
 
 def verify(path: Path | None, earlier: Path | None) -> str:
@@ -134,8 +136,8 @@ def verify(path: Path | None, earlier: Path | None) -> str:
     return said + f", continues revision {before.revision}"
 
 
-def draw(path: Path, basis: Basis) -> None:
-    """Rank and residual over revisions, as PNG: a thin line a projection, the mean bold."""
+def draw(path: Path, basis: Basis, max_rank: float) -> None:
+    """Rank and residual over revisions, as PNG: a thin line a projection, the mean bold; max_rank: as a share of q."""
     import matplotlib
 
     matplotlib.use("Agg")
@@ -152,7 +154,7 @@ def draw(path: Path, basis: Basis) -> None:
     left.plot(x, rank.mean(1), color="C0", linewidth=2, marker="o", label="rank r: mean, and each projection")
     left.bar(x, values("added").mean(1), color="C1", alpha=0.6, label="columns added, mean")
     for width in widths:
-        left.axhline(width, color="0.4", linestyle="--", linewidth=0.8, label=f"q = {width}")
+        left.axhline(int(max_rank * width), color="C0", linestyle="--", linewidth=0.8, label=f"ceiling, of q = {width}")
     left.set_title("rank", fontsize=10)
     for key, color, label in (("rho", "C3", "before the update"), ("rho_after", "C2", "after it")):
         right.plot(x, values(key), color=color, linewidth=0.6, alpha=0.4)

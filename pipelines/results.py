@@ -42,7 +42,7 @@ FIGURES = (
     Figure("train_seconds", "training, s", 1, 1, True),
 )
 OTHERS = ("miou_teacher", "held_in_psnr", "steps", "threads", "device", "train_key", "evaluate_key")
-IDENTITY = ("condition", "variant", "budget", "sequence", "place", "scene", "seed", "state")
+IDENTITY = ("condition", "variant", "budget", "sequence", "place", "visit", "scene", "seed", "state")
 COLUMNS = (*IDENTITY, *(figure.key for figure in FIGURES), *OTHERS)
 
 
@@ -120,14 +120,19 @@ def groups(rows: list[Row], *names: str) -> dict[tuple, list[Row]]:
     return found
 
 
+def counted(rows: list[Row]) -> list[Row]:
+    """Without the first scene of a sequence, which has no earlier knowledge, and scenes that come again, which know
+    themselves."""
+    return [row for row in rows if row["place"] != 1 and row["visit"] == 1]
+
+
 def compare(rows: list[Row], baseline: str) -> list[Line]:
     """Mean ± spread over scenes and seeds, and paired differences against the baseline.
 
-    Choices: the first scene of a sequence has no earlier knowledge: it counts in no mean, though its row is written.
+    Choices: of a sequence only those rows that are `counted`; every row is written.
       A pair needs both runs: what failed on either side drops out of the difference, and the line counts its runs.
     """
-    counted = [row for row in rows if row["place"] != 1]
-    by_line = groups(counted, "condition", "budget", "variant")
+    by_line = groups(counted(rows), "condition", "budget", "variant")
     lines = []
     for (condition, budget, variant), members in by_line.items():
         done = [row for row in members if row["state"] == "done"]

@@ -10,7 +10,7 @@ from typing import Any
 
 from chebsplat.formats import artifact
 from chebsplat.pipelines import study_figures
-from chebsplat.pipelines.results import COLUMNS, FIGURES, Figure, Line, Row, compare, groups, traces
+from chebsplat.pipelines.results import COLUMNS, FIGURES, Figure, Line, Row, compare, counted, groups, traces
 from chebsplat.pipelines.study import Run, Study
 from chebsplat.statistics import Difference, Summary, summarize
 
@@ -103,7 +103,7 @@ def table_row(line: Line, lines: list[Line]) -> list[tuple[str, str, bool]]:
 
 def scene_table(rows: list[Row]) -> list[list[str]]:
     """Header and rows: each scene apart, mean ± spread over seeds (and, in sequences, over orders)."""
-    done = [row for row in rows if row["state"] == "done" and row["place"] != 1]
+    done = [row for row in counted(rows) if row["state"] == "done"]
     figures = [
         figure for figure in FIGURES if figure.key in BY_SCENE and any(row[figure.key] is not None for row in done)
     ]
