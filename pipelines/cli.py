@@ -149,7 +149,7 @@ def study(name: str, cores: int, threads: int, out: Path | None, only_plan: bool
     """Run a study (of pipelines/configs/studies, or a .toml): its table, figure and page; goes on where it stopped."""
 
     def action() -> int:
-        from chebsplat.pipelines import results, study_page
+        from chebsplat.pipelines import results, study_page, transfer
         from chebsplat.pipelines import study as studies
         from chebsplat.pipelines.run import Outcome, say
 
@@ -164,7 +164,8 @@ def study(name: str, cores: int, threads: int, out: Path | None, only_plan: bool
         outcome = Outcome() if no_run else studies.execute(Path(name).stem, runs, cores, used)
         rows = [results.row_of(run, outcome.failed) for run in runs]
         command = f"make study={name} cores={cores} threads={used}"
-        print(study_page.write(folder, asked, runs, rows, command).absolute())
+        more = transfer.sections(folder, asked, rows) if asked.sequences else []
+        print(study_page.write(folder, asked, runs, rows, command, more).absolute())
         return outcome.code
 
     guarded(action)

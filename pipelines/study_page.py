@@ -5,8 +5,9 @@ from __future__ import annotations
 import base64
 import csv
 import math
+from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from chebsplat.formats import artifact
 from chebsplat.pipelines import study_figures
@@ -14,13 +15,21 @@ from chebsplat.pipelines.results import COLUMNS, FIGURES, Figure, Line, Row, com
 from chebsplat.pipelines.study import Run, Study
 from chebsplat.statistics import Difference, Summary, summarize
 
+if TYPE_CHECKING:
+    from chebsplat.pipelines.transfer import Section
+
 PICTURE = "error-against-time.png"
 STABILITY = Path("build/bench/stability.csv")  # of `make stability`
 BY_SCENE = ("miou", "miou_gain", "psnr", "n_gaussians", "train_seconds")
 
 
-def write(out: Path, study: Study, runs: list[Run], rows: list[Row], command: str) -> Path:
-    """Fill `out`; returns the page. Runs that failed or have not run are named, and count in no mean."""
+def write(
+    out: Path, study: Study, runs: list[Run], rows: list[Row], command: str, more: Sequence[Section] = ()
+) -> Path:
+    """Fill `out`; returns the page. Runs that failed or have not run are named, and count in no mean.
+
+    Args: more: further sections, whose pictures lie in `out` already.
+    """
     out.mkdir(parents=True, exist_ok=True)
     with (out / "results.csv").open("w", newline="") as handle:
         writer = csv.DictWriter(handle, COLUMNS)
@@ -39,6 +48,7 @@ def write(out: Path, study: Study, runs: list[Run], rows: list[Row], command: st
         "missing": missing(rows),
         "note": note(study, rows),
         "stability": stability(STABILITY),
+        "more": more,
     }
     (out / "results.md").write_text(markdown(parts))
     import jinja2
@@ -46,9 +56,12 @@ def write(out: Path, study: Study, runs: list[Run], rows: list[Row], command: st
     from chebsplat.pipelines.study_template import PAGE
     from chebsplat.stages.page import STYLE
 
-    picture = "data:image/png;base64," + base64.b64encode((out / PICTURE).read_bytes()).decode()
+    pictures = {
+        name: "data:image/png;base64," + base64.b64encode((out / name).read_bytes()).decode()
+        for name in (PICTURE, *(section.picture for section in more if section.picture))
+    }
     page = jinja2.Environment(autoescape=True, undefined=jinja2.StrictUndefined).from_string(PAGE)
-    (out / "study.html").write_text(page.render(style=STYLE, picture=picture, **parts))
+    (out / "study.html").write_text(page.render(style=STYLE, picture=pictures[PICTURE], pictures=pictures, **parts))
     return out / "study.html"
 
 
@@ -201,8 +214,12 @@ def markdown(parts: dict[str, Any]) -> str:
     text = [f"## {study.title}", "", study.about, "", *(f"- {what}: {value}" for what, value in parts["facts"])]
     text += ["", f"![error against run time]({PICTURE})", "", parts["note"], ""]
     rows = [[f"{a}<br>{f'**{b}**' if bold else b}" if b else a for a, b, bold in row] for _, row in parts["table"]]
-    for heading, table in (("", [parts["header"], *rows]), ("### Each scene", parts["scenes"])):
+    tables = [("", "", "", [parts["header"], *rows])]
+    tables += [(f"### {s.heading}", s.note, s.picture, s.table) for s in parts["more"]]
+    for heading, note, picture, table in (*tables, ("### Each scene", "", "", parts["scenes"])):
         text += [heading, ""] if heading else []
+        text += [note, ""] if note else []
+        text += [f"![{heading.strip('# ')}]({picture})", ""] if picture else []
         text += ["| " + " | ".join(row) + " |" for row in table[:1]]
         text += ["|" + "---|" * len(table[0])]
         text += ["| " + " | ".join(row) + " |" for row in table[1:]] + [""]
