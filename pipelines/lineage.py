@@ -105,7 +105,7 @@ def change_of_weights(a: Basis, b: Basis) -> str:
     if not shared:
         return "none in common"
     first, second = (np.concatenate([basis.weights[name].ravel() for name in shared]) for basis in (a, b))
-    change = np.linalg.norm(second - first) / max(np.linalg.norm(first), 1e-30)
+    change = float(np.linalg.norm(second - first)) / max(float(np.linalg.norm(first)), 1e-30)
     return f"{len(shared)} arrays of {len(a.weights)} and {len(b.weights)} in common, relative change {change:.3f}"
 
 

@@ -123,10 +123,11 @@ def reach_table(study: Study, condition: str, curves: dict[str, dict[tuple, dict
                 cells.append(reach(mean_curve(mine, x, "miou"), target).share(whole))
             cells += runs_that_reach(mine, base, last)
             scenes = [place[2] for place in mine]  # orders and seeds of one scene are not independent
-            ends = {key: [[of[p][last][key] for p in mine] for of in (mine, base)] for key in ("miou", "psnr")}
-            cells.append(difference_text(paired_difference(*ends["miou"], scenes), SHOWN["miou"]))
-            cells.append(worst_scene(list(mine), *ends["miou"]))
-            cells.append(difference_text(paired_difference(*ends["psnr"], scenes), SHOWN["psnr"]))
+            for key in ("miou", "psnr"):
+                values, others = ([of[p][last][key] for p in mine] for of in (mine, base))
+                cells.append(difference_text(paired_difference(values, others, scenes), SHOWN[key]))
+                if key == "miou":
+                    cells.append(worst_scene(scenes, values, others))
             table.append([condition, *cells] if condition else cells)
     return table
 
@@ -145,11 +146,11 @@ def runs_that_reach(mine: dict[tuple, dict[str, Row]], base: dict[tuple, dict[st
     ]
 
 
-def worst_scene(places: list[tuple], mine: list[float], base: list[float]) -> str:
+def worst_scene(scenes: list[str], mine: list[float], base: list[float]) -> str:
     """The lowest mean difference of any scene, over orders and seeds, in points, and which scene it is."""
     by_scene: dict[str, list[float]] = {}
-    for place, a, b in zip(places, mine, base, strict=True):
-        by_scene.setdefault(place[2], []).append(100 * (a - b))
+    for scene, a, b in zip(scenes, mine, base, strict=True):
+        by_scene.setdefault(scene, []).append(100 * (a - b))
     scene = min(by_scene, key=lambda name: float(np.mean(by_scene[name])))
     return f"{np.mean(by_scene[scene]):+.1f} {scene}"
 
