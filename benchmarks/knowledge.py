@@ -1,8 +1,8 @@
 """What the knowledge space costs a training: its regulariser in every step, its update after the last one.
 
 Usage: python benchmarks/knowledge.py --work work/office0 [--steps 200] [--out build/bench]
-The folder holds the links `ingest`, `sfm` and `teacher`, from `make scene=office0 stage=...`. Steps with the regulariser
-and without take turns in one training at full resolution, so that other load on the machine meets both alike.
+The folder holds the links `ingest`, `sfm` and `teacher`, from `make scene=office0 stage=...`. Steps with and without
+the regulariser take turns in one training at full resolution, so that other load on the machine meets both alike.
 """
 
 from __future__ import annotations
@@ -54,10 +54,8 @@ def main() -> None:
     parser.add_argument("--steps", type=int, default=200)
     parser.add_argument("--out", type=Path, default=Path("build/bench"))
     options = parser.parse_args()
-    threads, load = torch.get_num_threads(), os.getloadavg()[0]
-    print(
-        f"chebsplat {chebsplat.__version__}, {os.cpu_count()} cores, load {load:.1f}; torch {torch.__version__} on {threads} threads"
-    )
+    print(f"chebsplat {chebsplat.__version__}, torch {torch.__version__} on {torch.get_num_threads()} threads; "
+          f"{os.cpu_count()} cores, load {os.getloadavg()[0]:.1f}")  # fmt: skip
     trainer = trainer_of(options.work)
     assert trainer.model.shape is not None
     projections = trainer.model.shape.encoder.projections()
