@@ -145,13 +145,18 @@ def extend(name: str, gaussians: Path, scene: str) -> list[Path]:
     """
     if is_sequence(name) or not name or set(name) & set("/@"):
         raise ConfigError(f"a HEAD cannot be called {name!r}: a sequence is, or it holds a / or @")
+    from chebsplat.stages import config as configs
+
     manifest, planner = artifact.read_manifest(gaussians, STAGES["train"].schema), Planner()
+    config = configs.build({"scene": {"name": scene}}, f"scene {scene}")
     folders: list[Path] = []
 
     def build(head: Path | None) -> Path | None:
         if head is not None and manifest.key in {entry["gaussians"] for entry in read_lineage(head)}:
             return None
-        step = planner.knowledge(gaussians, manifest.key, head, scene)
+        earlier = {} if head is None else {"basis": head}
+        keys = {"gaussians": manifest.key} | {role: path.name for role, path in earlier.items()}
+        step = planner.step(STAGES["cks"], config, {"gaussians": gaussians} | earlier, keys)
         plan = write_plan([entry(step, git_state(HERE)) | {"threads": 1}])
         folders.append(plan.parent)  # until the revision is linked, its plan keeps `clean-stale` from it
         with redirect_stdout(io.StringIO()):

@@ -204,19 +204,10 @@ class Planner:
             if basis is not None and "basis" not in left_out and stage.name in ("train", "cks"):
                 inputs["basis"] = basis
             keys = {role: path.name for role, path in inputs.items()}
-            steps[stage.name] = self._step(stage, config, inputs, keys, raw.get(stage.name))
+            steps[stage.name] = self.step(stage, config, inputs, keys, raw.get(stage.name))
         return Plan(title, source_sentence(name, asked, source), list(steps.values()), left_out)
 
-    def knowledge(self, gaussians: Path, key: str, basis: Path | None, scene: str) -> Step:
-        """The step that adds a trained scene, whose checkpoint has this key, to a basis."""
-        from chebsplat.stages import config as configs
-
-        config = configs.build({"scene": {"name": scene}}, f"scene {scene}")
-        earlier = {} if basis is None else {"basis": basis}
-        keys = {"gaussians": key} | {role: path.name for role, path in earlier.items()}
-        return self._step(STAGES["cks"], config, {"gaussians": gaussians} | earlier, keys)
-
-    def _step(
+    def step(
         self, stage: Stage, config: Any, inputs: dict[str, Path], keys: dict[str, str], raw: str | None = None
     ) -> Step:
         """A stage's step; keys: of its inputs, by role."""
