@@ -158,6 +158,16 @@ def test_what_is_exported_starts_scenes_elsewhere(chain, tmp_path, monkeypatch):
     assert read_basis(train.inputs["basis"]).lineage == read_basis(chain[1]).lineage
 
 
+@pytest.mark.parametrize(("asked", "number"), [("shared@2", 2), ("shared", 3)])
+def test_a_scene_starts_from_the_revision_of_a_head_that_is_named_or_the_newest(chain, asked, number):
+    from chebsplat.pipelines.cli import plans
+
+    (plan,) = plans(scene="toy", sequence=None, settings="", ablation="", basis=asked)
+    assert plan.title == f"toy@basis=shared@{number}"
+    assert {step.stage for step in plan.steps if "basis" in step.inputs} == {"train"}
+    assert next(step for step in plan.steps if step.stage == "train").inputs["basis"] == chain[number - 1]
+
+
 def test_a_sequence_that_is_not_made_yet_says_how_to_make_it():
     code, _, said = call("log", "toys")
     assert code == 2
