@@ -152,14 +152,13 @@ def compare(rows: list[Row], baseline: str) -> list[Line]:
 
 
 def _pairs(done: list[Row], against: list[Row], key: str) -> list[tuple[str, float, float]]:
-    """(scene, value, the baseline's) of the same scene, seed and place in a sequence."""
+    """(scene, value, the baseline's) of the same scene, seed and place in a sequence.
+
+    Choices: a scene in several sequences is one unit: its baseline is the same run in all of them.
+    """
 
     def place(row: Row) -> tuple:
         return row["sequence"], row["place"], row["scene"], row["seed"]
 
     other = {place(row): row[key] for row in against if row[key] is not None}
-    return [
-        (f"{row['sequence']}/{row['scene']}", row[key], other[place(row)])
-        for row in done
-        if row[key] is not None and place(row) in other
-    ]
+    return [(row["scene"], row[key], other[place(row)]) for row in done if row[key] is not None and place(row) in other]

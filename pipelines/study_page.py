@@ -163,7 +163,9 @@ def note(study: Study, rows: list[Row]) -> str:
     n_scenes = len({row["scene"] for row in rows})
     unit = f"Student's over the {n_scenes} scenes" if n_scenes > 1 else "Student's over the seeds of the one scene"
     first = (
-        " The first scene of a sequence, which has no earlier knowledge, counts in no mean." if study.sequences else ""
+        " Of a sequence neither the first scene, which has no earlier knowledge, nor one that comes again is counted."
+        if study.sequences
+        else ""
     )
     return (
         f"Mean ± standard deviation over scenes and seeds, on held-out test views. Below it: the mean difference "
