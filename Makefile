@@ -10,7 +10,7 @@ CHOICE := $(if $(scene),--scene '$(scene)') $(if $(sequence),--sequence '$(seque
 
 # `make scene=office0` needs no target: naming a scene, a sequence or a study means running it.
 .DEFAULT_GOAL := $(if $(study),study,$(if $(scene)$(sequence),run,help))
-.PHONY: help run study plan verify clean-stale setup test test-all stability bench-raster bench-train bench-descriptor bench-encoder bench-refresh bench-knowledge bench-shapes bench-store nouns teacher teacher-quality lint lock
+.PHONY: help run study plan verify clean-stale setup test test-all stability bench-raster bench-train bench-descriptor bench-encoder bench-layouts bench-refresh bench-knowledge bench-shapes bench-store nouns teacher teacher-quality lint lock
 
 run: $(READY)  ## make scene=NAME|FOLDER [stage=] [set=a.b=c,...] [ablation=] [basis=NAME@REVISION] [cores=]; or sequence=NAME
 	@$(CHEBSPLAT) run $(CHOICE) $(if $(stage),--stage '$(stage)') $(if $(cores),--cores '$(cores)')
@@ -67,6 +67,10 @@ bench-descriptor: $(READY)  ## routes to the descriptor: error over time, bars, 
 bench-encoder: $(READY)  ## office0's region encoder: error against run time of torch, onnxruntime and its 8-bit variant
 	@$(CHEBSPLAT) run --scene office0 --stage export && $(CHEBSPLAT) run --scene office0 --stage onnx
 	@$(PY) benchmarks/encoder.py --work work/office0 $(args)
+
+bench-layouts: $(READY)  ## office0's exported layouts: bytes, and error beside the checkpoint; build/bench/layouts.csv
+	@$(CHEBSPLAT) run --scene office0 --stage export
+	@$(PY) benchmarks/layouts.py --work work/office0 $(args)
 
 bench-refresh: $(READY)  ## cost of refreshing in training, and staleness (args="--capture DIR --points DIR --features DIR")
 	@$(PY) benchmarks/refresh.py $(args)

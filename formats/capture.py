@@ -18,6 +18,8 @@ SCHEMA = "chebsplat.capture/1"
 OPTIONAL = {
     "depth": ("float32", ("view", "row", "column"), "scene units, z-depth, nan where unknown"),
     "labels": ("int16", ("view", "row", "column"), "class index, -1 ignored"),
+    "pseudo_labels": ("int16", ("view", "row", "column"), "class index that a 2D network gave, -1 none"),
+    "confidence": ("float16", ("view", "row", "column"), "of the pseudo labels, 0 to 1"),
     "loss_mask": ("bool", ("view", "row", "column"), "true where a pixel counts"),
 }
 Stack = np.ndarray | StoredArray
@@ -32,7 +34,7 @@ class Capture:
     Ks:             f64 [V, 3, 3] pixels, pixel centres at half integers (COLMAP).
     cam_from_world: f64 [V, 4, 4] OpenCV axes, or None where poses are unknown.
     is_test:        bool [V]; test views are never trained on.
-    depth, labels, loss_mask: as in OPTIONAL, or None. class_names[labels] names a pixel.
+    depth, labels, pseudo_labels, confidence, loss_mask: as in OPTIONAL, or None. class_names[labels] names a pixel.
     points:         f32 [N, 3] in the world, where the source has its own, with point_colors u8 [N, 3] or None.
     source:         which source, and notes about what was dropped or changed; protocol: name and parameters.
     """
@@ -50,6 +52,8 @@ class Capture:
     protocol: dict[str, Any] = field(default_factory=dict)
     points: np.ndarray | None = None
     point_colors: np.ndarray | None = None
+    pseudo_labels: Stack | None = None
+    confidence: Stack | None = None
 
     @property
     def size(self) -> tuple[int, int]:
@@ -127,7 +131,7 @@ def _check(capture: Capture, where: str) -> None:
         data = getattr(capture, name)
         if data is not None and tuple(data.shape) != tuple(capture.images.shape[:3]):
             raise InputError(f"{where}: {name} is {data.shape}, images are {capture.images.shape}")
-    if capture.labels is not None and not capture.class_names:
+    if (capture.labels is not None or capture.pseudo_labels is not None) and not capture.class_names:
         raise InputError(f"{where}: labels without class names; name them in scene.json or labels.json")
     if capture.cam_from_world is not None:
         rotations = capture.cam_from_world[:, :3, :3]

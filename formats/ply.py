@@ -61,6 +61,8 @@ def read_ply(path: Path) -> tuple[dict[str, np.ndarray], int, np.ndarray | None]
     """Raw parameters, file degree, and labels where the file has them. Normals and tags are optional.
 
     Raises: InputError naming the file: not a PLY, truncated, not a 3DGS layout, or non-finite values.
+    Choices: an infinite logit, which converters write for 8-bit opacities of exactly 0 or 1, becomes ±20: the same
+      opacity in float32.
     """
     from plyfile import PlyData, PlyParseError
 
@@ -87,11 +89,13 @@ def read_ply(path: Path) -> tuple[dict[str, np.ndarray], int, np.ndarray | None]
     rest = block([f"f_rest_{i}" for i in range(n_rest)]) if n_rest else np.zeros((n, 0), np.float32)
     shN = np.zeros((n, 15, 3), np.float32)
     shN[:, : n_rest // 3] = rest.reshape(n, 3, n_rest // 3).transpose(0, 2, 1)
+    opacity = block(["opacity"])[:, 0]
+    opacity = np.where(np.isinf(opacity), np.copysign(np.float32(20), opacity), opacity)
     parameters = {
         "means": block(["x", "y", "z"]),
         "log_scales": block(_TAIL[1:4]),
         "quats": block(_TAIL[4:]),
-        "logit_opacities": block(["opacity"])[:, 0],
+        "logit_opacities": opacity,
         "sh0": block(_FIXED[6:])[:, None],
         "shN": shN,
     }

@@ -20,7 +20,9 @@ def teacher_kind(config: Any, probe: dict[str, bool]) -> tuple[str, str]:
         return "none", "train.semantics is false"
     if wanted == "labels" and not probe["labels"]:
         raise ConfigError("teacher.kind is labels, but the source has none; use teacher.kind=auto, or teacher.model")
-    if config.teacher.model and wanted in ("labels", "none"):
+    if wanted == "given" and not probe.get("pseudo_labels"):
+        raise ConfigError("teacher.kind is given, but the source brings no pseudo labels; use teacher.kind=auto")
+    if config.teacher.model and wanted in ("labels", "given", "none"):
         raise ConfigError(f"teacher.kind is {wanted}, so teacher.model would not be used; set teacher.kind=onnx too")
     if wanted == "none":
         return "none", "teacher.kind is none"

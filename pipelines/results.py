@@ -6,6 +6,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from chebsplat import protocols
 from chebsplat.formats import artifact
 from chebsplat.formats.documents import read_document
 from chebsplat.formats.gaussians import read_trace
@@ -32,6 +33,7 @@ FIGURES = (
     Figure("macc", "mAcc, %", 1, 100),
     Figure("oa", "OA, %", 1, 100),
     Figure("boundary_miou", "boundary mIoU, %", 1, 100),
+    Figure("point_miou", "mIoU of 3D points, %", 1, 100),
     Figure("psnr", "PSNR, dB", 2),
     Figure("ssim", "SSIM", 4),
     Figure("n_gaussians", "Gaussians", 0, 1, True),
@@ -41,17 +43,22 @@ FIGURES = (
     Figure("frames_per_second", "frames/s", 1, 1, True),
     Figure("train_seconds", "training, s", 1, 1, True),
 )
-OTHERS = ("miou_teacher", "held_in_psnr", "steps", "threads", "device", "train_key", "evaluate_key")
+OTHERS = ("miou_teacher", "protocol", "held_in_psnr", "steps", "threads", "device", "train_key", "evaluate_key")
 IDENTITY = ("condition", "variant", "budget", "sequence", "place", "visit", "scene", "seed", "state")
+POOLED = ("miou", "miou_gain", "macc", "oa")  # what a protocol may work out over all scenes together
 COLUMNS = (*IDENTITY, *(figure.key for figure in FIGURES), *OTHERS)
 
 
 def row_of(run: Run, failed: dict[str, tuple[int, str, Path]]) -> Row:
     """One run's figures; None where a thing was not measured. `state` is `done`, or why there are none.
 
+    Beside the COLUMNS it holds `segmentation`, all that the protocol says of the scene and of its teacher, and
+    `left_out`.
+
     Args: failed: of `Outcome`. Raises: InputError naming a damaged artifact.
     """
     row: Row = dict.fromkeys(COLUMNS) | {name: getattr(run, name) for name in IDENTITY[:-1]}
+    row |= {"protocol": run.protocol, "segmentation": {}, "left_out": {}}
     targets = run.plan.targets
     row |= {"train_key": targets["train"].name, "evaluate_key": targets["evaluate"].name}
     if not targets["evaluate"].joinpath("artifact.json").is_file():
@@ -65,15 +72,13 @@ def row_of(run: Run, failed: dict[str, tuple[int, str, Path]]) -> Row:
     summary = read_document(targets["export"], scene, "summary.json")
     trace = read_trace(targets["train"], train)
     segmentation = figures.get("segmentation") or {}
-    for key in ("miou", "macc", "oa", "boundary_miou"):
-        row[key] = segmentation.get("scene", {}).get(key)  # a protocol measures some of them
-    if row["miou"] is not None and segmentation.get("teacher", {}).get("miou") is not None:
-        row["miou_teacher"] = segmentation["teacher"]["miou"]
-        row["miou_gain"] = row["miou"] - row["miou_teacher"]
+    row |= segmented(segmentation.get("scene", {}), segmentation.get("teacher", {}))
     counts = summary["by_degree"]
     kept = sum(n * (degree + 1) ** 2 for degree, n in enumerate(counts))
     return row | {
         "state": "done",
+        "segmentation": segmentation,
+        "left_out": figures["left_out"],
         "psnr": figures["image"]["psnr"],
         "ssim": figures["image"]["ssim"],
         "n_gaussians": figures["n_gaussians"],
@@ -87,6 +92,31 @@ def row_of(run: Run, failed: dict[str, tuple[int, str, Path]]) -> Row:
         "threads": train.threads,
         "device": train.device,
     }
+
+
+def segmented(scene: dict[str, Any], teacher: dict[str, Any]) -> Row:
+    """The columns that figures of a scene and of its teacher fill; a protocol measures some of them."""
+    row: Row = {key: scene.get(key) for key in ("miou", "macc", "oa", "boundary_miou", "point_miou")}
+    if row["miou"] is not None and teacher.get("miou") is not None:
+        row |= {"miou_teacher": teacher["miou"], "miou_gain": row["miou"] - teacher["miou"]}
+    return row
+
+
+def over_scenes(rows: list[Row]) -> list[Row]:
+    """One row a seed (and sequence), its POOLED figures those of all its scenes together as the protocol has it.
+
+    Args: rows: finished ones of one protocol. The rows themselves, where it has no rule for several scenes.
+    """
+    rule = getattr(protocols.ALL[rows[0]["protocol"]], "over_scenes", None) if rows else None
+    if rule is None:
+        return rows
+    found = []
+    for members in groups([row for row in rows if row["segmentation"]], "sequence", "seed").values():
+        sides = [[row["segmentation"].get(side) for row in members] for side in ("scene", "teacher")]
+        scene, teacher = ({} if None in of_side else rule(of_side) for of_side in sides)
+        name = "+".join(sorted(row["scene"] for row in members))
+        found.append(dict.fromkeys(POOLED) | members[0] | {"scene": name, "place": 0} | segmented(scene, teacher))
+    return found
 
 
 def traces(runs: list[Run], rows: list[Row]) -> list[tuple[Row, list[dict[str, float]]]]:
@@ -131,21 +161,24 @@ def compare(rows: list[Row], baseline: str) -> list[Line]:
 
     Choices: of a sequence only those rows that are `counted`; every row is written.
       A pair needs both runs: what failed on either side drops out of the difference, and the line counts its runs.
+      Where a protocol works out a figure over all scenes together, that of a seed is one value, and needs all of them.
     """
     by_line = groups(counted(rows), "condition", "budget", "variant")
     lines = []
     for (condition, budget, variant), members in by_line.items():
         done = [row for row in members if row["state"] == "done"]
-        against = by_line.get((condition, budget, baseline), [])
+        against = [row for row in by_line.get((condition, budget, baseline), []) if row["state"] == "done"]
+        together = over_scenes(done), over_scenes(against)
         summaries, differences = {}, {}
         for figure in FIGURES:
-            values = [row[figure.key] for row in done if row[figure.key] is not None]
+            mine, theirs = together if figure.key in POOLED else (done, against)
+            values = [row[figure.key] for row in mine if row[figure.key] is not None]
             if values:
                 summaries[figure.key] = summarize(values)
-            pairs = _pairs(done, against, figure.key) if variant != baseline else []
+            pairs = _pairs(mine, theirs, figure.key) if variant != baseline else []
             if pairs:
-                scenes, mine, other = zip(*pairs, strict=True)
-                found = paired_difference(mine, other, list(scenes), figure.ratio)
+                scenes, own, other = zip(*pairs, strict=True)
+                found = paired_difference(own, other, list(scenes), figure.ratio)
                 differences[figure.key] = found
         lines.append(Line(condition, budget, variant, len(done), len(members), summaries, differences))
     return lines

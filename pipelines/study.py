@@ -81,6 +81,10 @@ class Run:
         return wanted_steps(self.plan, LAST)
 
     @property
+    def protocol(self) -> str:
+        return next(step.sections["ingest"]["protocol"] for step in self.plan.steps if step.stage == "ingest")
+
+    @property
     def name(self) -> str:
         """For its link, and for people."""
         parts = (self.condition, self.variant, self.budget, self.sequence, self.place or "", self.scene)
@@ -119,6 +123,7 @@ def expand(study: Study) -> list[Run]:
     """Every run, planned; scenes vary slowest and variants fastest, so that a study cut short has compared something.
 
     Raises: ConfigError, InputError.
+    Choices: all runs of a condition are measured under one protocol, since figures of two must not meet in a mean.
     """
     planner = Planner()
     chains = [("", [scene]) for scene in study.scenes]
@@ -134,6 +139,10 @@ def expand(study: Study) -> list[Run]:
                 found += sorted(some, key=lambda run: (order.index(run.budget), run.place))
     finally:
         planner.save()
+    for condition in study.conditions:
+        used = sorted({run.protocol for run in found if run.condition == condition})
+        if len(used) > 1:
+            raise ConfigError(f"scenes measured as {' and as '.join(used)} do not compare; set ingest.protocol")
     return found
 
 

@@ -9,6 +9,8 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from chebsplat import protocols
+from chebsplat.errors import DataFailure
 from chebsplat.formats import artifact
 from chebsplat.pipelines import study_figures
 from chebsplat.pipelines.results import COLUMNS, FIGURES, Figure, Line, Row, compare, counted, groups, traces
@@ -32,7 +34,7 @@ def write(
     """
     out.mkdir(parents=True, exist_ok=True)
     with (out / "results.csv").open("w", newline="") as handle:
-        writer = csv.DictWriter(handle, COLUMNS)
+        writer = csv.DictWriter(handle, COLUMNS, extrasaction="ignore")
         writer.writeheader()
         writer.writerows(rows)
     settings = settings_of(study) if study.against else None
@@ -49,19 +51,22 @@ def write(
         "note": note(study, rows),
         "stability": stability(STABILITY),
         "more": more,
+        "left_out": left_out(rows),
     }
     (out / "results.md").write_text(markdown(parts))
-    import jinja2
-
+    from chebsplat.pipelines.study_pictures import gallery
     from chebsplat.pipelines.study_template import PAGE
-    from chebsplat.stages.page import STYLE
+    from chebsplat.stages.report import LARGEST
+    from chebsplat.stages.viewer import rendered
 
-    pictures = {
+    drawings = {
         name: "data:image/png;base64," + base64.b64encode((out / name).read_bytes()).decode()
         for name in (PICTURE, *(section.picture for section in more if section.picture))
     }
-    page = jinja2.Environment(autoescape=True, undefined=jinja2.StrictUndefined).from_string(PAGE)
-    (out / "study.html").write_text(page.render(style=STYLE, picture=pictures[PICTURE], pictures=pictures, **parts))
+    page = rendered(PAGE, picture=drawings[PICTURE], drawings=drawings, **parts, **gallery(study, runs, rows))
+    if len(page) > LARGEST:
+        raise DataFailure(f"the page would have {len(page) / 1e6:.0f} MB; name fewer scenes or variants in the study")
+    (out / "study.html").write_text(page)
     return out / "study.html"
 
 
@@ -141,6 +146,17 @@ def missing(rows: list[Row]) -> list[tuple[str, str]]:
     ]
 
 
+def left_out(rows: list[Row]) -> list[tuple[str, str, str]]:
+    """(what, why, by which variants) of all that finished runs left out."""
+    done = [row for row in rows if row["state"] == "done"]
+    every = list(dict.fromkeys(row["variant"] for row in done))
+    found: dict[tuple[str, str], dict[str, None]] = {}
+    for row in done:
+        for entry in row["left_out"].items():
+            found.setdefault(entry, {})[row["variant"]] = None
+    return sorted((*entry, "all" if len(by) == len(every) else ", ".join(by)) for entry, by in found.items())
+
+
 def stability(path: Path) -> list[tuple[str, int, int, float]]:
     """(part, cases, cases failed, largest error ÷ its tolerance) of the last `make stability`; none if it never ran."""
     if not path.is_file():
@@ -167,8 +183,10 @@ def note(study: Study, rows: list[Row]) -> str:
         if study.sequences
         else ""
     )
+    if any(hasattr(protocols.ALL[row["protocol"]], "over_scenes") for row in rows):
+        first += " mIoU, mAcc and OA are of all scenes of a seed together, as the protocol has it."
     return (
-        f"Mean ± standard deviation over scenes and seeds, on held-out test views. Below it: the mean difference "
+        f"Mean ± standard deviation over scenes and seeds, on the views of the protocol. Below it: the mean difference "
         f"(× ratio) from {study.baseline} of runs with the same scene, seed, condition and budget, with its "
         f"95 % interval ({unit}); bold where the interval excludes no effect.{first}"
     )  # fmt: skip
@@ -187,6 +205,7 @@ def facts(runs: list[Run], rows: list[Row], command: str) -> list[tuple[str, str
     }
     found = [
         ("command", command),
+        ("protocol", ", ".join(sorted({row["protocol"] for row in rows}))),
         ("runs", f"{len(done)} of {len(rows)} done; {len({m.key for m in manifests})} different trainings"),
         ("device", ", ".join(sorted({m.device for m in manifests})) + f" ({processor()})"),
         ("threads a run", ", ".join(map(str, threads))),
@@ -228,6 +247,9 @@ def markdown(parts: dict[str, Any]) -> str:
     if parts["stability"]:
         text += ["### Extreme cases (`make stability`)", "", "| part | cases | failed | largest error ÷ tolerance |"]
         text += ["|---|---|---|---|", *(f"| {m} | {n} | {bad} | {e:.2g} |" for m, n, bad, e in parts["stability"]), ""]
+    if parts["left_out"]:
+        text += ["### Left out, and why", ""]
+        text += [*(f"- {what}: {why} ({by})" for what, why, by in parts["left_out"]), ""]
     if parts["missing"]:
         text += ["### Runs without figures", "", *(f"- {run}: {why}" for run, why in parts["missing"]), ""]
     return "\n".join(text)

@@ -52,9 +52,10 @@ class SfmSection(_Section):
 
 
 class TeacherSection(_Section):
-    """`auto`: the ONNX model if one is given, otherwise the embedded teacher; `labels`: the noisy-labels teacher."""
+    """`auto`: the ONNX model if one is given, otherwise the embedded teacher; `labels`: the noisy-labels teacher;
+    `given`: pseudo labels with a confidence that the source brings (Panoptic Lifting's ScanNet)."""
 
-    kind: Literal["auto", "labels", "onnx", "none"] = "auto"
+    kind: Literal["auto", "labels", "given", "onnx", "none"] = "auto"
     downscale: int = Field(4, ge=1)  # pixels of a view that an entry of its map is wide; a coarser model's own
     n_channels: int = Field(13, ge=2)  # of class codes: of labels, and of a closed-set segmenter
     # an ONNX model (docs/teachers.md)

@@ -55,7 +55,9 @@ def run(job: Job) -> None:
         job.left_out("mIoU", "the capture has no labels to compare with")
         segmentation = {}
     else:
-        segmentation = protocol.measure(views, task(job, capture, scene))
+        segmentation = protocol.measure(views, task(job, capture, scene, renderer))
+        if "point_miou" in segmentation["scene"] and segmentation["scene"]["point_miou"] is None:
+            job.left_out("3D point mIoU", "the capture has no depth with poses")
     for _ in views:  # whatever the protocol did not look at
         pass
     pictures |= {name: np.stack(maps) for name, maps in shown.items()}
@@ -89,11 +91,29 @@ def camera(scene: Scene, index: int) -> View:
     return View(K, pose, cameras.width, cameras.height)
 
 
-def task(job: Job, capture: Capture, scene: Scene) -> Any:
+def placed(depth: np.ndarray, view: View) -> np.ndarray:
+    """Where in the world the pixels of a view lie, f64 [H, W, 3]; nan where its depth [H, W] is."""
+    import numpy as np
+
+    from chebsplat.cameras import unproject
+
+    pixels = np.indices(depth.shape).reshape(2, -1).T
+    K, pose = (matrix.double().numpy() for matrix in (view.K, view.viewmat))
+    return unproject(depth, K, pose, pixels).reshape(*depth.shape, 3)
+
+
+def task(job: Job, capture: Capture, scene: Scene, renderer: SceneRenderer) -> Any:
     from chebsplat.protocols.task import Task
+    from chebsplat.surface import features_at
+
+    def at(points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        parts = (renderer.means, renderer.quats, renderer.scales, renderer.opacities)
+        means, quats, scales, opacities = (part.double().numpy() for part in parts)
+        return features_at(points, means, quats, scales, opacities, scene.parameters["features"])
 
     assert scene.label_embeddings is not None and scene.label_names is not None
-    return Task(scene.label_names, scene.label_embeddings, capture.class_names or [], job.config.evaluate.boundary)
+    names, boundary = capture.class_names or [], job.config.evaluate.boundary
+    return Task(scene.label_names, scene.label_embeddings, names, boundary, at)
 
 
 def seen(
@@ -118,6 +138,9 @@ def seen(
         return translated(labels, scene.label_names, capture.class_names, -1)
 
     truths = None if capture.labels is None else Named(capture.names, capture.labels, "labels")
+    depths = None  # in the scene's units only where the scene was built on the capture's own poses
+    if capture.depth is not None and capture.cam_from_world is not None:
+        depths = Named(capture.names, capture.depth, "depth")
     teachers = told = None
     if "features" in job.inputs and scene.labels is not None:
         teacher = read_features(job.inputs["features"])
@@ -140,6 +163,8 @@ def seen(
             shown.setdefault("teacher", []).append(as_classes(view.teacher_labels))
         if truths is not None:
             view.truth = truths[name]
+            if depths is not None:
+                view.surface = placed(depths[name], cameras[name])
             shown.setdefault("labels", []).append(view.truth)
         yield view
 

@@ -15,6 +15,7 @@ CURVES = (
     (("loss_color", "loss_features"), "loss: colour, disagreement with the teacher"),
     (("n",), "Gaussians"),
 )
+NAMED = {"psnr": "PSNR", "loss_color": "colour", "loss_features": "features"}
 
 
 def palette(n: int) -> np.ndarray:
@@ -107,9 +108,7 @@ def curves(trace: list[dict[str, float]], test_psnr: float) -> list[str]:
             for color, column in zip(("#1f6feb", "#e36209"), columns, strict=False):
                 if any(row.get(column) for row in trace):
                     values = [row[column] or np.nan for row in trace]
-                    axis.plot(
-                        seconds, values, color=color, marker=".", markersize=4, label=column.removeprefix("loss_")
-                    )
+                    axis.plot(seconds, values, color=color, marker=".", markersize=4, label=NAMED.get(column))
             if columns == ("psnr",):
                 axis.plot(seconds[-1:], [test_psnr], "*", color="#e36209", markersize=11, label="test views")
             if columns != ("n",):

@@ -63,7 +63,7 @@ def understood(path: Path, text: str, phrases: list[str]) -> Query:
     from chebsplat.formats.features import read_features
 
     features = read_features(path)
-    if features.convention["kind"] == "labels" or features.convention.get("output") == "logits":
+    if features.convention["kind"] in ("labels", "given") or features.convention.get("output") == "logits":
         return among_labels(features, text, phrases)
     model = read_manifest(path).config["teacher"]["model"]
     try:

@@ -25,30 +25,26 @@ STAGE_OF = {
     "basis": "cks",
     "evaluation": "evaluate",
 }
-
-
-CAPTIONS = {
-    "truth": "photo",
-    "renders": "render",
-    "labels": "true labels",
-    "teacher": "2D teacher's labels",
-    "predicted": "scene's labels",
-    "error": "colour error",
-    "wrong": "wrong labels",
+BYTES = {
+    "unpruned_ply": "PLY with every SH band (unpruned)",
+    "ply": "scene.ply",
+    "split": "PLY split by SH degree",
+    "ragged": "ragged arrays",
+    "semantic": "semantic arrays",
 }
+FRAMES = {"color": "colour", "color_and_features": "colour and features"}
 
 
 def run(job: Job) -> None:
     import json
-
-    import jinja2
 
     from chebsplat.formats.artifact import read_manifest
     from chebsplat.formats.evaluation import read_evaluation
     from chebsplat.formats.gaussians import read_gaussians
     from chebsplat.stages import figures as draw
     from chebsplat.stages import report_parts as parts
-    from chebsplat.stages.page import PAGE, STYLE
+    from chebsplat.stages.page import PAGE
+    from chebsplat.stages.viewer import rendered
 
     evaluation = read_evaluation(job.inputs["evaluation"])
     gaussians = read_gaussians(job.inputs["gaussians"])
@@ -65,25 +61,24 @@ def run(job: Job) -> None:
     for manifest in manifests.values():
         versions |= manifest.versions
         settings |= manifest.config
-    rows = summary_rows(figures)
+    rows = summary_rows(figures, manifests["scene"].facts["by_degree"] if "scene" in manifests else None)
     write_table(job.out / "figures.csv", rows)
     write_table(job.out / "trace.csv", [list(gaussians.trace[0]), *(list(row.values()) for row in gaussians.trace)])
-    names = parts.label_names(job, figures)
+    names = parts.label_names(job.inputs, figures)
     colors = {name: "#" + bytes(color).hex() for name, color in zip(names, draw.palette(len(names)), strict=True)}
-    pictures, seen = parts.picture_rows(evaluation, names, job.config.report.n_pictures, job.out)
-    page = jinja2.Environment(autoescape=True, undefined=jinja2.StrictUndefined).from_string(PAGE)
-    text = page.render(
-        style=STYLE,
+    pictures, pixels = parts.picture_rows(evaluation, names, job.config.report.n_pictures, job.out)
+    text = rendered(
+        PAGE,
         name=figures["source"].get("name") or figures["source"].get("kind", "scene"),
         source=figures["source"],
         protocol=figures["protocol"],
         teacher=teacher_words(manifests["features"].facts) if "features" in manifests else None,
         rows=rows[1:],
         tiles=parts.tiles(figures, gaussians),
-        legend=[(name, colors[name]) for name in seen],
+        legend=parts.legend(pixels, names, colors),
         classes=parts.class_rows(figures, colors),
         pictures=pictures,
-        captions=CAPTIONS,
+        modes=parts.modes(pictures),
         curves=draw.curves(gaussians.trace, figures["image"]["psnr"]),
         stages=stages,
         total=sum(seconds for _, seconds, *_ in stages),
@@ -107,8 +102,11 @@ def teacher_words(facts: dict[str, Any]) -> tuple[str, str]:
     convention = facts["convention"]
     if facts["kind"] == "labels":
         return "noisy labels", f"the source's own with {convention['confusion']:.0%} of the segments confused"
-    views = f"{convention['n_scales']} scale(s){', flips' if convention['flips'] else ''}"
-    return convention["teacher"], f"ONNX {convention['output']} of {views}, {facts['n_labels']} labels"
+    if facts["kind"] == "given":
+        return "pseudo labels", f"the source's own with a confidence by pixel, {facts['n_labels']} labels"
+    scales = "one scale" if convention["n_scales"] == 1 else f"{convention['n_scales']} scales"
+    views = f"{scales}{' and flips' if convention['flips'] else ''}"
+    return convention["teacher"], f"ONNX {convention['output']} at {views}, {facts['n_labels']} labels"
 
 
 def absent_stages(job: Job, gaussians: Gaussians) -> dict[str, str]:
@@ -125,7 +123,7 @@ def absent_stages(job: Job, gaussians: Gaussians) -> dict[str, str]:
     return {f"stage {STAGE_OF[role]}": why or "its artifact was not given" for role, why in absent.items()}
 
 
-def summary_rows(figures: dict[str, Any]) -> list[list[str]]:
+def summary_rows(figures: dict[str, Any], by_degree: list[int] | None) -> list[list[str]]:
     """Header, then (figure, scene, teacher). What was not measured says so."""
 
     def shown(value: float | None, form: str) -> str:
@@ -139,19 +137,26 @@ def summary_rows(figures: dict[str, Any]) -> list[list[str]]:
         ["LPIPS (vgg, images in [0, 1])", shown(figures["lpips"], "{:.3f}"), ""],
     ]
     segmentation = figures.get("segmentation") or {}
-    names = {"miou": "mIoU", "macc": "mAcc", "oa": "OA", "boundary_miou": "mIoU in the boundary band"}
+    names = {"miou": "mIoU", "macc": "mAcc", "oa": "OA", "boundary_miou": "mIoU in the boundary band",
+             "point_miou": "mIoU of 3D points"}  # fmt: skip
     for key, name in names.items():
-        if segmentation:
+        if key in segmentation.get("scene", {}):
             teacher = segmentation.get("teacher")
             values = [segmentation["scene"][key], teacher[key] if teacher else None]
             rows.append([name, shown(values[0], "{:.1%}"), shown(values[1], "{:.1%}") if teacher else ""])
     rows.append(["Gaussians", f"{figures['n_gaussians']:,}", ""])
-    rows += [[f"bytes, {name}", f"{size:,}", ""] for name, size in figures["bytes"].items()]
-    rows += [[f"frames/s, {n.replace('_', ' ')}", f"{v:.1f}", ""] for n, v in figures["frames_per_second"].items()]
+    if by_degree is not None:
+        rows.append(["Gaussians of SH degree 0, 1, 2, 3", " / ".join(f"{n:,}" for n in by_degree), ""])
+    whole = figures["bytes"]["unpruned_ply"]
+    for name, size in figures["bytes"].items():
+        share = "" if name == "unpruned_ply" else f" ({size / whole:.0%} of unpruned)"
+        rows.append([f"bytes, {BYTES[name]}", f"{size:,}{share}", ""])
+    rows += [[f"frames/s, {FRAMES[name]}", f"{v:.1f}", ""] for name, v in figures["frames_per_second"].items()]
     split = figures["milliseconds"]
-    under = f"{split['width']}x{split['height']}, {split['threads']} threads, {split['device']}"
-    parts = ("projection", "sh", "sort", "blend")
-    rows += [[f"ms a frame, {part} ({under})", f"{split[part]:.2f}", ""] for part in parts]
+    threads = "one thread" if split["threads"] == 1 else f"{split['threads']} threads"
+    under = f"{split['width']}x{split['height']}, {threads}, {split['device']}"
+    parts = {"projection": "projection", "sh": "SH", "sort": "sort", "blend": "blend"}
+    rows += [[f"ms a frame, {name} ({under})", f"{split[part]:.2f}", ""] for part, name in parts.items()]
     return rows
 
 

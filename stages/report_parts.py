@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from typing import TYPE_CHECKING, Any
 
 from chebsplat.errors import InputError
@@ -9,21 +10,57 @@ from chebsplat.errors import InputError
 if TYPE_CHECKING:
     from pathlib import Path
 
+    import numpy as np
+
     from chebsplat.formats.evaluation import Evaluation
     from chebsplat.formats.gaussians import Gaussians
-    from chebsplat.stages.command import Job
 
 
-def label_names(job: Job, figures: dict[str, Any]) -> list[str]:
+IN_LEGEND = 30  # labels; an open vocabulary has hundreds
+CAPTIONS = {
+    "truth": "photo",
+    "renders": "render",
+    "labels": "true labels",
+    "teacher": "2D teacher's labels",
+    "predicted": "scene's labels",
+    "error": "colour error",
+    "wrong": "wrong labels",
+}
+
+
+def side(caption: str, base: str, over: str | None = None) -> dict[str, str | None]:
+    """One side of the slider: a picture and what lies over it, by their keys."""
+    return {"caption": caption, "base": base, "over": over}
+
+
+def modes(pictures: list[dict[str, Any]]) -> list[list[Any]]:
+    """What the slider of a scene's report can compare, of the pictures that there are."""
+    there = {key for key, _, _ in pictures[0]["images"]}
+    errors = side("colour error, 4 times", "error")
+    wrong = side("render, wrong labels in red", "renders", "wrong")
+    found: list[list[Any]] = [
+        ["photo | render", side("photo", "truth"), side("render", "renders")],
+        ["true labels | scene", side("true labels", "truth", "labels"), side("scene's labels", "renders", "predicted")],
+        [
+            "2D teacher | scene",
+            side("2D teacher's labels", "truth", "teacher"),
+            side("scene's labels", "renders", "predicted"),
+        ],
+        ["errors", errors, wrong if "wrong" in there else side("render", "renders")],
+    ]
+    return [mode for mode in found if {s[key] for s in mode[1:] for key in ("base", "over")} <= there | {None}]
+
+
+def label_names(inputs: dict[str, Path], figures: dict[str, Any]) -> list[str]:
     """Names of the labels in the pictures: the capture's classes, or the scene's own labels where it has none."""
     from chebsplat.formats.artifact import read_manifest
     from chebsplat.formats.capture import read_capture
     from chebsplat.formats.documents import read_document
 
-    classes = read_capture(job.inputs["capture"]).class_names if "capture" in job.inputs else None
+    classes = read_capture(inputs["capture"]).class_names if "capture" in inputs else None
     classes = classes or (figures.get("segmentation") or {}).get("classes")
-    if classes is None and "scene" in job.inputs:
-        path = job.inputs["scene"]
+    if classes is None and "scene" in inputs:
+        path = inputs["scene"]
         classes = list(read_document(path, read_manifest(path), "labels.json").values())
     return classes or []
 
@@ -40,7 +77,7 @@ def tiles(figures: dict[str, Any], gaussians: Gaussians) -> list[tuple[str, str,
         found.append((f"{segmentation['scene']['oa']:.1%}", "pixels right", "overall accuracy"))
     found.append((f"{figures['n_gaussians']:,}", "Gaussians", f"PLY {figures['bytes']['ply'] / 1e6:.1f} MB"))
     for name, value in list(figures["frames_per_second"].items())[:1]:
-        found.append((f"{value:.0f}", "frames a second", name.replace("_", " ")))
+        found.append((f"{value:.0f}", "frames a second", "colour alone" if name == "color" else "colour and features"))
     last = gaussians.trace[-1]
     return [*found, (f"{last['seconds']:.0f} s", "training", f"{last['step']:.0f} steps")]
 
@@ -56,10 +93,17 @@ def class_rows(figures: dict[str, Any], colors: dict[str, str]) -> list[tuple[st
     return sorted(rows, key=lambda row: -row[2])
 
 
+def legend(pixels: Counter[int], names: list[str], colors: dict[str, str]) -> list[tuple[str, str]]:
+    """(name, colour) of the labels that cover the most pixels, in their order, and how many more there are."""
+    kept = sorted(label for label, _ in pixels.most_common(IN_LEGEND))
+    more = len(pixels) - len(kept)
+    return [(names[k], colors[names[k]]) for k in kept] + ([(f"and {more} more", "transparent")] if more else [])
+
+
 def picture_rows(
     evaluation: Evaluation, names: list[str], count: int, out: Path
-) -> tuple[list[dict[str, Any]], list[str]]:
-    """Pictures of evenly spaced test views, and the names of the labels in them; a PNG of the first.
+) -> tuple[list[dict[str, Any]], Counter[int]]:
+    """Pictures (key, URI, caption) of evenly spaced views, and pixels of each label in them; a PNG of the first.
 
     Raises: InputError if a picture holds a label that has no name.
     """
@@ -69,20 +113,32 @@ def picture_rows(
 
     views, pictures = evaluation.figures["names"], evaluation.pictures
     per_view = evaluation.figures["image"]["per_view"]["psnr"]
-    rows, sheet, seen = [], [], {-1}
+    rows, sheet = [], []
+    pixels: Counter[int] = Counter()
     for k in np.unique(np.linspace(0, len(views) - 1, min(count, len(views))).round().astype(int)):
         truth, render = pictures["truth"][k], pictures["renders"][k]
         maps = {kind: pictures[kind][k] for kind in ("labels", "teacher", "predicted") if kind in pictures}
-        seen |= {int(value) for labels in maps.values() for value in np.unique(labels)}
-        if max(seen) >= len(names):
-            raise InputError(f"label {max(seen)} in the pictures has no name; pass --in-capture, or evaluate again")
+        for labels in maps.values():
+            pixels.update(counted(labels))
+        if max(pixels, default=-1) >= len(names):
+            raise InputError(f"label {max(pixels)} in the pictures has no name; pass --in-capture, or evaluate again")
         images = [("truth", draw.data_uri(truth, photo=True)), ("renders", draw.data_uri(render, photo=True))]
         images.append(("error", draw.data_uri(draw.error_map(render, truth), photo=True)))
         colored = {kind: draw.colored(labels, len(names)) for kind, labels in maps.items()}
         images += [(kind, draw.data_uri(image)) for kind, image in colored.items()]
         if {"labels", "predicted"} <= maps.keys():
             images.append(("wrong", draw.data_uri(draw.wrong_map(maps["predicted"], maps["labels"]))))
-        rows.append({"name": views[k], "psnr": per_view[k], "images": images})
+        captions = CAPTIONS | {"renders": f"render, {per_view[k]:.1f} dB"}
+        named = [(key, uri, captions[key]) for key, uri in images]
+        rows.append({"name": f"{views[k]}, {per_view[k]:.1f} dB", "images": named})
         sheet.append(np.concatenate([truth, render, *colored.values()], 1))
     draw.png(np.concatenate(sheet[:2], 0), out / "pictures.png")
-    return rows, [names[k] for k in sorted(seen - {-1})]
+    return rows, pixels
+
+
+def counted(labels: np.ndarray) -> dict[int, int]:
+    """Pixels of each label of a map; -1 is none."""
+    import numpy as np
+
+    found, counts = np.unique(labels[labels >= 0], return_counts=True)
+    return dict(zip(found.tolist(), counts.tolist(), strict=True))

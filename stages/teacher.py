@@ -24,9 +24,10 @@ def run(job: Job) -> None:
     settings, capture = job.config.teacher, read_capture(job.inputs["capture"])
     if settings.kind == "none":
         raise ConfigError("teacher.kind is none: this scene has no teacher; leave the stage out")
-    if settings.kind == "labels":
-        features = from_labels(job, capture, settings)
-        job.facts |= {"kind": "labels", "n_labels": len(features.label_names), "convention": features.convention}
+    if settings.kind in ("labels", "given"):
+        make = from_labels if settings.kind == "labels" else from_pseudo_labels
+        features = make(job, capture, settings)
+        job.facts |= {"kind": settings.kind, "n_labels": len(features.label_names), "convention": features.convention}
         write_features(job.out, features)
     else:
         from_encoder(job, capture, settings)
@@ -124,6 +125,26 @@ def from_labels(job: Job, capture: Capture, settings: TeacherSection) -> Feature
         mode="json", include={"downscale", "confusion", "blur", "noise", "seed", "n_channels"}
     )
     return Features(capture.names, features, capture.class_names, codes, pseudo, confidence, convention)
+
+
+def from_pseudo_labels(job: Job, capture: Capture, settings: TeacherSection) -> Features:
+    """What a 2D network took the views for, as the source brings it; a pixel weighs as much as it is sure."""
+    import numpy as np
+
+    from chebsplat.codes import class_codes
+    from chebsplat.formats.features import Features
+    from chebsplat.pseudo_labels import voted
+
+    if capture.pseudo_labels is None or capture.confidence is None or not capture.class_names:
+        raise DataFailure("the capture has no pseudo labels with confidences; use teacher.kind = auto")
+    codes = class_codes(capture.class_names, settings.n_channels)
+    views = []
+    for view, _ in job.progress.track(range(len(capture.names)), len(capture.names), "teacher"):
+        views.append(voted(capture.pseudo_labels[view], capture.confidence[view], codes, settings.downscale))
+    features, labels, confidence = (np.stack(parts) for parts in zip(*views, strict=True))
+    convention = {"kind": "given", "normalized": True, "n_scales": 1, "flips": False, "downscale": settings.downscale}
+    half = features.astype(np.float16), labels, confidence.astype(np.float16)
+    return Features(capture.names, half[0], capture.class_names, codes, *half[1:], convention)
 
 
 main = command("teacher", run)

@@ -138,8 +138,19 @@ def write_scannet_sg(folder, fields, suffix="png"):
 
 
 def write_scannet_pl(folder, fields, folded=True, objects=None):
-    """`folded`: labels as the authors give them away, reduced; otherwise ScanNet's own and its objects' ids."""
+    """`folded`: labels as the authors give them away, reduced; otherwise ScanNet's own and its objects' ids.
+
+    Pseudo labels of half the size where the fields have them, with the confidence of each pixel.
+    """
     write_scannet(folder, fields)
+    for k, labels in enumerate(fields.get("pseudo_labels", ())):
+        ids = [REDUCED_IDS[name] for name in scannet_closed.CLASSES]
+        save(folder / f"m2f_semantics/{10 * k}.png", raw_labels(labels[::2, ::2], ids))
+        place = folder / f"m2f_probabilities/{10 * k}.npz"
+        place.parent.mkdir(exist_ok=True)
+        confidence = fields["confidence"][k, ::2, ::2].astype(np.float32)
+        shares = np.zeros((*confidence.shape, 22), np.float32)
+        np.savez_compressed(place, probability=shares, confidence=confidence, confidence_notta=confidence)
     for k, labels in enumerate(fields["labels"]):
         save(folder / f"depth/{10 * k}.png", stored_depth(fields["depth"][k]))
         if folded:

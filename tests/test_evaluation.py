@@ -168,6 +168,22 @@ def test_views_of_capture_and_teacher_in_another_order_change_no_figure(toy, tmp
 
 
 @pytest.mark.xdist_group("toy")
+def test_points_are_measured_where_depth_and_poses_say_where_they_lie(toy, tmp_path):
+    measured = read_evaluation(toy["evaluate"]).figures["segmentation"]
+    for side in ("scene", "teacher"):  # other weights of the same surfaces
+        assert 0 < abs(measured[side]["point_miou"] - measured[side]["miou"]) < 0.1
+    record = read_capture(toy["ingest"])
+    record.depth = None
+    inputs = inputs_of(toy, "evaluate")
+    inputs["capture"] = published(tmp_path / "c", "chebsplat.capture/1", write_capture, record)
+    assert run_stage("evaluate", tmp_path / "out", inputs) == 0
+    figures = read_evaluation(tmp_path / "out").figures
+    assert figures["segmentation"]["scene"]["point_miou"] is None
+    assert "depth" in figures["left_out"]["3D point mIoU"]
+    assert figures["segmentation"]["scene"]["miou"] == measured["scene"]["miou"]
+
+
+@pytest.mark.xdist_group("toy")
 @pytest.mark.parametrize("protocol", ["replica-f3", "deep-blending", "scannet-open", "scannet-closed"])
 def test_a_teacher_of_other_labels_than_the_protocols_is_exit_4(toy, protocol, tmp_path, capsys):
     record = read_capture(toy["ingest"])

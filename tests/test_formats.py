@@ -33,6 +33,8 @@ def make_capture():
         {"name": "labels"},
         rng.random((7, 3), dtype=np.float32),
         rng.integers(0, 255, (7, 3), dtype=np.uint8),
+        rng.integers(-1, 2, (3, 4, 5)).astype(np.int16),
+        rng.random((3, 4, 5)).astype(np.float16),
     )
 
 
@@ -212,6 +214,22 @@ def test_ply_reads_back(tmp_path, degree):
     assert np.array_equal(found_labels, labels)
     assert set(found) == set(p)
     assert all(np.array_equal(found[name], p[name]) for name in found)
+
+
+def test_an_opacity_of_exactly_0_or_1_reads_and_other_values_must_be_finite(tmp_path):
+    """Converters of formats with 8-bit opacities write infinite logits."""
+    p = gaussian_parameters()
+    p["logit_opacities"][:3] = np.inf, -np.inf, 30
+    ply.write_ply(tmp_path / "a.ply", p, 3)
+    found = ply.read_ply(tmp_path / "a.ply")[0]["logit_opacities"]
+    assert found[:3].tolist() == [20, -20, 30]
+    assert np.array_equal(found[3:], p["logit_opacities"][3:])
+    for name in ("logit_opacities", "means"):
+        p[name][0] = np.nan if name == "logit_opacities" else np.inf
+        ply.write_ply(tmp_path / "a.ply", p, 3)
+        with pytest.raises(InputError, match=f"{name} holds non-finite"):
+            ply.read_ply(tmp_path / "a.ply")
+        p["logit_opacities"][0] = 0
 
 
 def test_full_ply_has_the_62_float_header(tmp_path):

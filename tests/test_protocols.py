@@ -100,6 +100,32 @@ def test_labels_on_paper():
     assert replica_gt.measure([seen, more], task)["scene"]["miou"] == pytest.approx((3 / 4 + 1 / 3) / 2)
 
 
+def test_where_nothing_is_known_nothing_is_measured():
+    task = Task(["wall"], np.eye(1), ["wall"])
+    found = labels.measure([view([[0, 0]], 1, truth=np.array([[-1, -1]]))], task)["scene"]
+    assert found == dict.fromkeys(("miou", "macc", "oa", "boundary_miou", "point_miou")) | {"iou": {"wall": None}}
+
+
+def test_points_on_paper():
+    # One pixel a point: three of the five lie apart, two share a cell, of which the first counts; one is unknown.
+    # truth    wall wall floor (floor) ?    the scene there: wall, nothing, floor   wall 1/2, floor 1/1: mean 3/4
+    # teacher  wall floor floor (wall) ?                                            wall 1/2, floor 1/2: mean 1/2
+    places = np.array([[[0.0, 0, 0], [50, 0, 0], [100, 0, 0], [100, 1e-3, 0], [7, 0, 0]]])
+    truth = np.array([[0, 0, 1, 1, -1]])
+
+    def at(points):
+        assert points.tolist() == places[0, :3].tolist()
+        return one_hot([1, 0, 0], 2), np.array([0.5, 0, 0.1])
+
+    task = Task(["floor", "wall"], np.eye(2), ["wall", "floor"], at=at)
+    fields = {"truth": truth, "teacher_labels": np.array([[1, 0, 0, 1, 1]]), "surface": places}
+    found = labels.measure([view([[1, 1, 0, 0, 0]], 2, **fields)], task)
+    assert (found["scene"]["point_miou"], found["teacher"]["point_miou"]) == (3 / 4, 1 / 2)
+    fields["surface"] = None
+    found = labels.measure([view([[1, 1, 0, 0, 0]], 2, **fields)], task)
+    assert found["scene"]["point_miou"] is found["teacher"]["point_miou"] is None
+
+
 # replica-f3, deep-blending
 
 

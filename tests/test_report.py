@@ -3,23 +3,21 @@
 import base64
 import io
 import json
-import shutil
-import subprocess
+from collections import Counter
 from html.parser import HTMLParser
-from types import SimpleNamespace
 
 import numpy as np
 import pytest
+from browser import BROWSER, browsed
 from shared import run_stage
 
 from chebsplat.errors import InputError
 from chebsplat.formats.artifact import Manifest, publish
 from chebsplat.formats.evaluation import read_evaluation
 from chebsplat.stages import figures as draw
-from chebsplat.stages.report_parts import class_rows, label_names, picture_rows
+from chebsplat.stages.report_parts import class_rows, label_names, legend, picture_rows
 
 pytestmark = pytest.mark.xdist_group("toy")
-BROWSER = shutil.which("chromium") or shutil.which("google-chrome")
 
 
 class Fetches(HTMLParser):
@@ -76,15 +74,24 @@ def test_labels_are_named_by_the_capture_and_otherwise_by_the_scene(toy, tmp_pat
     with publish(tmp_path / "scene", manifest) as out:
         (out / "labels.json").write_text(json.dumps({"0": "sofa", "1": "lamp"}))
     inputs = {"scene": tmp_path / "scene"}
-    assert label_names(SimpleNamespace(inputs=inputs), {}) == ["sofa", "lamp"]
+    assert label_names(inputs, {}) == ["sofa", "lamp"]
     inputs["capture"] = toy["ingest"]
     classes = read_evaluation(toy["evaluate"]).figures["segmentation"]["classes"]
-    assert label_names(SimpleNamespace(inputs=inputs), {}) == classes
+    assert label_names(inputs, {}) == classes
 
 
 def test_a_label_without_a_name_is_an_error_not_a_colour(toy, tmp_path):
     with pytest.raises(InputError, match="has no name"):
         picture_rows(read_evaluation(toy["evaluate"]), ["wall"], 1, tmp_path)
+
+
+def test_a_legend_names_the_labels_that_cover_most_and_how_many_more_there_are():
+    names = [f"label {k}" for k in range(40)]
+    colors = dict.fromkeys(names, "#000")
+    pixels = Counter({k: 100 - k for k in range(40)} | {39: 1000})
+    shown = legend(pixels, names, colors)
+    assert [name for name, _ in shown] == [*names[:29], "label 39", "and 10 more"]
+    assert len(legend(Counter({3: 1}), names, colors)) == 1
 
 
 def test_classes_are_listed_best_first_and_those_that_never_occur_are_not():
@@ -113,32 +120,6 @@ def test_a_page_that_would_be_too_large_is_refused(toy, tmp_path, monkeypatch):
     assert not (tmp_path / "report").exists()
 
 
-WATCH = """<script>
-const problems = []; onerror = (...all) => problems.push(String(all));
-addEventListener("load", () => {
-  document.querySelectorAll(".modes button").forEach(button => button.click());
-  parent.postMessage({ wide: document.documentElement.scrollWidth, problems,
-    shown: [...document.querySelectorAll(".stage img:not([hidden])")].map(image => image.naturalWidth) }, "*");
-});</script>"""
-FRAME = """<body><pre></pre><script>
-addEventListener("message", event => document.querySelector("pre").textContent = JSON.stringify(event.data));
-</script><iframe src="page.html" style="border: 0; width: WIDEpx; height: 900px"></iframe></body>"""
-
-
-def browsed(folder, text, wide):
-    """What a browser makes of a page in a frame `wide` pixels across: (its report, console lines, its requests)."""
-    (folder / "page.html").write_text(text.replace("<head>", "<head>" + WATCH))
-    (folder / "frame.html").write_text(FRAME.replace("WIDE", str(wide)))
-    command = [BROWSER, "--headless", "--no-sandbox", "--disable-gpu", "--enable-logging=stderr", "--dump-dom"]
-    command += [f"--user-data-dir={folder}/profile", f"--log-net-log={folder}/net.json", "--window-size=1500,1000"]
-    command += ["--virtual-time-budget=5000", "--host-resolver-rules=MAP * ~NOTFOUND"]
-    done = subprocess.run([*command, (folder / "frame.html").as_uri()], capture_output=True, text=True, timeout=120)
-    seen = json.loads(done.stdout.split("<pre>")[1].split("</pre>")[0])
-    console = [line for line in done.stderr.splitlines() if "CONSOLE" in line]
-    log = (folder / "net.json").read_text().splitlines()  # the browser's own requests have another site
-    return seen, console, [line for line in log if "site=file://" in line and '"url":"http' in line]
-
-
 in_a_browser = pytest.mark.skipif(BROWSER is None, reason="neither chromium nor google-chrome is installed")
 
 
@@ -151,6 +132,8 @@ def test_in_a_browser_the_page_fits_its_width_without_an_error_or_a_request(toy,
     assert seen["wide"] <= wide
     assert len(seen["shown"]) > 1
     assert all(seen["shown"])
+    # one picture a side, and what lies over it; nothing is left over from the mode before
+    assert seen["layers"] == {"photo | render": 2, "true labels | scene": 4, "2D teacher | scene": 4, "errors": 3}
 
 
 @pytest.mark.slow

@@ -61,6 +61,7 @@ def read(folder, kind, **settings):
     module = KINDS[kind]
     fields = module.read(folder, IngestSection(min_views=2, **settings))
     probe = module.probe(folder)
+    assert probe.pop("pseudo_labels", False) == ("pseudo_labels" in fields)
     assert probe == {"poses": True, "depth": "depth" in fields, "labels": "labels" in fields}
     assert all(path.is_file() for path in module.files(folder))
     return fields
@@ -114,6 +115,50 @@ def test_scannet_as_panoptic_lifting_lays_it_out(scene, tmp_path):
     assert np.flatnonzero(found["is_test"]).tolist() == [0, 5, 10, 15]
     assert "segmentation_data.pkl" in found["source"]["notes"][1]
     assert "points" not in found
+
+
+def with_pseudo_labels(scene):
+    """Blocks of 2 x 2 pixels share a label and a confidence; some have none."""
+    rng = np.random.default_rng(0)
+    n, height, width = scene["labels"].shape
+    blocks = rng.integers(-1, 21, (n, height // 2, width // 2)).astype(np.int16)
+    sure = np.where(blocks >= 0, rng.random(blocks.shape), 0).astype(np.float16)
+    pseudo, confidence = (part.repeat(2, 1).repeat(2, 2) for part in (blocks, sure))
+    return scene | {"pseudo_labels": pseudo, "confidence": confidence}
+
+
+def test_panoptic_liftings_pseudo_labels_come_with_their_confidence(scene, tmp_path):
+    scene = with_pseudo_labels(with_classes(scene, scannet_closed.CLASSES))
+    folder = tmp_path / "scene0000_00"
+    layouts.write_scannet_pl(folder, scene)
+    found = read(folder, "scannet")
+    compare(found, scene)
+    assert np.array_equal(found["pseudo_labels"], scene["pseudo_labels"])
+    assert np.array_equal(found["confidence"], scene["confidence"])
+    assert found["pseudo_labels"].dtype == np.int16 and (found["pseudo_labels"] == -1).any()
+    assert "Not read: segmentation_data.pkl." in found["source"]["notes"]
+    assert {path.name for path in scannet.files(folder)} >= {"10.npz", "splits.json"}
+    shutil.rmtree(folder / "rs_semantics")  # scenes in the wild have pseudo labels alone
+    again = read(folder, "scannet")
+    assert "labels" not in again and again["class_names"] == list(scannet_closed.CLASSES)
+    assert np.array_equal(again["pseudo_labels"], scene["pseudo_labels"])
+
+
+@pytest.mark.parametrize("damage", ["missing", "text", "pickle", "range", "key"])
+def test_damaged_confidences_are_named(scene, tmp_path, damage):
+    scene = with_pseudo_labels(with_classes(scene, scannet_closed.CLASSES))
+    layouts.write_scannet_pl(tmp_path, scene)
+    file = tmp_path / "m2f_probabilities/20.npz"
+    if damage == "missing":
+        file.unlink()
+    elif damage == "text":
+        file.write_text("hello")
+    elif damage == "pickle":
+        np.savez(file, confidence=np.array([{}], object))
+    else:
+        np.savez(file, **{"sure" if damage == "key" else "confidence": np.full((4, 4), 2.0)})
+    with pytest.raises(InputError, match=r"m2f_probabilities/20\.npz.*copy it again"):
+        scannet.read(tmp_path, SETTINGS)
 
 
 def test_scannets_own_labels_are_reduced_and_corrected_by_object(scene, tmp_path):

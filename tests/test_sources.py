@@ -63,6 +63,8 @@ def test_statue_with_images_of_several_sizes_is_padded_and_masked():
     assert fields["images"].shape[0] == 6
     assert not fields["loss_mask"].all()
     assert (fields["images"][~fields["loss_mask"]] == 0).all()
+    with pytest.raises(InputError, match="dense/0 holds undistorted images and their model"):
+        colmap.read(data("statue_colmap"), SMALL)
 
 
 def test_opengl_cameras_become_opencv_and_names_sort_naturally(tmp_path):

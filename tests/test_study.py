@@ -6,16 +6,21 @@ import os
 import subprocess
 import sys
 
+import numpy as np
 import pytest
+from browser import BROWSER, browsed
 from shared import ROOT
 
 from chebsplat.errors import ConfigError
 from chebsplat.formats.artifact import Manifest, publish
+from chebsplat.formats.capture import Capture, write_capture
+from chebsplat.formats.evaluation import Evaluation, write_evaluation
 from chebsplat.pipelines.plan import names
 from chebsplat.pipelines.results import compare, row_of
 from chebsplat.pipelines.sequences import scenes_of
 from chebsplat.pipelines.study import Study, checked_study, execute, expand, outstanding, read_study
 from chebsplat.pipelines.study_page import stability, write
+from chebsplat.pipelines.study_pictures import gallery
 from chebsplat.stages.registry import STAGES
 
 
@@ -32,8 +37,8 @@ def study(**changes):
     return checked_study(values | changes, "study")
 
 
-def publish_stage(run, stage, documents):
-    """An artifact of a run, without running it."""
+def publish_stage(run, stage, fill):
+    """An artifact of a run, without running it. fill: documents by name, or what writes them into a folder."""
     step = next(step for step in run.steps if step.stage == stage)
     if step.fresh:
         return
@@ -41,16 +46,24 @@ def publish_stage(run, stage, documents):
     manifest = Manifest(STAGES[stage].schema, step.key, stage, {}, step.sections, 0, threads=2, code=code)
     step.path.parent.mkdir(parents=True, exist_ok=True)
     with publish(step.path, manifest) as tmp:
-        for name, text in documents.items():
-            (tmp / name).write_text(text)
+        if callable(fill):
+            fill(tmp)
+        else:
+            for name, text in fill.items():
+                (tmp / name).write_text(text)
 
 
-def finish(run, miou=0.5, psnr=30.0, n=100, seconds=10.0, steps=10):
-    """Pretend that a run was made and found these figures."""
+def finish(run, miou=0.5, psnr=30.0, n=100, seconds=10.0, steps=10, segmentation=None, labels=None):
+    """Pretend that a run was made and found these figures. labels: (class names, predicted i16 [1, 4, 6])."""
     figures = {"image": {"psnr": psnr, "ssim": 0.9}, "n_gaussians": n, "bytes": {"ply": 10 * n, "ragged": 5 * n}}
     figures |= {"frames_per_second": {"color": 50.0}}
     whole = {"miou": miou, "macc": miou, "oa": miou, "boundary_miou": miou}
-    figures["segmentation"] = {"scene": whole, "teacher": whole | {"miou": 0.25}}
+    figures["segmentation"] = segmentation or {"scene": whole, "teacher": whole | {"miou": 0.25}}
+    if labels is not None:
+        blank, K = np.zeros((1, 4, 6, 3), np.uint8), np.eye(3)[None]
+        truth = np.zeros((1, 4, 6), np.int16)
+        capture = Capture(["a"], blank, K, np.eye(4)[None], np.array([True]), labels=truth, class_names=labels[0])
+        publish_stage(run, "ingest", lambda tmp: write_capture(tmp, capture))
     for step in run.steps:
         if step.stage not in ("train", "export", "evaluate"):
             publish_stage(run, step.stage, {"empty.json": "{}"})
@@ -59,7 +72,12 @@ def finish(run, miou=0.5, psnr=30.0, n=100, seconds=10.0, steps=10):
     )
     # 10 Gaussians keep degree 3 (16 coefficients) and 30 degree 0 (1): 190 of 640.
     publish_stage(run, "export", {"summary.json": json.dumps({"by_degree": [30, 0, 0, 10]})})
-    publish_stage(run, "evaluate", {"figures.json": json.dumps(figures)})
+    figures |= {"names": ["a"], "left_out": {"LPIPS": "not measured"}}
+    figures["image"]["per_view"] = {"psnr": [psnr]}
+    pictures = {name: np.zeros((1, 4, 6, 3), np.uint8) for name in ("truth", "renders")}
+    if labels is not None:
+        pictures |= {"labels": truth, "predicted": labels[1]}
+    publish_stage(run, "evaluate", lambda tmp: write_evaluation(tmp, Evaluation(figures, pictures)))
 
 
 def test_a_study_is_every_combination_and_each_step_once():
@@ -75,6 +93,17 @@ def test_a_study_is_every_combination_and_each_step_once():
     assert {(s["steps"], s["seed"], s["encoder"]) for s in settings} == {
         (steps, seed, encoder) for steps in (10, 20) for seed in (0, 1) for encoder in ("transformer", "off")
     }
+
+
+def test_a_budget_of_seconds_is_a_training_by_the_clock_beside_one_of_steps():
+    runs = expand(study(seeds=[0], budgets={"steps": [10], "seconds": [2.5, 60]}))
+    found = {
+        (run.budget, step.sections["train"]["steps"], step.sections["train"]["seconds"])
+        for run in runs for step in run.steps if step.stage == "train"
+    }  # fmt: skip
+    own = next(step.sections["train"]["steps"] for step in expand(study())[0].steps if step.stage == "train")
+    assert found == {("10 steps", 10, None), ("2.5 s", own, 2.5), ("60 s", own, 60)}
+    assert len({run.plan.targets["train"] for run in runs}) == 6
 
 
 def test_only_a_teacher_that_draws_is_computed_for_every_seed():
@@ -124,6 +153,83 @@ def test_the_table_says_what_a_hand_works_out():
     assert gain.excluded
     assert lines["full"].differences["n_gaussians"].mean == pytest.approx(0.5)
     assert not lines["full"].differences["psnr"].excluded
+
+
+def test_scannet_opens_scenes_are_summed_and_those_of_scannet_closed_averaged_before_seeds_are_compared(tmp_path):
+    # truth and prediction of wall and floor, in pixels           alone            summed, as scannet-open has it
+    # toy      wall 9 right, 1 taken for floor; floor 1 right     (9/10 + 1/2)/2   wall 9/19, floor 1/11
+    # office0  floor 9, all taken for wall                        0                its mean: (9/19 + 1/11)/2
+    a, b = ([[0] * 20 for _ in range(20)] for _ in range(2))
+    a[0][0], a[0][1], a[1][1], b[1][0] = 9, 1, 1, 9
+    alone, summed = {"toy": (0.7, a), "office0": (0.0, b)}, (9 / 19 + 1 / 11) / 2
+    for protocol, expected in (("scannet-open", summed), ("scannet-closed", 0.35)):
+        asked = study(scenes=list(alone), settings={"ingest": {"protocol": protocol}})
+        runs = expand(asked)
+        for run in runs:
+            miou, matrix = alone[run.scene]
+            if (run.variant, run.seed) == ("full", 1):  # a seed in which every pixel is right
+                miou, matrix = 1.0, [[sum(row) if k == j else 0 for j in range(20)] for k, row in enumerate(matrix)]
+            finish(run, segmentation={"scene": {"miou": miou, "confusion": matrix}})
+        rows = [row_of(run, {}) for run in runs]
+        lines = compared(runs, rows)
+        assert (lines["less"].summaries["miou"].mean, lines["less"].summaries["miou"].n) == (pytest.approx(expected), 2)
+        assert lines["full"].summaries["miou"].mean == pytest.approx((expected + 1) / 2)
+        gain = lines["full"].differences["miou"]
+        assert (gain.mean, gain.n_pairs) == (pytest.approx((1 - expected) / 2), 2)
+        assert lines["full"].differences["psnr"].n_pairs == 4
+        page = write(tmp_path / protocol, asked, runs, rows, "c").read_text()
+        assert "all scenes of a seed together" in page and f"<dd>{protocol}</dd>" in page
+        # without one of its scenes, a seed is no partner of the whole one
+        rows[0] = row_of(runs[0], {}) | {"state": "not run yet"}
+        assert (rows[0]["scene"], rows[0]["seed"], rows[0]["variant"]) == ("toy", 0, "full")
+        assert compared(runs, rows)["full"].differences["miou"].n_pairs == 1
+
+
+def test_scenes_measured_in_two_ways_are_not_compared(tmp_path, monkeypatch):
+    from chebsplat.pipelines import plan
+
+    known = plan.scene_values
+    office = {"ingest": {"protocol": "replica-f3"}}
+
+    def values(scene):
+        title, own, *rest = known(scene)
+        return title, plan.merged(own, office if scene == "office0" else {}), *rest
+
+    monkeypatch.setattr(plan, "scene_values", values)
+    with pytest.raises(ConfigError, match="as labels and as replica-f3 do not compare"):
+        expand(study(scenes=["toy", "office0"]))
+
+
+def test_the_page_shows_a_view_of_each_scene_in_one_set_of_colours(tmp_path):
+    asked = study(scenes=["toy", "office0"], budgets={"steps": [10, 20]})
+    runs = expand(asked)
+    classes = {"toy": ["wall", "sofa"], "office0": ["sofa", "lamp"]}
+    for run in runs:
+        iou = {"sofa": 0.5, "wall": None} if run.variant == "less" else {"sofa": 0.75, "wall": 0.25}
+        found = np.full((1, 4, 6), classes[run.scene].index("sofa"), np.int16)
+        if (run.scene, run.variant, run.seed) != ("office0", "full", 0):
+            finish(run, segmentation={"scene": {"iou": iou}}, labels=(classes[run.scene], found))
+    rows = [row_of(run, {}) for run in runs]
+    shown = gallery(asked, runs, rows)
+    assert [row["name"] for row in shown["pictures"]] == ["toy", "office0"]
+    toy, office = ({key: uri for key, uri, _ in row["images"]} for row in shown["pictures"])
+    assert toy["labels of less"] == toy["labels of full"] == office["labels of less"] != toy["labels"]
+    assert "render of full" not in office  # that run has failed; the slider says so by a button that is off
+    assert [name for name, _ in shown["legend"]] == ["wall", "sofa"]
+    assert [(name, mean, other) for name, _, mean, other in shown["classes"]] == [
+        ("sofa", 0.75, 0.5),
+        ("wall", 0.25, None),
+    ]
+    assert shown["shown"] == "20 steps, seed 0"
+    names = ["photo | full", "true labels | full", "photo | less", "less | full", "less | full, labels"]
+    assert [mode[0] for mode in shown["modes"]] == names
+    page = write(tmp_path, asked, runs, rows, "c").read_text()
+    assert page.count("data-of=") == 6 + 4
+    if BROWSER is not None:  # which ends on the scene that lacks a variant
+        seen, console, _ = browsed(tmp_path, page, 1440)
+        assert seen["problems"] == console == []
+        assert len(seen["shown"]) == 2 and all(seen["shown"])
+    assert '<td class="w">LPIPS</td><td class="w">not measured</td><td class="w">all</td>' in page
 
 
 def test_a_run_that_failed_is_named_and_counts_in_no_mean(tmp_path):
@@ -283,3 +389,39 @@ lr_means = 1e30
         assert states["whole"] == "done"
         assert states["breaks"].startswith("train failed with exit code 4: step ")
     assert len(list(work.glob("store/train/*/artifact.json"))) == 1
+
+
+@pytest.mark.slow
+@pytest.mark.xdist_group("cli")
+def test_a_study_by_the_clock_spends_its_seconds_shares_the_machine_and_makes_a_page_for_a_browser(tmp_path, work):
+    (tmp_path / "clock.toml").write_text("""
+title = "By the clock"
+about = "One variant, two budgets."
+scenes = ["toy"]
+baseline = "features-only"
+budgets = { steps = [5], seconds = [8] }
+[settings]
+teacher = { kind = "labels" }
+sfm = { max_points = 200 }
+[variants.features-only]
+ablation = "features-only"
+""")
+    command = [sys.executable, "-m", "chebsplat.pipelines.cli", "study", str(tmp_path / "clock.toml")]
+    command += ["--cores", "1", "--threads", "2", "--out", str(tmp_path / "out")]
+    done = subprocess.run(command, capture_output=True, text=True, cwd=ROOT, env=os.environ)
+    assert done.returncode == 0, done.stderr
+    assert "1 at once, 1 threads each" in done.stderr  # no more threads than cores
+    with (tmp_path / "out/results.csv").open() as handle:
+        rows = {row["budget"]: row for row in csv.DictReader(handle)}
+    assert set(rows) == {"5 steps", "8 s"}
+    assert rows["5 steps"]["steps"] == "5"
+    assert rows["8 s"]["threads"] == "1"
+    assert 7 < float(rows["8 s"]["train_seconds"]) < 20  # the step in which they run out is finished
+    assert int(rows["8 s"]["steps"]) > 5
+    if BROWSER is not None:
+        seen, console, requests = browsed(tmp_path, (tmp_path / "out/study.html").read_text(), 390)
+        assert seen["problems"] == console == requests == []
+        assert seen["wide"] <= 390
+        assert all(seen["shown"])
+        first = "photo | features-only"
+        assert seen["layers"] == {first: 2, first.replace("photo", "true labels"): 4}

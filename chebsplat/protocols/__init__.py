@@ -10,6 +10,7 @@ parameters go with every figure. Every module has
     ON_TRAINING  whether the training views are evaluated, and none is held out
     TRUTH        "labels" of the capture, or "teacher": the teacher's own
     measure(views, task) -> dict with `classes` and `scene`, and `teacher` where the truth is the capture's
+    over_scenes(scenes) -> dict, where figures of several scenes together are no plain mean of every run's
 """
 
 from __future__ import annotations

@@ -44,6 +44,11 @@ def measure(views: Iterable[Seen], task: Task) -> dict[str, Any]:
     return {"classes": classes} | {side: summed([matrix]) for side, matrix in sums.items()}
 
 
+def over_scenes(scenes: list[dict[str, Any]]) -> dict[str, Any]:
+    """Figures of several scenes together, from what `measure` says of each."""
+    return summed([np.array(scene["confusion"]) for scene in scenes])
+
+
 def summed(matrices: list[np.ndarray]) -> dict[str, Any]:
     """Figures of confusion matrices [20, 20] of several scenes, rows by truth, summed first."""
     matrix = np.sum(matrices, axis=0)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -19,6 +19,7 @@ class Seen:
     features: f32 [H, W, C] as rendered; labels: i16 [H, W] their label among the task's `names`.
     teacher:  f32 [h, w, C] and teacher_labels i16 [H, W], None without a teacher.
     truth:    i16 [H, W] index into the task's `classes`, IGNORE where unknown; None without labels.
+    surface:  f64 [H, W, 3] where in the world its pixels lie, nan where unknown; None without depth.
     """
 
     name: str
@@ -27,16 +28,21 @@ class Seen:
     teacher: np.ndarray | None = None
     teacher_labels: np.ndarray | None = None
     truth: np.ndarray | None = None
+    surface: np.ndarray | None = None
 
 
 @dataclass
 class Task:
-    """names, embeddings [L, C] of the labels that features are asked for; classes of the truth; boundary: pixels."""
+    """names, embeddings [L, C] of the labels that features are asked for; classes of the truth; boundary: pixels.
+
+    at: points [M, 3] of the world -> features [M, C] of the scene there and their weights [M], 0 where it has nothing.
+    """
 
     names: list[str]
     embeddings: np.ndarray
     classes: list[str] = field(default_factory=list)
     boundary: int = 5
+    at: Callable[[np.ndarray], tuple[np.ndarray, np.ndarray]] | None = None
 
 
 class Named(Mapping[str, np.ndarray]):
@@ -61,6 +67,11 @@ def translated(labels: np.ndarray, names: list[str], classes: list[str], unknown
     """Labels among `names` as indices into `classes`, IGNORE kept; a name that is no class becomes `unknown`."""
     table = np.array([*(classes.index(name) if name in classes else unknown for name in names), IGNORE])
     return table[labels]
+
+
+def predicted(labels: np.ndarray, names: list[str], classes: list[str], unknown: int) -> np.ndarray:
+    """As `translated`, of a prediction: where there is none, it is `unknown` too, and not left out of the count."""
+    return np.where(labels == IGNORE, unknown, translated(labels, names, classes, unknown))
 
 
 def required(names: list[str], classes: tuple[str, ...], protocol: str, also: tuple[str, ...] = ()) -> None:

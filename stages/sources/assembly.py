@@ -12,13 +12,13 @@ import numpy as np
 
 from chebsplat.errors import DataFailure, InputError
 from chebsplat.stages.sources.common import DISTORTED, Camera, Frame, Listing, natural
-from chebsplat.stages.sources.pictures import DEEP, GREY, companion, nearest, open_photo
+from chebsplat.stages.sources.label_images import indexed, label_ids
+from chebsplat.stages.sources.pictures import DEEP, GREY, companion, confidences, nearest, open_photo
 
 if TYPE_CHECKING:
     from chebsplat.stages.config import IngestSection
 
-IGNORED = {"void", "ignore", "ignored", "unlabeled", "unlabelled", "undefined", "unknown"}
-MAX_ID, WORKERS = 65_535, 4
+WORKERS = 4
 
 
 def assemble(listing: Listing, settings: IngestSection, class_names: tuple[str, ...] | None = None) -> dict[str, Any]:
@@ -34,11 +34,12 @@ def assemble(listing: Listing, settings: IngestSection, class_names: tuple[str, 
     shapes = [geometry(frame.camera, settings.max_side) for frame in frames]
     full = (len(frames), max(shape.height for shape in shapes), max(shape.width for shape in shapes))
     stacks = {"images": np.zeros((*full, 3), np.uint8), "loss_mask": np.zeros(full, bool)}
-    for name, empty in (("depth", np.float32(np.nan)), ("labels", np.int32(-1))):
+    empties = {"depth": np.float32(np.nan), "labels": np.int32(-1), "pseudo_labels": np.int32(0)}
+    for name, empty in (empties | {"confidence": np.float16(0)}).items():
         if listing.has(name):
             stacks[name] = np.full(full, empty)
         elif n := sum(getattr(frame, name) is not None for frame in listing.frames):
-            notes.append(f"Only {n} of {len(listing.frames)} frames have {name}, which are left out.")
+            notes.append(f"Only {n} of {len(listing.frames)} frames have {name.replace('_', ' ')}, which are left out.")
     lookup = functools.lru_cache(8)(positions)  # frames of one camera share it
 
     def fill(k: int) -> None:
@@ -56,6 +57,12 @@ def assemble(listing: Listing, settings: IngestSection, class_names: tuple[str, 
     if "labels" in stacks:
         wanted = class_names or listing.class_names
         fields["labels"], fields["class_names"], said = indexed(stacks["labels"], listing.label_names, wanted)
+        notes += said
+    if "pseudo_labels" in stacks:
+        wanted = fields.get("class_names") or class_names or listing.class_names
+        found = indexed(stacks["pseudo_labels"], listing.pseudo_names, wanted and tuple(wanted))
+        fields["pseudo_labels"], fields["class_names"], said = found
+        fields["confidence"] = stacks["confidence"]
         notes += said
     if not stacks["loss_mask"].all():
         fields["loss_mask"] = stacks["loss_mask"]
@@ -149,7 +156,7 @@ def _pycolmap_camera(camera: Camera) -> Any:
 def read_view(
     frame: Frame, listing: Listing, view: Geometry, at: np.ndarray, wanted: set[str]
 ) -> dict[str, np.ndarray]:
-    """images u8 [H, W, 3] and loss_mask bool [H, W]; where `wanted`, depth f32 and labels i32 [H, W]."""
+    """images u8 [H, W, 3], loss_mask bool [H, W]; where `wanted`, depth, labels, pseudo_labels, confidence [H, W]."""
     camera, size = frame.camera, (frame.camera.width, frame.camera.height)
     inside = within(at, size)
     image, opaque = open_photo(frame.image, size, listing.upright)
@@ -168,6 +175,11 @@ def read_view(
     if "labels" in wanted and frame.labels is not None:
         ids = label_ids(frame, listing, size)
         fields["labels"] = np.where(inside, nearest(ids, at, size), np.int32(-1))
+    if "pseudo_labels" in wanted and frame.pseudo_labels is not None and frame.confidence is not None:
+        ids = companion(frame.pseudo_labels, size, GREY, "8- or 16-bit ids", listing.any_label_size)
+        fields["pseudo_labels"] = np.where(inside, nearest(ids.astype(np.int32), at, size), np.int32(0))
+        sure = nearest(confidences(frame.confidence), at, size)
+        fields["confidence"] = np.where(inside & (fields["pseudo_labels"] > 0), sure, 0).astype(np.float16)
     return fields
 
 
@@ -181,19 +193,6 @@ def moved(at: np.ndarray, camera: Camera, other: Camera) -> tuple[np.ndarray, tu
     (fx, fy, cx, cy), (gx, gy, dx, dy) = camera.pinhole, other.pinhole
     place = np.stack([(at[0] - cx) * (gx / fx) + dx, (at[1] - cy) * (gy / fy) + dy])
     return place, (other.width, other.height)
-
-
-def label_ids(frame: Frame, listing: Listing, size: tuple[int, int]) -> np.ndarray:
-    """Raw ids i32 [h, w] of a frame's label image, its corrected objects replaced. InputError beyond MAX_ID."""
-    assert frame.labels is not None
-    ids = companion(frame.labels, size, GREY, "8- or 16-bit ids", listing.any_label_size).astype(np.int32)
-    if ids.max() > MAX_ID:
-        raise InputError(f"{frame.labels} holds id {ids.max()}; ids up to {MAX_ID} are supported")
-    if frame.objects is not None and listing.corrections:
-        objects = companion(frame.objects, ids.shape[::-1], GREY, "8- or 16-bit ids")
-        for which, value in listing.corrections.items():
-            ids[objects == which] = value
-    return ids
 
 
 def resampled(image: Any, camera: Camera, view: Geometry, at: np.ndarray) -> np.ndarray:
@@ -211,35 +210,3 @@ def resampled(image: Any, camera: Camera, view: Geometry, at: np.ndarray) -> np.
 
     x, y = at[0] * size[0] / camera.width - 0.5, at[1] * size[1] / camera.height - 0.5
     return np.stack([map_coordinates(small[..., c], [y, x], order=1, mode="nearest") for c in range(3)], -1)
-
-
-def indexed(
-    raw: np.ndarray, names: dict[int, str] | None, class_names: tuple[str, ...] | None
-) -> tuple[np.ndarray, list[str], list[str]]:
-    """Raw ids [V, H, W] (-1: none) as indices i16 into class names; the names, and notes on what became -1.
-
-    Choices: the classes are those that occur, in the order of their ids, or `class_names` where given. Ids are named
-      by `names`, else by their place in `class_names`, else class_<id> with 0 ignored.
-    Raises:  DataFailure if nothing is left.
-    """
-    counts = sum(np.bincount(view.ravel() + 1, minlength=MAX_ID + 2) for view in raw)
-    present = [int(v) for v in np.flatnonzero(counts) - 1 if v >= 0]
-    known = names if names is not None else dict(enumerate(class_names or ()))
-    if names is None and class_names is None:
-        known = {v: f"class_{v}" for v in present if v != 0}
-    named = {v: known[v] for v in present if v in known and known[v].lower() not in IGNORED}
-    result = list(class_names or dict.fromkeys(named.values()))
-    notes = []
-    if nameless := [str(v) for v in present if v not in known and v != 0]:
-        notes.append(f"Label ids without a name are ignored: {', '.join(nameless)}.")
-    if foreign := sorted(set(named.values()) - set(result)):
-        notes.append(f"Labels that are not among the class names are ignored: {', '.join(foreign)}.")
-    table = np.full(MAX_ID + 2, -1, np.int16)
-    for value, name in named.items():
-        table[value + 1] = result.index(name) if name in result else -1
-    if (table < 0).all():
-        raise DataFailure(f"no label has a name (ids {present[:8]}); give names, or take the labels away")
-    labels = np.empty(raw.shape, np.int16)
-    for k, view in enumerate(raw):  # one by one: a copy of all would be the largest thing in memory
-        labels[k] = table[view + 1]
-    return labels, result, notes

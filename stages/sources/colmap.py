@@ -95,6 +95,8 @@ def _label_names(folder: Path) -> dict[int, str] | None:
 
 def _listing(folder: Path) -> Listing:
     place, images = _model_folder(folder), folder / "images"
+    if not images.is_dir() and (undistorted := sorted(path.parent for path in folder.glob("dense/**/images"))):
+        raise InputError(f"{images} is missing; {undistorted[0]} holds undistorted images and their model: name that")
     model = _model(place)
     found = set(common.images_in(images))
     on_disk, has = len(found), probe(folder)

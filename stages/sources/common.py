@@ -49,6 +49,8 @@ class Frame:
     labels: Path | None = None
     mask: Path | None = None
     objects: Path | None = None  # ids of objects, as large as the labels
+    pseudo_labels: Path | None = None  # what a 2D network took the photo for
+    confidence: Path | None = None  # .npz whose `confidence` [h, w] says how sure it was
 
 
 @dataclass
@@ -57,6 +59,7 @@ class Listing:
 
     label_names:  by raw id. class_names: all classes in order; None: those that occur.
     corrections:  object id -> raw id of the label that its pixels take instead.
+    pseudo_names: by id in the pseudo labels; 0 is none.
     any_label_size: label images may have another resolution than their photos.
     depth_scale:  stored units in one scene unit; no_depth: stored values that mean "unknown".
     depth_camera: a pinhole camera of the depth images, at the photo's place; None: the photo's own.
@@ -67,6 +70,7 @@ class Listing:
     label_names: dict[int, str] | None = None
     class_names: tuple[str, ...] | None = None
     corrections: dict[int, int] = field(default_factory=dict)
+    pseudo_names: dict[int, str] | None = None
     any_label_size: bool = False
     depth_scale: float = 1000.0
     no_depth: tuple[int, ...] = (0,)
@@ -74,14 +78,8 @@ class Listing:
     notes: list[str] = field(default_factory=list)
     upright: bool = False  # turn every image by its EXIF orientation; otherwise only where its camera asks for it
 
-    def files(self) -> list[Path]:
-        """Every image file that a capture depends on."""
-        parts = ((f.image, f.depth, f.labels, f.mask, f.objects) for f in self.frames)
-        of = (path for paths in parts for path in paths if path is not None)
-        return sorted(of)
-
     def has(self, what: str) -> bool:
-        """Whether every frame has a "pose", "depth" or "labels"."""
+        """Whether every frame has a "pose", "depth", "labels" and so on."""
         return bool(self.frames) and all(getattr(frame, what) is not None for frame in self.frames)
 
 

@@ -56,6 +56,21 @@ def companion(
     return np.asarray(image if modes is not None or image.mode in DEEP else image.convert("L"))
 
 
+def confidences(path: Path) -> np.ndarray:
+    """The array `confidence` [h, w] of an .npz file, f32 in [0, 1]; nothing in it is unpickled. Raises InputError."""
+    import zipfile
+    import zlib
+
+    try:
+        with np.load(path, allow_pickle=False) as parts:
+            found = np.asarray(parts["confidence"], np.float32)
+    except (OSError, KeyError, ValueError, TypeError, zipfile.BadZipFile, zlib.error) as error:
+        raise InputError(f"{path} holds no readable array `confidence` ({error}); copy it again") from None
+    if found.ndim != 2 or not ((found >= 0) & (found <= 1 + 1e-4)).all():
+        raise InputError(f"{path}: `confidence` must be an image of values in 0...1; copy it again")
+    return found.clip(0, 1)
+
+
 def nearest(values: np.ndarray, at: np.ndarray, size: tuple[int, int]) -> np.ndarray:
     """The stored pixels [H, W] of `values` [h, w] that hold positions `at` [2, H, W] in a photo of (width, height)."""
     height, width = values.shape

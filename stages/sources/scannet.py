@@ -15,6 +15,7 @@ from chebsplat.stages.sources.common import Camera, Frame, Listing
 SENSOR = 1296  # width of the colour sensor, which intrinsics refer to even where images are reduced
 OFF_CENTRE = 0.1  # of the width, by which a principal point may lie off the middle
 POINTS = "points3d.ply"
+PSEUDO, CONFIDENCE = "m2f_semantics", "m2f_probabilities"  # of Mask2Former with test-time augmentation
 OF_PL = ("splits.json", "segmentation_data.pkl", "rs_semantics", "m2f_semantics")  # never in an SG folder
 
 
@@ -45,7 +46,7 @@ def read(folder: Path, settings: Any, class_names: tuple[str, ...] | None = None
 def probe(folder: Path) -> dict[str, bool]:
     """Light: reads names only. What some frame has, every frame must have: `read` fails otherwise."""
     return {"poses": True, "depth": any(common.names_below(folder / "depth")),
-            "labels": _labels_folder(folder) is not None}  # fmt: skip
+            "labels": _labels_folder(folder) is not None, "pseudo_labels": _has_pseudo_labels(folder)}  # fmt: skip
 
 
 def files(folder: Path) -> list[Path]:
@@ -54,8 +55,15 @@ def files(folder: Path) -> list[Path]:
     places = ["color", "depth", *([labels] if labels else []), *(["instance"] if labels == "semantics" else [])]
     data = [folder / place / name for place in places for name in common.names_below(folder / place)]
     texts = [path for place in ("pose", "intrinsic") for path in (folder / place).glob("*.txt")]
+    if _has_pseudo_labels(folder):
+        data += [folder / PSEUDO / name for name in common.names_below(folder / PSEUDO)]
+        texts += list((folder / CONFIDENCE).glob("*.npz"))
     single = [folder / name for name in (POINTS, "splits.json") if (folder / name).is_file()]
     return sorted([*data, *texts, *single, *([table] if table is not None and table.is_file() else [])])
+
+
+def _has_pseudo_labels(folder: Path) -> bool:
+    return (folder / CONFIDENCE).is_dir() and any(common.names_below(folder / PSEUDO))
 
 
 def _is_reduced(folder: Path) -> bool:
@@ -115,6 +123,7 @@ def _listing(folder: Path) -> Listing:
     size, _ = common.header(folder / "color" / images[0])
     camera = _camera(folder, "color", size, SENSOR)
     has, place = probe(folder), _labels_folder(folder)
+    pseudo = has["pseudo_labels"]
     frames = [
         Frame(
             name,
@@ -124,12 +133,16 @@ def _listing(folder: Path) -> Listing:
             folder / f"depth/{name}.png" if has["depth"] else None,
             folder / f"{place}/{name}.png" if place else None,
             objects=folder / f"instance/{name}.png" if place == "semantics" else None,
+            pseudo_labels=folder / f"{PSEUDO}/{name}.png" if pseudo else None,
+            confidence=folder / f"{CONFIDENCE}/{name}.npz" if pseudo else None,
         )
         for name, image, pose in zip(names, images, poses, strict=True)
     ]
     reduced = _is_reduced(folder)
     protocol = scannet_closed if reduced else scannet_open
-    listing = Listing("scannet", frames, class_names=protocol.CLASSES if place else None, any_label_size=True)
+    listing = Listing("scannet", frames, class_names=protocol.CLASSES if place or pseudo else None, any_label_size=True)
+    reduced_names = dict(enumerate(("void", *scannet_closed.CLASSES)))
+    listing.pseudo_names = reduced_names if pseudo else None
     listing.notes.append(f"ScanNet as {'Panoptic Lifting' if reduced else 'Semantic Gaussians'} lays it out.")
     if extra := sum(path.stem not in set(names) for path in (folder / "pose").glob("*.txt")):
         listing.notes.append(f"{extra} poses have no image in color/ and are left out.")
@@ -137,14 +150,14 @@ def _listing(folder: Path) -> Listing:
         depth_size, _ = common.header(folder / f"depth/{names[0]}.png")
         listing.depth_camera = _camera(folder, "depth", depth_size, depth_size[0])
     if place == "rs_semantics":
-        listing.label_names = dict(enumerate(("void", *scannet_closed.CLASSES)))
+        listing.label_names = reduced_names
     elif place == "semantics":
         listing.label_names, listing.corrections = scannet_labels.reduced(_table(folder), folder.resolve().name)
         if listing.corrections:
             listing.notes.append(f"{len(listing.corrections)} objects take the hand-corrected labels of this scene.")
     elif place == "label-filt":
         listing.label_names = scannet_labels.mapped(_table(folder))
-    if unused := [name for name in ("segmentation_data.pkl", "m2f_semantics", "m2f_probabilities", "m2f_invalid")
-                  if (folder / name).exists()]:  # fmt: skip
+    others = ("segmentation_data.pkl", "m2f_invalid", *(() if pseudo else (PSEUDO, CONFIDENCE)))
+    if unused := [name for name in others if (folder / name).exists()]:
         listing.notes.append(f"Not read: {', '.join(unused)}.")
     return listing
