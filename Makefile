@@ -6,13 +6,13 @@ unexport PYTHONDONTWRITEBYTECODE
 
 CHEBSPLAT := .venv/bin/chebsplat
 CHOICE := $(if $(scene),--scene '$(scene)') $(if $(sequence),--sequence '$(sequence)') $(if $(set),--set '$(set)') \
-  $(if $(ablation),--ablation '$(ablation)')
+  $(if $(ablation),--ablation '$(ablation)') $(if $(basis),--basis '$(basis)')
 
 # `make scene=office0` needs no target: naming a scene, a sequence or a study means running it.
 .DEFAULT_GOAL := $(if $(study),study,$(if $(scene)$(sequence),run,help))
-.PHONY: help run study plan verify clean-stale setup test test-all stability bench-raster bench-train bench-descriptor bench-encoder bench-layouts bench-refresh bench-shapes bench-store nouns teacher teacher-quality lint lock
+.PHONY: help run study plan verify clean-stale setup test test-all stability bench-raster bench-train bench-descriptor bench-encoder bench-layouts bench-refresh bench-knowledge bench-shapes bench-store nouns teacher teacher-quality lint lock
 
-run: $(READY)  ## make scene=NAME|FOLDER [stage=] [set=a.b=c,...] [ablation=] [cores=]; or sequence=NAME
+run: $(READY)  ## make scene=NAME|FOLDER [stage=] [set=a.b=c,...] [ablation=] [basis=NAME@REVISION] [cores=]; or sequence=NAME
 	@$(CHEBSPLAT) run $(CHOICE) $(if $(stage),--stage '$(stage)') $(if $(cores),--cores '$(cores)')
 
 study: $(READY)  ## make study=NAME [cores=] [threads=] [args=--no-run]: its runs, then table, figure, page in build/studies
@@ -52,6 +52,11 @@ bench-train: $(READY)  ## office0 without the shape branch: seconds of 3000 step
 
 stability: $(READY)  ## every extreme case, naive and ours; build/bench/stability.csv; fails if one does (args=--only X)
 	@$(PY) -m benchmarks.stability $(args)
+
+bench-knowledge: $(READY)  ## what the knowledge space costs office0's training: regulariser and update against a step
+	@$(CHEBSPLAT) run --scene office0 --set teacher.kind=labels --stage teacher
+	@$(CHEBSPLAT) run --scene office0 --set teacher.kind=labels --stage sfm
+	@$(PY) benchmarks/knowledge.py --work work/office0@teacher.kind=labels $(args)
 
 bench-shapes: $(READY)  ## which shapes a classifier tells apart, ours beside FPFH and others; build/bench/shapes.csv, .png
 	@$(PY) -m benchmarks.shapes $(args)

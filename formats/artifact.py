@@ -73,7 +73,7 @@ def publish(out: Path, manifest: Manifest) -> Iterator[Path]:
             except OSError:
                 if not is_published(out):
                     raise InputError(f"{out} exists and is not an artifact; choose another --out") from None
-            _sync_directory(out.parent)
+            sync_directory(out.parent)
     finally:
         shutil.rmtree(tmp, ignore_errors=True)
 
@@ -151,10 +151,11 @@ def _sync_tree(root: Path) -> None:
         if path.is_file():
             with path.open("rb") as handle:
                 os.fsync(handle.fileno())
-    _sync_directory(root)
+    sync_directory(root)
 
 
-def _sync_directory(path: Path) -> None:
+def sync_directory(path: Path) -> None:
+    """Make its entries outlive a power cut."""
     handle = os.open(path, os.O_RDONLY)
     try:
         os.fsync(handle)

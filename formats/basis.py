@@ -1,4 +1,4 @@
-"""`basis/1`: one revision of the core knowledge space; revisions form an append-only chain."""
+"""`basis/2`: one revision of the core knowledge space; revisions form an append-only chain."""
 
 from __future__ import annotations
 
@@ -11,16 +11,19 @@ import numpy as np
 
 from chebsplat.errors import InputError
 from chebsplat.formats import artifact
+from chebsplat.formats.documents import read_document, write_document
 from chebsplat.formats.tensors import read_tensors, write_tensors
 
-SCHEMA = "chebsplat.basis/1"
+SCHEMA = "chebsplat.basis/2"
+ORTHONORMAL = 1e-6
 
 
 @dataclass
 class Basis:
     """`bases[name]` [q, r] has orthonormal columns; `weights[name]` [q, p] is the encoder's own matrix beside it.
 
-    `lineage` holds one entry a revision, the oldest first: scene, key, rank and residual before and after.
+    `lineage` holds one entry a revision, the oldest first: `scene`, `gaussians` (the checkpoint's key), and
+    `projections`: by name the report of `cks.update`. The scene's columns are those from `rank_before` to `rank_after`.
     """
 
     bases: dict[str, np.ndarray]
@@ -36,18 +39,37 @@ def write_basis(out: Path, basis: Basis) -> None:
     """Fill the directory that `artifact.publish` yields. Raises ValueError on a non-finite value."""
     write_tensors(out / "bases.safetensors", basis.bases)
     write_tensors(out / "weights.safetensors", basis.weights)
-    (out / "lineage.json").write_text(json.dumps(basis.lineage, indent=1) + "\n")
+    write_document(out / "lineage.json", basis.lineage)
 
 
 def read_basis(path: Path) -> Basis:
-    """Raises: InputError naming the damaged file, or a basis whose columns are not orthonormal to 1e-5."""
+    """Raises: InputError naming the damaged file, or a basis that is not orthonormal or not what its lineage says."""
     manifest = artifact.read_manifest(path, SCHEMA)
     bases = read_tensors(path, manifest, "bases.safetensors")
     weights = read_tensors(path, manifest, "weights.safetensors")
+    lineage = read_lineage(path)
+    file = path / "bases.safetensors"
     for name, columns in bases.items():
-        error = np.abs(columns.T.astype(np.float64) @ columns - np.eye(columns.shape[1])).max(initial=0.0)
-        if error > 1e-5:
+        if (error := off_orthonormal(columns)) > ORTHONORMAL:
+            raise InputError(f"{file}: {name} is not orthonormal ({error:.1e}); {artifact.remedy(path)}")
+        rank = lineage[-1]["projections"].get(name, {}).get("rank_after") if lineage else 0
+        if rank != columns.shape[1]:
             raise InputError(
-                f"{path / 'bases.safetensors'}: {name} is not orthonormal ({error:.1e}); {artifact.remedy(path)}"
+                f"{file}: {name} has {columns.shape[1]} columns, its lineage {rank}; {artifact.remedy(path)}"
             )
-    return Basis(bases, weights, json.loads(artifact.checked(path, manifest, "lineage.json").read_text()))
+    return Basis(bases, weights, lineage)
+
+
+def off_orthonormal(columns: np.ndarray) -> float:
+    """Largest entry of |BᵀB − I| of columns [q, r], in float64."""
+    return float(np.abs(columns.T.astype(np.float64) @ columns - np.eye(columns.shape[1])).max(initial=0.0))
+
+
+def read_lineage(path: Path) -> list[dict[str, Any]]:
+    """The lineage alone. Raises InputError naming file and remedy."""
+    manifest = artifact.read_manifest(path, SCHEMA)
+    entries: list[dict[str, Any]] = read_document(path, manifest, "lineage.json")
+    for entry in entries:
+        if not {"scene", "gaussians", "projections"} <= entry.keys():
+            raise InputError(f"{path / 'lineage.json'} lacks fields: {json.dumps(entry)[:80]}; {artifact.remedy(path)}")
+    return entries

@@ -10,6 +10,7 @@ from typing import Any
 import click
 
 from chebsplat.errors import ConfigError
+from chebsplat.pipelines.basis_cli import basis
 from chebsplat.pipelines.guard import guarded
 from chebsplat.pipelines.uses import USES
 from chebsplat.stages.registry import STAGES
@@ -39,28 +40,31 @@ def main() -> None:
     """Semantic 3D Gaussian Splatting that understands shape."""
 
 
-for _command in USES:
+for _command in (*USES, basis):
     main.add_command(_command)
 
 
-def plans(scene: str | None, sequence: str | None, settings: str, ablation: str) -> list[Any]:
-    """The plan of a scene, or those of a sequence, each training on the basis of the one before."""
-    from chebsplat.pipelines import plan as planning
+def plans(scene: str | None, sequence: str | None, settings: str, ablation: str, basis: str) -> list[Any]:
+    """The plan of a scene, after those of the scenes that its basis comes from, or the plans of a sequence."""
+    from chebsplat.pipelines import bases, sequences
+    from chebsplat.pipelines.plan import Planner
 
     if (scene is None) == (sequence is None):
         raise ConfigError("name one of scene= and sequence=")
-    planner = planning.Planner()
+    if sequence is not None and basis:
+        raise ConfigError("a sequence starts from nothing; basis= goes with scene=")
+    planner = Planner()
     try:
-        if scene is not None:
-            return [planner.plan(scene, settings, ablation)]
-        found: list[Any] = []
-        basis: Path | None = None
-        for place, name in enumerate(planning.read_toml("sequences", str(sequence))["scenes"], start=1):
-            plan = planner.plan(name, settings, ablation, basis, keep_knowledge=True)
-            plan.title = f"{sequence}-{place}-{plan.title}"
-            basis = plan.targets.get("cks", basis)
-            found.append(plan)
-        return found
+        if sequence is not None:
+            return sequences.chain(planner, sequence, settings, ablation)
+        if not basis:
+            return [planner.plan(str(scene), settings, ablation)]
+        earlier, path, name = bases.before(planner, basis, settings, ablation)
+        plan = planner.plan(str(scene), settings, ablation, path)
+        plan.title += ("+" if ablation or settings else "@") + f"basis={name}"
+        for found in earlier:
+            found.asked = False
+        return [*earlier, plan]
     finally:
         planner.save()
 
@@ -75,7 +79,7 @@ def checked_stage(stage: str | None, found: list[Any]) -> str | None:
         near = difflib.get_close_matches(stage, list(STAGES), 1)
         raise ConfigError(f"no stage is called {stage}" + (f"; did you mean {near[0]}?" if near else ""))
     for plan in found:
-        if stage not in plan.targets:
+        if plan.asked and stage not in plan.targets:
             raise ConfigError(f"{plan.title} leaves out {stage}: {plan.left_out.get(stage, 'not needed')}")
     return stage
 
@@ -85,6 +89,9 @@ OPTIONS = [
     click.option("--sequence", help="scenes in order, each starting from the knowledge of those before"),
     click.option("--set", "settings", default="", help="section.key=value,..."),
     click.option("--ablation", default="", help="a named set of settings"),
+    click.option(
+        "--basis", default="", help="start from this knowledge: NAME[@REVISION] of a sequence or HEAD, FOLDER/"
+    ),
 ]
 
 
@@ -98,13 +105,13 @@ def with_scene(command: Any) -> Any:
 @with_scene
 @click.option("--stage", help="stop after this stage")
 @click.option("--cores", type=click.IntRange(1), default=os.cpu_count())
-def run(scene: str | None, sequence: str | None, settings: str, ablation: str, stage: str | None, cores: int) -> None:
+def run(stage: str | None, cores: int, **choice: Any) -> None:
     """Bring a scene up to date; recompute only what is stale."""
 
     def action() -> int:
         from chebsplat.pipelines.run import execute
 
-        found = plans(scene, sequence, settings, ablation)
+        found = plans(**choice)
         return execute(found, checked_stage(stage or None, found), cores)
 
     guarded(action)
@@ -112,13 +119,17 @@ def run(scene: str | None, sequence: str | None, settings: str, ablation: str, s
 
 @main.command()
 @with_scene
-def plan(scene: str | None, sequence: str | None, settings: str, ablation: str) -> None:
+def plan(**choice: Any) -> None:
     """Show what would run, what is fresh, and what the scene leaves out, and why."""
 
     def action() -> int:
-        for found in plans(scene, sequence, settings, ablation):
+        from chebsplat.pipelines.run import wanted_steps
+
+        chosen = plans(**choice)
+        keys = {step.key for found in chosen if found.asked for step in wanted_steps(found, None, chosen)}
+        for found in chosen:
             print(f"{found.title}: {found.source}")
-            for step in found.steps:
+            for step in (step for step in found.steps if step.key in keys):
                 print(f"  {'fresh' if step.fresh else 'would run':9s} {step.stage:9s} {step.key}")
             for what, why in found.left_out.items():
                 print(f"  left out  {what}: {why}")
@@ -138,7 +149,7 @@ def study(name: str, cores: int, threads: int, out: Path | None, only_plan: bool
     """Run a study (of pipelines/configs/studies, or a .toml): its table, figure and page; goes on where it stopped."""
 
     def action() -> int:
-        from chebsplat.pipelines import results, study_page
+        from chebsplat.pipelines import results, study_page, transfer
         from chebsplat.pipelines import study as studies
         from chebsplat.pipelines.run import Outcome, say
 
@@ -153,7 +164,8 @@ def study(name: str, cores: int, threads: int, out: Path | None, only_plan: bool
         outcome = Outcome() if no_run else studies.execute(Path(name).stem, runs, cores, used)
         rows = [results.row_of(run, outcome.failed) for run in runs]
         command = f"make study={name} cores={cores} threads={used}"
-        print(study_page.write(folder, asked, runs, rows, command).absolute())
+        more = transfer.sections(folder, asked, rows) if asked.sequences else []
+        print(study_page.write(folder, asked, runs, rows, command, more).absolute())
         return outcome.code
 
     guarded(action)
@@ -201,10 +213,12 @@ def clean_stale(yes: bool) -> None:
 @main.command()
 def scenes() -> None:
     """List the scenes, ablations, sequences and studies that have a name."""
+    from chebsplat.pipelines.bases import head_names
     from chebsplat.pipelines.plan import names
 
     for kind in ("scenes", "ablations", "sequences", "studies"):
         print(f"{kind}: {' '.join(names(kind))}")
+    print(f"HEADs: {' '.join(head_names()) or 'none'}")
 
 
 @main.command(hidden=True)

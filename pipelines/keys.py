@@ -23,18 +23,18 @@ PLACES = (
 
 
 def step_key(
-    stage: Stage, sections: dict[str, Any], inputs: dict[str, Path], code: dict[str, Any], raw: str | None = None
+    stage: Stage, sections: dict[str, Any], inputs: dict[str, str], code: dict[str, Any], raw: str | None = None
 ) -> str:
     """Key of a stage's artifact, 16 hex digits.
 
-    Args: sections: the config that the stage reads; inputs: artifacts by role, whose names are their keys;
+    Args: sections: the config that the stage reads; inputs: keys of artifacts by role;
           code: of `Code.stage`; raw: `content_hash` of the files outside the store that the stage reads.
     """
     identity = {
         "stage": stage.name,
         "schema": stage.schema,
         "config": placeless(sections),
-        "inputs": {role: path.name for role, path in inputs.items()},
+        "inputs": inputs,
         "code": code,
     } | ({} if raw is None else {"raw": raw})
     text = json.dumps(identity, sort_keys=True, separators=(",", ":"), allow_nan=False)

@@ -8,6 +8,8 @@ from typing import TYPE_CHECKING, Any
 from chebsplat.errors import ConfigError
 
 if TYPE_CHECKING:
+    from pathlib import Path
+
     from chebsplat.formats.teacher_model import TeacherModel
 
 
@@ -27,7 +29,7 @@ def teacher_kind(config: Any, probe: dict[str, bool]) -> tuple[str, str]:
     return ("onnx" if wanted == "auto" else wanted), ""
 
 
-def left_out_stages(config: Any, kind: str, why: str, probe: dict[str, bool], knowledge: bool) -> dict[str, str]:
+def left_out_stages(config: Any, kind: str, why: str, probe: dict[str, bool]) -> dict[str, str]:
     """Stages that this scene does not need, and why."""
     left_out: dict[str, str] = {}
     if kind == "none":
@@ -37,12 +39,20 @@ def left_out_stages(config: Any, kind: str, why: str, probe: dict[str, bool], kn
         left_out |= {"describe": "train.encoder is off", "onnx": "train.encoder is off"}
     elif not config.train.albo:
         left_out |= {"describe": "train.albo is false: tokens hold no descriptor"}
-    if not knowledge or "onnx" in left_out:
-        left_out["cks"] = "no sequence is named" if not knowledge else left_out["onnx"]
     if probe["poses"] and probe["depth"]:
         left_out["sfm: matching"] = "poses and depth are given"
     elif probe["poses"]:
         left_out["sfm: pose estimation"] = "poses are given"
+    return left_out
+
+
+def left_out_knowledge(config: Any, kind: str, why: str, basis: Path | None, keep: bool) -> dict[str, str]:
+    """Why a scene does not train on a given basis, or keeps nothing of its knowledge, if so."""
+    reasons = {"off": "train.encoder is off", "mlp": "train.encoder is mlp: it has no projections"}
+    unable = f"no encoder is trained ({why})" if kind == "none" else reasons.get(config.train.encoder, "")
+    left_out = {} if basis is None or not unable else {"basis": unable}
+    if unable or not keep:
+        left_out["cks"] = unable or "no sequence is named"
     return left_out
 
 

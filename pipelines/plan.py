@@ -6,7 +6,6 @@ import difflib
 import hashlib
 import os
 import re
-import subprocess
 import tomllib
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -17,9 +16,15 @@ from chebsplat.formats.teacher_model import TeacherModel, read_teacher
 from chebsplat.pipelines import store
 from chebsplat.pipelines.code import Code, installed
 from chebsplat.pipelines.keys import PLACES, content_hash, step_key
-from chebsplat.pipelines.needs import left_out_projection, left_out_stages, source_sentence, teacher_kind
+from chebsplat.pipelines.needs import (
+    left_out_knowledge,
+    left_out_projection,
+    left_out_stages,
+    source_sentence,
+    teacher_kind,
+)
 from chebsplat.stages.projection import reference_files
-from chebsplat.stages.registry import STAGES
+from chebsplat.stages.registry import STAGES, Stage
 from chebsplat.teachers import EMBEDDED
 
 CONFIGS = Path(__file__).parent / "configs"
@@ -43,12 +48,16 @@ class Step:
 
 @dataclass
 class Plan:
-    """Steps in order, with what is left out and why. `title` names the links: scene[@ablation]."""
+    """Steps in order, with what is left out and why. `title` names the links: scene[@ablation].
+
+    `asked` is false of a scene that is only made as far as another one needs it.
+    """
 
     title: str
     source: str
     steps: list[Step]
     left_out: dict[str, str] = field(default_factory=dict)
+    asked: bool = True
 
     @property
     def targets(self) -> dict[str, Path]:
@@ -178,8 +187,8 @@ class Planner:
         projection = config.projection.model_copy(update={"model": teacher.model})
         config = config.model_copy(update={"source": source, "teacher": teacher, "projection": projection})
         model = read_teacher(Path(teacher.model)) if kind == "onnx" and teacher.model else None
-        left_out = left_out_stages(config, kind, why, probe, basis is not None or keep_knowledge)
-        left_out |= left_out_projection(kind, model)
+        left_out = left_out_stages(config, kind, why, probe) | left_out_projection(kind, model)
+        left_out |= left_out_knowledge(config, kind, why, basis, keep_knowledge)
         steps: dict[str, Step] = {}
         root = Path(source.path) if source.path else None
         raw = {"ingest": content_hash(files, root, self.file_memo.values)}
@@ -189,16 +198,22 @@ class Planner:
         if config.evaluate.lpips_weights:
             raw["evaluate"] = self._hash_files([Path(config.evaluate.lpips_weights)], "evaluate.lpips_weights")
         for stage in STAGES.values():
-            if stage.name in left_out or (stage.name == "cks" and not keep_knowledge):
+            if stage.name in left_out:
                 continue
             inputs = {role: steps[of].path for role, of in stage.roles.items() if of in steps}
-            if basis is not None and "cks" not in left_out and stage.name in ("train", "cks"):
+            if basis is not None and "basis" not in left_out and stage.name in ("train", "cks"):
                 inputs["basis"] = basis
-            sections = config.sections(stage.sections)
-            code = self.code.stage(stage.name)
-            key = step_key(stage, sections, inputs, code, raw.get(stage.name))
-            steps[stage.name] = Step(stage.name, key, store.artifact_path(stage.name, key), inputs, sections, code)
+            keys = {role: path.name for role, path in inputs.items()}
+            steps[stage.name] = self.step(stage, config, inputs, keys, raw.get(stage.name))
         return Plan(title, source_sentence(name, asked, source), list(steps.values()), left_out)
+
+    def step(
+        self, stage: Stage, config: Any, inputs: dict[str, Path], keys: dict[str, str], raw: str | None = None
+    ) -> Step:
+        """A stage's step; keys: of its inputs, by role."""
+        sections, code = config.sections(stage.sections), self.code.stage(stage.name)
+        key = step_key(stage, sections, keys, code, raw)
+        return Step(stage.name, key, store.artifact_path(stage.name, key), inputs, sections, code)
 
     def _probe(self, source: Any) -> tuple[dict[str, bool], list[Path]]:
         """What the source has, and the raw files its capture depends on."""
@@ -229,14 +244,3 @@ class Planner:
             if not file.is_file():
                 raise InputError(f"{file} is missing; correct {setting}")
         return content_hash(files, None, self.file_memo.values)
-
-
-def git_state(root: Path) -> dict[str, Any]:
-    """{"commit", "dirty"} of the checkout; empty outside one."""
-    try:
-        run = {"cwd": root, "capture_output": True, "text": True, "check": True}
-        commit = subprocess.run(["git", "rev-parse", "HEAD"], **run).stdout.strip()  # type: ignore[call-overload]
-        status = subprocess.run(["git", "status", "--porcelain"], **run).stdout.strip()  # type: ignore[call-overload]
-    except (OSError, subprocess.CalledProcessError):
-        return {}
-    return {"commit": commit, "dirty": bool(status)}

@@ -44,7 +44,7 @@ FIGURES = (
     Figure("train_seconds", "training, s", 1, 1, True),
 )
 OTHERS = ("miou_teacher", "protocol", "held_in_psnr", "steps", "threads", "device", "train_key", "evaluate_key")
-IDENTITY = ("condition", "variant", "budget", "sequence", "place", "scene", "seed", "state")
+IDENTITY = ("condition", "variant", "budget", "sequence", "place", "visit", "scene", "seed", "state")
 POOLED = ("miou", "miou_gain", "macc", "oa")  # what a protocol may work out over all scenes together
 COLUMNS = (*IDENTITY, *(figure.key for figure in FIGURES), *OTHERS)
 
@@ -150,15 +150,20 @@ def groups(rows: list[Row], *names: str) -> dict[tuple, list[Row]]:
     return found
 
 
+def counted(rows: list[Row]) -> list[Row]:
+    """Without the first scene of a sequence, which has no earlier knowledge, and scenes that come again, which know
+    themselves."""
+    return [row for row in rows if row["place"] != 1 and row["visit"] == 1]
+
+
 def compare(rows: list[Row], baseline: str) -> list[Line]:
     """Mean ± spread over scenes and seeds, and paired differences against the baseline.
 
-    Choices: the first scene of a sequence has no earlier knowledge: it counts in no mean, though its row is written.
+    Choices: of a sequence only those rows that are `counted`; every row is written.
       A pair needs both runs: what failed on either side drops out of the difference, and the line counts its runs.
       Where a protocol works out a figure over all scenes together, that of a seed is one value, and needs all of them.
     """
-    counted = [row for row in rows if row["place"] != 1]
-    by_line = groups(counted, "condition", "budget", "variant")
+    by_line = groups(counted(rows), "condition", "budget", "variant")
     lines = []
     for (condition, budget, variant), members in by_line.items():
         done = [row for row in members if row["state"] == "done"]
@@ -180,14 +185,13 @@ def compare(rows: list[Row], baseline: str) -> list[Line]:
 
 
 def _pairs(done: list[Row], against: list[Row], key: str) -> list[tuple[str, float, float]]:
-    """(scene, value, the baseline's) of the same scene, seed and place in a sequence."""
+    """(scene, value, the baseline's) of the same scene, seed and place in a sequence.
+
+    Choices: a scene in several sequences is one unit: its baseline is the same run in all of them.
+    """
 
     def place(row: Row) -> tuple:
         return row["sequence"], row["place"], row["scene"], row["seed"]
 
     other = {place(row): row[key] for row in against if row[key] is not None}
-    return [
-        (f"{row['sequence']}/{row['scene']}", row[key], other[place(row)])
-        for row in done
-        if row[key] is not None and place(row) in other
-    ]
+    return [(row["scene"], row[key], other[place(row)]) for row in done if row[key] is not None and place(row) in other]

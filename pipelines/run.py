@@ -10,14 +10,14 @@ import shutil
 import subprocess
 import sys
 import time
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
 from chebsplat.pipelines import store
-from chebsplat.pipelines.plan import Plan, Step, git_state
+from chebsplat.pipelines.plan import Plan, Step
 
 HERE = Path(__file__).parent
 # Snakemake's own words go to a file; its jobs inherit the real stderr, which may be a terminal.
@@ -38,8 +38,8 @@ def say(text: str) -> None:
 
 def execute(plans: list[Plan], stage: str | None, cores: int) -> int:
     """Bring plans up to date, up to `stage`; prints the last artifact (the report's page) on stdout. Exit code."""
-    wanted = [wanted_steps(plan, stage) for plan in plans]
-    steps = {step.key: step for some in wanted for step in some}
+    asked = [plan for plan in plans if plan.asked]
+    steps = {step.key: step for plan in asked for step in wanted_steps(plan, stage, plans)}
     stale = [step for step in steps.values() if not step.fresh]
     for plan in plans:
         say(f"{plan.title}: {plan.source}")
@@ -55,23 +55,21 @@ def execute(plans: list[Plan], stage: str | None, cores: int) -> int:
         return code
     if stale:
         seconds(list(steps.values()), {step.key for step in stale})
-    for some in wanted:
-        last = some[-1].path
-        print(last / "report.html" if some[-1].stage == "report" else last)
+    for plan in asked:
+        last = next(step for step in reversed(plan.steps) if stage in (None, step.stage))
+        print(last.path / "report.html" if last.stage == "report" else last.path)
     return 0
 
 
-def wanted_steps(plan: Plan, stage: str | None) -> list[Step]:
-    """All steps, or `stage` and what it needs."""
-    if stage is None:
-        return plan.steps
-    by_path = {step.path: step for step in plan.steps}
-    waiting, needed = [step for step in plan.steps if step.stage == stage], set()
+def wanted_steps(plan: Plan, stage: str | None, others: Iterable[Plan] = ()) -> list[Step]:
+    """All steps of a plan, or its `stage`, and what they need, of other plans too."""
+    by_path = {step.path: step for some in (*others, plan) for step in some.steps}
+    waiting, needed = [step for step in plan.steps if stage in (None, step.stage)], set()
     while waiting:
         step = waiting.pop()
         needed.add(step.key)
         waiting += [by_path[path] for path in step.inputs.values() if path in by_path]
-    return [step for step in plan.steps if step.key in needed]
+    return [step for step in by_path.values() if step.key in needed]
 
 
 def snakemake(steps: list[Step], cores: int, threads: int | None = None) -> Outcome:
@@ -80,22 +78,14 @@ def snakemake(steps: list[Step], cores: int, threads: int | None = None) -> Outc
     Args: threads: of one job, so that cores // threads run at once; `evaluate`, which measures frames per second, then
           runs alone. None: every job may use all cores.
     """
-    work = store.work()
     state = git_state(HERE)
     entries = [entry(step, state) for step in steps]
     for item in entries:
         item["threads"] = 1 if threads is None else cores if item["stage"] == "evaluate" else threads
-    text = json.dumps({"steps": entries}, indent=1)
-    folder = work / ".plans" / f"{hashlib.sha256(text.encode()).hexdigest()[:16]}-{os.getpid()}"
-    shutil.rmtree(folder, ignore_errors=True)
-    folder.mkdir(parents=True)
-    for item in entries:
-        (folder / f"{item['stage']}-{item['key']}.json").write_text(json.dumps(item["config"], indent=1))
-    plan, words = folder / "plan.json", folder / "snakemake.log"
-    plan.with_suffix(".part").write_text(text)
-    os.replace(plan.with_suffix(".part"), plan)
+    plan = write_plan(entries)
+    folder, words = plan.parent, plan.parent / "snakemake.log"
     command = [sys.executable, "-c", SNAKEMAKE, str(words), "--workflow-profile", "none"]
-    command += ["--snakefile", str(HERE / "Snakefile"), "--directory", str(work)]
+    command += ["--snakefile", str(HERE / "Snakefile"), "--directory", str(store.work())]
     command += ["--profile", str(HERE / "profiles/default"), "--cores", str(cores), "--config", f"plan={plan}"]
     environment = os.environ | {"CHEBSPLAT_THREADS": str(threads or cores)}
     done = subprocess.run(command, stdout=subprocess.DEVNULL, env=environment)
@@ -103,6 +93,21 @@ def snakemake(steps: list[Step], cores: int, threads: int | None = None) -> Outc
         shutil.rmtree(folder, ignore_errors=True)
         return Outcome()
     return failures(steps, folder, words)
+
+
+def write_plan(entries: list[dict[str, Any]]) -> Path:
+    """The plan of a run, in a folder of its own with each job's config; as long as this process lives, `clean-stale`
+    spares what it names."""
+    text = json.dumps({"steps": entries}, indent=1)
+    folder = store.work() / ".plans" / f"{hashlib.sha256(text.encode()).hexdigest()[:16]}-{os.getpid()}"
+    shutil.rmtree(folder, ignore_errors=True)
+    folder.mkdir(parents=True)
+    for item in entries:
+        (folder / f"{item['stage']}-{item['key']}.json").write_text(json.dumps(item["config"], indent=1))
+    plan = folder / "plan.json"
+    plan.with_suffix(".part").write_text(text)
+    os.replace(plan.with_suffix(".part"), plan)
+    return plan
 
 
 def failures(steps: list[Step], folder: Path, words: Path) -> Outcome:
@@ -124,6 +129,17 @@ def failures(steps: list[Step], folder: Path, words: Path) -> Outcome:
 def last_word(log: Path) -> str:
     lines = log.read_text().strip().splitlines() if log.is_file() else []
     return lines[-1] if lines else "no message"
+
+
+def git_state(root: Path) -> dict[str, Any]:
+    """{"commit", "dirty"} of the checkout; empty outside one."""
+    try:
+        run = {"cwd": root, "capture_output": True, "text": True, "check": True}
+        commit = subprocess.run(["git", "rev-parse", "HEAD"], **run).stdout.strip()  # type: ignore[call-overload]
+        status = subprocess.run(["git", "status", "--porcelain"], **run).stdout.strip()  # type: ignore[call-overload]
+    except (OSError, subprocess.CalledProcessError):
+        return {}
+    return {"commit": commit, "dirty": bool(status)}
 
 
 def entry(step: Step, state: dict[str, Any]) -> dict[str, Any]:
@@ -153,7 +169,8 @@ def job(plan: Path, key: str) -> int:
         os.environ |= {"OMP_NUM_THREADS": threads, "NUMBA_NUM_THREADS": threads}
     step = next(s for s in json.loads(plan.read_text())["steps"] if s["key"] == key)
     files = plan.parent / f"{step['stage']}-{key}"
-    logging.getLogger("chebsplat").addHandler(logging.FileHandler(f"{files}.log"))
+    handler = logging.FileHandler(f"{files}.log")
+    logging.getLogger("chebsplat").addHandler(handler)
     arguments = ["--config", f"{files}.json", "--out", step["path"], "--key", key]
     arguments += ["--code", json.dumps(step["code"])]
     for role, path in step["inputs"].items():
@@ -164,6 +181,9 @@ def job(plan: Path, key: str) -> int:
             import_module(f"chebsplat.stages.{step['stage']}").main(arguments, prog_name=step["stage"])
     except SystemExit as stop:
         code = stop.code if isinstance(stop.code, int) else 1
+    finally:
+        logging.getLogger("chebsplat").removeHandler(handler)
+        handler.close()
     if code:
         Path(f"{files}.exit").write_text(str(code))
     return code

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import tomllib
 from collections.abc import Iterator
 from dataclasses import dataclass, field
@@ -15,6 +16,7 @@ from chebsplat.pipelines import plan as planning
 from chebsplat.pipelines import store
 from chebsplat.pipelines.plan import Plan, Planner, Step, merged
 from chebsplat.pipelines.run import Outcome, say, snakemake, wanted_steps
+from chebsplat.pipelines.sequences import scenes_of
 
 LAST = "evaluate"  # a study measures; a page and an ONNX file for each of its runs would be waste
 
@@ -41,7 +43,8 @@ class Study(_Strict):
 
     Conditions are what results are averaged within (a teacher, a noise level); variants are compared, each with
     `baseline`, under the same condition, budget, scene and seed. A variant may also name an `ablation`, and, in a study
-    of sequences, `knowledge = false`: every scene from nothing.
+    of sequences, `knowledge = false`: every scene from nothing. What a scene passes on is what it learned with the last
+    budget, whatever the budget of the next: budgets then show how soon a scene gets somewhere, all else being equal.
     """
 
     title: str
@@ -54,12 +57,14 @@ class Study(_Strict):
     settings: dict[str, dict[str, Any]] = {}
     conditions: dict[str, dict[str, Any]] = {"": {}}
     variants: dict[str, dict[str, Any]] = Field(min_length=1)
+    pairs: list[tuple[str, str]] = []  # variants to compare besides, the second with the first
     against: str = ""  # section.key whose value is the figure's horizontal axis, instead of run time
 
 
 @dataclass(frozen=True)
 class Run:
-    """One point of a study. `place` counts from 1 within a sequence; 0 outside one."""
+    """One point of a study. `place` counts from 1 within a sequence, and `visit` how often its scene has come; 0 and 1
+    outside one."""
 
     condition: str
     variant: str
@@ -68,6 +73,7 @@ class Run:
     seed: int
     sequence: str
     place: int
+    visit: int
     plan: Plan = field(compare=False)
 
     @property
@@ -108,6 +114,8 @@ def checked_study(values: dict[str, Any], origin: str) -> Study:
         raise ConfigError(f"{origin}: name scenes or sequences, one of them")
     if study.baseline not in study.variants:
         raise ConfigError(f"{origin}: baseline {study.baseline} is none of its variants: {', '.join(study.variants)}")
+    for name in (name for pair in study.pairs for name in pair if name not in study.variants):
+        raise ConfigError(f"{origin}: pairs: {name} is none of its variants: {', '.join(study.variants)}")
     return study
 
 
@@ -118,51 +126,48 @@ def expand(study: Study) -> list[Run]:
     Choices: all runs of a condition are measured under one protocol, since figures of two must not meet in a mean.
     """
     planner = Planner()
-    chains = [("", study.scenes)] if study.scenes else []
-    chains += [(name, planning.read_toml("sequences", name)["scenes"]) for name in study.sequences]
+    chains = [("", [scene]) for scene in study.scenes]
+    chains += [(Path(name).stem, scenes_of(name)) for name in study.sequences]
+    order = list(study.budgets.settings())
+    found: list[Run] = []
     try:
-        runs = [
-            run
-            for sequence, scenes in chains
-            for chain in ([[scene] for scene in scenes] if not sequence else [scenes])
-            for seed in study.seeds
-            for condition in study.conditions
-            for budget in study.budgets.settings()
-            for variant in study.variants
-            for run in _chain(planner, study, condition, variant, budget, seed, sequence, chain)
-        ]
+        for sequence, chain in chains:
+            for seed, condition in itertools.product(study.seeds, study.conditions):
+                some: list[Run] = []
+                for variant in study.variants:
+                    some += _chain(planner, study, condition, variant, seed, sequence, chain)
+                found += sorted(some, key=lambda run: (order.index(run.budget), run.place))
     finally:
         planner.save()
     for condition in study.conditions:
-        found = sorted({run.protocol for run in runs if run.condition == condition})
-        if len(found) > 1:
-            raise ConfigError(f"scenes measured as {' and as '.join(found)} do not compare; set ingest.protocol")
-    return runs
+        used = sorted({run.protocol for run in found if run.condition == condition})
+        if len(used) > 1:
+            raise ConfigError(f"scenes measured as {' and as '.join(used)} do not compare; set ingest.protocol")
+    return found
 
 
 def _chain(
-    planner: Planner,
-    study: Study,
-    condition: str,
-    variant: str,
-    budget: str,
-    seed: int,
-    sequence: str,
-    chain: list[str],
+    planner: Planner, study: Study, condition: str, variant: str, seed: int, sequence: str, chain: list[str]
 ) -> Iterator[Run]:
-    """The runs of scenes that follow one another; the chain of a scene on its own has one link."""
+    """The runs of scenes that follow one another, with every budget; the chain of a scene on its own has one link."""
     own = dict(study.variants[variant])
     ablation = own.pop("ablation", None)
     knowledge = bool(own.pop("knowledge", True)) and bool(sequence)
     basis: Path | None = None
+    budgets = study.budgets.settings()
     for place, scene in enumerate(chain, start=1):
         values = merged(study.settings, study.conditions[condition])
         values = merged(values, planning.read_toml("ablations", ablation) if ablation else {})
-        values = merged(merged(values, own), {"train": study.budgets.settings()[budget]})
-        values = merged(values, seeded(scene, values, seed))
-        found = planner.plan(scene, basis=basis, keep_knowledge=knowledge, values=values)
-        basis = found.targets.get("cks", basis)
-        yield Run(condition, variant, budget, found.title, seed, sequence, place if sequence else 0, found)
+        values = merged(values, own)
+        earlier = basis
+        for budget, spent in budgets.items():
+            settings = merged(values, {"train": spent})
+            settings = merged(settings, seeded(scene, settings, seed))
+            keep = knowledge and budget == list(budgets)[-1]
+            found = planner.plan(scene, basis=earlier, keep_knowledge=keep, values=settings)
+            basis = found.targets.get("cks", basis)
+            where = (place, chain[:place].count(scene)) if sequence else (0, 1)
+            yield Run(condition, variant, budget, found.title, seed, sequence, *where, found)
 
 
 def seeded(scene: str, values: dict[str, Any], seed: int) -> dict[str, Any]:
@@ -172,7 +177,7 @@ def seeded(scene: str, values: dict[str, Any], seed: int) -> dict[str, Any]:
 
 
 def outstanding(runs: list[Run]) -> list[Step]:
-    """Steps that are not there yet, each once, in an order that fits."""
+    """Steps that are not there yet, each once."""
     steps = {step.key: step for run in runs for step in (*run.steps, *_knowledge(run))}
     return [step for step in steps.values() if not step.fresh]
 

@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from chebsplat.pipelines.results import Row, groups
+from chebsplat.pipelines.results import Row, counted, groups
 from chebsplat.statistics import summarize
 
 MARKERS = "osD^vP*X<>"
@@ -24,7 +24,7 @@ def draw(path: Path, rows: list[Row], traces: Traces, settings: dict[str, float]
     matplotlib.use("Agg")
     import matplotlib.pyplot as plt
 
-    done = [row for row in rows if row["state"] == "done" and row["place"] != 1]
+    done = [row for row in counted(rows) if row["state"] == "done"]
     variants = list(dict.fromkeys(row["variant"] for row in rows))
     style = {
         name: {"color": f"C{k % 10}", "marker": MARKERS[k % len(MARKERS)], "label": name}

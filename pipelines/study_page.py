@@ -5,24 +5,33 @@ from __future__ import annotations
 import base64
 import csv
 import math
+from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from chebsplat import protocols
 from chebsplat.errors import DataFailure
 from chebsplat.formats import artifact
 from chebsplat.pipelines import study_figures
-from chebsplat.pipelines.results import COLUMNS, FIGURES, Figure, Line, Row, compare, groups, traces
+from chebsplat.pipelines.results import COLUMNS, FIGURES, Figure, Line, Row, compare, counted, groups, traces
 from chebsplat.pipelines.study import Run, Study
 from chebsplat.statistics import Difference, Summary, summarize
+
+if TYPE_CHECKING:
+    from chebsplat.pipelines.transfer import Section
 
 PICTURE = "error-against-time.png"
 STABILITY = Path("build/bench/stability.csv")  # of `make stability`
 BY_SCENE = ("miou", "miou_gain", "psnr", "n_gaussians", "train_seconds")
 
 
-def write(out: Path, study: Study, runs: list[Run], rows: list[Row], command: str) -> Path:
-    """Fill `out`; returns the page. Runs that failed or have not run are named, and count in no mean."""
+def write(
+    out: Path, study: Study, runs: list[Run], rows: list[Row], command: str, more: Sequence[Section] = ()
+) -> Path:
+    """Fill `out`; returns the page. Runs that failed or have not run are named, and count in no mean.
+
+    Args: more: further sections, whose pictures lie in `out` already.
+    """
     out.mkdir(parents=True, exist_ok=True)
     with (out / "results.csv").open("w", newline="") as handle:
         writer = csv.DictWriter(handle, COLUMNS, extrasaction="ignore")
@@ -41,6 +50,7 @@ def write(out: Path, study: Study, runs: list[Run], rows: list[Row], command: st
         "missing": missing(rows),
         "note": note(study, rows),
         "stability": stability(STABILITY),
+        "more": more,
         "left_out": left_out(rows),
     }
     (out / "results.md").write_text(markdown(parts))
@@ -49,8 +59,11 @@ def write(out: Path, study: Study, runs: list[Run], rows: list[Row], command: st
     from chebsplat.stages.report import LARGEST
     from chebsplat.stages.viewer import rendered
 
-    picture = "data:image/png;base64," + base64.b64encode((out / PICTURE).read_bytes()).decode()
-    page = rendered(PAGE, picture=picture, **parts, **gallery(study, runs, rows))
+    drawings = {
+        name: "data:image/png;base64," + base64.b64encode((out / name).read_bytes()).decode()
+        for name in (PICTURE, *(section.picture for section in more if section.picture))
+    }
+    page = rendered(PAGE, picture=drawings[PICTURE], drawings=drawings, **parts, **gallery(study, runs, rows))
     if len(page) > LARGEST:
         raise DataFailure(f"the page would have {len(page) / 1e6:.0f} MB; name fewer scenes or variants in the study")
     (out / "study.html").write_text(page)
@@ -108,7 +121,7 @@ def table_row(line: Line, lines: list[Line]) -> list[tuple[str, str, bool]]:
 
 def scene_table(rows: list[Row]) -> list[list[str]]:
     """Header and rows: each scene apart, mean ± spread over seeds (and, in sequences, over orders)."""
-    done = [row for row in rows if row["state"] == "done" and row["place"] != 1]
+    done = [row for row in counted(rows) if row["state"] == "done"]
     figures = [
         figure for figure in FIGURES if figure.key in BY_SCENE and any(row[figure.key] is not None for row in done)
     ]
@@ -166,7 +179,9 @@ def note(study: Study, rows: list[Row]) -> str:
     n_scenes = len({row["scene"] for row in rows})
     unit = f"Student's over the {n_scenes} scenes" if n_scenes > 1 else "Student's over the seeds of the one scene"
     first = (
-        " The first scene of a sequence, which has no earlier knowledge, counts in no mean." if study.sequences else ""
+        " Of a sequence neither the first scene, which has no earlier knowledge, nor one that comes again is counted."
+        if study.sequences
+        else ""
     )
     if any(hasattr(protocols.ALL[row["protocol"]], "over_scenes") for row in rows):
         first += " mIoU, mAcc and OA are of all scenes of a seed together, as the protocol has it."
@@ -220,8 +235,12 @@ def markdown(parts: dict[str, Any]) -> str:
     text = [f"## {study.title}", "", study.about, "", *(f"- {what}: {value}" for what, value in parts["facts"])]
     text += ["", f"![error against run time]({PICTURE})", "", parts["note"], ""]
     rows = [[f"{a}<br>{f'**{b}**' if bold else b}" if b else a for a, b, bold in row] for _, row in parts["table"]]
-    for heading, table in (("", [parts["header"], *rows]), ("### Each scene", parts["scenes"])):
+    tables = [("", "", "", [parts["header"], *rows])]
+    tables += [(f"### {s.heading}", s.note, s.picture, s.table) for s in parts["more"]]
+    for heading, note, picture, table in (*tables, ("### Each scene", "", "", parts["scenes"])):
         text += [heading, ""] if heading else []
+        text += [note, ""] if note else []
+        text += [f"![{heading.strip('# ')}]({picture})", ""] if picture else []
         text += ["| " + " | ".join(row) + " |" for row in table[:1]]
         text += ["|" + "---|" * len(table[0])]
         text += ["| " + " | ".join(row) + " |" for row in table[1:]] + [""]

@@ -23,7 +23,13 @@ main { max-width: 1640px }
 <div class="card wide"><table><thead><tr>{% for cell in header %}<th{% if loop.index0 < labels|length %} class="t"{% endif %}>{{ cell }}</th>{% endfor %}</tr></thead><tbody>
 {% for is_base, row in table %}<tr{% if is_base %} class="base"{% endif %}>{% for value, change, sure in row %}<td{% if loop.index0 < labels|length %} class="t"{% endif %}>{{ value }}{% if change %}<small{% if sure %} class="sure"{% endif %}>{{ change }}</small>{% endif %}</td>{% endfor %}</tr>
 {% endfor %}</tbody></table></div>
-{% if missing %}<h2>Runs without figures</h2>
+{% for section in more %}<h2>{{ section.heading }}</h2>
+<p class="soft">{{ section.note }}</p>
+{% if section.picture %}<div class="card"><img src="{{ drawings[section.picture] }}" alt="{{ section.heading }}"></div>{% endif %}
+<div class="card wide"><table><thead><tr>{% for cell in section.table[0] %}<th{% if loop.index0 < 2 %} class="t"{% endif %}>{{ cell }}</th>{% endfor %}</tr></thead><tbody>
+{% for row in section.table[1:] %}<tr>{% for cell in row %}<td{% if loop.index0 < 2 %} class="t"{% endif %}>{{ cell }}</td>{% endfor %}</tr>
+{% endfor %}</tbody></table></div>
+{% endfor %}{% if missing %}<h2>Runs without figures</h2>
 <div class="card failed"><ul>{% for run, why in missing %}<li>{{ run }}: {{ why }}</li>{% endfor %}</ul></div>{% endif %}
 {% if classes %}<h2>IoU by class</h2>
 <div class="card">{% include "bars" %}<p class="soft">Blue: {{ compared }}, %, mean over scenes and seeds{{ " (" + shown.rsplit(", ", 1)[0] + ")" if ", " in shown }}.{% if compared != study.baseline %} Orange mark, and in brackets: {{ study.baseline }}.{% endif %}</p></div>{% endif %}

@@ -26,7 +26,7 @@ def run(job: Job) -> None:
     if old.bases and set(old.bases) != set(projections):
         raise DataFailure("the basis belongs to an encoder of another depth; start another sequence")
     bases: dict[str, Any] = {}
-    entry: dict[str, Any] = {"gaussians": read_manifest(job.inputs["gaussians"]).key}
+    reports: dict[str, Any] = {}
     for name, weight in projections.items():
         start = torch.from_numpy(old.bases[name]) if name in old.bases else None
         if start is not None and len(start) != len(weight):
@@ -40,10 +40,12 @@ def run(job: Job) -> None:
             rule=settings.energy_rule,
         )
         bases[name] = grown.numpy()
-        entry[name] = report
+        reports[name] = report
     weights = {name: value.numpy() for name, value in encoder.state_dict().items()}
     if not old.bases:
         job.left_out("earlier basis", "this is the first scene of its sequence")
+    key = read_manifest(job.inputs["gaussians"]).key
+    entry = {"scene": job.config.scene.name, "gaussians": key, "projections": reports}
     job.facts |= {"revision": old.revision + 1, "ranks": {name: b.shape[1] for name, b in bases.items()}}
     write_basis(job.out, Basis(bases, weights, [*old.lineage, entry]))
 

@@ -72,6 +72,8 @@ def knowledge(job: Job, model: Any, train: dict[str, Any]) -> dict[str, Any]:
         fitting = {k: torch.from_numpy(v) for k, v in basis.weights.items() if k in state and state[k].shape == v.shape}
         model.shape.encoder.load_state_dict(state | fitting)
         job.facts["warm_started"] = len(fitting)
+        if other := sorted(state.keys() - fitting.keys()):
+            job.left_out(f"warm start of {', '.join(other)}", "the earlier encoder has none of this shape")
     return {name: torch.from_numpy(basis.bases[name]) for name in projections} if train["weight_basis"] > 0 else {}
 
 

@@ -75,8 +75,8 @@ def test_any_sequence_keeps_rank_bounded_and_columns_orthonormal(q, p, rank, log
         basis, report = update(basis, W, energy=energy, max_rank=fraction, rule=rule)
         assert before <= basis.shape[1] <= fraction * q
         assert report["added"] == basis.shape[1] - before == report["rank_after"] - report["rank_before"]
-        assert 0 <= report["rho"] <= 1
-        assert -1e-12 <= report["energy"] <= 1
+        assert 0 <= report["rho_after"] <= report["rho"] * (1 + 1e-9) <= 1 + 1e-9
+        assert report["energy"] == pytest.approx(1 - report["rho_after"] ** 2, abs=1e-9)
         assert orthonormality(basis) < 1.2e-7  # one ulp: a column of few entries cannot be rounded better
         before = basis.shape[1]
 
@@ -220,6 +220,21 @@ def test_regulariser_has_finite_gradients_at_any_size(size):
     if size == 1:
         assert W.grad[:4].abs().max() < 1e-7
         assert W.grad[4:].abs().min() > 0
+
+
+def test_the_gradient_of_the_regulariser_is_that_of_its_formula():
+    given = {
+        "a": weights(16, 24).double().requires_grad_(True),
+        "b": weights(8, 8, 3).double().requires_grad_(True),
+    }
+    bases = {"a": torch.linalg.qr(weights(16, 5).double())[0], "b": torch.linalg.qr(weights(8, 2, seed=1).double())[0]}
+    terms = [((W - B @ (B.T @ W)) ** 2).sum() / (W.detach() ** 2).sum()
+             for W, B in zip(given.values(), bases.values(), strict=True)]  # fmt: skip
+    alphas = {"a": torch.tensor(2.0), "b": 0.5}
+    expected = torch.autograd.grad((2 * terms[0] + 0.5 * terms[1]) / 2, list(given.values()))
+    found = torch.autograd.grad(basis_loss(given, bases, alphas), list(given.values()))
+    for mine, exact in zip(found, expected, strict=True):
+        assert torch.allclose(mine, exact, rtol=1e-12, atol=1e-15)
 
 
 def test_regulariser_is_nothing_before_there_is_knowledge():

@@ -31,7 +31,7 @@ def publish_gaussians(path, gaussians):
 
 
 def publish_basis(path, basis):
-    with artifact.publish(path, Manifest("chebsplat.basis/1", "k", "cks")) as tmp:
+    with artifact.publish(path, Manifest("chebsplat.basis/2", "k", "cks")) as tmp:
         write_basis(tmp, basis)
     return path
 
@@ -88,13 +88,20 @@ def test_bit_flip_is_named_with_the_remedy(tmp_path, file):
         read_gaussians(path)
 
 
-def test_basis_round_trip_and_refusal_of_a_skew_basis(tmp_path):
+def test_basis_round_trip_and_refusal_of_what_its_columns_and_lineage_contradict(tmp_path):
     q, _ = np.linalg.qr(np.random.default_rng(0).normal(size=(8, 3)))
     weights = {"layer0.query": np.ones((8, 8), np.float32)}
-    given = Basis({"layer0.query": q.astype(np.float32)}, weights, [{"scene": "toy", "rank": 3}])
+    entry = {"scene": "toy", "gaussians": "k", "projections": {"layer0.query": {"rank_after": 3}}}
+    given = Basis({"layer0.query": q.astype(np.float32)}, weights, [entry])
     found = read_basis(publish_basis(tmp_path / "b", given))
     np.testing.assert_array_equal(found.bases["layer0.query"], given.bases["layer0.query"])
     assert (found.revision, found.lineage) == (1, given.lineage)
     given.bases["layer0.query"] *= 1.01
     with pytest.raises(InputError, match="not orthonormal"):
         read_basis(publish_basis(tmp_path / "skew", given))
+    given.bases["layer0.query"] = q[:, :2].astype(np.float32)
+    with pytest.raises(InputError, match="2 columns, its lineage 3"):
+        read_basis(publish_basis(tmp_path / "short", given))
+    given.lineage[0].pop("scene")
+    with pytest.raises(InputError, match="lacks fields"):
+        read_basis(publish_basis(tmp_path / "nameless", given))

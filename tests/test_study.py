@@ -17,6 +17,7 @@ from chebsplat.formats.capture import Capture, write_capture
 from chebsplat.formats.evaluation import Evaluation, write_evaluation
 from chebsplat.pipelines.plan import names
 from chebsplat.pipelines.results import compare, row_of
+from chebsplat.pipelines.sequences import scenes_of
 from chebsplat.pipelines.study import Study, checked_study, execute, expand, outstanding, read_study
 from chebsplat.pipelines.study_page import stability, write
 from chebsplat.pipelines.study_pictures import gallery
@@ -52,7 +53,7 @@ def publish_stage(run, stage, fill):
                 (tmp / name).write_text(text)
 
 
-def finish(run, miou=0.5, psnr=30.0, n=100, seconds=10.0, segmentation=None, labels=None):
+def finish(run, miou=0.5, psnr=30.0, n=100, seconds=10.0, steps=10, segmentation=None, labels=None):
     """Pretend that a run was made and found these figures. labels: (class names, predicted i16 [1, 4, 6])."""
     figures = {"image": {"psnr": psnr, "ssim": 0.9}, "n_gaussians": n, "bytes": {"ply": 10 * n, "ragged": 5 * n}}
     figures |= {"frames_per_second": {"color": 50.0}}
@@ -66,7 +67,9 @@ def finish(run, miou=0.5, psnr=30.0, n=100, seconds=10.0, segmentation=None, lab
     for step in run.steps:
         if step.stage not in ("train", "export", "evaluate"):
             publish_stage(run, step.stage, {"empty.json": "{}"})
-    publish_stage(run, "train", {"trace.csv": f"step,seconds,psnr\n5,{seconds / 2},20\n10,{seconds},25\n"})
+    publish_stage(
+        run, "train", {"trace.csv": f"step,seconds,psnr\n{steps // 2},{seconds / 2},20\n{steps},{seconds},25\n"}
+    )
     # 10 Gaussians keep degree 3 (16 coefficients) and 30 degree 0 (1): 190 of 640.
     publish_stage(run, "export", {"summary.json": json.dumps({"by_degree": [30, 0, 0, 10]})})
     figures |= {"names": ["a"], "left_out": {"LPIPS": "not measured"}}
@@ -275,25 +278,53 @@ def test_a_figure_may_be_drawn_against_a_setting(tmp_path):
     assert (tmp_path / "error-against-time.png").stat().st_size > 10_000
 
 
-def test_a_sequence_carries_knowledge_and_scratch_does_not():
-    variants = {"scratch": {"knowledge": False}, "both": {}, "warm": {"train": {"weight_basis": 0.0}}}
-    runs = expand(study(scenes=[], sequences=["toys"], seeds=[0], baseline="scratch", variants=variants))
-    assert len(runs) == 6
+@pytest.fixture
+def there_and_back(tmp_path):
+    """A sequence whose first scene comes again at its end."""
+    (tmp_path / "back.toml").write_text('scenes = ["toy", "office0", "toy"]')
+    return str(tmp_path / "back.toml")
+
+
+VARIANTS = {"scratch": {"knowledge": False}, "both": {}, "warm": {"train": {"weight_basis": 0.0}}}
+
+
+def step_of(run, stage):
+    return next(step for step in run.plan.steps if step.stage == stage)
+
+
+def test_a_sequence_carries_knowledge_and_scratch_does_not(there_and_back):
+    runs = expand(study(scenes=[], sequences=[there_and_back], seeds=[0], baseline="scratch", variants=VARIANTS))
+    assert [(run.place, run.visit) for run in runs if run.variant == "both"] == [(1, 1), (2, 1), (3, 2)]
     for run in runs:
-        (train,) = (step for step in run.steps if step.stage == "train")
-        assert ("basis" in train.inputs) == (run.place == 2 and run.variant != "scratch")
+        assert ("basis" in step_of(run, "train").inputs) == (run.place > 1 and run.variant != "scratch")
         finish(run, miou=0.1 * run.place)
     lines = compared(runs, [row_of(run, {}) for run in runs], "scratch")
-    assert lines["both"].n_runs == 1
+    assert lines["both"].n_runs == 1  # neither the first scene nor the one that comes again
     assert lines["both"].summaries["miou"].mean == pytest.approx(0.2)
     assert any(step.stage == "cks" for step in outstanding(runs))
+
+
+def test_every_budget_starts_from_what_the_last_one_taught(there_and_back):
+    budgets = {"steps": [10, 20]}
+    variants = {name: VARIANTS[name] for name in ("scratch", "both")}
+    runs = expand(
+        study(scenes=[], sequences=[there_and_back], seeds=[0], baseline="scratch", variants=variants, budgets=budgets)
+    )
+    both = {(run.budget, run.place): run for run in runs if run.variant == "both"}
+    for place in (2, 3):
+        basis = step_of(both["20 steps", place - 1], "cks").path
+        assert {step_of(both[budget, place], "train").inputs["basis"] for budget in ("10 steps", "20 steps")} == {basis}
+    assert all("cks" not in run.plan.targets for (budget, _), run in both.items() if budget == "10 steps")
+    cks = [step for step in outstanding(runs) if step.stage == "cks"]
+    assert len(cks) == 3
 
 
 @pytest.mark.parametrize("name", names("studies"))
 def test_every_study_of_ours_can_be_planned(name):
     found = read_study(name)
     generated = [scene for scene in found.scenes if not scene.startswith("house")]
-    few = found.model_copy(update={"scenes": generated[:1], "seeds": found.seeds[:1]})
+    orders = [name for name in found.sequences if not any(scene.startswith("house") for scene in scenes_of(name))]
+    few = found.model_copy(update={"scenes": generated[:1], "sequences": orders[:1], "seeds": found.seeds[:1]})
     runs = expand(few)
     assert {run.variant for run in runs} == set(found.variants)
 

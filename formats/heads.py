@@ -1,0 +1,56 @@
+"""HEADs: the revisions of one basis that many processes extend, each a link `1`, `2`, ... to a finished artifact.
+
+The HEAD is the highest number. It moves by creating the next link, which the file system grants to one process alone:
+compare-and-swap, without a lock or a half-written file that a killed process could leave behind.
+"""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable
+from pathlib import Path
+
+from chebsplat.errors import InputError
+from chebsplat.formats import artifact
+
+
+def revisions(folder: Path) -> list[Path]:
+    """Artifacts of all revisions, the oldest first; none for a folder that is not there.
+
+    Raises: InputError naming a revision that is missing or whose artifact is.
+    """
+    numbers = [int(name) for name in (os.listdir(folder) if folder.is_dir() else []) if name.isdigit()]
+    found = [folder / str(number) for number in range(1, max(numbers, default=0) + 1)]
+    for link in found:
+        if not artifact.is_published(link):
+            raise InputError(f"{link} is no finished revision: restore its artifact, or delete {folder} and begin anew")
+    return [link.resolve() for link in found]
+
+
+def advance(folder: Path, count: int, target: Path) -> bool:
+    """Make `target` revision `count` + 1, if there are `count` revisions; False where another process has moved on.
+
+    Raises: InputError if `target` is not a finished artifact.
+    """
+    artifact.read_manifest(target)
+    folder.mkdir(parents=True, exist_ok=True)
+    try:
+        os.symlink(os.path.relpath(target, folder.resolve()), folder / str(count + 1))
+    except FileExistsError:
+        return False
+    artifact.sync_directory(folder)
+    return True
+
+
+def extend(folder: Path, build: Callable[[Path | None], Path | None]) -> list[Path]:
+    """Append a revision to a HEAD, however many processes do so at once; returns all revisions.
+
+    Args: build: makes the artifact that follows the given one (None: the first), or returns None if that one already
+          holds what is to be added. It is called again whenever another process was faster.
+    Raises: InputError, and what `build` raises.
+    """
+    while True:
+        found = revisions(folder)
+        made = build(found[-1] if found else None)
+        if made is None or advance(folder, len(found), made):
+            return found if made is None else [*found, made]

@@ -1,0 +1,174 @@
+"""A HEAD that many processes move loses nothing, shows nothing half made, and needs no repair after a kill."""
+
+import itertools
+import os
+import random
+import subprocess
+import sys
+import time
+
+import numpy as np
+import pytest
+from shared import ROOT, gaussian_parameters
+
+from chebsplat.errors import ConfigError, InputError
+from chebsplat.formats import artifact, heads
+from chebsplat.formats.artifact import Manifest
+from chebsplat.formats.basis import Basis, off_orthonormal, read_basis, read_lineage, write_basis
+from chebsplat.formats.cameras import Cameras
+from chebsplat.formats.gaussians import SCHEMA, Gaussians, write_gaussians
+
+COUNTING = """
+import sys
+from pathlib import Path
+from chebsplat.formats import artifact, heads
+from chebsplat.formats.basis import SCHEMA, Basis, read_lineage, write_basis
+
+root, who = Path(sys.argv[1]), sys.argv[2]
+for number in range(int(sys.argv[3])):
+    name = f"{who}-{number}"
+
+    def build(head):
+        lineage = [] if head is None else read_lineage(head)
+        if name in {entry["gaussians"] for entry in lineage}:
+            return None
+        out = root / "store/cks" / f"{len(lineage) + 1}-{name}"
+        with artifact.publish(out, artifact.Manifest(SCHEMA, out.name, "cks")) as tmp:
+            write_basis(tmp, Basis({}, {}, [*lineage, {"scene": who, "gaussians": name, "projections": {}}]))
+        return out
+
+    heads.extend(root / "basis-shared", build)
+"""
+EXTENDING = """
+import sys
+from pathlib import Path
+from chebsplat.pipelines.bases import extend
+
+who = sys.argv[2]
+for number in range(int(sys.argv[3])):
+    extend("shared", Path(sys.argv[1]) / f"trained/{who}-{number}", f"room{who}")
+"""
+
+
+def race(script, root, n_processes, n_updates, n_kills, pause, watch):
+    """Run so many processes, killing a random one now and then, and starting it again; returns how many were killed."""
+    environment = os.environ | {"CHEBSPLAT_WORK": str(root), "OMP_NUM_THREADS": "1"}
+
+    def start(who):
+        command = [sys.executable, "-c", script, str(root), str(who), str(n_updates)]
+        return subprocess.Popen(command, cwd=ROOT, env=environment, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE)
+
+    running, rng, killed = {who: start(who) for who in range(n_processes)}, random.Random(0), 0
+    while running:
+        time.sleep(rng.uniform(0, pause))
+        watch()
+        for who, process in list(running.items()):
+            if process.poll() is not None:
+                _, error = process.communicate()
+                assert process.returncode == 0, error.decode()
+                del running[who]
+        if running and killed < n_kills:
+            who = rng.choice(sorted(running))
+            running[who].kill()
+            running[who].communicate()
+            running[who] = start(who)
+            killed += 1
+    return killed
+
+
+def nothing_is_lost(root, n_processes, n_updates):
+    """All revisions, each the continuation of the one before, each update in them once."""
+    found = heads.revisions(root / "basis-shared")
+    assert len(found) == n_processes * n_updates
+    lineages = [read_lineage(path) for path in found]
+    assert all(later[:-1] == earlier for earlier, later in itertools.pairwise(lineages))
+    names = [entry["gaussians"] for entry in lineages[-1]]
+    assert sorted(names) == sorted(f"{who}-{k}" for who in range(n_processes) for k in range(n_updates))
+    return found
+
+
+def read_all(root):
+    for path in heads.revisions(root / "basis-shared"):
+        artifact.verify(path)
+
+
+def test_processes_that_are_killed_lose_no_update_and_leave_no_half_revision(tmp_path):
+    killed = race(COUNTING, tmp_path, 4, 6, n_kills=8, pause=0.25, watch=lambda: read_all(tmp_path))
+    assert killed >= 4
+    nothing_is_lost(tmp_path, 4, 6)
+
+
+def trained(path, key, seed):
+    """A checkpoint whose encoder is random and its projections of rank 1, so that many scenes have news."""
+    import torch
+
+    from chebsplat.encoder import RegionEncoder
+
+    torch.manual_seed(seed)
+    encoder = RegionEncoder(4, 3, width=32, n_layers=1)
+    with torch.no_grad():
+        for weight in encoder.projections().values():
+            weight.copy_(torch.randn(32, 1) @ torch.randn(1, 32))
+    modules = {f"shape.encoder.{name}": value.numpy() for name, value in encoder.state_dict().items()}
+    notes = {"encoder": {"n_inputs": 4, "n_channels": 3} | encoder.settings}
+    cameras = Cameras(["a"], np.eye(3)[None], np.eye(4)[None], 5, 4)
+    with artifact.publish(path, Manifest(SCHEMA, key, "train")) as tmp:
+        write_gaussians(tmp, Gaussians(gaussian_parameters(), cameras, modules, notes=notes))
+    return path
+
+
+@pytest.mark.slow
+def test_eighty_updates_by_eight_killed_processes_are_all_there_and_orthonormal(tmp_path):
+    for who in range(8):
+        for number in range(10):
+            trained(tmp_path / f"trained/{who}-{number}", f"{who}-{number}", 10 * who + number)
+    killed = race(EXTENDING, tmp_path, 8, 10, n_kills=24, pause=3.0, watch=lambda: read_all(tmp_path))
+    assert killed >= 8
+    for path in nothing_is_lost(tmp_path, 8, 10):
+        assert all(off_orthonormal(columns) <= 1e-6 for columns in read_basis(path).bases.values())
+
+
+@pytest.fixture
+def work(tmp_path, monkeypatch):
+    monkeypatch.setenv("CHEBSPLAT_WORK", str(tmp_path))
+    monkeypatch.delenv("REPLICA_ROOT", raising=False)
+    monkeypatch.chdir(ROOT)
+    return tmp_path
+
+
+def test_a_head_grows_by_scenes_and_a_scene_it_knows_adds_nothing(work):
+    from chebsplat.pipelines import bases, store
+
+    for seed in range(3):
+        found = bases.extend("shared", trained(work / f"trained/{seed}", f"k{seed}", seed), f"room{seed}")
+        assert len(found) == seed + 1
+    again = bases.extend("shared", work / "trained/1", "room1")
+    assert again == found
+    assert bases.revisions("shared@2") == found[:2]
+    assert {basis.shape[1] for basis in read_basis(found[-1]).bases.values()} == {3}
+    assert [entry["scene"] for entry in read_lineage(found[-1])] == ["room0", "room1", "room2"]
+    assert bases.head_names() == ["shared"]
+    assert store.unnamed() == []  # its links keep its artifacts, and its plans are gone
+    with pytest.raises(ConfigError, match="has 3 revisions"):
+        bases.revisions("shared@4")
+    with pytest.raises(ConfigError, match="did you mean shared"):
+        bases.revisions("shard")
+    for name in ("offices", "a/b", "a@1", ""):
+        with pytest.raises(ConfigError, match="cannot be called"):
+            bases.extend(name, work / "trained/0", "room0")
+
+
+def test_a_head_moves_only_from_the_revision_that_was_read(tmp_path):
+    for name in "ab":
+        with artifact.publish(tmp_path / name, Manifest("chebsplat.basis/2", name, "cks")) as tmp:
+            write_basis(tmp, Basis({}, {}, []))
+    folder = tmp_path / "basis-x"
+    assert heads.advance(folder, 0, tmp_path / "a")
+    assert not heads.advance(folder, 0, tmp_path / "b")
+    assert heads.revisions(folder) == [tmp_path / "a"]
+    assert heads.advance(folder, 1, tmp_path / "b")
+    with pytest.raises(InputError, match="missing"):
+        heads.advance(folder, 2, tmp_path / "nothing")
+    (folder / "1").unlink()
+    with pytest.raises(InputError, match="no finished revision"):
+        heads.revisions(folder)
