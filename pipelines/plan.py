@@ -85,7 +85,9 @@ def scene_values(scene: str) -> tuple[str, dict[str, Any]]:
             raise InputError(f"{folder} is not a folder; correct scene=")
         from chebsplat.stages.sources.common import detect
 
-        name = re.sub(r"[^\w.-]+", "-", folder.resolve().name).lstrip(".") or "scene"
+        parts = folder.resolve().parts[1:]
+        words = next((k for k in range(1, len(parts)) if re.search(r"[a-zA-Z]", parts[-k])), 1)  # "dense/0" is no "0"
+        name = re.sub(r"[^\w.-]+", "-", "-".join(parts[-words:])).lstrip(".") or "scene"
         name += "-scene" if name == "store" else ""  # links lie beside the store
         return name, {"scene": {"name": name}, "source": {"kind": detect(folder), "path": str(folder)}}
     values = read_toml("scenes", scene)

@@ -149,7 +149,7 @@ def test_a_change_of_setting_makes_exactly_these_stages_stale(settings, expected
 def photo_folder(folder):
     from PIL import Image
 
-    folder.mkdir()
+    folder.mkdir(parents=True)
     for k in range(4):
         Image.new("RGB", (32, 24), (60 * k, 0, 0)).save(folder / f"{k}.jpg")
     return f"{folder}/"
@@ -220,6 +220,11 @@ def test_the_embedded_teacher_is_used_unless_another_is_asked_for(tmp_path):
 def test_a_model_that_would_not_be_used_is_an_error(kind):
     with pytest.raises(ConfigError, match=r"teacher\.kind=onnx"):
         Planner().plan("toy", f"teacher.kind={kind},teacher.model=model.onnx")
+
+
+def test_a_folder_without_letters_is_named_with_the_folders_above_it(tmp_path):
+    photo_folder(tmp_path / "statue" / "dense" / "0")
+    assert Planner().plan(f"{tmp_path}/statue/dense/0").title == "dense-0"
 
 
 def test_a_scene_may_be_any_folder_that_no_scene_is_named_after(tmp_path, monkeypatch):
