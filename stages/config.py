@@ -146,7 +146,7 @@ class TrainSection(_Section):
     lr_opacities: float = 5e-2
     lr_sh0: float = 2.5e-3
     lr_sh: float = 1.25e-4  # of bands 1 to 3
-    lr_features: float = 1e-2
+    lr_features: float = 3e-3  # for 3000 steps; 1e-2 for 1000: their product matters, more fits each view's errors
     lr_encoder: float = 1e-3
     lr_masks: float = 5e-2
     lr_sh_masks: float = 5e-2
