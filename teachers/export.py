@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 import torch
 
+from chebsplat.stages.onnx import forget_origin
 from chebsplat.teachers.network import MULTIPLE, Encoder
 
 OPSET = 18
@@ -63,5 +64,6 @@ def _halve(path: Path) -> None:
     del model.graph.node[:]
     model.graph.node.extend(nodes)
     del model.graph.value_info[:]
+    forget_origin(model)
     onnx.checker.check_model(model)
     onnx.save(model, str(path))

@@ -7,6 +7,7 @@ import sys
 import numpy as np
 import pytest
 from click.testing import CliRunner
+from shared import ROOT
 
 from chebsplat.formats.encoder import DYNAMIC, FLOAT, FUSED, read_encoder
 from chebsplat.formats.gaussians import read_gaussians
@@ -62,6 +63,11 @@ def test_encoder_and_fusion_equal_torch_at_50_shapes(toy):
         worst = np.maximum(worst, [np.abs(f - w.numpy()).max() for f, w in zip(found, wanted, strict=True)])
     assert len(SHAPES) == 50
     assert (worst < 1e-5).all(), worst
+
+
+def test_models_do_not_say_where_they_were_made(toy):
+    for path in [*toy["onnx"].glob("*.onnx"), ROOT / "teachers" / "embedded.onnx"]:
+        assert b"site-packages" not in path.read_bytes()
 
 
 def test_the_quantised_encoder_is_smaller_and_its_error_is_on_record(toy):
