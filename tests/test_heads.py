@@ -122,7 +122,7 @@ def test_eighty_updates_by_eight_killed_processes_are_all_there_and_orthonormal(
     for who in range(8):
         for number in range(10):
             trained(tmp_path / f"trained/{who}-{number}", f"{who}-{number}", 10 * who + number)
-    killed = race(EXTENDING, tmp_path, 8, 10, n_kills=24, pause=3.0, watch=lambda: read_all(tmp_path))
+    killed = race(EXTENDING, tmp_path, 8, 10, n_kills=24, pause=0.8, watch=lambda: read_all(tmp_path))
     assert killed >= 8
     for path in nothing_is_lost(tmp_path, 8, 10):
         assert all(off_orthonormal(columns) <= 1e-6 for columns in read_basis(path).bases.values())
