@@ -2,12 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
 from typing import Any
 
 import numpy as np
 import torch
-from torch import Tensor, nn
+from torch import Tensor
 
 EPS = torch.finfo(torch.float64).eps
 DROPPED = 1e-6  # a column that keeps less of its length than this beside the others is dropped
@@ -70,7 +69,7 @@ def update(
     if rho <= max(10 * EPS * q**0.5, tolerance if rank else 0.0) or room <= 0:
         return given, report
     vectors, values, _ = torch.linalg.svd(residual, full_matrices=False)
-    gained = nn.functional.pad(torch.cumsum(values**2, 0), (1, 0))  # by 0, 1, 2, ... of the vectors
+    gained = torch.nn.functional.pad(torch.cumsum(values**2, 0), (1, 0))  # by 0, 1, 2, ... of the vectors
     reached = (total - missed + gained) / total if rule == "total" else gained / missed
     count = min(int((reached < energy).sum()), room, len(values))
     if count == 0:
@@ -164,54 +163,19 @@ class _Outside(torch.autograd.Function):
         return (None, *(own * factor for own, factor in zip(ctx.slopes, slope.unbind(), strict=True)))
 
 
-def regularizer(W: Tensor, basis: Tensor, alpha: Tensor | float = 1.0) -> Tensor:
-    """α ‖W − B Bᵀ W‖² / ‖W‖², in [0, α] (Eq 14); 0 for a basis without columns, and for W = 0.
+def regularizer(W: Tensor, basis: Tensor) -> Tensor:
+    """‖W − B Bᵀ W‖² / ‖W‖², in [0, 1] (Eq 14); 0 for a basis without columns, and for W = 0.
 
-    Args: W [q, p]; basis [q, r] orthonormal; alpha: strength, ≥ 0.
-    Choices: relative, so that shrinking W does not lower it: the denominator carries no gradient, nor does α, whose
-      best value here would be 0. Scaled by max|W| first, so that 1e±25 neither overflows nor vanishes.
+    Args: W [q, p]; basis [q, r] orthonormal.
+    Choices: relative, so that shrinking W does not lower it: the denominator carries no gradient. Scaled by max|W|
+      first, so that 1e±25 neither overflows nor vanishes. The printed α is `train.weight_basis`: learned by this loss
+      its best value would be 0, and without a gradient from it nothing teaches it.
     """
-    return basis_loss({"": W}, {"": basis}, {"": alpha})
+    return basis_loss({"": W}, {"": basis})
 
 
-def basis_loss(
-    projections: dict[str, Tensor], bases: dict[str, Tensor], alphas: Mapping[str, Tensor | float] | None = None
-) -> Tensor:
-    """Mean over projections of `regularizer`, α = 1 where not given; 0 without bases (the first scene)."""
+def basis_loss(projections: dict[str, Tensor], bases: dict[str, Tensor]) -> Tensor:
+    """Mean over projections of `regularizer`; 0 without bases (the first scene)."""
     if not bases:
         return torch.tensor(0.0)
-    shares = _Outside.apply(list(bases.values()), *(projections[name] for name in bases))
-    if alphas is not None:
-        shares = shares * torch.stack([torch.as_tensor(alphas[name]).detach().to(shares) for name in bases])
-    return shares.mean()
-
-
-class Modulation(nn.Module):
-    """Learned strength α > 0 of each projection's regulariser; starts at 1.
-
-    Choices: α = softplus, and `regularizer` stops its own gradient to α. What teaches α instead is `loss`: it rests at
-      α = 1 + cos(task gradient, regulariser gradient), so that earlier knowledge is held on to where that also serves
-      the new scene (up to 2) and let go where the two fight (towards 0).
-    """
-
-    def __init__(self, names: Iterable[str]):
-        super().__init__()
-        self.names = tuple(names)
-        self.raw = nn.Parameter(torch.full((len(self.names),), float(np.log(np.expm1(1.0)))))
-
-    def forward(self) -> dict[str, Tensor]:
-        """α by projection name, each a scalar with gradient to the module."""
-        return dict(zip(self.names, nn.functional.softplus(self.raw).unbind(), strict=True))
-
-    def loss(self, task: dict[str, Tensor], knowledge: dict[str, Tensor]) -> Tensor:
-        """½ mean (α − 1 − cos)², cos between gradients [q, p] of task loss and regulariser; 0 where one vanishes."""
-        alphas, terms = self(), []
-        for name in self.names:
-            a, b = (_direction(g[name].detach().double().flatten()) for g in (task, knowledge))
-            terms.append(0.5 * (alphas[name] - 1 - (a @ b).to(alphas[name].dtype)) ** 2)
-        return torch.stack(terms).mean() if terms else self.raw.sum()
-
-
-def _direction(vector: Tensor) -> Tensor:
-    scaled = vector / vector.abs().amax().clamp_min(1e-300) if vector.numel() else vector
-    return scaled / scaled.norm().clamp_min(1e-300)
+    return _Outside.apply(list(bases.values()), *(projections[name] for name in bases)).mean()

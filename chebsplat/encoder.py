@@ -17,6 +17,30 @@ def positional_encoding(positions: Tensor) -> Tensor:
     return torch.cat([positions, angles.sin(), angles.cos()], -1)
 
 
+class Standardize(nn.Module):
+    """Every input less its mean, over its deviation, within ±5; constants, no weights.
+
+    Choices: a LayerNorm over a token's inputs would compare its descriptor's degrees with one another: their means
+      differ by more than they vary from one Gaussian to the next, and semantic features beside them are drowned.
+    """
+
+    mean: Tensor
+    deviation: Tensor
+
+    def __init__(self, n_inputs: int):
+        super().__init__()
+        self.register_buffer("mean", torch.zeros(n_inputs))
+        self.register_buffer("deviation", torch.ones(n_inputs))
+
+    def set(self, first: int, mean: Tensor, deviation: Tensor) -> None:
+        """The constants [k] of inputs `first`, `first + 1`, ..."""
+        columns = slice(first, first + len(mean))
+        self.mean[columns], self.deviation[columns] = mean, deviation.clamp_min(1e-6)
+
+    def forward(self, inputs: Tensor) -> Tensor:
+        return ((inputs - self.mean) / self.deviation).clamp(-5, 5)
+
+
 class Attention(nn.Module):
     """Multi-head self-attention whose padded keys get no weight."""
 
@@ -57,8 +81,8 @@ class RegionEncoder(nn.Module):
       n_inputs:   width of a token's input: flattened descriptor, context, or both; 0 for positions alone.
       n_channels: width of the semantic features.
       n_layers:   0 replaces attention by a maximum over tokens (the paper's ablation without the transformer).
-    Choices: pre-norm, with output projection and feed-forward; inputs are normalised by a LayerNorm, so that
-      descriptors of any magnitude start alike; a region without members gives a finite vector that nothing reads.
+    Choices: pre-norm, with output projection and feed-forward; each input is standardised; a region without members
+      gives a finite vector that nothing reads.
     """
 
     def __init__(self, n_inputs: int, n_channels: int, width: int = 32, n_layers: int = 2, n_heads: int = 4):
@@ -67,7 +91,7 @@ class RegionEncoder(nn.Module):
         self.settings = {"width": width, "n_layers": n_layers, "n_heads": n_heads}
         self.embed_position = nn.Linear(3 + 6 * N_FREQUENCIES, width)
         if n_inputs:
-            self.norm_input = nn.LayerNorm(n_inputs)
+            self.norm_input = Standardize(n_inputs)
             self.embed_input = nn.Linear(n_inputs, width)
         self.hidden = nn.Linear(width, width)
         self.region_token = nn.Parameter(torch.zeros(width))

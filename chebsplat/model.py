@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch
@@ -53,6 +53,13 @@ class Rendered:
     index: Tensor
 
 
+class Encoded(NamedTuple):
+    """Encodings [R, C] with a gradient, of the regions i64 [R], none twice."""
+
+    values: Tensor
+    regions: Tensor
+
+
 HELD = ("members", "centers", "descriptors", "positions", "cover", "weights", "cache")  # by `Shape`
 DESCRIBED = ("given", "mask", "values", "n_described", "n_regions")  # by its `Descriptors`
 
@@ -70,6 +77,10 @@ class Shape(nn.Module):
         self.encoder = RegionEncoder(
             self.n_described + n_context, n_channels, train["width"], n_layers, train["n_heads"]
         )
+        if n_context:  # unit vectors
+            rms = torch.full((n_context,), n_context**-0.5)
+            self.encoder.norm_input.set(self.n_described, torch.zeros(n_context), rms)
+        self.keeps_norm = False  # an earlier scene's constants are kept, with its weights
         self.gate = Gate(n_channels)
         self.regions: Regions | None = None
         names = ("n_angles", "max_degree", "anisotropy", "bandwidth", "spectrum", "n_eigs")
@@ -123,6 +134,9 @@ class Shape(nn.Module):
             shapes = raw["quats"].detach(), raw["log_scales"].detach()
             self.descriptors = self.described.update(means, *shapes, self.members, regions.radius, descriptors)
         where = means[self.centers]
+        seen = self.descriptors[self.members >= 0]
+        if self.n_described and len(seen) and not self.keeps_norm:
+            self.encoder.norm_input.set(0, seen.mean(0), seen.std(0, unbiased=False))
         offsets = means[self.members.clamp_min(0)] - where[:, None]
         self.positions = offsets / max(regions.radius, 1e-12)
         cover = covering(means.numpy(), where.numpy(), regions.radius, self.train_settings["n_covers"])
@@ -161,22 +175,32 @@ class Shape(nn.Module):
             inputs = torch.cat([inputs, features.detach()[members.clamp_min(0)]], -1)
         return self.encoder(inputs, self.positions[chosen], members >= 0)
 
-    def fuse(self, features: Tensor, index: Tensor, generator: torch.Generator | None = None) -> Tensor:
-        """Fused features [V, C] of the Gaussians `index` [V].
+    def sample(self, features: Tensor, index: Tensor, generator: torch.Generator) -> Encoded:
+        """Encode anew `regions_per_step` of the regions that reach the Gaussians `index` [V]; the cache keeps them."""
+        reached = torch.unique(self.cover[index])
+        reached = reached[reached >= 0]
+        order = torch.randperm(len(reached), generator=generator)[: self.train_settings["regions_per_step"]]
+        chosen = reached[order]
+        fresh = Encoded(self.encode(features, chosen), chosen)
+        self.cache = self.cache.index_copy(0, chosen, fresh.values.detach())
+        return fresh
 
-        With a generator, `regions_per_step` of the regions that reach them are encoded anew, with gradient, and
-        the rest come from the cache; without one the cache alone is used.
+    def fuse(self, features: Tensor, index: Tensor, fresh: Encoded | None = None) -> Tensor:
+        """Fused features [V, C] of the Gaussians `index` [V]; encodings are fresh ones, or as the cache has them."""
+        fresh = fresh or Encoded(self.cache[:0], torch.zeros(0, dtype=torch.int64))
+        return fuse_in_view(self.gate, features, (self.cache, *fresh), self.cover, self.weights, index)
+
+    def distance(self, features: Tensor, fresh: Encoded) -> Tensor:
+        """Mean distance of encodings to the features of their regions' members, which get no gradient.
+
+        Choices: beside the printed losses, which reach the encoder through what the gate lets pass, a few percent:
+          by them alone it stays at one vector for all regions. The distance, not its square: a region across an edge
+          takes the side that has more members.
         """
-        chosen, fresh = torch.zeros(0, dtype=torch.int64), self.cache[:0]
-        cache = self.cache
-        if generator is not None:
-            reached = torch.unique(self.cover[index])
-            reached = reached[reached >= 0]
-            order = torch.randperm(len(reached), generator=generator)[: self.train_settings["regions_per_step"]]
-            chosen = reached[order]
-            fresh = self.encode(features, chosen)
-            self.cache = self.cache.index_copy(0, chosen, fresh.detach())
-        return fuse_in_view(self.gate, features, (cache, fresh, chosen), self.cover, self.weights, index)
+        members = self.members[fresh.regions]
+        wanted = features.detach()[members.clamp_min(0)]
+        mask = members >= 0
+        return ((fresh.values[:, None] - wanted).square().sum(-1) + 1e-12).sqrt()[mask].mean()
 
 
 class SceneModel:
@@ -260,7 +284,10 @@ class SceneModel:
         aside: dict[str, Tensor] = {}
         features = None
         if fused and self.shape is not None and self.shape.regions is not None:
-            features = self.shape.fuse(raw["features"], index, generator)
+            fresh = None if generator is None else self.shape.sample(raw["features"], index, generator)
+            features = self.shape.fuse(raw["features"], index, fresh)
+            if fresh is not None and len(fresh.regions):
+                aside["shape"] = self.shape.distance(raw["features"], fresh)
         elif "features" in raw:
             features = take(raw["features"], index)
         if masked and (soft := self.soft_mask(index, features)) is not None:

@@ -22,6 +22,7 @@ RATES = {
     "prune_logits": "lr_masks",
     "sh_logits": "lr_sh_masks",
 }
+TRAVEL, MOST = 10.0, 5e-2  # a rate that is not given: less than TRAVEL over all steps does not arrive
 FASTER = {"means": 0.01, "features": 0.01, "modules": 0.01}  # what a rate has fallen to at the end; 0.1 elsewhere
 
 
@@ -32,7 +33,8 @@ def adam(model: SceneModel, settings: dict[str, Any], extent: float) -> torch.op
     """
     groups = []
     for name, value in model.raw.items():
-        rate = settings[RATES[name]] * (extent if name == "means" else 1)
+        rate = settings[RATES[name]] or min(TRAVEL / settings["steps"], MOST)
+        rate *= extent if name == "means" else 1
         groups.append({"params": [value], "rate": rate, "name": name})
     weights = [p for module in model.modules.values() for p in module.parameters()]
     if weights:

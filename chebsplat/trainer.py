@@ -182,6 +182,8 @@ class Trainer:
             losses["features"] = settings["weight_features"] * distance
         if "mask" in aside and pruning:
             losses["mask"] = settings["weight_mask"] * aside["mask"].mean()
+        if "shape" in aside and settings["weight_shape"] > 0:
+            losses["shape"] = settings["weight_shape"] * aside["shape"]
         if "bands" in aside:
             guidance = None if self.guidance is None else self.guidance[rendered.index]
             losses["sh"] = settings["weight_sh"] * sh_prune.sh_loss(aside["bands"], guidance)

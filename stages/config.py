@@ -125,7 +125,7 @@ class TrainSection(_Section):
     n_layers: int = Field(2, ge=1)
     n_heads: int = Field(4, ge=1)
     encode_every: int = Field(4, ge=1)  # steps from one that encodes regions anew to the next
-    regions_per_step: int = Field(32, ge=1)  # encoded anew in such a step; the others come from the cache
+    regions_per_step: int = Field(64, ge=1)  # encoded anew in such a step; the others come from the cache
     n_covers: int = Field(4, ge=1)  # regions that reach a Gaussian, at most
     context: Literal["features", "none"] = "features"  # what tokens hold beside the descriptor
     # schedule, as fractions of the budget
@@ -146,14 +146,15 @@ class TrainSection(_Section):
     lr_opacities: float = 5e-2
     lr_sh0: float = 2.5e-3
     lr_sh: float = 1.25e-4  # of bands 1 to 3
-    lr_features: float = 3e-3  # for 3000 steps; 1e-2 for 1000: their product matters, more fits each view's errors
-    lr_encoder: float = 1e-3
+    lr_features: float | None = Field(None, gt=0)  # None: 10 / steps, at most 5e-2; more fits each view's errors
+    lr_encoder: float = 3e-3
     lr_masks: float = 5e-2
     lr_sh_masks: float = 5e-2
     # weights
     weight_ssim: float = Field(0.2, ge=0, le=1)
     weight_features: float = Field(1.0, ge=0)
     feature_loss: Literal["length", "l1"] = "length"  # l1: the paper's and Feature-3DGS'
+    weight_shape: float = Field(1.0, ge=0)  # of encodings' distance to their members' features; 0: printed
     weight_mask: float = Field(1e-2, ge=0)
     weight_sh: float = Field(1e-4, ge=0)
     weight_basis: float = Field(1.0, ge=0)

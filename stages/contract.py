@@ -46,7 +46,7 @@ def contract(encoder: Any, config: dict[str, Any]) -> dict[str, Any]:
             "files": ["encoder.onnx", "encoder.int8.onnx"],
             "inputs": inputs,
             "outputs": {"encodings": array("float32", ["regions", c], "none", "one semantic vector a region (Eq 7)")},
-            "normalization": "none outside the graph: it begins with a LayerNorm over each member's inputs",
+            "normalization": "none outside the graph: it begins by standardising each input with constants of its own",
         },
         "fusion": {
             "files": ["fusion.onnx"],

@@ -111,8 +111,9 @@ def follow(job: Job, trainer: Trainer, train: dict[str, Any]) -> list[dict[str, 
         since.append(figures)
         if trainer.step % train["report_every"] == 0 or trainer.share >= 1:
             row = {"step": trainer.step, "seconds": trainer.seconds, "n": figures["n"]}
-            for name in figures.keys() - row.keys():
-                row[name] = sum(entry.get(name, 0.0) for entry in since) / len(since)
+            for name in {name for entry in since for name in entry} - row.keys():
+                found = [entry[name] for entry in since if name in entry]  # encodings have a loss in some steps only
+                row[name] = sum(found) / len(found)
             row |= {"psnr": trainer.held_in_psnr(watched), "sh_kept": trainer.model.sh_kept()}
             since = []
             trace.append({k: float(v) for k, v in row.items()})

@@ -71,6 +71,7 @@ def knowledge(job: Job, model: Any, train: dict[str, Any]) -> dict[str, Any]:
         state = model.shape.encoder.state_dict()
         fitting = {k: torch.from_numpy(v) for k, v in basis.weights.items() if k in state and state[k].shape == v.shape}
         model.shape.encoder.load_state_dict(state | fitting)
+        model.shape.keeps_norm = any(name.startswith("norm_input.") for name in fitting)
         job.facts["warm_started"] = len(fitting)
         if other := sorted(state.keys() - fitting.keys()):
             job.left_out(f"warm start of {', '.join(other)}", "the earlier encoder has none of this shape")

@@ -7,7 +7,7 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from chebsplat.cks import Modulation, basis_loss, project, regularizer, update
+from chebsplat.cks import basis_loss, project, regularizer, update
 
 ORTHONORMAL = 3e-8  # METHOD section 7, for float32 columns measured in float64
 
@@ -230,9 +230,8 @@ def test_the_gradient_of_the_regulariser_is_that_of_its_formula():
     bases = {"a": torch.linalg.qr(weights(16, 5).double())[0], "b": torch.linalg.qr(weights(8, 2, seed=1).double())[0]}
     terms = [((W - B @ (B.T @ W)) ** 2).sum() / (W.detach() ** 2).sum()
              for W, B in zip(given.values(), bases.values(), strict=True)]  # fmt: skip
-    alphas = {"a": torch.tensor(2.0), "b": 0.5}
-    expected = torch.autograd.grad((2 * terms[0] + 0.5 * terms[1]) / 2, list(given.values()))
-    found = torch.autograd.grad(basis_loss(given, bases, alphas), list(given.values()))
+    expected = torch.autograd.grad((terms[0] + terms[1]) / 2, list(given.values()))
+    found = torch.autograd.grad(basis_loss(given, bases), list(given.values()))
     for mine, exact in zip(found, expected, strict=True):
         assert torch.allclose(mine, exact, rtol=1e-12, atol=1e-15)
 
@@ -242,32 +241,6 @@ def test_regulariser_is_nothing_before_there_is_knowledge():
     regularizer(W, torch.zeros(32, 0)).backward()
     assert (W.grad == 0).all()
     assert basis_loss({}, {}).item() == 0
-
-
-def test_regulariser_scales_with_alpha_but_teaches_it_nothing():
-    modulation = Modulation(["a"])
-    alphas = modulation()
-    assert alphas["a"].item() == pytest.approx(1.0)
-    W = weights().requires_grad_(True)
-    basis = torch.eye(32)[:, :4]
-    assert regularizer(W, basis, 3.0).item() == pytest.approx(3 * regularizer(W, basis).item())
-    basis_loss({"a": W}, {"a": basis}, alphas).backward()
-    assert modulation.raw.grad is None
-    assert W.grad.abs().sum() > 0
-
-
-@pytest.mark.parametrize(("sign", "rests_at"), [(1.0, 2.0), (-1.0, 0.0), (0.0, 1.0)])
-def test_modulation_grows_where_knowledge_serves_the_scene_and_fades_where_it_fights(sign, rests_at):
-    modulation = Modulation(["a", "b"])
-    optimizer = torch.optim.Adam(modulation.parameters(), lr=0.1)
-    gradient = {"a": weights() * 1e-30, "b": weights(seed=1) * 1e30}
-    for _ in range(300):
-        optimizer.zero_grad()
-        modulation.loss(gradient, {n: sign * g for n, g in gradient.items()}).backward()
-        optimizer.step()
-    for alpha in modulation().values():
-        assert alpha.item() == pytest.approx(rests_at, abs=0.1)
-        assert alpha.item() > 0
 
 
 @pytest.mark.parametrize(

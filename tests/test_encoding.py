@@ -5,11 +5,13 @@ import pytest
 import torch
 
 from chebsplat.codes import VOCABULARY, class_codes
-from chebsplat.encoder import RegionEncoder
+from chebsplat.encoder import RegionEncoder, Standardize
 from chebsplat.fusion import Gate, propagate, propagation_weights
 from chebsplat.gaussians import activated, covariances, initial_gaussians, local_shape
+from chebsplat.model import SceneModel
 from chebsplat.noisy_teacher import confusable, confuse_segments, decode, noisy_features, reduced
 from chebsplat.regions import build_regions, covering
+from chebsplat.stages.config import Config
 
 
 def cloud(n=600, seed=0):
@@ -180,3 +182,45 @@ def test_labels_are_told_in_parts_as_they_are_in_one():
     cosines = features / np.linalg.norm(features, axis=-1, keepdims=True) @ embeddings.T
     assert np.array_equal(labels, cosines.argmax(-1))
     assert np.allclose(confidence, 1 / np.exp((cosines - cosines.max(-1, keepdims=True)) / 0.1).sum(-1))
+
+
+def test_inputs_are_standardised_and_outliers_bounded():
+    norm = Standardize(3)
+    norm.set(0, torch.tensor([100.0, -2.0]), torch.tensor([0.5, 0.0]))
+    found = norm(torch.tensor([[101.0, -2.0, 0.25], [1e30, -2.0, -9.0]]))
+    assert found.tolist() == [[2.0, 0.0, 0.25], [5.0, 0.0, -5.0]]
+
+
+def two_shapes() -> tuple[SceneModel, torch.Tensor]:
+    """A flat patch and a ball, far apart, each with features of its own; tokens hold descriptors alone."""
+    generator, n = np.random.default_rng(0), 300
+    flat, ball = generator.normal(size=(n, 3)) * [1, 1, 0.02], generator.normal(size=(n, 3))
+    means = np.concatenate([flat, ball + np.array([20, 0, 0])])
+    spread = np.concatenate([np.tile(np.diag([0.04, 0.04, 1e-5]), (n, 1, 1)), np.tile(np.eye(3) * 0.02, (n, 1, 1))])
+    config = Config.model_validate({"describe": {"n_regions": 60, "n_angles": 2}, "train": {"context": "none"}})
+    raw = initial_gaussians(means, np.full((2 * n, 3), 128, np.uint8), spread)
+    model = SceneModel(raw, config.describe.model_dump(), config.train.model_dump(), 2)
+    kind = (torch.arange(2 * n) >= n).long()
+    with torch.no_grad():
+        model.raw["features"].copy_(torch.eye(2)[kind])
+    return model, kind
+
+
+def test_the_encoder_learns_meaning_from_shape_and_leaves_the_features_alone():
+    torch.manual_seed(0)
+    model, kind = two_shapes()
+    shape, features, generator = model.shape, model.raw["features"], torch.Generator().manual_seed(0)
+    shape.refresh(model.raw)
+    everyone, optimizer = torch.arange(len(kind)), torch.optim.Adam(shape.encoder.parameters(), lr=3e-3)
+    seen = shape.descriptors[shape.members >= 0]
+    assert shape.encoder.norm_input(seen).abs().max() <= 5
+    losses = []
+    for _ in range(60):
+        optimizer.zero_grad()
+        losses.append(shape.distance(features, shape.sample(features, everyone, generator)))
+        losses[-1].backward()
+        optimizer.step()
+    assert losses[-1] < 0.2 * losses[0]
+    assert features.grad is None
+    shape.refresh(model.raw)
+    assert (shape.cache.argmax(1) == kind[shape.centers]).all()
