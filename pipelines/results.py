@@ -85,7 +85,7 @@ def row_of(run: Run, failed: dict[str, tuple[int, str, Path]]) -> Row:
         "sh_kept": kept / (16 * sum(counts)),
         "bytes_ply": figures["bytes"]["ply"],
         "bytes_ragged": figures["bytes"]["ragged"],
-        "frames_per_second": figures["frames_per_second"]["color"],
+        "frames_per_second": figures["frames_per_second"].get("color"),
         "train_seconds": trace[-1]["seconds"],
         "held_in_psnr": trace[-1]["psnr"],
         "steps": int(trace[-1]["step"]),

@@ -75,13 +75,14 @@ def wanted_steps(plan: Plan, stage: str | None, others: Iterable[Plan] = ()) -> 
 def snakemake(steps: list[Step], cores: int, threads: int | None = None) -> Outcome:
     """Run these steps; logs of those that fail stay in `work/.plans`.
 
-    Args: threads: of one job, so that cores // threads run at once; `evaluate`, which measures frames per second, then
-          runs alone. None: every job may use all cores.
+    Args: threads: of one job, so that cores // threads run at once; `evaluate`, where it measures frames per second,
+          then runs alone. None: every job may use all cores.
     """
     state = git_state(HERE)
     entries = [entry(step, state) for step in steps]
     for item in entries:
-        item["threads"] = 1 if threads is None else cores if item["stage"] == "evaluate" else threads
+        timed = item["stage"] == "evaluate" and item["config"]["evaluate"]["timing_repeats"] > 0
+        item["threads"] = 1 if threads is None else cores if timed else threads
     plan = write_plan(entries)
     folder, words = plan.parent, plan.parent / "snakemake.log"
     command = [sys.executable, "-c", SNAKEMAKE, str(words), "--workflow-profile", "none"]

@@ -185,7 +185,7 @@ class CksSection(_Section):
 
 class EvaluateSection(_Section):
     boundary: int = Field(5, ge=1)  # pixels, half width of the boundary band
-    timing_repeats: int = Field(3, ge=1)
+    timing_repeats: int = Field(3, ge=0)  # 0: no timing; studies then evaluate in parallel
     lpips_weights: str | None = None  # .safetensors or .pth with VGG-16 and LPIPS' taps; None: not measured
 
 

@@ -65,8 +65,12 @@ def run(job: Job) -> None:
     figures["image"] = image_figures(pictures["renders"], pictures["truth"], masks, lpips)
     figures["n_gaussians"] = len(scene.parameters["means"])
     figures["bytes"] = scene.summary["bytes"]
-    figures["frames_per_second"] = timing(renderer, cameras, settings.timing_repeats, scene.labels is not None)
-    figures["milliseconds"] = frame_split(renderer, cameras, settings.timing_repeats)
+    figures |= {"frames_per_second": {}, "milliseconds": {}}
+    if settings.timing_repeats:
+        figures["frames_per_second"] = timing(renderer, cameras, settings.timing_repeats, scene.labels is not None)
+        figures["milliseconds"] = frame_split(renderer, cameras, settings.timing_repeats)
+    else:
+        job.left_out("frames a second", "evaluate.timing_repeats is 0")
     figures["lpips"] = figures["image"]["lpips"]
     if lpips is None:
         job.left_out("LPIPS", "evaluate.lpips_weights names no file: not measured")

@@ -156,11 +156,11 @@ def summary_rows(figures: dict[str, Any], by_degree: list[int] | None, of_step: 
         share = "" if name == "unpruned_ply" else f" ({size / whole:.0%} of unpruned)"
         rows.append([f"bytes, {BYTES[name]}", f"{size:,}{share}", ""])
     rows += [[f"frames/s, {FRAMES[name]}", f"{v:.1f}", ""] for name, v in figures["frames_per_second"].items()]
-    split = figures["milliseconds"]
-    threads = "one thread" if split["threads"] == 1 else f"{split['threads']} threads"
-    under = f"{split['width']}x{split['height']}, {threads}, {split['device']}"
-    parts = {"projection": "projection", "sh": "SH", "sort": "sort", "blend": "blend"}
-    rows += [[f"ms a frame, {name} ({under})", f"{split[part]:.2f}", ""] for part, name in parts.items()]
+    if split := figures["milliseconds"]:
+        threads = "one thread" if split["threads"] == 1 else f"{split['threads']} threads"
+        under = f"{split['width']}x{split['height']}, {threads}, {split['device']}"
+        parts = {"projection": "projection", "sh": "SH", "sort": "sort", "blend": "blend"}
+        rows += [[f"ms a frame, {name} ({under})", f"{split[part]:.2f}", ""] for part, name in parts.items()]
     rows += [[f"ms a training step, {part}", f"{value:.2f}", ""] for part, value in of_step.items()]
     return rows
 
