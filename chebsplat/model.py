@@ -12,7 +12,7 @@ from torch import Tensor, nn
 from chebsplat import adapt, sh_prune
 from chebsplat.descriptor import n_degrees
 from chebsplat.encoder import RegionEncoder
-from chebsplat.fusion import Gate, propagation_weights
+from chebsplat.fusion import Gate, propagate, propagation_weights
 from chebsplat.fusion_kernels import fuse_in_view
 from chebsplat.rasterize import rasterize
 from chebsplat.rasterize.projection import rotation_matrices
@@ -189,6 +189,10 @@ class Shape(nn.Module):
         """Fused features [V, C] of the Gaussians `index` [V]; encodings are fresh ones, or as the cache has them."""
         fresh = fresh or Encoded(self.cache[:0], torch.zeros(0, dtype=torch.int64))
         return fuse_in_view(self.gate, features, (self.cache, *fresh), self.cover, self.weights, index)
+
+    def alone(self) -> Tensor:
+        """Features [N, C] of all Gaussians by the cached encodings alone (Eq 9), zero where no region reaches."""
+        return propagate(self.cache, self.cover, self.weights)
 
     def distance(self, features: Tensor, fresh: Encoded) -> Tensor:
         """Mean distance of encodings to the features of their regions' members, which get no gradient.

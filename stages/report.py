@@ -62,7 +62,7 @@ def run(job: Job) -> None:
         versions |= manifest.versions
         settings |= manifest.config
     by_degree = manifests["scene"].facts["by_degree"] if "scene" in manifests else None
-    rows = summary_rows(figures, by_degree, manifests["gaussians"].facts["milliseconds"])
+    rows = summary_rows(figures, by_degree, manifests["gaussians"].facts)
     write_table(job.out / "figures.csv", rows)
     write_table(job.out / "trace.csv", [list(gaussians.trace[0]), *(list(row.values()) for row in gaussians.trace)])
     names = parts.label_names(job.inputs, figures)
@@ -124,10 +124,10 @@ def absent_stages(job: Job, gaussians: Gaussians) -> dict[str, str]:
     return {f"stage {STAGE_OF[role]}": why or "its artifact was not given" for role, why in absent.items()}
 
 
-def summary_rows(figures: dict[str, Any], by_degree: list[int] | None, of_step: dict[str, float]) -> list[list[str]]:
+def summary_rows(figures: dict[str, Any], by_degree: list[int] | None, trained: dict[str, Any]) -> list[list[str]]:
     """Header, then (figure, scene, teacher). What was not measured says so.
 
-    Args: by_degree: Gaussians by SH degree, None where unknown; of_step: milliseconds of a training step by part.
+    Args: by_degree: Gaussians by SH degree, None where unknown; trained: facts of the training.
     """
 
     def shown(value: float | None, form: str) -> str:
@@ -161,7 +161,10 @@ def summary_rows(figures: dict[str, Any], by_degree: list[int] | None, of_step: 
         under = f"{split['width']}x{split['height']}, {threads}, {split['device']}"
         parts = {"projection": "projection", "sh": "SH", "sort": "sort", "blend": "blend"}
         rows += [[f"ms a frame, {name} ({under})", f"{split[part]:.2f}", ""] for part, name in parts.items()]
-    rows += [[f"ms a training step, {part}", f"{value:.2f}", ""] for part, value in of_step.items()]
+    if known := trained.get("encoder"):
+        share = f"{known['agreement']:.1%} (the commonest label: {known['commonest']:.1%})"
+        rows.append(["Gaussians that encodings alone name as their features do", share, ""])
+    rows += [[f"ms a training step, {part}", f"{v:.2f}", ""] for part, v in trained["milliseconds"].items()]
     return rows
 
 

@@ -65,10 +65,24 @@ def run(job: Job) -> None:
         encoder = model.shape.encoder
         notes["encoder"] = {"n_inputs": encoder.n_inputs, "n_channels": encoder.n_channels} | encoder.settings
         job.facts["described_anew"] = model.shape.described.share_described
+    if model.shape is not None and features is not None:
+        job.facts["encoder"] = agreement(model.shape.alone().numpy(), parameters["features"], features.label_embeddings)
     timed = max(trainer.step - 1, 1)  # all but the first
     job.facts |= {"n_gaussians": left, "steps": trainer.step, "seconds_per_step": trace[-1]["seconds"] / timed}
     job.facts["milliseconds"] = {part: 1e3 * seconds / timed for part, seconds in trainer.laps.seconds.items()}
     write_gaussians(job.out, Gaussians(parameters, cameras, modules, optimizer_state(trainer), trace, notes))
+
+
+def agreement(alone: np.ndarray, features: np.ndarray, embeddings: np.ndarray) -> dict[str, float]:
+    """What encodings alone know: of the Gaussians, the part whose label [L, C] by them is that by their own features,
+    and the part that has the commonest label, which an encoder that knows nothing reaches.
+    """
+    import numpy as np
+
+    from chebsplat.noisy_teacher import decode
+
+    found, wanted = decode(alone, embeddings)[0], decode(features, embeddings)[0]
+    return {"agreement": float((found == wanted).mean()), "commonest": float(np.bincount(wanted).max() / len(wanted))}
 
 
 def note_left_out(job: Job, train: dict[str, Any], has_semantics: bool) -> None:
