@@ -272,14 +272,12 @@ class SceneModel:
         degree: int,
         *,
         masked: bool = True,
-        semantic: bool = True,
         fused: bool = False,
         generator: torch.Generator | None = None,
     ) -> tuple[Rendered, dict[str, Tensor]]:
         """Colour and features in one pass; the second result holds masks for the losses.
 
-        degree: SH bands in use; masked: apply the pruning masks; semantic: render features too, fused
-        ones if `fused`; generator: regions are encoded anew.
+        degree: SH bands in use; masked: apply the pruning masks; fused: render fused features, not the raw ones.
         """
         raw = self.raw
         with torch.no_grad():
@@ -289,9 +287,13 @@ class SceneModel:
         scales, opacities = take(raw["log_scales"], index).exp(), take(raw["logit_opacities"], index).sigmoid()
         aside: dict[str, Tensor] = {}
         features = None
-        if "features" in raw and (semantic or (masked and self.semantic_gate is not None)):
-            with torch.set_grad_enabled(semantic and torch.is_grad_enabled()):
-                features = self._features_in_view(index, fused, generator if semantic else None, aside)
+        if fused and self.shape is not None and self.shape.regions is not None:
+            fresh = None if generator is None else self.shape.sample(raw["features"], index, generator)
+            features = self.shape.fuse(raw["features"], index, fresh)
+            if fresh is not None and len(fresh.regions):
+                aside["shape"] = self.shape.distance(raw["features"], fresh)
+        elif "features" in raw:
+            features = take(raw["features"], index)
         if masked and (soft := self.soft_mask(index, features)) is not None:
             aside["mask"] = soft
             scales, opacities = adapt.apply_mask(adapt.hard_mask(soft), scales, opacities)
@@ -300,27 +302,13 @@ class SceneModel:
             aside["bands"] = masks
         eye = -view.viewmat[:3, :3].T @ view.viewmat[:3, 3]
         colors = colors_in_view(self.bands(), masks, index, raw["means"], eye, degree)
-        channels = colors if features is None or not semantic else torch.cat([colors, features], -1)
+        channels = colors if features is None else torch.cat([colors, features], -1)
         render, alpha, meta = rasterize(
             means, quats, scales, opacities, channels, view.viewmat[None], view.K[None], view.width, view.height
         )
         parts = render[0].split([3, channels.shape[1] - 3], -1)  # one gradient, where two slices would make two
-        rendered = Rendered(parts[0], alpha[0], parts[1] if parts[1].shape[-1] else None, meta, index)
+        rendered = Rendered(parts[0], alpha[0], parts[1] if features is not None else None, meta, index)
         return rendered, aside
-
-    def _features_in_view(
-        self, index: Tensor, fused: bool, generator: torch.Generator | None, aside: dict[str, Tensor]
-    ) -> Tensor:
-        """Features [V, C] of the Gaussians `index`, fused or not; the loss of regions encoded anew goes to `aside`."""
-        features, shape = self.raw["features"], self.shape
-        if not fused or shape is None or shape.regions is None:
-            return take(features, index)
-        fresh = None
-        if generator is not None:
-            fresh = shape.sample(features, index, generator)
-            if len(fresh.regions):
-                aside["shape"] = shape.distance(features, fresh)
-        return shape.fuse(features, index, fresh)
 
     @torch.no_grad()
     def fused_features(self) -> np.ndarray | None:

@@ -33,7 +33,7 @@ def adam(model: SceneModel, settings: dict[str, Any], extent: float) -> torch.op
     """
     groups = []
     for name, value in model.raw.items():
-        rate = settings[RATES[name]] or min(TRAVEL * settings["features_every"] / settings["steps"], MOST)
+        rate = settings[RATES[name]] or min(TRAVEL / settings["steps"], MOST)
         rate *= extent if name == "means" else 1
         groups.append({"params": [value], "rate": rate, "name": name})
     weights = [p for module in model.modules.values() for p in module.parameters()]

@@ -167,12 +167,10 @@ class Trainer:
         settings, factor = self.settings, self.schedule.factor(share)
         target, mask = self.views.target(index, factor)
         pruning = self.schedule.has("prune_from", share)
-        every = settings["features_every"]
         rendered, aside = self.model.render(
             self.views.camera(index, factor),
             self.schedule.degree(share),
             masked=pruning,
-            semantic=self.step % every == 0,
             fused=self._encodes(share),
             generator=self.generator if self.step % settings["encode_every"] == 0 else None,
         )
@@ -181,7 +179,7 @@ class Trainer:
         if rendered.features is not None and self.views.features is not None:
             wanted = self.views.features(index)
             distance = feature_distance(rendered.features, wanted, mask, settings["feature_loss"])
-            losses["features"] = every * settings["weight_features"] * distance
+            losses["features"] = settings["weight_features"] * distance
         if "mask" in aside and pruning:
             losses["mask"] = settings["weight_mask"] * aside["mask"].mean()
         if "shape" in aside and settings["weight_shape"] > 0:
@@ -216,9 +214,7 @@ class Trainer:
         """Mean PSNR over training views at full resolution, dB."""
         scores = []
         for index in indices:
-            rendered, _ = self.model.render(
-                self.views.camera(index, 1), self.schedule.degree(self.share), semantic=False
-            )
+            rendered, _ = self.model.render(self.views.camera(index, 1), self.schedule.degree(self.share))
             image = (rendered.rgb.clamp(0, 1) * 255).round().byte().numpy()
             mask = None if self.views.masks is None else self.views.masks[index].numpy()
             truth = self.views.images[index].numpy()

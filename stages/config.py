@@ -124,7 +124,6 @@ class TrainSection(_Section):
     width: int = Field(32, ge=4)
     n_layers: int = Field(2, ge=1)
     n_heads: int = Field(4, ge=1)
-    features_every: int = Field(2, ge=1)  # steps from one that renders features, and is taught them, to the next
     encode_every: int = Field(4, ge=1)  # steps from one that encodes regions anew to the next
     regions_per_step: int = Field(64, ge=1)  # encoded anew in such a step; the others come from the cache
     n_covers: int = Field(4, ge=1)  # regions that reach a Gaussian, at most
@@ -160,12 +159,6 @@ class TrainSection(_Section):
     weight_sh: float = Field(1e-4, ge=0)
     weight_basis: float = Field(1.0, ge=0)
     warm_start: bool = True  # start the encoder from the basis' stored weights
-
-    @model_validator(mode="after")
-    def _encodes_where_features_are_rendered(self) -> TrainSection:
-        if self.encode_every % self.features_every:
-            raise ValueError(f"encode_every must be a multiple of features_every, {self.features_every}")
-        return self
 
     @model_validator(mode="after")
     def _grows_before_bands_close(self) -> TrainSection:

@@ -121,8 +121,7 @@ def test_a_resumed_training_takes_the_same_steps_to_the_bit(tiny_trainer, tmp_pa
 def test_growth_without_semantic_guidance_takes_the_same_steps_and_other_places(tiny_trainer):
     """The loss is split into two backward passes; their sum moves parameters as one does."""
     guided, alone = (
-        tiny_trainer(steps=20, densify_from=0.8, densify_until=0.8, features_every=1, densify_semantic=k)
-        for k in (True, False)
+        tiny_trainer(steps=20, densify_from=0.8, densify_until=0.8, densify_semantic=k) for k in (True, False)
     )
     for made in (guided, alone):
         with torch.no_grad():  # features of zero would not move geometry
@@ -157,8 +156,8 @@ def test_gaussians_that_break_are_removed_and_counted(tiny_trainer):
 def test_a_view_that_makes_the_loss_non_finite_is_named(tiny_trainer):
     made = tiny_trainer()
     made.views.features = lambda index: torch.full((10, 12, 8), torch.nan)
-    with pytest.raises(DataFailure, match=r"step 2, view view\d: loss features is not finite; .* look at the view"):
-        list(made.steps())
+    with pytest.raises(DataFailure, match=r"step 1, view view\d: loss features is not finite; .* look at the view"):
+        next(made.steps())
 
 
 def test_a_breakdown_is_named(tiny_trainer):
@@ -196,23 +195,8 @@ def test_kernels_just_compiled_and_kernels_from_the_cache_give_the_same_bits(tmp
 
 
 @pytest.mark.parametrize(
-    ("settings", "rate"),
-    [({"features_every": 1}, 1e-2), ({}, 2e-2), ({"steps": 50}, 5e-2), ({"lr_features": 3e-3}, 3e-3)],
+    ("settings", "rate"), [({"steps": 1000}, 1e-2), ({"steps": 50}, 5e-2), ({"steps": 1000, "lr_features": 3e-3}, 3e-3)]
 )
 def test_the_features_rate_fits_the_number_of_steps(tiny_trainer, settings, rate):
-    groups = {
-        group["name"]: group["rate"] for group in tiny_trainer(**{"steps": 1000} | settings).optimizer.param_groups
-    }
+    groups = {group["name"]: group["rate"] for group in tiny_trainer(**settings).optimizer.param_groups}
     assert groups["features"] == pytest.approx(rate)
-
-
-def test_features_are_rendered_and_taught_in_every_second_step_only(tiny_trainer):
-    made = tiny_trainer(steps=8, densify="off", sh_prune=False, features_every=2)
-    for step, figures in enumerate(made.steps(), start=1):
-        assert ("loss_features" in figures) == (made.model.raw["features"].grad is not None)
-        assert ("loss_features" in figures) == (step % 2 == 0)
-        assert made.model.raw["means"].grad.abs().sum() > 0
-    rendered, aside = made.model.render(made.views.camera(0, 1), 3, semantic=False)
-    assert rendered.features is None and aside["mask"].requires_grad
-    with pytest.raises(ValueError, match="multiple of features_every"):
-        config.TrainSection(encode_every=3, features_every=2)
