@@ -125,7 +125,7 @@ class TrainSection(_Section):
     n_layers: int = Field(2, ge=1)
     n_heads: int = Field(4, ge=1)
     encode_every: int = Field(4, ge=1)  # steps from one that encodes regions anew to the next
-    regions_per_step: int = Field(64, ge=1)  # encoded anew in such a step; the others come from the cache
+    regions_per_step: int = Field(32, ge=1)  # encoded anew in such a step; the others come from the cache
     n_covers: int = Field(4, ge=1)  # regions that reach a Gaussian, at most
     context: Literal["features", "none"] = "features"  # what tokens hold beside the descriptor
     # schedule, as fractions of the budget
