@@ -33,7 +33,8 @@ def adam(model: SceneModel, settings: dict[str, Any], extent: float) -> torch.op
     """
     groups = []
     for name, value in model.raw.items():
-        rate = settings[RATES[name]] or min(TRAVEL / settings["steps"], MOST)
+        given = settings[RATES[name]]  # 0 holds a parameter where it is
+        rate = min(TRAVEL / settings["steps"], MOST) if given is None else given
         rate *= extent if name == "means" else 1
         groups.append({"params": [value], "rate": rate, "name": name})
     weights = [p for module in model.modules.values() for p in module.parameters()]

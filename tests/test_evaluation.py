@@ -130,10 +130,8 @@ def test_lpips_given_weights_and_the_time_by_part_are_in_the_evaluation(toy, wei
     split = figures["milliseconds"]
     assert all(split[part] > 0 for part in ("projection", "sh", "sort", "blend"))
     assert (split["width"], split["height"], split["device"]) == (96, 72, "cpu") and split["threads"] >= 1
-    assert (
-        run_stage("evaluate", tmp_path / "untimed", inputs_of(toy, "evaluate"), changed(evaluate={"timing_repeats": 0}))
-        == 0
-    )
+    config = changed(evaluate={"timing_repeats": 0})
+    assert run_stage("evaluate", tmp_path / "untimed", inputs_of(toy, "evaluate"), config) == 0
     untimed = read_evaluation(tmp_path / "untimed").figures
     assert untimed["frames_per_second"] == untimed["milliseconds"] == {} and "frames a second" in untimed["left_out"]
     without = read_evaluation(toy["evaluate"]).figures

@@ -198,5 +198,7 @@ def test_kernels_just_compiled_and_kernels_from_the_cache_give_the_same_bits(tmp
     ("settings", "rate"), [({"steps": 1000}, 1e-2), ({"steps": 50}, 5e-2), ({"steps": 1000, "lr_features": 3e-3}, 3e-3)]
 )
 def test_the_features_rate_fits_the_number_of_steps(tiny_trainer, settings, rate):
-    groups = {group["name"]: group["rate"] for group in tiny_trainer(**settings).optimizer.param_groups}
+    made = tiny_trainer(lr_sh=0.0, **settings)
+    groups = {group["name"]: group["rate"] for group in made.optimizer.param_groups}
+    assert groups["sh1"] == 0  # given, if nothing
     assert groups["features"] == pytest.approx(rate)
