@@ -74,14 +74,42 @@ def step(backend: str, n: int = N, channels: int = CHANNELS, dtype: torch.dtype 
     return run
 
 
+def training_step(features: int, *, by_cell: bool) -> Callable[[], None]:
+    """A training's step: three colours and `features` of a teacher at a quarter of the image's size, both losses."""
+    arguments, (width, height) = [a.requires_grad_(True) for a in scene(N, 3 + features)], SIZE
+    color, target = torch.rand(height, width, 3), torch.rand(height // 4, width // 4, features)
+
+    def run() -> None:
+        for a in arguments:
+            a.grad = None
+        *gaussians, channels = arguments
+        if features and by_cell:
+            parts = [part.contiguous() for part in channels.split([3, features], -1)]
+            render, _, meta = rasterize(*gaussians, parts[0], *camera(*SIZE), backend="cpu", cell_colors=parts[1])
+            image, rendered = render[0], meta["cells"][0]
+        else:
+            image, rendered = rasterize(*gaussians, channels, *camera(*SIZE), backend="cpu")[0][0].split(
+                [3, features], -1
+            )
+        loss = photometric(image, color, None, 0.2)
+        (loss + feature_distance(rendered, target) if features else loss).backward()
+
+    return run
+
+
 def stages() -> dict[str, Callable[[], object]]:
     """The numba stages by themselves, without torch; `forward` and `backward` are the kernels."""
     means, quats, scales, opacities, colors = (t.detach().numpy() for t in scene(N, CHANNELS))
     viewmats, Ks, width, height = camera(*SIZE)
     view, ceiling = (viewmats[0].double().numpy(), Ks[0].double().numpy(), width, height), np.float32(0.999)
-    gaussians, by_channel, no_slope = (means, quats, scales), (opacities, colors), np.zeros(N, np.float32)
+    gaussians, by_channel, no_slope = (
+        (means, quats, scales),
+        (opacities, colors, colors[:, :0]),
+        np.zeros(N, np.float32),
+    )
     rng = np.random.default_rng(0)
-    grad = rng.random((height, width, CHANNELS), np.float32), rng.random((height, width), np.float32)
+    no_cells = np.zeros((height // 4, width // 4, 0), np.float32)
+    grad = rng.random((height, width, CHANNELS), np.float32), no_cells, rng.random((height, width), np.float32)
     means2d, covariances, whitening, _, depths, radii, _ = ellipses.project(*gaussians, *view, 0.01, 1e10, 0.3)
 
     def bins() -> binning.Bins:
@@ -95,9 +123,9 @@ def stages() -> dict[str, Callable[[], object]]:
     splats = pack()
 
     def forward() -> tuple[np.ndarray, ...]:
-        return tiles.forward(splats, found.tile_starts, found.rank, CHANNELS, width, height, ceiling)
+        return tiles.forward(splats, found.tile_starts, found.rank, CHANNELS, 0, width, height, ceiling)
 
-    _, _, *seen = forward()
+    _, _, _, *seen = forward()
 
     def backward() -> tuple[Any, ...]:
         return tiles.backward(N, splats, *found, *seen, ceiling, *grad, False)
@@ -295,6 +323,9 @@ def main() -> None:
         "cpu, 3 channels": (4, step("cpu", channels=3)), "cpu, 100k": (4, step("cpu", n=100_000)),
         "cpu, 5k": (4, step("cpu", n=5_000)), "cpu, no loss": (4, render_and_back()), "loss": (4, loss()),
         "multiply-adds": (1, multiply),
+        "training step, 3 colors": (4, training_step(0, by_cell=False)),
+        "training step, 32 features by pixel": (4, training_step(32, by_cell=False)),
+        "training step, 32 features by cell": (4, training_step(32, by_cell=True)),
     }  # fmt: skip
     for name, action in stages().items():
         variants |= {f"{name}, {n} thread{'s'[: n > 1]}": (n, action) for n in (1, 4)}
@@ -316,6 +347,8 @@ def main() -> None:
         ("kernels over the FMA floor, one thread", kernels / floor, "<=", 4.0),
         ("one thread over four", times["cpu, 1 thread"] / base, ">=", 2.5),
         ("19 channels over 3", base / times["cpu, 3 channels"], "<=", 2.0),
+        ("a step with 32 features by cell over without", times["training step, 32 features by cell"]
+         / times["training step, 3 colors"], "<=", 1.5),
         ("loss over rasterization", times["loss"] / times["cpu, no loss"], "<=", 0.5),
         ("100k Gaussians over 20k", times["cpu, 100k"] / base, "<=", 1.9),
         ("image error, root mean square", found["cpu"]["image"], "<=", 1e-6),

@@ -34,11 +34,11 @@ def frame_parts(renderer: SceneRenderer, view: View) -> tuple[dict[str, float], 
     sh0, shN, degrees = (renderer.raw[name][index] for name in ("sh0", "shN", "degrees"))
     colors = colors_by_degree(sh0, shN, means - eye, degrees).contiguous().numpy()
     clock.append(time.perf_counter())
-    strengths, size = opacities.numpy(), (view.width, view.height)
-    bins = binning.bin_gaussians(centers, covariances, depths, radii, strengths, colors, *size)
-    splats = tiles.pack(bins.order, centers, whitening, strengths, colors)
+    strengths, size, none = opacities.numpy(), (view.width, view.height), colors[:, :0]
+    bins = binning.bin_gaussians(centers, covariances, depths, radii, strengths, colors, none, *size)
+    splats = tiles.pack(bins.order, centers, whitening, strengths, colors, none)
     clock.append(time.perf_counter())
-    image, *_ = tiles.forward(splats, bins.tile_starts, bins.rank, 3, *size, np.float32(MAX_ALPHA))
+    image, *_ = tiles.forward(splats, bins.tile_starts, bins.rank, 3, 0, *size, np.float32(MAX_ALPHA))
     frame = (torch.from_numpy(image).clamp(0, 1) * 255).round().byte().numpy()
     clock.append(time.perf_counter())
     return dict(zip(PARTS, np.diff(clock).tolist(), strict=True)), frame

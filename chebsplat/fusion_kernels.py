@@ -22,6 +22,20 @@ ZERO, ONE, LARGE, MINUS_LOG2E = np.float32(0), np.float32(1), np.float32(100), n
 
 
 @inline
+def _times(x, n, matrix, column, start):
+    """start + Σ_j x[j] matrix[j, column:] over j < n, a multiple of four; four sums, that none waits for another."""
+    step = matrix.shape[1]
+    a, b, c, d = start, splat(ZERO), splat(ZERO), splat(ZERO)
+    for j in range(0, n, 4):
+        at = j * step + column
+        a = fma(spread(x, j), load(matrix, at), a)
+        b = fma(spread(x, j + 1), load(matrix, at + step), b)
+        c = fma(spread(x, j + 2), load(matrix, at + 2 * step), c)
+        d = fma(spread(x, j + 3), load(matrix, at + 3 * step), d)
+    return (a + b) + (c + d)
+
+
+@inline
 def _mixed(features, encodings, cover, weights, by_input, bias, i, f, s, g, x):
     """Fill the padded rows f (features), s (shape) and g (gate) of Gaussian i, and x = [s, f]; is it covered?"""
     channels, width = features.shape[1], len(bias)
@@ -37,10 +51,7 @@ def _mixed(features, encodings, cover, weights, by_input, bias, i, f, s, g, x):
         store(x, width + at, load(f, at))
     covered = cover[i, 0] >= 0
     for at in range(0, width, LANES):
-        logit = load(bias, at)
-        for j in range(2 * width):
-            logit = fma(spread(x, j), load(by_input, j * width + at), logit)
-        power = splat(MINUS_LOG2E) * logit
+        power = splat(MINUS_LOG2E) * _times(x, 2 * width, by_input, at, load(bias, at))
         share = splat(ONE) / (splat(ONE) + exp2(where(power > splat(LARGE), splat(LARGE), power)))
         store(g, at, share if covered else splat(ONE))
     return covered
@@ -95,10 +106,7 @@ def _backward(features, encodings, cover, weights, index, by_input, bias, by_out
                 store(inward, at, up * (splat(ONE) - share))
                 store(inward, width + at, up * share)
             for at in range(0, 2 * width, LANES):
-                total = load(inward, at)
-                for c in range(channels):
-                    total = fma(spread(slope, c), load(by_output, c * 2 * width + at), total)
-                store(inward, at, total)
+                store(inward, at, _times(slope, width, by_output, at, load(inward, at)))
             for at in range(0, width, LANES):
                 down = load(slope, at)
                 place = block * width + at

@@ -44,7 +44,8 @@ def take(values: Tensor, index: Tensor) -> Tensor:
 
 @dataclass
 class Rendered:
-    """rgb [H, W, 3], alpha [H, W, 1], features [H, W, C] or None; `index` [V] the Gaussians in the frustum."""
+    """rgb [H, W, 3], alpha [H, W, 1], features [H, W, C], or [h, w, C] if so asked, or None; `index` [V] the Gaussians
+    in the frustum."""
 
     rgb: Tensor
     alpha: Tensor
@@ -274,10 +275,12 @@ class SceneModel:
         masked: bool = True,
         fused: bool = False,
         generator: torch.Generator | None = None,
+        grid: tuple[int, int] | None = None,
     ) -> tuple[Rendered, dict[str, Tensor]]:
         """Colour and features in one pass; the second result holds masks for the losses.
 
-        degree: SH bands in use; masked: apply the pruning masks; fused: render fused features, not the raw ones.
+        degree: SH bands in use; masked: apply the pruning masks; fused: render fused features, not the raw ones; grid:
+        features are only needed as means over h × w cells, which is cheap where the cells are the rasterizer's.
         """
         raw = self.raw
         with torch.no_grad():
@@ -302,13 +305,15 @@ class SceneModel:
             aside["bands"] = masks
         eye = -view.viewmat[:3, :3].T @ view.viewmat[:3, 3]
         colors = colors_in_view(self.bands(), masks, index, raw["means"], eye, degree)
-        channels = colors if features is None else torch.cat([colors, features], -1)
-        render, alpha, meta = rasterize(
-            means, quats, scales, opacities, channels, view.viewmat[None], view.K[None], view.width, view.height
-        )
+        gaussians, camera = (means, quats, scales, opacities), (view.viewmat[None], view.K[None])
+        size = view.width, view.height
+        if features is None or (grid is not None and size == (4 * grid[1], 4 * grid[0])):
+            render, alpha, meta = rasterize(*gaussians, colors, *camera, *size, cell_colors=features)
+            return Rendered(render[0], alpha[0], None if features is None else meta["cells"][0], meta, index), aside
+        channels = torch.cat([colors, features], -1)
+        render, alpha, meta = rasterize(*gaussians, channels, *camera, *size)
         parts = render[0].split([3, channels.shape[1] - 3], -1)  # one gradient, where two slices would make two
-        rendered = Rendered(parts[0], alpha[0], parts[1] if features is not None else None, meta, index)
-        return rendered, aside
+        return Rendered(parts[0], alpha[0], parts[1], meta, index), aside
 
     @torch.no_grad()
     def fused_features(self) -> np.ndarray | None:

@@ -167,17 +167,18 @@ class Trainer:
         settings, factor = self.settings, self.schedule.factor(share)
         target, mask = self.views.target(index, factor)
         pruning = self.schedule.has("prune_from", share)
+        wanted = None if self.views.features is None else self.views.features(index)
         rendered, aside = self.model.render(
             self.views.camera(index, factor),
             self.schedule.degree(share),
             masked=pruning,
             fused=self._encodes(share),
             generator=self.generator if self.step % settings["encode_every"] == 0 else None,
+            grid=None if wanted is None else (wanted.shape[0], wanted.shape[1]),
         )
         self.laps.mark("render")
         losses = {"color": photometric(rendered.rgb, target, mask, settings["weight_ssim"])}
-        if rendered.features is not None and self.views.features is not None:
-            wanted = self.views.features(index)
+        if rendered.features is not None and wanted is not None:
             distance = feature_distance(rendered.features, wanted, mask, settings["feature_loss"])
             losses["features"] = settings["weight_features"] * distance
         if "mask" in aside and pruning:

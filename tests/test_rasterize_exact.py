@@ -64,6 +64,65 @@ def test_any_channels_and_edges_are_exact(channels, size):
     check(scene(channels=channels), *size)
 
 
+@pytest.mark.parametrize("n", [1, 5, 16, 33])
+@pytest.mark.parametrize("size", [(53, 37), (32, 16), (17, 1), (3, 2)], ids=lambda size: f"{size[0]}x{size[1]}")
+@pytest.mark.parametrize("backend", ["reference", "cpu"])
+def test_cell_colors_are_means_over_cells_of_what_colors_would_be(backend, size, n):
+    arguments, generator = scene(channels=3), torch.Generator().manual_seed(1)
+    arguments.append(torch.rand(150, n, generator=generator))
+    (viewmats, K, width, height), corners = (
+        camera(*size),
+        [(y, x) for y in range(0, size[1], 4) for x in range(0, size[0], 4)],
+    )
+    doubtful = undecided([*arguments[:4], torch.cat(arguments[4:], 1)], width, height)[0]
+    decided = torch.stack([~doubtful[y : y + 4, x : x + 4].any() for y, x in corners])
+    assert decided.double().mean() > 0.7
+    weights = torch.randn(height, width, 3, generator=generator).masked_fill(doubtful[..., None], 0)
+    of_means = torch.randn(len(corners), n, generator=generator) * decided[:, None]
+
+    def differentiated(dtype, render):
+        leaves = [a.to(dtype, copy=True).requires_grad_(True) for a in arguments]
+        image, means = render(leaves, viewmats.to(dtype), K.to(dtype), width, height)
+        ((image * weights).sum() + (means * of_means).sum()).backward()
+        return image.detach()[~doubtful], means.detach()[decided], [a.grad for a in leaves]
+
+    def by_pixel(leaves, *camera):
+        image = rasterize(*leaves[:4], torch.cat(leaves[4:], 1), *camera, backend="reference")[0][0]
+        return image[..., :3], torch.stack([image[y : y + 4, x : x + 4, 3:].mean((0, 1)) for y, x in corners])
+
+    def by_cell(leaves, *camera):
+        image, _, meta = rasterize(*leaves[:5], *camera, backend=backend, cell_colors=leaves[5])
+        return image[0], meta["cells"].flatten(0, 2)
+
+    exact = differentiated(torch.float64, by_pixel)
+    found = differentiated(torch.float32 if backend == "cpu" else torch.float64, by_cell)
+    for x, y in zip(found[:2], exact[:2], strict=True):
+        assert (x.double() - y).abs().max() <= IMAGE
+    for name, x, y in zip((*NAMES, "cell_colors"), found[2], exact[2], strict=True):
+        assert (x.double() - y).norm() <= GRADIENT * y.norm(), name
+
+
+def test_a_gaussian_with_a_broken_cell_color_is_not_drawn():
+    arguments, generator = scene(channels=3), torch.Generator().manual_seed(1)
+    in_cells = torch.rand(150, 4, generator=generator)
+    in_cells[7, 2] = torch.nan
+    gone = [torch.cat([a[:7], a[8:]]) for a in (*arguments, in_cells)]
+    viewmats, K, width, height = camera()
+    for backend in ("reference", "cpu"):
+        broken = rasterize(*arguments, viewmats, K, width, height, backend=backend, cell_colors=in_cells)
+        without = rasterize(*gone[:5], viewmats, K, width, height, backend=backend, cell_colors=gone[5])
+        torch.testing.assert_close(broken[0], without[0])
+        torch.testing.assert_close(broken[2]["cells"], without[2]["cells"])
+
+
+def test_a_non_finite_gradient_of_the_cells_is_an_error():
+    arguments = [a.requires_grad_(True) for a in scene(channels=3)]
+    viewmats, K, width, height = camera()
+    _, _, meta = rasterize(*arguments, viewmats, K, width, height, backend="cpu", cell_colors=arguments[4].detach())
+    with pytest.raises(ValueError, match="view 0 is not finite"):
+        (meta["cells"] * torch.inf).sum().backward()
+
+
 @pytest.mark.parametrize("mode", ["classic", "antialiased"])
 @pytest.mark.parametrize("size", [0.02, 0.2, 1.0], ids=["less than a pixel", "about a pixel", "pixels"])
 def test_each_mode_is_exact_at_any_size_of_gaussians(mode, size):

@@ -60,11 +60,13 @@ def _box(means2d, covariances, opacities, i, width, height, boxes):
 
 
 @inline
-def _usable(radii, opacities, colors, i):
+def _usable(radii, opacities, colors, cell_colors, i):
     """Projected, bright enough, and finite in opacity and in every channel."""
     check = np.float32(0)
     for d in range(colors.shape[1]):
         check += colors[i, d] * np.float32(0)
+    for d in range(cell_colors.shape[1]):
+        check += cell_colors[i, d] * np.float32(0)
     return radii[i] != 0 and opacities[i] >= np.float32(ALPHA_MIN) and math.isfinite(opacities[i]) and check == 0
 
 
@@ -91,11 +93,11 @@ def _sort(index, keys):
 
 
 @kernel
-def _boxes(means2d, covariances, radii, opacities, colors, width, height):
+def _boxes(means2d, covariances, radii, opacities, colors, cell_colors, width, height):
     """Boxes of tiles i32 [N, 4], all 0 for a Gaussian that touches none."""
     boxes = np.zeros((len(means2d), 4), np.int32)
     for i in prange(len(means2d)):
-        if _usable(radii, opacities, colors, i):
+        if _usable(radii, opacities, colors, cell_colors, i):
             _box(means2d, covariances, opacities, i, width, height, boxes)
     return boxes
 
@@ -158,14 +160,14 @@ def _deal(order, boxes, columns, rows):
 
 def bin_gaussians(
     means2d: np.ndarray, covariances: np.ndarray, depths: np.ndarray, radii: np.ndarray, opacities: np.ndarray,
-    colors: np.ndarray, width: int, height: int,
+    colors: np.ndarray, cell_colors: np.ndarray, width: int, height: int,
 ) -> Bins:  # fmt: skip
     """Pairs of Gaussians and tiles of one view.
 
-    Args: as `ellipses.project` gives them; opacities [N]; colors [N, D].
+    Args: as `ellipses.project` gives them; opacities [N]; colors [N, D], cell_colors [N, E].
     Choices: the box of the ellipse α ≥ 1/255; a Gaussian that is fainter, or not finite in opacity or in any
       channel, touches nothing. Ties in depth go by index.
     """
-    boxes = _boxes(means2d, covariances, radii, opacities, colors, width, height)
+    boxes = _boxes(means2d, covariances, radii, opacities, colors, cell_colors, width, height)
     order = _sort(*_shown(boxes, depths))
     return Bins(order, *_deal(order, boxes, (width + TILE - 1) // TILE, (height + TILE - 1) // TILE))

@@ -169,10 +169,10 @@ def unwind(alphas, weights, out, count, max_alpha):
 def record_colors(weights, tall_grads, channels, count, cell, places, records):
     """records[places[m], N_GEOMETRY:] += Σ_lanes weights[m] tall_grads: by cell, 16 rows of D `channels` and a margin.
 
-    The records have a multiple of four columns; what the last ones take up beyond D is never read.
+    The records have a multiple of four columns for them; what the last ones take up beyond D is never read.
     """
     row, at, step = channels, cell * (LANES * channels + LANES), records.shape[1]
-    channels = step - N_GEOMETRY
+    channels = (channels + 3) // 4 * 4
     for m in range(0, count, BLOCK):
         c = 0
         while c + 16 <= channels:
@@ -186,6 +186,46 @@ def record_colors(weights, tall_grads, channels, count, cell, places, records):
         if c < channels:
             multiply(records, N_GEOMETRY + c, places, m, step, weights, LANES * m, LANES, 1, tall_grads, at + c,
                      row, LANES, 8, 4, 1)  # fmt: skip
+
+
+@lanes
+def sum_lanes(weights, count, sums):
+    """sums[m] = Σ_lanes weights[m]: what Gaussian m adds to the whole cell."""
+    for m in range(count):
+        sums[m] = total(load(weights, LANES * m))
+
+
+@lanes
+def accumulate_means(splats, column, ranks, start, rows, shares, count, cell, sums):
+    """sums[cell] += Σ_m shares[m] splats[m, column:]: the cell channels, [cells, E], E a multiple of 16."""
+    for d in range(0, sums.shape[1], LANES):
+        at = cell * sums.shape[1] + d
+        summed = load(sums, at)
+        for m in range(count):
+            place = np.int64(ranks[start + rows[m]]) * splats.shape[1] + column + d
+            summed = fma(splat(shares[m]), load(splats, place), summed)
+        store(sums, at, summed)
+
+
+@lanes
+def add_slopes_of_means(splats, column, ranks, start, rows, count, cell, mean_grads, out):
+    """out[m] += the cell's gradient [cells, E] times Gaussian m's cell channels, the same at every lane."""
+    for m in range(count):
+        place = np.int64(ranks[start + rows[m]]) * splats.shape[1] + column
+        slope = splat(ZERO)
+        for d in range(0, mean_grads.shape[1], LANES):
+            slope = fma(load(splats, place + d), load(mean_grads, cell * mean_grads.shape[1] + d), slope)
+        store(out, LANES * m, load(out, LANES * m) + splat(total(slope)))
+
+
+@lanes
+def record_means(shares, mean_grads, count, cell, places, column, records):
+    """records[places[m], column:] += shares[m] times the cell's gradient."""
+    for m in range(count):
+        share, place = splat(shares[m]), places[m] * records.shape[1] + column
+        for d in range(0, mean_grads.shape[1], LANES):
+            slope = load(mean_grads, cell * mean_grads.shape[1] + d)
+            store(records, place + d, fma(share, slope, load(records, place + d)))
 
 
 @lanes

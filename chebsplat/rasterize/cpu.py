@@ -38,36 +38,38 @@ class _Project(torch.autograd.Function):
 
 
 class _Composite(torch.autograd.Function):
-    """Render [H, W, D] and alpha [H, W] of one view; backward also adds to `absgrad` [N, 2] if given, in place."""
+    """Render [H, W, D], means over cells, and alpha [H, W] of one view; backward also adds to `absgrad` if given."""
 
     @staticmethod
     def forward(  # type: ignore[override]
-        ctx: Any, means2d: Tensor, covariances: Tensor, opacities: Tensor, colors: Tensor,
+        ctx: Any, means2d: Tensor, covariances: Tensor, opacities: Tensor, colors: Tensor, cell_colors: Tensor,
         whitening: Tensor, depths: Tensor, radii: Tensor, absgrad: Tensor | None, size: tuple[int, int],
         max_alpha: float, view: int,
-    ) -> tuple[Tensor, Tensor]:  # fmt: skip
-        centers, spreads, strengths, channels, whitened, z, reach = (
-            t.detach().contiguous().numpy() for t in (means2d, covariances, opacities, colors, whitening, depths, radii)
+    ) -> tuple[Tensor, Tensor, Tensor]:  # fmt: skip
+        centers, spreads, strengths, whitened, z, reach = (
+            t.detach().contiguous().numpy() for t in (means2d, covariances, opacities, whitening, depths, radii)
         )
-        bins = binning.bin_gaussians(centers, spreads, z, reach, strengths, channels, *size)
-        splats = tiles.pack(bins.order, centers, whitened, strengths, channels)
+        channels, in_cells = colors.detach().contiguous().numpy(), cell_colors.detach().contiguous().numpy()
+        bins = binning.bin_gaussians(centers, spreads, z, reach, strengths, channels, in_cells, *size)
+        splats = tiles.pack(bins.order, centers, whitened, strengths, channels, in_cells)
         limit = np.float32(max_alpha)
-        found = tiles.forward(splats, bins.tile_starts, bins.rank, channels.shape[1], *size, limit)
-        render, transmittance, *seen = found
+        counts = channels.shape[1], in_cells.shape[1]
+        found = tiles.forward(splats, bins.tile_starts, bins.rank, *counts, *size, limit)
+        render, cells, transmittance, *seen = found
         ctx.arrays, ctx.absgrad = (len(centers), splats, *bins, *seen, limit), absgrad
         ctx.view = view
-        return torch.from_numpy(render), 1 - torch.from_numpy(transmittance)
+        return torch.from_numpy(render), torch.from_numpy(cells), 1 - torch.from_numpy(transmittance)
 
     @staticmethod
-    def backward(ctx: Any, grad_render, grad_alpha):  # type: ignore[no-untyped-def, override]
-        slopes = [g.contiguous().numpy() for g in (grad_render, grad_alpha)]
+    def backward(ctx: Any, *grads):  # type: ignore[no-untyped-def, override]
+        slopes = [g.contiguous().numpy() for g in grads]
         *found, finite = tiles.backward(*ctx.arrays, *slopes, ctx.absgrad is not None)
         if not finite:
             raise ValueError(f"the gradient of the image of view {ctx.view} is not finite")
-        to_means2d, moments, to_opacities, absolute, to_colors = (torch.from_numpy(a) for a in found)
+        to_means2d, moments, to_opacities, absolute, *to_channels = (torch.from_numpy(a) for a in found)
         if ctx.absgrad is not None:
             ctx.absgrad += absolute
-        return to_means2d, moments, to_opacities, to_colors, *[None] * 7
+        return to_means2d, moments, to_opacities, *to_channels, *[None] * 7
 
 
 def rasterize(
@@ -88,6 +90,7 @@ def rasterize(
     rasterize_mode: str = "classic",
     backgrounds: Tensor | None = None,
     absgrad: bool = False,
+    cell_colors: Tensor | None = None,
 ) -> tuple[Tensor, Tensor, dict[str, Any]]:
     """As `reference.rasterize`, in float32, and fast.
 
@@ -101,6 +104,11 @@ def rasterize(
     if viewmats.requires_grad or Ks.requires_grad:
         raise ValueError("the cpu backend gives cameras no gradient: use the reference")
     antialiased = is_antialiased(rasterize_mode)
+    in_cells = torch.zeros(len(means), 0) if cell_colors is None else cell_colors
+    if in_cells.dtype != torch.float32 or in_cells.device.type != "cpu":
+        raise ValueError(
+            f"cell_colors is {in_cells.dtype} on {in_cells.device}; the cpu backend takes float32 on the CPU"
+        )
     cameras = [(*(t.detach().double().contiguous().numpy() for t in pair), width, height, near_plane, far_plane, eps2d)
                for pair in zip(viewmats, Ks, strict=True)]  # fmt: skip
     views = [_Project.apply(means, quats, scales, camera) for camera in cameras]
@@ -114,16 +122,18 @@ def rasterize(
     composed = [
         _Composite.apply(
             means2d[c], covariances[c], compensated(opacities, compensations[c]) if antialiased else opacities,
-            colors if colors.ndim == 2 else colors[c],
+            colors if colors.ndim == 2 else colors[c], in_cells if in_cells.ndim == 2 else in_cells[c],
             whitening[c], depths[c], radii[c],
             absolute[c] if absgrad else None, (width, height), max_alpha, c,
         )
         for c in range(len(cameras))
     ]  # fmt: skip
-    renders, alphas = (_stack(parts) for parts in zip(*composed, strict=True))
+    renders, cells, alphas = (_stack(parts) for parts in zip(*composed, strict=True))
     if backgrounds is not None:
         renders = renders + (1 - alphas)[..., None] * backgrounds[:, None, None]
     meta = {"means2d": means2d, "conics": conics, "depths": depths, "radii": radii}
+    if cell_colors is not None:
+        meta["cells"] = cells
     return renders, alphas[..., None], meta
 
 

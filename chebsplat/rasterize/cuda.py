@@ -35,6 +35,7 @@ def rasterize(
     rasterize_mode: str = "classic",
     backgrounds: Tensor | None = None,
     absgrad: bool = False,
+    cell_colors: Tensor | None = None,
 ) -> tuple[Tensor, Tensor, dict[str, Any]]:
     """As `reference.rasterize`, of float32 tensors on a GPU.
 
@@ -47,6 +48,7 @@ def rasterize(
     is_antialiased(rasterize_mode)
     if means.dtype != torch.float32 or means.device.type != "cuda":
         raise ValueError(f"means is {means.dtype} on {means.device}; the cuda backend takes float32 on a GPU")
+    n_colors, colors = colors.shape[-1], reference.with_cells(colors, cell_colors)
     if colors.shape[-1] > MOST:
         raise ValueError(f"{colors.shape[-1]} channels; the cuda backend takes at most {MOST} channels")
     try:
@@ -58,8 +60,10 @@ def rasterize(
         ) from error
     _report_ceiling(max_alpha)
     if len(means) == 0:  # the background: gsplat is not asked to sort an empty scene
-        empty = (means, quats, scales, opacities, colors, viewmats, Ks, width, height)
-        return reference.rasterize(*empty, backgrounds=backgrounds, absgrad=absgrad)
+        empty = (means, quats, scales, opacities, colors[..., :n_colors], viewmats, Ks, width, height)
+        return reference.rasterize(*empty, backgrounds=backgrounds, absgrad=absgrad, cell_colors=cell_colors)
+    if backgrounds is not None:
+        backgrounds = torch.nn.functional.pad(backgrounds, (0, colors.shape[-1] - n_colors))
     gaussians = _without_broken(means, quats, scales, opacities, colors)
     renders, alphas, found = rasterization(
         *gaussians, viewmats, Ks, width, height,
@@ -67,7 +71,10 @@ def rasterize(
         backgrounds=backgrounds, absgrad=absgrad, rasterize_mode=rasterize_mode,
         channel_chunk=max(CHUNK, colors.shape[-1]),
     )  # fmt: skip
-    return renders, alphas, named(found)
+    meta = named(found)
+    if cell_colors is not None:
+        meta["cells"] = reference.cell_means(renders[..., n_colors:])
+    return renders[..., :n_colors], alphas, meta
 
 
 def _without_broken(

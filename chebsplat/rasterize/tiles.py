@@ -3,6 +3,10 @@
 A tile of 16×16 pixels is 16 cells of 4×4 (see `cells`). Forward tests a tile's Gaussians against all its cells at
 once, in chunks until every pixel is done, then sweeps cell by cell. Backward repeats the sweep, so that only the
 cells' bit masks are kept between the two.
+
+Channels come in two kinds: `colors` by pixel, and `cell_colors`, of which only the mean over each cell is rendered. A
+Gaussian's part in that mean is the sum of its 16 weights, so a cell channel costs a sixteenth of the products of the
+other kind, forward and backward.
 """
 
 from __future__ import annotations
@@ -33,14 +37,21 @@ def padded(channels):
     return (channels + 3) // 4 * 4
 
 
+@inline
+def whole(channels):
+    """Rounded up to whole vectors."""
+    return (channels + LANES - 1) // LANES * LANES
+
+
 @kernel
-def pack(order, means2d, whitening, opacities, colors):
+def pack(order, means2d, whitening, opacities, colors, cell_colors):
     """What the tiles read of each Gaussian, in rows of whole cache lines, front to back.
 
-    Returns: splats [V + 1, S]: mean, whitening, log₂ opacity, two unused, the channels, a 1 for alpha, and zeros.
+    Returns: splats [V + 1, S]: mean, whitening, log₂ opacity, two unused, the channels, a 1 for alpha, and zeros up to
+      column `whole(SHAPE + D + 1)`, where the cell channels begin.
     """
-    channels = colors.shape[1]
-    splats = np.zeros((len(order) + 1, (SHAPE + channels + LANES) // LANES * LANES), np.float32)
+    channels, column = colors.shape[1], whole(SHAPE + colors.shape[1] + 1)
+    splats = np.zeros((len(order) + 1, column + whole(cell_colors.shape[1])), np.float32)
     for m in prange(len(order)):
         i = order[m]
         splats[m, 0], splats[m, 1] = means2d[i, 0], means2d[i, 1]
@@ -49,6 +60,8 @@ def pack(order, means2d, whitening, opacities, colors):
         for d in range(channels):
             splats[m, SHAPE + d] = colors[i, d]
         splats[m, SHAPE + channels] = ONE
+        for d in range(cell_colors.shape[1]):
+            splats[m, column + d] = cell_colors[i, d]
     return splats
 
 
@@ -86,12 +99,22 @@ def _is_done(states, cell):
 
 
 @serial
-def _forward_tile(splats, ranks, start, stop, left, top, channels, max_alpha, masks, render, transmittance):
+def _inside(cell, width, height):
+    """How many pixels of a cell lie in what is left of the image from its tile's corner on."""
+    x, y = 4 * (cell & 3), 4 * (cell >> 2)
+    return max(min(4, width - x), 0) * max(min(4, height - y), 0)
+
+
+@serial
+def _forward_tile(
+    splats, ranks, start, stop, left, top, channels, max_alpha, masks, render, means, transmittance
+):  # fmt: skip
     """One tile of `forward`, into the flat render. Returns how many of its pairs were looked at."""
     height, width = transmittance.shape
     states, depth = np.empty((LANES, 2, LANES), np.float32), padded(channels)
     _begin(states, width - left, height - top)
-    sums = np.zeros((LANES, depth, LANES), np.float32)
+    sums, column = np.zeros((LANES, depth, LANES), np.float32), whole(SHAPE + channels + 1)
+    mean_sums, shares = np.zeros((LANES, splats.shape[1] - column), np.float32), np.empty(CHUNK, np.float32)
     shapes, chosen = np.empty((CHUNK, SHAPE), np.float32), np.empty((CHUNK + SLACK, depth), np.float32)
     alphas, weights = np.empty((CHUNK + AHEAD, LANES), np.float32), np.empty((CHUNK, LANES), np.float32)
     found, rows = np.empty(CHUNK + AHEAD + 1, np.int64), np.empty(CHUNK, np.int64)
@@ -109,6 +132,9 @@ def _forward_tile(splats, ranks, start, stop, left, top, channels, max_alpha, ma
             if count > 0:
                 cells.gather(splats, ranks, first, rows, count, chosen)
                 cells.accumulate(chosen, weights, count, cell, sums)
+                if means.shape[2] > 0:
+                    cells.sum_lanes(weights, count, shares)
+                    cells.accumulate_means(splats, column, ranks, first, rows, shares, count, cell, mean_sums)
             if _is_done(states, cell):
                 done |= 1 << cell
         first += n
@@ -122,18 +148,24 @@ def _forward_tile(splats, ranks, start, stop, left, top, channels, max_alpha, ma
                 n = min(4, width - x)
                 transmittance[y, x : x + n] = states[cell, 0, 4 * row : 4 * row + n]
                 cells.copy(pixels, 4 * row * channels, n * channels, render, (y * width + x) * channels)
+        n_inside = _inside(cell, width - left, height - top)
+        if n_inside > 0:
+            x, y = left // 4 + (cell & 3), top // 4 + (cell >> 2)
+            for c in range(means.shape[2]):
+                means[y, x, c] = mean_sums[cell, c] / np.float32(n_inside)
     return first - start
 
 
 @kernel
-def forward(splats, tile_starts, ranks, channels, width, height, max_alpha):
+def forward(splats, tile_starts, ranks, channels, cell_channels, width, height, max_alpha):
     """Composite front to back the splats of `pack`, listed by `binning.bin_gaussians`.
 
-    Returns: render [H, W, D], transmittance [H, W]; masks u16 [P] of the cells each pair may reach, and used [tiles],
-      the pairs that were looked at before all pixels were done: for `backward`.
+    Returns: render [H, W, D], means [⌈H/4⌉, ⌈W/4⌉, E] over the cells, transmittance [H, W]; masks u16 [P] of the cells
+      each pair may reach, and used [tiles], the pairs that were looked at before all pixels were done: for `backward`.
     """
     columns, n_tiles = (width + TILE - 1) // TILE, len(tile_starts) - 1
     render = np.empty(height * width * channels, np.float32)
+    means = np.empty(((height + 3) // 4, (width + 3) // 4, cell_channels), np.float32)
     transmittance = np.empty((height, width), np.float32)
     masks, used = np.empty(len(ranks), np.uint16), np.zeros(n_tiles, np.int64)
     for j in prange(16 * ((n_tiles + 15) // 16)):
@@ -141,15 +173,15 @@ def forward(splats, tile_starts, ranks, channels, width, height, max_alpha):
         if tile < n_tiles:
             used[tile] = _forward_tile(
                 splats, ranks, tile_starts[tile], tile_starts[tile + 1], (tile % columns) * TILE,
-                (tile // columns) * TILE, channels, max_alpha, masks, render, transmittance,
+                (tile // columns) * TILE, channels, max_alpha, masks, render, means, transmittance,
             )  # fmt: skip
-    return render.reshape((height, width, channels)), transmittance, masks, used
+    return render.reshape((height, width, channels)), means, transmittance, masks, used
 
 
 @serial
 def _backward_tile(
-    splats, ranks, pair, masks, start, n, left, top, channels, max_alpha, grad, grad_alpha, absolute, base, spare,
-    records,
+    splats, ranks, pair, masks, start, n, left, top, channels, max_alpha, grad, grad_means, grad_alpha, absolute, base,
+    spare, records,
 ):  # fmt: skip
     """One tile of `backward`: adds to the records of its pairs. Returns whether the gradient is finite.
 
@@ -161,6 +193,8 @@ def _backward_tile(
     _begin(states, width - left, height - top)
     row, finite = LANES * channels + LANES, True  # of tall_grads: a cell's pixels, and a margin
     tall_grads, grads = np.empty(LANES * row, np.float32), np.empty((LANES, padded(channels) + 4, LANES), np.float32)
+    column = whole(SHAPE + channels + 1)
+    mean_grads = np.zeros((LANES, splats.shape[1] - column), np.float32)
     for cell in range(LANES):
         x, at = left + 4 * (cell & 3), cell * row
         for y in range(top + 4 * (cell >> 2), top + 4 * (cell >> 2) + 4):
@@ -176,10 +210,16 @@ def _backward_tile(
             grads[cell, channels, lane] = grad_alpha[y, x] if y < height and x < width else ZERO
         finite &= cells.is_finite(tall_grads, cell * row, row)
         finite &= cells.is_finite(grads, LANES * (grads.shape[1] * cell + channels), LANES)
+        n_inside = _inside(cell, width - left, height - top)
+        if n_inside > 0:
+            x, y = left // 4 + (cell & 3), top // 4 + (cell >> 2)
+            for c in range(grad_means.shape[2]):
+                mean_grads[cell, c] = grad_means[y, x, c] / np.float32(n_inside)
+        finite &= cells.is_finite(mean_grads, cell * mean_grads.shape[1], mean_grads.shape[1])
     room = (n + AHEAD + BLOCK) // BLOCK * BLOCK
     shapes, chosen = np.empty((n, SHAPE), np.float32), np.zeros((room + SLACK, padded(depth)), np.float32)
     alphas, weights = np.empty((room, LANES), np.float32), np.empty((room, LANES), np.float32)
-    g, places = np.empty((room, LANES), np.float32), np.empty(room, np.int64)
+    g, places, shares = np.empty((room, LANES), np.float32), np.empty(room, np.int64), np.empty(n, np.float32)
     found, rows = np.empty(n + AHEAD + 1, np.int64), np.empty(n, np.int64)
     _place(splats, ranks, start, n, left, top, shapes)
     for cell in range(LANES):
@@ -193,6 +233,10 @@ def _backward_tile(
             places[m] = spare
         cells.gather(splats, ranks, start, rows, count, chosen)
         cells.slopes(chosen, grads, count, cell, depth, g)
+        if grad_means.shape[2] > 0:
+            cells.add_slopes_of_means(splats, column, ranks, start, rows, count, cell, mean_grads, g)
+            cells.sum_lanes(weights, count, shares)
+            cells.record_means(shares, mean_grads, count, cell, places, N_GEOMETRY + padded(channels), records)
         cells.unwind(alphas, weights, g, count, max_alpha)
         cells.record_colors(weights, tall_grads, channels, count, cell, places, records)
         cells.record_geometry(g, count, cell, places, records)
@@ -205,14 +249,28 @@ def _backward_tile(
 
 @kernel
 def backward(
-    n, splats, order, tile_starts, ranks, pair, pair_starts, masks, used, max_alpha, grad, grad_alpha, absolute
+    n,
+    splats,
+    order,
+    tile_starts,
+    ranks,
+    pair,
+    pair_starts,
+    masks,
+    used,
+    max_alpha,
+    grad,
+    grad_means,
+    grad_alpha,
+    absolute,
 ):
     """Gradients of n Gaussians, band by band, each Gaussian's records summed in the order of its pairs.
 
-    Args: masks, used as `forward` returned them; grad [H, W, D] of the render, grad_alpha [H, W]; absolute: whether to
-      gather the absolute gradient too.
+    Args: masks, used as `forward` returned them; grad [H, W, D] of the render, grad_means [⌈H/4⌉, ⌈W/4⌉, E],
+      grad_alpha [H, W]; absolute: whether to gather the absolute gradient too.
     Returns: gradients to means2d [n, 2]; moments [n, 3] for `ellipses.project_adjoint`; gradients to opacities [n],
-      the absolute gradient to means2d [n or 0, 2], to colors [n, D]; whether the image's gradient is finite.
+      the absolute gradient to means2d [n or 0, 2], to colors [n, D], to cell_colors [n, E]; whether the image's
+      gradient is finite.
     """
     height, width, channels = grad.shape
     flat = grad.reshape(-1)
@@ -222,8 +280,10 @@ def backward(
     for band in range(bands):
         n_tiles = (band_start(band + 1, rows) - band_start(band, rows)) * columns
         room = max(room, pair_starts[band, shown] - pair_starts[band, 0] + n_tiles)
-    records = np.empty((room, N_GEOMETRY + padded(channels)), np.float32)
+    cell_channels, column = grad_means.shape[2], N_GEOMETRY + padded(channels)
+    records = np.empty((room, column + whole(cell_channels)), np.float32)
     sums, to_colors = np.zeros((shown, N_GEOMETRY), np.float32), np.zeros((n, channels), np.float32)
+    to_cell_colors = np.zeros((n, cell_channels), np.float32)
     for band in range(bands):
         first_tile = band_start(band, rows) * columns
         n_tiles = band_start(band + 1, rows) * columns - first_tile
@@ -235,7 +295,7 @@ def backward(
                     records[pair[k] - base] = ZERO
                 finite[tile] = _backward_tile(
                     splats, ranks, pair, masks, tile_starts[tile], used[tile], (tile % columns) * TILE,
-                    (tile // columns) * TILE, channels, max_alpha, flat, grad_alpha, absolute, base,
+                    (tile // columns) * TILE, channels, max_alpha, flat, grad_means, grad_alpha, absolute, base,
                     n_pairs + tile - first_tile, records,
                 )  # fmt: skip
         for m in prange(shown):
@@ -247,6 +307,8 @@ def backward(
                     sums[m, d] += records[k, d]
                 for d in range(channels):
                     to_colors[order[m], d] += records[k, N_GEOMETRY + d]
+                for d in range(cell_channels):
+                    to_cell_colors[order[m], d] += records[k, column + d]
     to_means2d, moments = np.zeros((n, 2), np.float32), np.zeros((n, 3), np.float32)
     to_opacities, to_absolute = np.zeros(n, np.float32), np.zeros((n if absolute else 0, 2), np.float32)
     for m in prange(shown):
@@ -257,4 +319,4 @@ def backward(
         to_opacities[i] = sums[m, 0] * 2.0 ** (-splats[m, 5]) / math.log(2.0)
         if absolute:
             to_absolute[i, 0], to_absolute[i, 1] = sums[m, 6], sums[m, 7]
-    return to_means2d, moments, to_opacities, to_absolute, to_colors, finite.all()
+    return to_means2d, moments, to_opacities, to_absolute, to_colors, to_cell_colors, finite.all()
