@@ -149,14 +149,14 @@ class TrainSection(_Section):
     lr_features: float | None = Field(None, gt=0)  # None: 10 / steps, at most 5e-2; more fits each view's errors
     lr_encoder: float = 3e-3
     lr_masks: float = 5e-2
-    lr_sh_masks: float = 5e-2
+    lr_sh_masks: float = 0.4  # fast, under a weak penalty: for as many bands closed, dearer the other way round
     # weights
     weight_ssim: float = Field(0.2, ge=0, le=1)
     weight_features: float = Field(1.0, ge=0)
     feature_loss: Literal["length", "l1"] = "length"  # l1: the paper's and Feature-3DGS'
     weight_shape: float = Field(1.0, ge=0)  # of encodings' distance to their members' features; 0: printed
     weight_mask: float = Field(1e-2, ge=0)
-    weight_sh: float = Field(1e-4, ge=0)
+    weight_sh: float = Field(4e-5, ge=0)
     weight_basis: float = Field(1.0, ge=0)
     warm_start: bool = True  # start the encoder from the basis' stored weights
 
