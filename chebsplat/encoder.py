@@ -57,17 +57,18 @@ class Attention(nn.Module):
         for part in (self.query, self.key, self.value, self.output):
             nn.init.normal_(part.weight, std=0.02)
 
-    def forward(self, tokens: Tensor, mask: Tensor) -> Tensor:
-        """tokens [M, n, width], mask [M, n] true where a token exists -> [M, n, width]."""
-        heads = (tokens.shape[0], tokens.shape[1], self.n_heads, tokens.shape[2] // self.n_heads)
-        q, k, v = (part(tokens).reshape(heads).transpose(1, 2) for part in (self.query, self.key, self.value))
+    def forward(self, tokens: Tensor, mask: Tensor, wanted: int) -> Tensor:
+        """tokens [M, n, width], mask [M, n] true where a token exists -> [M, wanted, width], of the first tokens."""
+        heads = (tokens.shape[0], -1, self.n_heads, tokens.shape[2] // self.n_heads)
+        asking = ((self.query, tokens[:, :wanted]), (self.key, tokens), (self.value, tokens))
+        q, k, v = (part(values).reshape(heads).transpose(1, 2) for part, values in asking)
         scores = q @ k.transpose(-1, -2) / math.sqrt(heads[-1])
         weights = scores.masked_fill(~mask[:, None, None, :], -1e9).softmax(-1)
-        return self.output((weights @ v).transpose(1, 2).reshape(tokens.shape))
+        return self.output((weights @ v).transpose(1, 2).reshape(tokens.shape[0], wanted, -1))
 
 
 class Block(nn.Module):
-    """Pre-norm attention and feed-forward, each with its residual."""
+    """Pre-norm attention and feed-forward, each with its residual; of the first `wanted` tokens, which see all."""
 
     def __init__(self, width: int, n_heads: int):
         super().__init__()
@@ -75,8 +76,8 @@ class Block(nn.Module):
         self.attention = Attention(width, n_heads)
         self.forward_1, self.forward_2 = nn.Linear(width, 2 * width), nn.Linear(2 * width, width)
 
-    def forward(self, tokens: Tensor, mask: Tensor) -> Tensor:
-        tokens = tokens + self.attention(self.norm_attention(tokens), mask)
+    def forward(self, tokens: Tensor, mask: Tensor, wanted: int) -> Tensor:
+        tokens = tokens[:, :wanted] + self.attention(self.norm_attention(tokens), mask, wanted)
         return tokens + self.forward_2(nn.functional.gelu(self.forward_1(self.norm_forward(tokens))))
 
 
@@ -125,8 +126,8 @@ class RegionEncoder(nn.Module):
         region = self.region_token.expand(tokens.shape[0], 1, -1)
         tokens = torch.cat([region, tokens], 1)
         mask = torch.cat([torch.ones_like(mask[:, :1]), mask], 1)
-        for block in self.blocks:
-            tokens = block(tokens, mask)
+        for depth, block in enumerate(self.blocks, 1):  # only the region token is read: the last block makes no other
+            tokens = block(tokens, mask, 1 if depth == len(self.blocks) else tokens.shape[1])
         return self.decode(self.norm(tokens[:, 0]))
 
     @classmethod

@@ -178,8 +178,9 @@ class Shape(nn.Module):
 
     def sample(self, features: Tensor, index: Tensor, generator: torch.Generator) -> Encoded:
         """Encode anew `regions_per_step` of the regions that reach the Gaussians `index` [V]; the cache keeps them."""
-        reached = torch.unique(self.cover[index])
-        reached = reached[reached >= 0]
+        cover, is_reached = self.cover[index], torch.zeros(len(self.members), dtype=torch.bool)
+        is_reached[cover[cover >= 0]] = True
+        reached = is_reached.nonzero()[:, 0]
         order = torch.randperm(len(reached), generator=generator)[: self.train_settings["regions_per_step"]]
         chosen = reached[order]
         fresh = Encoded(self.encode(features, chosen), chosen)
