@@ -59,12 +59,16 @@ class Attention(nn.Module):
 
     def forward(self, tokens: Tensor, mask: Tensor, wanted: int) -> Tensor:
         """tokens [M, n, width], mask [M, n] true where a token exists -> [M, wanted, width], of the first tokens."""
-        heads = (tokens.shape[0], -1, self.n_heads, tokens.shape[2] // self.n_heads)
-        asking = ((self.query, tokens[:, :wanted]), (self.key, tokens), (self.value, tokens))
-        q, k, v = (part(values).reshape(heads).transpose(1, 2) for part, values in asking)
-        scores = q @ k.transpose(-1, -2) / math.sqrt(heads[-1])
+        asking = tokens[:, :wanted]
+        q, k, v = self._heads(self.query(asking)), self._heads(self.key(tokens)), self._heads(self.value(tokens))
+        scores = q @ k.transpose(-1, -2) / math.sqrt(q.shape[-1])
         weights = scores.masked_fill(~mask[:, None, None, :], -1e9).softmax(-1)
-        return self.output((weights @ v).transpose(1, 2).reshape(tokens.shape[0], wanted, -1))
+        return self.output((weights @ v).transpose(1, 2).reshape(asking.shape))
+
+    def _heads(self, values: Tensor) -> Tensor:
+        """[M, n, width] -> [M, heads, n, width / heads]."""
+        shape = (*values.shape[:2], self.n_heads, values.shape[2] // self.n_heads)
+        return values.reshape(shape).transpose(1, 2)
 
 
 class Block(nn.Module):

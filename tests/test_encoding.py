@@ -69,6 +69,15 @@ def test_an_empty_region_encodes_to_something_finite(n_layers):
     assert torch.isfinite(found).all()
 
 
+@pytest.mark.parametrize("n_layers", [0, 2])
+def test_no_region_encodes_to_nothing_and_has_a_gradient(n_layers):
+    encoder = RegionEncoder(5, 13, n_layers=n_layers)
+    found = encoder(torch.zeros(0, 8, 5), torch.zeros(0, 8, 3), torch.zeros(0, 8, dtype=torch.bool))
+    found.sum().backward()
+    assert found.shape == (0, 13)
+    assert all(p.grad is None or p.grad.abs().max() == 0 for p in encoder.parameters())
+
+
 def test_heads_must_divide_the_width():
     with pytest.raises(ValueError, match="multiple"):
         RegionEncoder(3, 4, width=30, n_heads=4)
