@@ -229,6 +229,24 @@ def record_means(shares, mean_grads, count, cell, places, column, records):
 
 
 @lanes
+def clear(records, at):
+    """records[at] = 0."""
+    step = records.shape[1]
+    for d in range(0, step - LANES + 1, LANES):
+        store(records, at * step + d, splat(ZERO))
+    for d in range(step // LANES * LANES, step):
+        records[at, d] = ZERO
+
+
+@lanes
+def add_means(records, at, column, sums, i):
+    """sums[i] += records[at, column:], whole vectors."""
+    for d in range(0, sums.shape[1], LANES):
+        place = i * sums.shape[1] + d
+        store(sums, place, load(sums, place) + load(records, at * records.shape[1] + column + d))
+
+
+@lanes
 def record_geometry(g, count, cell, places, records):
     """records[places[m], :6] += Σ_lanes g (1, x, y, x², xy, y²), offsets from the tile's middle."""
     at = LANES * SHAPE * cell

@@ -283,7 +283,7 @@ def backward(
     cell_channels, column = grad_means.shape[2], N_GEOMETRY + padded(channels)
     records = np.empty((room, column + whole(cell_channels)), np.float32)
     sums, to_colors = np.zeros((shown, N_GEOMETRY), np.float32), np.zeros((n, channels), np.float32)
-    to_cell_colors = np.zeros((n, cell_channels), np.float32)
+    to_cell_colors = np.zeros((n, whole(cell_channels)), np.float32)
     for band in range(bands):
         first_tile = band_start(band, rows) * columns
         n_tiles = band_start(band + 1, rows) * columns - first_tile
@@ -292,7 +292,7 @@ def backward(
             if _spread(j, n_tiles) < n_tiles:
                 tile = first_tile + _spread(j, n_tiles)
                 for k in range(tile_starts[tile], tile_starts[tile + 1]):
-                    records[pair[k] - base] = ZERO
+                    cells.clear(records, pair[k] - base)
                 finite[tile] = _backward_tile(
                     splats, ranks, pair, masks, tile_starts[tile], used[tile], (tile % columns) * TILE,
                     (tile // columns) * TILE, channels, max_alpha, flat, grad_means, grad_alpha, absolute, base,
@@ -307,8 +307,7 @@ def backward(
                     sums[m, d] += records[k, d]
                 for d in range(channels):
                     to_colors[order[m], d] += records[k, N_GEOMETRY + d]
-                for d in range(cell_channels):
-                    to_cell_colors[order[m], d] += records[k, column + d]
+                cells.add_means(records, k, column, to_cell_colors, order[m])
     to_means2d, moments = np.zeros((n, 2), np.float32), np.zeros((n, 3), np.float32)
     to_opacities, to_absolute = np.zeros(n, np.float32), np.zeros((n if absolute else 0, 2), np.float32)
     for m in prange(shown):
@@ -319,4 +318,4 @@ def backward(
         to_opacities[i] = sums[m, 0] * 2.0 ** (-splats[m, 5]) / math.log(2.0)
         if absolute:
             to_absolute[i, 0], to_absolute[i, 1] = sums[m, 6], sums[m, 7]
-    return to_means2d, moments, to_opacities, to_absolute, to_colors, to_cell_colors, finite.all()
+    return to_means2d, moments, to_opacities, to_absolute, to_colors, to_cell_colors[:, :cell_channels], finite.all()
