@@ -89,3 +89,11 @@ def test_two_cases_of_one_name_are_refused(suite):
     case.case("twice")(lambda: None)
     with pytest.raises(ValueError, match="twice"):
         case.case("twice")(lambda: None)
+
+
+def test_every_training_that_ought_to_break_ends_whole_or_names_its_step(suite):
+    from benchmarks.stability import training
+
+    ends = {name: training.ended(build()) for name, build in training.SCENES.items()}
+    assert {name: how for name, (how, error) in ends.items() if error > 0} == {}
+    assert any(how.startswith("stopped") for how, _ in ends.values())

@@ -118,8 +118,10 @@ def _at_the_camera(means: torch.Tensor) -> None:
 
 
 def _rates(factor: float) -> Trainer:
-    names = [name for name in Config().train.model_dump() if name.startswith("lr_")]
-    return tiny_trainer(**{name: getattr(Config().train, name) * factor for name in names})
+    trainer = tiny_trainer()
+    for group in trainer.optimizer.param_groups:
+        group["rate"] *= factor
+    return trainer
 
 
 def _flat() -> np.ndarray:
