@@ -88,9 +88,8 @@ def training_step(features: int, *, by_cell: bool) -> Callable[[], None]:
             render, _, meta = rasterize(*gaussians, parts[0], *camera(*SIZE), backend="cpu", cell_colors=parts[1])
             image, rendered = render[0], meta["cells"][0]
         else:
-            image, rendered = rasterize(*gaussians, channels, *camera(*SIZE), backend="cpu")[0][0].split(
-                [3, features], -1
-            )
+            render = rasterize(*gaussians, channels, *camera(*SIZE), backend="cpu")[0][0]
+            image, rendered = render.split([3, features], -1)
         loss = photometric(image, color, None, 0.2)
         (loss + feature_distance(rendered, target) if features else loss).backward()
 
@@ -102,13 +101,9 @@ def stages() -> dict[str, Callable[[], object]]:
     means, quats, scales, opacities, colors = (t.detach().numpy() for t in scene(N, CHANNELS))
     viewmats, Ks, width, height = camera(*SIZE)
     view, ceiling = (viewmats[0].double().numpy(), Ks[0].double().numpy(), width, height), np.float32(0.999)
-    gaussians, by_channel, no_slope = (
-        (means, quats, scales),
-        (opacities, colors, colors[:, :0]),
-        np.zeros(N, np.float32),
-    )
+    gaussians, by_channel = (means, quats, scales), (opacities, colors, colors[:, :0])
+    no_slope, no_cells = np.zeros(N, np.float32), np.zeros((height // 4, width // 4, 0), np.float32)
     rng = np.random.default_rng(0)
-    no_cells = np.zeros((height // 4, width // 4, 0), np.float32)
     grad = rng.random((height, width, CHANNELS), np.float32), no_cells, rng.random((height, width), np.float32)
     means2d, covariances, whitening, _, depths, radii, _ = ellipses.project(*gaussians, *view, 0.01, 1e10, 0.3)
 

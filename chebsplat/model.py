@@ -14,7 +14,7 @@ from chebsplat.descriptor import n_degrees
 from chebsplat.encoder import RegionEncoder
 from chebsplat.fusion import Gate, propagate, propagation_weights
 from chebsplat.fusion_kernels import fuse_in_view
-from chebsplat.rasterize import rasterize
+from chebsplat.rasterize import CELL, rasterize
 from chebsplat.rasterize.projection import rotation_matrices
 from chebsplat.refresh import Descriptors, Names
 from chebsplat.regions import Regions, build_regions, covering
@@ -44,8 +44,8 @@ def take(values: Tensor, index: Tensor) -> Tensor:
 
 @dataclass
 class Rendered:
-    """rgb [H, W, 3], alpha [H, W, 1], features [H, W, C], or [h, w, C] if so asked, or None; `index` [V] the Gaussians
-    in the frustum."""
+    """rgb [H, W, 3], alpha [H, W, 1], features [H, W, C], [h, w, C] by cell of the rasterizer, or None; `index` [V]
+    the Gaussians in the frustum."""
 
     rgb: Tensor
     alpha: Tensor
@@ -281,7 +281,7 @@ class SceneModel:
         """Colour and features in one pass; the second result holds masks for the losses.
 
         degree: SH bands in use; masked: apply the pruning masks; fused: render fused features, not the raw ones; grid:
-        features are only needed as means over h × w cells, which is cheap where the cells are the rasterizer's.
+        features are only wanted as means over h × w cells, and rendered so where these are the rasterizer's.
         """
         raw = self.raw
         with torch.no_grad():
@@ -308,7 +308,7 @@ class SceneModel:
         colors = colors_in_view(self.bands(), masks, index, raw["means"], eye, degree)
         gaussians, camera = (means, quats, scales, opacities), (view.viewmat[None], view.K[None])
         size = view.width, view.height
-        if features is None or (grid is not None and size == (4 * grid[1], 4 * grid[0])):
+        if features is None or (grid is not None and size == (CELL * grid[1], CELL * grid[0])):
             render, alpha, meta = rasterize(*gaussians, colors, *camera, *size, cell_colors=features)
             return Rendered(render[0], alpha[0], None if features is None else meta["cells"][0], meta, index), aside
         channels = torch.cat([colors, features], -1)

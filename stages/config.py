@@ -149,7 +149,7 @@ class TrainSection(_Section):
     lr_features: float | None = Field(None, gt=0)  # None: 10 / steps, at most 5e-2; more fits each view's errors
     lr_encoder: float = 3e-3
     lr_masks: float = 5e-2
-    lr_sh_masks: float = 0.4  # fast, under a weak penalty: for as many bands closed, dearer the other way round
+    lr_sh_masks: float = 0.4  # fast, under a weak penalty: docs/results.md
     # weights
     weight_ssim: float = Field(0.2, ge=0, le=1)
     weight_features: float = Field(1.0, ge=0)

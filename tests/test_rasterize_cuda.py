@@ -58,6 +58,12 @@ def test_gsplat_takes_all_channels_at_once(channels, asked):
     assert asked["channel_chunk"] >= channels
 
 
+def test_gsplat_takes_cell_colors_as_channels_on_black(asked):
+    image, _, meta = render(scene(channels=3), backgrounds=torch.ones(1, 3), cell_colors=torch.rand(150, 5))
+    assert asked["channel_chunk"] >= 8 and asked["backgrounds"].tolist() == [[1.0] * 3 + [0.0] * 5]
+    assert image.shape[-1] == 3 and meta["cells"].shape == (1, 10, 14, 5)
+
+
 def test_more_channels_than_gsplat_has_are_refused(asked):
     with pytest.raises(ValueError, match="512 channels"):
         render(scene(channels=513))

@@ -70,10 +70,8 @@ def test_any_channels_and_edges_are_exact(channels, size):
 def test_cell_colors_are_means_over_cells_of_what_colors_would_be(backend, size, n):
     arguments, generator = scene(channels=3), torch.Generator().manual_seed(1)
     arguments.append(torch.rand(150, n, generator=generator))
-    (viewmats, K, width, height), corners = (
-        camera(*size),
-        [(y, x) for y in range(0, size[1], 4) for x in range(0, size[0], 4)],
-    )
+    viewmats, K, width, height = camera(*size)
+    corners = [(y, x) for y in range(0, height, 4) for x in range(0, width, 4)]
     doubtful = undecided([*arguments[:4], torch.cat(arguments[4:], 1)], width, height)[0]
     decided = torch.stack([~doubtful[y : y + 4, x : x + 4].any() for y, x in corners])
     assert decided.double().mean() > 0.7

@@ -7,6 +7,8 @@ from typing import Any
 import torch
 from torch import Tensor
 
+CELL = 4  # pixels, the side of a cell of `cell_colors`
+
 
 def rasterize(
     means: Tensor, *args: Any, backend: str = "auto", **options: Any
@@ -32,4 +34,4 @@ def rasterize(
     return chosen.rasterize(means, *args, **options)
 
 
-__all__ = ["rasterize"]
+__all__ = ["CELL", "rasterize"]

@@ -39,6 +39,18 @@ E0, E1, E2, E3, E4, E5 = (np.float32(c) for c in np.polynomial.polynomial.polyfi
 
 
 @inline
+def padded(channels):
+    """Rounded up to fours."""
+    return (channels + 3) // 4 * 4
+
+
+@inline
+def whole(channels):
+    """Rounded up to whole vectors."""
+    return (channels + LANES - 1) // LANES * LANES
+
+
+@inline
 def _larger(a, b):
     return where(a > b, a, b)
 
@@ -172,7 +184,7 @@ def record_colors(weights, tall_grads, channels, count, cell, places, records):
     The records have a multiple of four columns for them; what the last ones take up beyond D is never read.
     """
     row, at, step = channels, cell * (LANES * channels + LANES), records.shape[1]
-    channels = (channels + 3) // 4 * 4
+    channels = padded(channels)
     for m in range(0, count, BLOCK):
         c = 0
         while c + 16 <= channels:

@@ -11,7 +11,7 @@ from torch import Tensor
 from chebsplat.rasterize import binning, ellipses, tiles
 from chebsplat.rasterize.projection import compensated, is_antialiased
 
-NAMES = ("means", "quats", "scales", "opacities", "colors", "viewmats", "Ks")
+NAMES = ("means", "quats", "scales", "opacities", "colors", "viewmats", "Ks", "cell_colors")
 
 
 class _Project(torch.autograd.Function):
@@ -98,17 +98,14 @@ def rasterize(
       backward, on a gradient of the image that is not finite.
     Choices: `conics`, `depths` and `radii` have no gradient here. Bitwise equal for any number of threads.
     """
-    for name, tensor in zip(NAMES, (means, quats, scales, opacities, colors, viewmats, Ks), strict=True):
+    in_cells = torch.zeros(len(means), 0) if cell_colors is None else cell_colors
+    given = means, quats, scales, opacities, colors, viewmats, Ks, in_cells
+    for name, tensor in zip(NAMES, given, strict=True):
         if tensor.dtype != torch.float32 or tensor.device.type != "cpu":
             raise ValueError(f"{name} is {tensor.dtype} on {tensor.device}; the cpu backend takes float32 on the CPU")
     if viewmats.requires_grad or Ks.requires_grad:
         raise ValueError("the cpu backend gives cameras no gradient: use the reference")
     antialiased = is_antialiased(rasterize_mode)
-    in_cells = torch.zeros(len(means), 0) if cell_colors is None else cell_colors
-    if in_cells.dtype != torch.float32 or in_cells.device.type != "cpu":
-        raise ValueError(
-            f"cell_colors is {in_cells.dtype} on {in_cells.device}; the cpu backend takes float32 on the CPU"
-        )
     cameras = [(*(t.detach().double().contiguous().numpy() for t in pair), width, height, near_plane, far_plane, eps2d)
                for pair in zip(viewmats, Ks, strict=True)]  # fmt: skip
     views = [_Project.apply(means, quats, scales, camera) for camera in cameras]

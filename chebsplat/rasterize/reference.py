@@ -15,6 +15,7 @@ import torch
 from torch import Tensor
 from torch.nn.functional import hardshrink
 
+from chebsplat.rasterize import CELL
 from chebsplat.rasterize.projection import Projected, compensated, is_antialiased, project
 
 ALPHA_MIN = 1 / 255  # fainter contributions are skipped
@@ -61,7 +62,7 @@ def rasterize(
       absgrad:     whether meta's `means2d` carries `absgrad` [C, N, 2], after backward the sum over pixels of the
         absolute gradient.
       cell_colors: [N, E] or [C, N, E], channels of which only means over cells of 4×4 pixels are wanted, on black; on
-        the cpu backend they cost a sixteenth of what `colors` do.
+        the cpu backend they take a sixteenth of the products of `colors`.
     Returns: renders [C, H, W, D], alphas [C, H, W, 1], and meta: `means2d` [C, N, 2] (retains its gradient),
       `conics` [C, N, 3], `depths` [C, N], `radii` [C, N] and, given cell_colors, `cells` [C, ⌈H/4⌉, ⌈W/4⌉, E], each
       the mean over those of its pixels that lie in the image.
@@ -111,7 +112,7 @@ def with_cells(colors: Tensor, cell_colors: Tensor | None) -> Tensor:
 
 def cell_means(images: Tensor) -> Tensor:
     """Means [C, ⌈H/4⌉, ⌈W/4⌉, E] of images [C, H, W, E] over cells of 4×4 pixels, cut off by the image's edge."""
-    means = torch.nn.functional.avg_pool2d(images.permute(0, 3, 1, 2), 4, ceil_mode=True, count_include_pad=False)
+    means = torch.nn.functional.avg_pool2d(images.permute(0, 3, 1, 2), CELL, ceil_mode=True, count_include_pad=False)
     return means.permute(0, 2, 3, 1)
 
 

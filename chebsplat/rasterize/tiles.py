@@ -33,25 +33,20 @@ def _spread(j, n):
 
 
 @inline
-def padded(channels):
-    return (channels + 3) // 4 * 4
-
-
-@inline
-def whole(channels):
-    """Rounded up to whole vectors."""
-    return (channels + LANES - 1) // LANES * LANES
+def cell_column(channels):
+    """Where the cell channels of a splat begin: behind its shape, its channels and the 1 for alpha."""
+    return cells.whole(SHAPE + channels + 1)
 
 
 @kernel
 def pack(order, means2d, whitening, opacities, colors, cell_colors):
     """What the tiles read of each Gaussian, in rows of whole cache lines, front to back.
 
-    Returns: splats [V + 1, S]: mean, whitening, log₂ opacity, two unused, the channels, a 1 for alpha, and zeros up to
-      column `whole(SHAPE + D + 1)`, where the cell channels begin.
+    Returns: splats [V + 1, S]: mean, whitening, log₂ opacity, two unused, the channels, a 1 for alpha, zeros, and from
+      `cell_column` on the cell channels and zeros.
     """
-    channels, column = colors.shape[1], whole(SHAPE + colors.shape[1] + 1)
-    splats = np.zeros((len(order) + 1, column + whole(cell_colors.shape[1])), np.float32)
+    channels, column = colors.shape[1], cell_column(colors.shape[1])
+    splats = np.zeros((len(order) + 1, column + cells.whole(cell_colors.shape[1])), np.float32)
     for m in prange(len(order)):
         i = order[m]
         splats[m, 0], splats[m, 1] = means2d[i, 0], means2d[i, 1]
@@ -111,9 +106,9 @@ def _forward_tile(
 ):  # fmt: skip
     """One tile of `forward`, into the flat render. Returns how many of its pairs were looked at."""
     height, width = transmittance.shape
-    states, depth = np.empty((LANES, 2, LANES), np.float32), padded(channels)
+    states, depth = np.empty((LANES, 2, LANES), np.float32), cells.padded(channels)
     _begin(states, width - left, height - top)
-    sums, column = np.zeros((LANES, depth, LANES), np.float32), whole(SHAPE + channels + 1)
+    sums, column = np.zeros((LANES, depth, LANES), np.float32), cell_column(channels)
     mean_sums, shares = np.zeros((LANES, splats.shape[1] - column), np.float32), np.empty(CHUNK, np.float32)
     shapes, chosen = np.empty((CHUNK, SHAPE), np.float32), np.empty((CHUNK + SLACK, depth), np.float32)
     alphas, weights = np.empty((CHUNK + AHEAD, LANES), np.float32), np.empty((CHUNK, LANES), np.float32)
@@ -192,8 +187,8 @@ def _backward_tile(
     states = np.empty((LANES, 2, LANES), np.float32)
     _begin(states, width - left, height - top)
     row, finite = LANES * channels + LANES, True  # of tall_grads: a cell's pixels, and a margin
-    tall_grads, grads = np.empty(LANES * row, np.float32), np.empty((LANES, padded(channels) + 4, LANES), np.float32)
-    column = whole(SHAPE + channels + 1)
+    grads = np.empty((LANES, cells.padded(channels) + 4, LANES), np.float32)
+    tall_grads, column = np.empty(LANES * row, np.float32), cell_column(channels)
     mean_grads = np.zeros((LANES, splats.shape[1] - column), np.float32)
     for cell in range(LANES):
         x, at = left + 4 * (cell & 3), cell * row
@@ -217,7 +212,7 @@ def _backward_tile(
                 mean_grads[cell, c] = grad_means[y, x, c] / np.float32(n_inside)
         finite &= cells.is_finite(mean_grads, cell * mean_grads.shape[1], mean_grads.shape[1])
     room = (n + AHEAD + BLOCK) // BLOCK * BLOCK
-    shapes, chosen = np.empty((n, SHAPE), np.float32), np.zeros((room + SLACK, padded(depth)), np.float32)
+    shapes, chosen = np.empty((n, SHAPE), np.float32), np.zeros((room + SLACK, cells.padded(depth)), np.float32)
     alphas, weights = np.empty((room, LANES), np.float32), np.empty((room, LANES), np.float32)
     g, places, shares = np.empty((room, LANES), np.float32), np.empty(room, np.int64), np.empty(n, np.float32)
     found, rows = np.empty(n + AHEAD + 1, np.int64), np.empty(n, np.int64)
@@ -236,7 +231,7 @@ def _backward_tile(
         if grad_means.shape[2] > 0:
             cells.add_slopes_of_means(splats, column, ranks, start, rows, count, cell, mean_grads, g)
             cells.sum_lanes(weights, count, shares)
-            cells.record_means(shares, mean_grads, count, cell, places, N_GEOMETRY + padded(channels), records)
+            cells.record_means(shares, mean_grads, count, cell, places, N_GEOMETRY + cells.padded(channels), records)
         cells.unwind(alphas, weights, g, count, max_alpha)
         cells.record_colors(weights, tall_grads, channels, count, cell, places, records)
         cells.record_geometry(g, count, cell, places, records)
@@ -249,21 +244,9 @@ def _backward_tile(
 
 @kernel
 def backward(
-    n,
-    splats,
-    order,
-    tile_starts,
-    ranks,
-    pair,
-    pair_starts,
-    masks,
-    used,
-    max_alpha,
-    grad,
-    grad_means,
-    grad_alpha,
+    n, splats, order, tile_starts, ranks, pair, pair_starts, masks, used, max_alpha, grad, grad_means, grad_alpha,
     absolute,
-):
+):  # fmt: skip
     """Gradients of n Gaussians, band by band, each Gaussian's records summed in the order of its pairs.
 
     Args: masks, used as `forward` returned them; grad [H, W, D] of the render, grad_means [⌈H/4⌉, ⌈W/4⌉, E],
@@ -280,10 +263,10 @@ def backward(
     for band in range(bands):
         n_tiles = (band_start(band + 1, rows) - band_start(band, rows)) * columns
         room = max(room, pair_starts[band, shown] - pair_starts[band, 0] + n_tiles)
-    cell_channels, column = grad_means.shape[2], N_GEOMETRY + padded(channels)
-    records = np.empty((room, column + whole(cell_channels)), np.float32)
+    cell_channels, column = grad_means.shape[2], N_GEOMETRY + cells.padded(channels)
+    records = np.empty((room, column + cells.whole(cell_channels)), np.float32)
     sums, to_colors = np.zeros((shown, N_GEOMETRY), np.float32), np.zeros((n, channels), np.float32)
-    to_cell_colors = np.zeros((n, whole(cell_channels)), np.float32)
+    to_cell_colors = np.zeros((n, cells.whole(cell_channels)), np.float32)
     for band in range(bands):
         first_tile = band_start(band, rows) * columns
         n_tiles = band_start(band + 1, rows) * columns - first_tile
