@@ -1,7 +1,9 @@
 """Propagation and gate (Eqs 9-10) of the Gaussians in view in one sweep, in numba.
 
-Twin of `fusion.propagate` and `fusion.Gate`, which are its oracles. Sums run in a fixed order, so the gradients are the
-same bits for any number of threads; plain indexing would add them up in the order in which threads arrive.
+Twin of `fusion.propagate` and `fusion.Gate`, which are its oracles. What the gate's linear map makes of a propagated
+shape is the propagated image of the regions' encodings: that half of its products is done by region, of which there are
+far fewer. Sums run in a fixed order, so the gradients are the same bits for any number of threads; plain indexing would
+add them up in the order in which threads arrive.
 """
 
 from __future__ import annotations
@@ -17,7 +19,7 @@ from chebsplat.jit import inline, kernel, prange
 from chebsplat.simd import exp2, fma, load, splat, spread, store, where
 
 LANES = 16
-N_BLOCKS = 32  # of the Gaussians in view, each with sums of its own
+N_BLOCKS = 16  # of the Gaussians in view, each with sums of its own
 ZERO, ONE, LARGE, MINUS_LOG2E = np.float32(0), np.float32(1), np.float32(100), np.float32(-1.4426950408889634)
 
 
@@ -35,66 +37,71 @@ def _times(x, n, matrix, column, start):
     return (a + b) + (c + d)
 
 
+@kernel
+def _product(rows, matrix):
+    """rows [n, m] times matrix [m, width], m a multiple of four."""
+    out = np.empty((len(rows), matrix.shape[1]), np.float32)
+    for i in prange(len(rows)):
+        for at in range(0, matrix.shape[1], LANES):
+            store(out, i * matrix.shape[1] + at, _times(rows[i], len(matrix), matrix, at, splat(ZERO)))
+    return out
+
+
 @inline
-def _mixed(features, encodings, cover, weights, by_input, bias, i, f, s, g, x):
-    """Fill the padded rows f (features), s (shape) and g (gate) of Gaussian i, and x = [s, f]; is it covered?"""
+def _mixed(features, encodings, images, cover, weights, by_input, bias, i, f, s, g):
+    """Fill the padded rows f (features), s (shape) and g (gate) of Gaussian i; is it covered?"""
     channels, width = features.shape[1], len(bias)
     for c in range(channels):
         f[c] = features[i, c]
-    for at in range(0, width, LANES):
-        total = splat(ZERO)
-        for k in range(cover.shape[1]):
-            if cover[i, k] >= 0:
-                total = fma(splat(weights[i, k]), load(encodings, cover[i, k] * width + at), total)
-        store(s, at, total)
-        store(x, at, total)
-        store(x, width + at, load(f, at))
     covered = cover[i, 0] >= 0
     for at in range(0, width, LANES):
-        power = splat(MINUS_LOG2E) * _times(x, 2 * width, by_input, at, load(bias, at))
+        shape, power = splat(ZERO), load(bias, at)
+        for k in range(cover.shape[1]):
+            if cover[i, k] >= 0:
+                place, weight = cover[i, k] * width + at, splat(weights[i, k])
+                shape, power = fma(weight, load(encodings, place), shape), fma(weight, load(images, place), power)
+        power = splat(MINUS_LOG2E) * _times(f, width, by_input, at, power)
         share = splat(ONE) / (splat(ONE) + exp2(where(power > splat(LARGE), splat(LARGE), power)))
+        store(s, at, shape)
         store(g, at, share if covered else splat(ONE))
     return covered
 
 
 @kernel
-def _forward(features, encodings, cover, weights, index, by_input, bias):
+def _forward(features, encodings, images, cover, weights, index, by_input, bias):
     channels, width = features.shape[1], len(bias)
     out = np.empty((len(index), channels), np.float32)
     for block in prange(N_BLOCKS):
-        rows, x = np.zeros((3, width), np.float32), np.empty(2 * width, np.float32)
+        rows = np.zeros((3, width), np.float32)
         f, s, g = rows[0], rows[1], rows[2]
         for v in range(block * len(index) // N_BLOCKS, (block + 1) * len(index) // N_BLOCKS):
-            _mixed(features, encodings, cover, weights, by_input, bias, index[v], f, s, g, x)
+            _mixed(features, encodings, images, cover, weights, by_input, bias, index[v], f, s, g)
             for c in range(channels):
                 out[v, c] = g[c] * f[c] + (ONE - g[c]) * s[c]
     return out
 
 
 @kernel
-def _backward(features, encodings, cover, weights, index, by_input, bias, by_output, slot, n_fresh, grad):
-    """Gradients to features [N, C] and, as sums by block, to the fresh encodings, the gate's weights and its bias.
+def _backward(features, encodings, images, cover, weights, index, by_input, bias, by_output, slot, n_fresh, grad):
+    """Gradients to features [N, C] and, as sums by block, to the regions' images, to the fresh encodings but for what
+    their images pass on, and to the gate's matrix for features and its bias.
 
-    by_output is the gate's matrix [C, 2 C] padded, by_input its transpose; slot [M] the row of a region among the
-    fresh ones, -1 where it has none.
+    by_output is that matrix [C, C] padded, by_input its transpose; slot [M] the row of a region among the fresh ones,
+    -1 where it has none.
     """
     channels, width = features.shape[1], len(bias)
     to_features = np.empty((len(features), channels), np.float32)
+    to_images = np.zeros((N_BLOCKS, len(encodings), width), np.float32)
     to_fresh = np.zeros((N_BLOCKS, n_fresh, width), np.float32)
-    to_gate = np.zeros((N_BLOCKS, 2 * width, width), np.float32)
-    to_bias = np.zeros((N_BLOCKS, width), np.float32)
+    to_matrix, to_bias = np.zeros((N_BLOCKS, width, width), np.float32), np.zeros((N_BLOCKS, width), np.float32)
     for i in prange(len(features)):
         to_features[i] = ZERO
     for block in prange(N_BLOCKS):
-        rows, x, inward = (
-            np.zeros((5, width), np.float32),
-            np.empty(2 * width, np.float32),
-            np.empty(2 * width, np.float32),
-        )
-        f, s, g, upper, slope = rows[0], rows[1], rows[2], rows[3], rows[4]
+        rows = np.zeros((6, width), np.float32)
+        f, s, g, upper, slope, inward = rows[0], rows[1], rows[2], rows[3], rows[4], rows[5]
         for v in range(block * len(index) // N_BLOCKS, (block + 1) * len(index) // N_BLOCKS):
             i = index[v]
-            covered = _mixed(features, encodings, cover, weights, by_input, bias, i, f, s, g, x)
+            covered = _mixed(features, encodings, images, cover, weights, by_input, bias, i, f, s, g)
             for c in range(channels):
                 upper[c] = grad[v, c]
             if not covered:
@@ -102,24 +109,23 @@ def _backward(features, encodings, cover, weights, index, by_input, bias, by_out
                 continue
             for at in range(0, width, LANES):
                 share, up = load(g, at), load(upper, at)
-                store(slope, at, up * (load(f, at) - load(s, at)) * share * (splat(ONE) - share))
-                store(inward, at, up * (splat(ONE) - share))
-                store(inward, width + at, up * share)
-            for at in range(0, 2 * width, LANES):
-                store(inward, at, _times(slope, width, by_output, at, load(inward, at)))
-            for at in range(0, width, LANES):
-                down = load(slope, at)
-                place = block * width + at
-                store(to_bias, place, load(to_bias, place) + down)
-                for j in range(2 * width):
-                    place = (block * 2 * width + j) * width + at
-                    store(to_gate, place, fma(spread(x, j), down, load(to_gate, place)))
+                down = up * (load(f, at) - load(s, at)) * share * (splat(ONE) - share)
+                store(slope, at, down)
+                store(to_bias, block * width + at, load(to_bias, block * width + at) + down)
+                for j in range(width):
+                    place = (block * width + j) * width + at
+                    store(to_matrix, place, fma(spread(f, j), down, load(to_matrix, place)))
                 for k in range(cover.shape[1]):
-                    if cover[i, k] >= 0 and slot[cover[i, k]] >= 0:
-                        place = (block * n_fresh + slot[cover[i, k]]) * width + at
-                        store(to_fresh, place, fma(splat(weights[i, k]), load(inward, at), load(to_fresh, place)))
-            to_features[i] = inward[width : width + channels]
-    return to_features, to_fresh, to_gate, to_bias
+                    if cover[i, k] >= 0:
+                        weight, place = splat(weights[i, k]), (block * len(encodings) + cover[i, k]) * width + at
+                        store(to_images, place, fma(weight, down, load(to_images, place)))
+                        if slot[cover[i, k]] >= 0:
+                            place = (block * n_fresh + slot[cover[i, k]]) * width + at
+                            store(to_fresh, place, fma(weight, up * (splat(ONE) - share), load(to_fresh, place)))
+            for at in range(0, width, LANES):
+                store(inward, at, _times(slope, width, by_output, at, load(upper, at) * load(g, at)))
+            to_features[i] = inward[:channels]
+    return to_features, to_images, to_fresh, to_matrix, to_bias
 
 
 def _padded(array: Tensor, *shape: int) -> np.ndarray:
@@ -134,34 +140,35 @@ class _Fuse(torch.autograd.Function):
     def forward(ctx: Any, features, fresh, matrix, bias, cache, chosen, cover, weights, index):  # type: ignore[no-untyped-def, override]
         channels = features.shape[1]
         width = -(-channels // LANES) * LANES
-        encodings = _padded(cache, len(cache), width)
+        encodings = _padded(cache, -(-len(cache) // 4) * 4, width)
         encodings[chosen.numpy(), :channels] = fresh.detach().numpy()
-        by_output = np.zeros((width, 2, width), np.float32)
-        by_output[:channels, :, :channels] = matrix.detach().reshape(channels, 2, channels).numpy()
-        by_output = by_output.reshape(width, 2 * width)
+        ctx.of_shape, ctx.of_features = (_padded(half, width, width) for half in matrix.split(channels, 1))
         ctx.arrays = (
             features.detach().contiguous().numpy(),
             encodings,
+            _product(encodings, np.ascontiguousarray(ctx.of_shape.T)),
             cover.numpy(),
             weights.numpy(),
             index.numpy(),
-            np.ascontiguousarray(by_output.T),
+            np.ascontiguousarray(ctx.of_features.T),
             _padded(bias, width),
         )
-        ctx.by_output, ctx.chosen = by_output, chosen.numpy()
+        ctx.chosen = chosen.numpy()
         return torch.from_numpy(_forward(*ctx.arrays))
 
     @staticmethod
     def backward(ctx: Any, grad):  # type: ignore[no-untyped-def, override]
         features, encodings = ctx.arrays[:2]
-        channels, width = features.shape[1], encodings.shape[1]
+        channels = features.shape[1]
         slot = np.full(len(encodings), -1)
         slot[ctx.chosen] = np.arange(len(ctx.chosen))
-        found = _backward(*ctx.arrays, ctx.by_output, slot, len(ctx.chosen), grad.contiguous().numpy())
-        to_features, to_fresh, to_gate, to_bias = (torch.from_numpy(a) for a in found)
-        to_matrix = to_gate.sum(0).reshape(2, width, width)[:, :channels, :channels].permute(2, 0, 1).flatten(1)
-        parts = to_features, to_fresh.sum(0)[:, :channels], to_matrix, to_bias.sum(0)[:channels]
-        return *parts, None, None, None, None, None
+        found = _backward(*ctx.arrays, ctx.of_features, slot, len(ctx.chosen), grad.contiguous().numpy())
+        to_features, to_images, to_fresh, to_matrix, to_bias = found[0], *(blocks.sum(0) for blocks in found[1:])
+        to_fresh += _product(to_images[ctx.chosen], ctx.of_shape)
+        halves = _product(np.ascontiguousarray(to_images.T), encodings), to_matrix.T
+        to_matrix = np.concatenate([half[:channels, :channels] for half in halves], 1)
+        grads = to_features, to_fresh[:, :channels], to_matrix, to_bias[:channels]
+        return *(torch.from_numpy(array) for array in grads), None, None, None, None, None
 
 
 def fuse_in_view(

@@ -62,10 +62,10 @@ def soft_histogram(values: Tensor, valid: Tensor, n_bins: int, low: Tensor, high
     inside = torch.where(valid, values - low[..., None], 0.0) / width[..., None]
     edges = torch.arange(1, n_bins, dtype=values.dtype, device=values.device)
     below = (20 * (edges - inside[..., None])).sigmoid()
-    ends = torch.zeros_like(inside[..., None])
-    mass = torch.diff(torch.cat([ends, below, ends + 1], -1), dim=-1)
-    count = valid.sum(-1, keepdim=True).clamp_min(1)
-    return (mass * valid[..., None]).sum(-2) / count
+    count = valid.sum(-1, keepdim=True)
+    share_below = torch.einsum("...nb,...n->...b", below, valid.to(values.dtype)) / count.clamp_min(1)
+    present = (count > 0).to(values.dtype)
+    return torch.diff(torch.cat([torch.zeros_like(present), share_below, present], -1), dim=-1)
 
 
 def band_colors(shN: Tensor, directions: Tensor) -> Tensor:
@@ -75,9 +75,8 @@ def band_colors(shN: Tensor, directions: Tensor) -> Tensor:
     Returns: [..., N, 3 bands, 3]; zero for bands that shN does not hold.
     """
     values = basis(directions, 3)[..., 1:]
-    values = values.expand(*values.shape[:-2], len(shN), -1)
     parts = [torch.einsum("...nk,nkc->...nc", values[..., a:b], shN[:, a:b]) for a, b in BANDS if b <= shN.shape[1]]
-    parts += [values.new_zeros(*values.shape[:-1], 3)] * (len(BANDS) - len(parts))
+    parts += [values.new_zeros(*values.shape[:-2], len(shN), 3)] * (len(BANDS) - len(parts))
     return torch.stack(parts, -2)
 
 
@@ -110,12 +109,13 @@ def region_guidance(shN: Tensor, members: Tensor, n: int, n_bins: int = 8) -> Te
     if len(members) == 0 or n == 0:
         return torch.ones(n, 3)
     n_bins += 1 - n_bins % 2
-    colors = band_colors(shN, guidance_directions()[:, None].to(shN))  # [Q, n, 3 bands, 3]
-    strongest = colors.abs().argmax(-1, keepdim=True)
-    changes = colors.gather(-1, strongest)[..., 0].permute(1, 2, 0)  # [n, 3 bands, Q]
     present = members >= 0
-    index = members.clamp_min(0)
-    weight, times = torch.zeros(n, 3), torch.zeros(n, 1)
+    used, place = members[present].unique(return_inverse=True)
+    index = torch.zeros_like(members).masked_scatter(present, place)  # of rows of `used`
+    colors = band_colors(shN[used], guidance_directions()[:, None].to(shN)).movedim(-1, 0).contiguous()
+    highest, lowest = colors.amax(0), colors.amin(0)
+    changes = torch.where(highest >= -lowest, highest, lowest).permute(1, 2, 0)  # [used, 3 bands, Q]
+    weight, times = torch.zeros(len(used), 3), torch.zeros(len(used), 1)
     for rows in torch.arange(len(members)).split(128):
         inside = changes[index[rows]].permute(0, 2, 1, 3).flatten(2)  # [M, 3 bands, k * Q]
         valid = present[rows][:, None, :, None].expand(-1, 3, -1, changes.shape[-1]).flatten(2)
@@ -126,8 +126,8 @@ def region_guidance(shN: Tensor, members: Tensor, n: int, n_bins: int = 8) -> Te
         spared = (1 - 0.5 * (found - without).abs().sum(-1)).clamp(0.05, 1)
         spared = spared.flip(-1).cummin(-1).values.flip(-1)
         weight.index_add_(0, index[rows][present[rows]], spared[:, None].expand(*index[rows].shape, 3)[present[rows]])
-    times.index_add_(0, index[present], torch.ones(int(present.sum()), 1))
-    return torch.where(times > 0, weight / times.clamp_min(1), torch.ones_like(weight))
+    times.index_add_(0, place, torch.ones(len(place), 1))
+    return torch.ones(n, 3).index_copy_(0, used, weight / times)
 
 
 def sh_loss(mask: Tensor, guidance: Tensor | None = None) -> Tensor:

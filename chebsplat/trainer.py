@@ -147,9 +147,9 @@ class Trainer:
         return self.model.shape is not None and self.schedule.has("encode_from", share)
 
     def refresh(self, regions: Regions | None = None, descriptors: Tensor | None = None) -> None:
-        """Regions, descriptors and band guidance of the Gaussians as they are now."""
+        """Regions and descriptors of the Gaussians as they are now."""
         self.laps.mark("growth and pruning")
-        shape, settings = self.model.shape, self.settings
+        shape = self.model.shape
         if shape is not None:
             shape.refresh(self.model.raw, regions, descriptors)
             regions = shape.regions
@@ -157,11 +157,19 @@ class Trainer:
             means = self.model.raw["means"].detach().double().numpy()
             regions = build_regions(means, *(self.describe[k] for k in ("n_regions", "region_size", "seed")))
         assert regions is not None
-        self.members = torch.as_tensor(regions.members)
-        if settings["sh_guided"] and "sh_logits" in self.model.raw:
+        self.members, self.guidance = torch.as_tensor(regions.members), None
+        self.laps.mark("refresh")
+
+    def _guided(self, index: Tensor) -> Tensor | None:
+        """Weights [V, 3] of the bands' penalty, found when they are first wanted after a refresh; None: all alike."""
+        if not self.settings["sh_guided"]:
+            return None
+        if self.guidance is None:
+            self.laps.mark("losses")
             shN = sh_prune.dense([band.detach() for band in self.model.bands()[1:]], len(self.model))
             self.guidance = sh_prune.region_guidance(shN, self.members, len(self.model))
-        self.laps.mark("refresh")
+            self.laps.mark("refresh")
+        return self.guidance[index]
 
     def _step(self, index: int, share: float) -> dict[str, float]:
         settings, factor = self.settings, self.schedule.factor(share)
@@ -186,8 +194,7 @@ class Trainer:
         if "shape" in aside and settings["weight_shape"] > 0:
             losses["shape"] = settings["weight_shape"] * aside["shape"]
         if "bands" in aside:
-            guidance = None if self.guidance is None else self.guidance[rendered.index]
-            losses["sh"] = settings["weight_sh"] * sh_prune.sh_loss(aside["bands"], guidance)
+            losses["sh"] = settings["weight_sh"] * sh_prune.sh_loss(aside["bands"], self._guided(rendered.index))
         if self.basis and self.model.shape is not None:
             projections = self.model.shape.encoder.projections()
             losses["basis"] = settings["weight_basis"] * cks.basis_loss(projections, self.basis)
