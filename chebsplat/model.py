@@ -274,14 +274,16 @@ class SceneModel:
         degree: int,
         *,
         masked: bool = True,
+        semantic: bool = True,
         fused: bool = False,
         generator: torch.Generator | None = None,
         grid: tuple[int, int] | None = None,
     ) -> tuple[Rendered, dict[str, Tensor]]:
         """Colour and features in one pass; the second result holds masks for the losses.
 
-        degree: SH bands in use; masked: apply the pruning masks; fused: render fused features, not the raw ones; grid:
-        features are only wanted as means over h × w cells, and rendered so where these are the rasterizer's.
+        degree: SH bands in use; masked: apply the pruning masks; semantic: render features too; fused: the fused ones,
+        not the raw ones; grid: features are only wanted as means over h × w cells, and rendered so where these are the
+        rasterizer's.
         """
         raw = self.raw
         with torch.no_grad():
@@ -301,6 +303,8 @@ class SceneModel:
         if masked and (soft := self.soft_mask(index, features)) is not None:
             aside["mask"] = soft
             scales, opacities = adapt.apply_mask(adapt.hard_mask(soft), scales, opacities)
+        if not semantic:  # the masks have seen them
+            features = None
         masks = self.sh_mask(index) if masked and degree > 0 else None
         if masks is not None:
             aside["bands"] = masks

@@ -222,7 +222,8 @@ class Trainer:
         """Mean PSNR over training views at full resolution, dB."""
         scores = []
         for index in indices:
-            rendered, _ = self.model.render(self.views.camera(index, 1), self.schedule.degree(self.share))
+            camera, degree = self.views.camera(index, 1), self.schedule.degree(self.share)
+            rendered, _ = self.model.render(camera, degree, semantic=False)
             image = (rendered.rgb.clamp(0, 1) * 255).round().byte().numpy()
             mask = None if self.views.masks is None else self.views.masks[index].numpy()
             truth = self.views.images[index].numpy()
