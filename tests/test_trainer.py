@@ -118,6 +118,22 @@ def test_a_resumed_training_takes_the_same_steps_to_the_bit(tiny_trainer, tmp_pa
             assert np.array_equal(value, parameters[name]), name
 
 
+def test_the_bands_guidance_is_found_when_wanted_and_anew_after_a_refresh(tiny_trainer):
+    made = tiny_trainer(steps=20, prune_from=0.5, densify="off", refresh_every=1000)
+    found = [made.guidance for _ in made.steps() if made.step < 14]
+    assert all(weights is None for weights in found[:9]) and found[9].shape == (len(made.model), 3)
+    assert all(weights is found[9] for weights in found[10:])
+    made.refresh()
+    assert made.guidance is None
+
+
+def test_a_picture_without_features_has_the_colours_of_one_with_them(tiny_trainer):
+    made = tiny_trainer()
+    pictures = [made.model.render(made.views.camera(0, 1), 3, semantic=k)[0] for k in (True, False)]
+    torch.testing.assert_close(pictures[1].rgb, pictures[0].rgb, rtol=0, atol=1e-6)
+    assert pictures[0].features is not None and pictures[1].features is None
+
+
 def test_growth_without_semantic_guidance_takes_the_same_steps_and_other_places(tiny_trainer):
     """The loss is split into two backward passes; their sum moves parameters as one does."""
     guided, alone = (
