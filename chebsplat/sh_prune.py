@@ -106,10 +106,10 @@ def region_guidance(shN: Tensor, members: Tensor, n: int, n_bins: int = 8) -> Te
       colours, so less is never seen. Gaussians in several regions take the mean, those in none 1. A guide of the
       penalty, not a path for gradients.
     """
-    if len(members) == 0 or n == 0:
+    present = members >= 0
+    if not present.any():
         return torch.ones(n, 3)
     n_bins += 1 - n_bins % 2
-    present = members >= 0
     used, place = members[present].unique(return_inverse=True)
     index = torch.zeros_like(members).masked_scatter(present, place)  # of rows of `used`
     colors = band_colors(shN[used], guidance_directions()[:, None].to(shN)).movedim(-1, 0).contiguous()

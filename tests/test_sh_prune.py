@@ -198,6 +198,7 @@ def test_guidance_is_one_outside_regions_and_without_regions():
     assert (weight[:2, 0] < 1).all()
     assert (weight[2:] == 1).all()
     assert (sh_prune.region_guidance(shN, torch.zeros(0, 3, dtype=torch.int64), 5) == 1).all()
+    assert (sh_prune.region_guidance(shN, torch.full((2, 3), -1), 5) == 1).all()
     assert sh_prune.region_guidance(shN[:0], torch.zeros(0, 3, dtype=torch.int64), 0).shape == (0, 3)
 
 
