@@ -10,7 +10,7 @@ CHOICE := $(if $(scene),--scene '$(scene)') $(if $(sequence),--sequence '$(seque
 
 # `make scene=office0` needs no target: naming a scene, a sequence or a study means running it.
 .DEFAULT_GOAL := $(if $(study),study,$(if $(scene)$(sequence),run,help))
-.PHONY: help run study plan verify clean-stale setup test test-all stability bench-raster bench-train bench-descriptor bench-encoder bench-layouts bench-refresh bench-knowledge bench-shapes bench-store nouns teacher teacher-quality lint lock
+.PHONY: help run study plan verify clean-stale setup test test-all stability bench-raster bench-train bench-descriptor bench-encoder bench-layouts bench-refresh bench-cost bench-knowledge bench-shapes bench-store nouns teacher teacher-quality lint lock
 
 run: $(READY)  ## make scene=NAME|FOLDER [stage=] [set=a.b=c,...] [ablation=] [basis=NAME@REVISION] [cores=]; or sequence=NAME
 	@$(CHEBSPLAT) run $(CHOICE) $(if $(stage),--stage '$(stage)') $(if $(cores),--cores '$(cores)')
@@ -52,6 +52,11 @@ bench-train: $(READY)  ## office0 without the shape branch: seconds of 3000 step
 
 stability: $(READY)  ## every extreme case, naive and ours; build/bench/stability.csv; fails if one does (args=--only X)
 	@$(PY) -m benchmarks.stability $(args)
+
+bench-cost: $(READY)  ## whole trainings of office0 beside plain 3DGS, by turns: the joint method's cost, by part (args=)
+	@$(CHEBSPLAT) run --scene office0 --stage teacher
+	@$(CHEBSPLAT) run --scene office0 --stage sfm
+	@$(PY) benchmarks/cost.py --work work/office0 $(args)
 
 bench-knowledge: $(READY)  ## what the knowledge space costs office0's training: regulariser and update against a step
 	@$(CHEBSPLAT) run --scene office0 --set teacher.kind=labels --stage teacher
