@@ -1,8 +1,9 @@
 """What the knowledge space costs a training: its regulariser in every step, its update after the last one.
 
-Usage: python benchmarks/knowledge.py --work work/office0 [--steps 200] [--out build/bench]
+Usage: python benchmarks/knowledge.py --work work/office0 [--turns 60] [--out build/bench]
 The folder holds the links `ingest`, `sfm` and `teacher`, from `make scene=office0 stage=...`. Steps with and without
-the regulariser take turns in one training at full resolution, so that other load on the machine meets both alike.
+the regulariser take turns in one training at full resolution, so that other load on the machine meets both alike; a
+turn lasts from one step that encodes regions anew to the next.
 """
 
 from __future__ import annotations
@@ -18,32 +19,24 @@ import chebsplat  # isort: skip  # before torch: a busy machine punishes OpenMP 
 import torch
 
 from chebsplat import cks
-from chebsplat.cameras import extent
 from chebsplat.formats.capture import read_capture
 from chebsplat.formats.features import read_features
 from chebsplat.formats.points import read_points
-from chebsplat.gaussians import initial_gaussians
-from chebsplat.model import SceneModel
 from chebsplat.stages.config import Config
-from chebsplat.stages.train_inputs import training_views
+from chebsplat.stages.train_inputs import trainer_of
 from chebsplat.trainer import Trainer
 
 BAR = 3.0  # per cent of the time of training
 
 
-def trainer_of(work: Path) -> Trainer:
+def prepared(work: Path) -> Trainer:
     config = Config()
-    train, describe = config.train.model_dump(), config.describe.model_dump()
+    train = config.train.model_dump()
     train |= {"coarse_until": 0.0, "encode_from": 0.0, "n_densify": 0, "refresh_every": 10**9}
     capture, points, features = (
         read_capture(work / "ingest"), read_points(work / "sfm"), read_features(work / "teacher")
     )  # fmt: skip
-    torch.manual_seed(0)
-    raw = initial_gaussians(points.means, points.colors, points.covariances)
-    model = SceneModel(raw, describe, train, features.features.shape[-1])
-    trainer = Trainer(
-        model, training_views(capture, points, features), train, describe, extent(points.cam_from_world), {}
-    )
+    trainer = trainer_of(capture, points, features, train, config.describe.model_dump())
     trainer.refresh()
     return trainer
 
@@ -51,25 +44,26 @@ def trainer_of(work: Path) -> Trainer:
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--work", type=Path, required=True)
-    parser.add_argument("--steps", type=int, default=200)
+    parser.add_argument("--turns", type=int, default=60)
     parser.add_argument("--out", type=Path, default=Path("build/bench"))
     options = parser.parse_args()
     print(f"chebsplat {chebsplat.__version__}, torch {torch.__version__} on {torch.get_num_threads()} threads; "
           f"{os.cpu_count()} cores, load {os.getloadavg()[0]:.1f}")  # fmt: skip
-    trainer = trainer_of(options.work)
+    trainer = prepared(options.work)
     assert trainer.model.shape is not None
     projections = trainer.model.shape.encoder.projections()
     began = time.perf_counter()
     bases = {name: cks.update(None, W.detach())[0] for name, W in projections.items()}
     update = time.perf_counter() - began
     times: dict[bool, list[float]] = {False: [], True: []}
-    rounds = trainer.steps()
-    for step in range(2 * options.steps + 20):
-        trainer.basis = bases if step % 2 else {}
+    rounds, period = trainer.steps(), trainer.settings["encode_every"]
+    for turn in range(2 * options.turns + 10):
+        trainer.basis = bases if turn % 2 else {}
         before = trainer.seconds
-        next(rounds)
-        if step >= 20:  # kernels are compiled and caches warm
-            times[bool(step % 2)].append(trainer.seconds - before)
+        for _ in range(period):
+            next(rounds)
+        if turn >= 10:  # kernels are compiled and caches warm
+            times[bool(turn % 2)].append((trainer.seconds - before) / period)
     alone = []
     for _ in range(200):
         began = time.perf_counter()

@@ -19,30 +19,22 @@ import chebsplat  # isort: skip  # before torch: a busy machine punishes OpenMP 
 import numba
 import torch
 
-from chebsplat.cameras import extent
 from chebsplat.descriptor import describe_members
 from chebsplat.formats.capture import read_capture
 from chebsplat.formats.features import read_features
 from chebsplat.formats.points import read_points
-from chebsplat.gaussians import initial_gaussians
-from chebsplat.model import SceneModel
 from chebsplat.stages.config import Config
-from chebsplat.stages.train_inputs import training_views
+from chebsplat.stages.train_inputs import trainer_of
 from chebsplat.trainer import Trainer
 
 INTERVALS = (25, 50, 100, 200, 400)
 
 
-def trainer_of(options: argparse.Namespace) -> Trainer:
+def prepared(options: argparse.Namespace) -> Trainer:
     config = Config()
-    train, describe = config.train.model_dump(), config.describe.model_dump()
-    train |= {"n_densify": 0, "refresh_every": 10**9}
+    train = config.train.model_dump() | {"n_densify": 0, "refresh_every": 10**9}
     capture, points = read_capture(options.capture), read_points(options.points)
-    features = read_features(options.features)
-    torch.manual_seed(0)
-    raw = initial_gaussians(points.means, points.colors, points.covariances)
-    model = SceneModel(raw, describe, train, features.features.shape[-1])
-    return Trainer(model, training_views(capture, points, features), train, describe, extent(points.cam_from_world), {})
+    return trainer_of(capture, points, read_features(options.features), train, config.describe.model_dump())
 
 
 def descriptors(trainer: Trainer) -> torch.Tensor:
@@ -65,7 +57,7 @@ def main() -> None:
         parser.add_argument(f"--{name}", type=Path, required=True)
     parser.add_argument("--out", type=Path, default=Path("build/bench"))
     options = parser.parse_args()
-    trainer = trainer_of(options)
+    trainer = prepared(options)
     trainer.refresh()
     begin = round(trainer.settings["encode_from"] * trainer.settings["steps"])
     before, spent, began = torch.zeros(0), 0.0, 0.0

@@ -22,16 +22,12 @@ import numba
 import numpy as np
 import torch
 
-from chebsplat.cameras import extent
 from chebsplat.formats.capture import read_capture
 from chebsplat.formats.features import read_features
 from chebsplat.formats.points import read_points
-from chebsplat.gaussians import initial_gaussians
-from chebsplat.model import SceneModel
 from chebsplat.rasterize import rasterize
 from chebsplat.stages.config import Config
-from chebsplat.stages.train_inputs import training_views
-from chebsplat.trainer import Trainer
+from chebsplat.stages.train_inputs import trainer_of
 from chebsplat.views import Views
 
 
@@ -53,12 +49,7 @@ def train(work: Path, backend: str, steps: int, seed: int) -> dict[str, Any]:
         read_points(work / "sfm"),
         read_features(work / "teacher"),
     )
-    torch.manual_seed(seed)
-    raw = initial_gaussians(points.means, points.colors, points.covariances)
-    model = SceneModel(raw, describe, settings, features.features.shape[-1])
-    trainer = Trainer(
-        model, training_views(capture, points, features), settings, describe, extent(points.cam_from_world), {}
-    )
+    trainer = trainer_of(capture, points, features, settings, describe)
     with mock.patch("chebsplat.model.rasterize", partial(rasterize, backend=backend)):
         trainer.refresh()
         began = time.perf_counter()
@@ -68,7 +59,7 @@ def train(work: Path, backend: str, steps: int, seed: int) -> dict[str, Any]:
         trainer.views = test_views(work)
         psnr = trainer.held_in_psnr(list(range(len(trainer.views.names))))
     found = {"backend": backend, "steps": steps, "seed": seed, "seconds": seconds, "psnr": psnr}
-    return found | {"gaussians": len(model), "channels": features.features.shape[-1]}
+    return found | {"gaussians": len(trainer.model), "channels": features.features.shape[-1]}
 
 
 def main() -> None:

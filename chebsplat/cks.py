@@ -139,23 +139,25 @@ def _rounded(columns: Tensor, given: Tensor) -> Tensor:
 class _Outside(torch.autograd.Function):
     """Share of each W's energy outside its basis, [n], and its gradient in closed form: 2 (W − B Bᵀ W) / ‖W‖².
 
-    A graph of a dozen small operations a projection takes twice as long.
+    A graph of a dozen small operations a projection takes twice as long; torch instead of NumPy, whose products of so
+    small matrices wake no threads, up to ten times.
     """
 
     @staticmethod
     def forward(ctx: Any, bases: list[Tensor], *weights: Tensor) -> Tensor:  # type: ignore[override]
         shares, ctx.slopes = [], []
-        for W, basis in zip(weights, bases, strict=True):
-            largest = float(W.abs().max()) if W.numel() and basis.shape[1] else 0.0
+        for weight, basis in zip(weights, bases, strict=True):
+            W, B = weight.detach().numpy(), basis.numpy()
+            largest = float(np.abs(W).max()) if W.size and B.shape[1] else 0.0
             if largest == 0:
                 shares.append(0.0)
-                ctx.slopes.append(torch.zeros_like(W))
+                ctx.slopes.append(torch.zeros_like(weight))
                 continue
             scaled = W / largest
-            rest = torch.addmm(scaled, basis, basis.T @ scaled, alpha=-1)
-            total = float(scaled.square().sum())
-            shares.append(float(rest.square().sum()) / total)
-            ctx.slopes.append(rest.mul_(2 / total / largest))
+            rest = scaled - B @ (B.T @ scaled)
+            total = float(np.square(scaled).sum())
+            shares.append(float(np.square(rest).sum()) / total)
+            ctx.slopes.append(torch.from_numpy(rest * (2 / total / largest)))
         return weights[0].new_tensor(shares)
 
     @staticmethod

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 from chebsplat.errors import ConfigError, DataFailure
 from chebsplat.stages.command import Job, command, n_threads
 from chebsplat.stages.resume import Saves
-from chebsplat.stages.train_inputs import first_regions, knowledge, training_views
+from chebsplat.stages.train_inputs import first_regions, knowledge, trainer_of
 
 if TYPE_CHECKING:
     import numpy as np
@@ -22,15 +22,11 @@ log = logging.getLogger("chebsplat")
 def run(job: Job) -> None:
     import torch
 
-    from chebsplat.cameras import extent
     from chebsplat.formats.cameras import Cameras
     from chebsplat.formats.capture import read_capture
     from chebsplat.formats.features import read_features
     from chebsplat.formats.gaussians import Gaussians, write_gaussians
     from chebsplat.formats.points import read_points
-    from chebsplat.gaussians import initial_gaussians
-    from chebsplat.model import SceneModel
-    from chebsplat.trainer import Trainer
 
     if job.device == "cuda":
         raise ConfigError("training runs on the CPU in this version; pass --device cpu")
@@ -38,15 +34,10 @@ def run(job: Job) -> None:
     capture, points = read_capture(job.inputs["capture"]), read_points(job.inputs["points"])
     features = read_features(job.inputs["features"]) if "features" in job.inputs and train["semantics"] else None
     note_left_out(job, train, features is not None)
-    torch.set_num_threads(
-        n_threads()
-    )  # sums of torch depend on it, and the same bytes are promised for the same number
-    torch.manual_seed(train["seed"])
-    raw = initial_gaussians(points.means, points.colors, points.covariances)
-    model = SceneModel(raw, describe, train, features.features.shape[-1] if features is not None else None)
-    views = training_views(capture, points, features)
-    bases = knowledge(job, model, train)
-    trainer = Trainer(model, views, train, describe, extent(points.cam_from_world), bases)
+    torch.set_num_threads(n_threads())  # sums of torch depend on it; the same bytes are promised for the same number
+    trainer = trainer_of(capture, points, features, train, describe)
+    model = trainer.model
+    trainer.basis = knowledge(job, model, train)
     first_regions(job, trainer, len(points.means))
     trace = follow(job, trainer, train)
     parameters, people = trainer.finish(), trainer.population

@@ -55,6 +55,24 @@ def training_views(capture: Capture, points: Points, features: Features | None) 
     )
 
 
+def trainer_of(
+    capture: Capture, points: Points, features: Features | None, train: dict[str, Any], describe: dict[str, Any]
+) -> Trainer:
+    """The training before its first refresh, without earlier knowledge; `train` and `describe` as in the config."""
+    import torch
+
+    from chebsplat.cameras import extent
+    from chebsplat.gaussians import initial_gaussians
+    from chebsplat.model import SceneModel
+    from chebsplat.trainer import Trainer
+
+    torch.manual_seed(train["seed"])
+    raw = initial_gaussians(points.means, points.colors, points.covariances)
+    model = SceneModel(raw, describe, train, None if features is None else features.features.shape[-1])
+    views = training_views(capture, points, features)
+    return Trainer(model, views, train, describe, extent(points.cam_from_world), {})
+
+
 def knowledge(job: Job, model: Any, train: dict[str, Any]) -> dict[str, Any]:
     """Bases of earlier scenes; with `train.warm_start` the encoder also starts from their weights."""
     if "basis" not in job.inputs or model.shape is None:
