@@ -14,24 +14,18 @@ from pathlib import Path
 
 import chebsplat  # isort: skip  # before torch: a busy machine punishes OpenMP threads that wait actively
 import torch
+from prepared import prepared
 
-from chebsplat.formats.capture import read_capture
-from chebsplat.formats.features import read_features
-from chebsplat.formats.points import read_points
 from chebsplat.pipelines.plan import read_toml
 from chebsplat.stages.config import Config
-from chebsplat.stages.train_inputs import trainer_of
 from chebsplat.trainer import Trainer
 
 BAR, TURN, REHEARSAL = 1.6, 50, 100
 
 
-def prepared(work: Path, ablation: str, steps: int) -> Trainer:
+def begun(work: Path, ablation: str, steps: int) -> Trainer:
     config = Config.model_validate(read_toml("ablations", ablation) if ablation != "full" else {})
-    train = config.train.model_dump() | {"steps": steps}
-    capture, points = read_capture(work / "ingest"), read_points(work / "sfm")
-    features = read_features(work / "teacher") if train["semantics"] else None
-    trainer = trainer_of(capture, points, features, train, config.describe.model_dump())
+    trainer = prepared(work, config.train.model_dump() | {"steps": steps}, config.describe.model_dump())
     trainer.refresh()
     return trainer
 
@@ -46,9 +40,9 @@ def main() -> None:
           f"{os.cpu_count()} cores, load {os.getloadavg()[0]:.1f}; bar {BAR}")  # fmt: skip
     variants = ("plain", "full", *options.ablations)
     for name in variants:
-        for _ in prepared(options.work, name, REHEARSAL).steps():
+        for _ in begun(options.work, name, REHEARSAL).steps():
             pass
-    trainers = {name: prepared(options.work, name, options.steps) for name in variants}
+    trainers = {name: begun(options.work, name, options.steps) for name in variants}
     rounds = {name: trainer.steps() for name, trainer in trainers.items()}
     for done in range(0, options.steps, TURN):
         for steps in rounds.values():

@@ -17,28 +17,12 @@ from pathlib import Path
 
 import chebsplat  # isort: skip  # before torch: a busy machine punishes OpenMP threads that wait actively
 import torch
+from prepared import prepared
 
 from chebsplat import cks
-from chebsplat.formats.capture import read_capture
-from chebsplat.formats.features import read_features
-from chebsplat.formats.points import read_points
 from chebsplat.stages.config import Config
-from chebsplat.stages.train_inputs import trainer_of
-from chebsplat.trainer import Trainer
 
 BAR = 3.0  # per cent of the time of training
-
-
-def prepared(work: Path) -> Trainer:
-    config = Config()
-    train = config.train.model_dump()
-    train |= {"coarse_until": 0.0, "encode_from": 0.0, "n_densify": 0, "refresh_every": 10**9}
-    capture, points, features = (
-        read_capture(work / "ingest"), read_points(work / "sfm"), read_features(work / "teacher")
-    )  # fmt: skip
-    trainer = trainer_of(capture, points, features, train, config.describe.model_dump())
-    trainer.refresh()
-    return trainer
 
 
 def main() -> None:
@@ -49,7 +33,11 @@ def main() -> None:
     options = parser.parse_args()
     print(f"chebsplat {chebsplat.__version__}, torch {torch.__version__} on {torch.get_num_threads()} threads; "
           f"{os.cpu_count()} cores, load {os.getloadavg()[0]:.1f}")  # fmt: skip
-    trainer = prepared(options.work)
+    config = Config()
+    train = config.train.model_dump()
+    train |= {"coarse_until": 0.0, "encode_from": 0.0, "n_densify": 0, "refresh_every": 10**9}
+    trainer = prepared(options.work, train, config.describe.model_dump())
+    trainer.refresh()
     assert trainer.model.shape is not None
     projections = trainer.model.shape.encoder.projections()
     began = time.perf_counter()
@@ -70,7 +58,7 @@ def main() -> None:
         cks.basis_loss(trainer.model.shape.encoder.projections(), bases).backward()
         alone.append(time.perf_counter() - began)
     without, with_it = (statistics.median(times[which]) for which in (False, True))
-    n_steps = Config().train.steps
+    n_steps = config.train.steps
     share = 100 * (statistics.median(alone) * n_steps + update) / (without * n_steps)
     found = {
         "projections": len(bases),

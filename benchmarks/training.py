@@ -21,13 +21,12 @@ from unittest import mock
 import numba
 import numpy as np
 import torch
+from prepared import prepared
 
 from chebsplat.formats.capture import read_capture
-from chebsplat.formats.features import read_features
 from chebsplat.formats.points import read_points
 from chebsplat.rasterize import rasterize
 from chebsplat.stages.config import Config
-from chebsplat.stages.train_inputs import trainer_of
 from chebsplat.views import Views
 
 
@@ -44,12 +43,7 @@ def train(work: Path, backend: str, steps: int, seed: int) -> dict[str, Any]:
     config = Config()
     settings, describe = config.train.model_dump(), config.describe.model_dump()
     settings |= {"steps": steps, "seed": seed, "encoder": "off", "max_gaussians": 20_000, "refresh_every": 10**9}
-    capture, points, features = (
-        read_capture(work / "ingest"),
-        read_points(work / "sfm"),
-        read_features(work / "teacher"),
-    )
-    trainer = trainer_of(capture, points, features, settings, describe)
+    trainer = prepared(work, settings, describe)
     with mock.patch("chebsplat.model.rasterize", partial(rasterize, backend=backend)):
         trainer.refresh()
         began = time.perf_counter()
@@ -59,7 +53,7 @@ def train(work: Path, backend: str, steps: int, seed: int) -> dict[str, Any]:
         trainer.views = test_views(work)
         psnr = trainer.held_in_psnr(list(range(len(trainer.views.names))))
     found = {"backend": backend, "steps": steps, "seed": seed, "seconds": seconds, "psnr": psnr}
-    return found | {"gaussians": len(trainer.model), "channels": features.features.shape[-1]}
+    return found | {"gaussians": len(trainer.model), "channels": trainer.model.raw["features"].shape[-1]}
 
 
 def main() -> None:
