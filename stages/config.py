@@ -121,8 +121,8 @@ class TrainSection(_Section):
     sh_degree: int = Field(3, ge=0, le=3)
     max_gaussians: int = Field(40_000, ge=16)
     min_gaussians: int = Field(64, ge=1)
-    width: int = Field(32, ge=4)
-    n_layers: int = Field(2, ge=1)
+    width: int = Field(32, ge=4, le=1024)
+    n_layers: int = Field(2, ge=1, le=64)
     n_heads: int = Field(4, ge=1)
     encode_every: int = Field(4, ge=1)  # steps from one that encodes regions anew to the next
     regions_per_step: int = Field(32, ge=1)  # encoded anew in such a step; the others come from the cache

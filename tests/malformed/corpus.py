@@ -1,0 +1,15 @@
+"""All malformed inputs, by kind."""
+
+from __future__ import annotations
+
+from malformed import settings
+from malformed.case import Case
+
+MODULES = (settings,)
+CASES: list[Case] = [case for module in MODULES for case in module.cases()]
+
+
+def sample(size: int) -> list[Case]:
+    """Evenly through the corpus, so that every kind is among them; the same on every call."""
+    size = min(size, len(CASES))
+    return [CASES[k * len(CASES) // size] for k in range(size)]
