@@ -1,0 +1,79 @@
+"""Files that people or other programs wrote: regular, of bounded size, UTF-8, and parsed or named in a clear error.
+
+Every reader of such a file goes through here, so that a pipe, a device, a folder, a file of gigabytes, bytes that are
+no text and a document nested a thousand levels deep are each refused at once, in the same words everywhere.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import re
+import stat
+import tomllib
+from pathlib import Path
+from typing import Any
+
+from chebsplat.errors import ChebsplatError, InputError
+
+LARGEST = 32 << 20  # bytes of text: a transforms.json of 20,000 frames; as JSON it takes up to 25 times as much memory
+LARGEST_TOML = 1 << 20  # tomllib reads about 2 MB a second
+RESTORE = "restore the file"
+# tomllib takes quadratic time over a dotted key; none of ours has more than four parts
+ENDLESS_KEY = re.compile(r"""(?<![\w"'-])(?:[\w"'-]++[ \t]*+\.[ \t]*+){64}""")
+SURROGATE = re.compile(r"\\u[dD][89abAB]")
+
+
+def regular(path: Path, remedy: str = RESTORE, error: type[ChebsplatError] = InputError) -> os.stat_result:
+    """Size and time of a regular file, links followed; anything else would block, or never end."""
+    try:
+        state = os.stat(path)
+    except FileNotFoundError:
+        raise error(f"{path} is missing; {remedy}") from None
+    except (OSError, ValueError) as fault:  # a looping link, a name too long, a null byte in it
+        raise error(f"{path}: {getattr(fault, 'strerror', None) or fault}; {remedy}") from None
+    if not stat.S_ISREG(state.st_mode):
+        kind = "a folder" if stat.S_ISDIR(state.st_mode) else "a pipe, a socket or a device"
+        raise error(f"{path} is {kind}, not a file; {remedy}")
+    return state
+
+
+def read_text(
+    path: Path, remedy: str = RESTORE, error: type[ChebsplatError] = InputError, largest: int = LARGEST
+) -> str:
+    """The text of a regular UTF-8 file. Raises `error` naming the file and the remedy."""
+    if (size := regular(path, remedy, error).st_size) > largest:
+        raise error(f"{path} has {size} bytes, more than the {largest} that are read; {remedy}")
+    try:
+        return Path(path).read_text(encoding="utf-8-sig")
+    except OSError as fault:
+        raise error(f"{path}: {fault.strerror}; {remedy}") from None
+    except UnicodeDecodeError as fault:
+        raise error(f"{path} is no UTF-8 text (byte {fault.start}); {remedy}") from None
+
+
+def parse_json(path: Path, remedy: str = RESTORE, error: type[ChebsplatError] = InputError) -> Any:
+    """The value in a JSON file. Raises `error`."""
+    text = read_text(path, remedy, error)
+    try:
+        value = json.loads(text)
+        if SURROGATE.search(text):  # half a character: it could be printed, hashed or written nowhere
+            json.dumps(value, ensure_ascii=False).encode()
+    except RecursionError:
+        raise error(f"{path} is nested too deeply; {remedy}") from None
+    except ValueError as fault:
+        raise error(f"{path} does not parse ({fault}); {remedy}") from None
+    return value
+
+
+def parse_toml(path: Path, remedy: str = RESTORE, error: type[ChebsplatError] = InputError) -> dict[str, Any]:
+    """The table in a TOML file. Raises `error`."""
+    text = read_text(path, remedy, error, LARGEST_TOML)
+    try:
+        if ENDLESS_KEY.search(text):
+            raise RecursionError
+        return tomllib.loads(text)
+    except RecursionError:
+        raise error(f"{path} is nested too deeply; {remedy}") from None
+    except ValueError as fault:
+        raise error(f"{path} does not parse ({fault}); {remedy}") from None
