@@ -127,23 +127,22 @@ def read_label_table(path: Path) -> tuple[list[str], np.ndarray | None]:
     """
     if path.suffix != ".npz":
         return list(read_label_set(path)), None
-    import zipfile
+    from chebsplat.formats.npz import finite32, read_npz
 
-    import numpy as np
-
-    try:
-        with np.load(path, allow_pickle=False) as arrays:
-            names = [str(name) for name in arrays["names"]]
-            embeddings = arrays["embeddings"].astype(np.float32) if "embeddings" in arrays.files else None
-    except (OSError, ValueError, KeyError, zipfile.BadZipFile) as error:
-        raise InputError(f"{path} is not an .npz with names and embeddings ({error}); write it again") from None
-    if not names or len(set(names)) != len(names):
-        raise InputError(f"{path}: names are missing or occur twice; write it again")
-    if embeddings is not None and not (
-        embeddings.ndim == 2 and len(embeddings) == len(names) and np.isfinite(embeddings).all()
-    ):
-        raise InputError(f"{path}: embeddings {embeddings.shape} do not fit {len(names)} names; write it again")
-    return names, embeddings
+    arrays = read_npz(path, ("names", "embeddings"), "write it again, with names and embeddings")
+    listed, embeddings = arrays.get("names"), arrays.get("embeddings")
+    if listed is None or listed.ndim != 1 or listed.dtype.kind != "U" or not 0 < len(set(listed)) == len(listed):
+        raise InputError(f"{path}: names are missing, occur twice or are no list of words; write it again")
+    names = [str(name) for name in listed]
+    if embeddings is None:
+        return names, None
+    rows = finite32(embeddings)
+    if rows is None or rows.ndim != 2 or len(rows) != len(names) or not rows.size:
+        raise InputError(
+            f"{path}: embeddings {embeddings.dtype} {embeddings.shape} do not fit {len(names)} names, or are not "
+            "finite; write it again"
+        )
+    return names, rows
 
 
 def read_label_set(path: Path) -> dict[str, list[str]]:

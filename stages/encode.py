@@ -105,15 +105,15 @@ def gaussians(scene: Path, features: Path | None, n_channels: int) -> tuple[dict
 
 def read_features(path: Path, n: int) -> np.ndarray:
     """Features f32 [N, C]. Raises InputError if the file holds anything else."""
-    import numpy as np
+    from chebsplat.formats.npz import finite32, read_npy
 
-    try:
-        values = np.load(path, allow_pickle=False)
-    except (OSError, ValueError) as error:
-        raise InputError(f"{path} is not a readable .npy ({error}); save a float32 array [{n}, C]") from None
-    if not isinstance(values, np.ndarray) or values.ndim != 2 or len(values) != n or not np.isfinite(values).all():
-        raise InputError(f"{path} is not a finite array [{n}, C], one row a Gaussian; save one")
-    return values.astype(np.float32)
+    held = read_npy(path, f"save a float32 array [{n}, C]")
+    values = finite32(held)
+    if values is None or values.ndim != 2 or len(values) != n:
+        raise InputError(
+            f"{path} is {held.dtype} {held.shape}, not a finite array [{n}, C], one row a Gaussian; save one"
+        )
+    return values
 
 
 def opened(path: Path) -> Any:

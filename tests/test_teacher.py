@@ -311,7 +311,7 @@ BAD = {
     "no TOML": (without_settings, 3, "tiny.toml is missing"),
     "broken TOML": (broken_settings, 3, "tiny.toml does not parse"),
     "no table": (without_table, 3, "tiny.npz is missing; correct `labels`"),
-    "not a table": (not_a_table, 3, "tiny.npz is not an .npz"),
+    "not a table": (not_a_table, 3, "tiny.npz is not a readable .npz"),
     "unknown key": (settings(labls="x"), 3, "did you mean labels"),
     "wrong value": (settings(mean=[0.5]), 3, "three numbers"),
     "no labels": (settings(labels=None), 3, "neither `labels` nor `text`"),
