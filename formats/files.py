@@ -11,6 +11,7 @@ import os
 import re
 import stat
 import tomllib
+from collections import Counter
 from pathlib import Path
 from typing import Any
 
@@ -21,7 +22,7 @@ LARGEST_TOML = 1 << 20  # tomllib reads about 2 MB a second
 RESTORE = "restore the file"
 # tomllib takes quadratic time over a dotted key; none of ours has more than four parts
 ENDLESS_KEY = re.compile(r"""(?<![\w"'-])(?:[\w"'-]++[ \t]*+\.[ \t]*+){64}""")
-SURROGATE = re.compile(r"\\u[dD][89abAB]")
+SURROGATE = re.compile(r"\\u[dD][89a-fA-F]")
 
 
 def regular(path: Path, remedy: str = RESTORE, error: type[ChebsplatError] = InputError) -> os.stat_result:
@@ -56,13 +57,22 @@ def parse_json(path: Path, remedy: str = RESTORE, error: type[ChebsplatError] = 
     """The value in a JSON file. Raises `error`."""
     text = read_text(path, remedy, error)
     try:
-        value = json.loads(text)
+        value = json.loads(text, object_pairs_hook=_once)
         if SURROGATE.search(text):  # half a character: it could be printed, hashed or written nowhere
             json.dumps(value, ensure_ascii=False).encode()
     except RecursionError:
         raise error(f"{path} is nested too deeply; {remedy}") from None
     except ValueError as fault:
         raise error(f"{path} does not parse ({fault}); {remedy}") from None
+    return value
+
+
+def _once(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
+    """A JSON object whose keys differ: of two values of one key neither is what its writer meant."""
+    value = dict(pairs)
+    if len(value) < len(pairs):
+        twice = Counter(key for key, _ in pairs).most_common(1)[0][0]
+        raise ValueError(f"{twice[:80]!r} is given twice")
     return value
 
 

@@ -18,6 +18,7 @@ from typing import IO, Any
 import numpy as np
 
 from chebsplat.errors import InputError
+from chebsplat.formats.files import regular
 
 LARGEST = 256 << 20  # bytes that the arrays asked for may take in all, unpacked
 # what numpy and zipfile raise
@@ -55,8 +56,7 @@ def finite32(values: np.ndarray) -> np.ndarray | None:
 
 @contextmanager
 def _readable(path: Path, kind: str, remedy: str) -> Iterator[None]:
-    if not path.is_file():
-        raise InputError(f"{path} is {'no regular file' if path.exists() else 'missing'}; {remedy}")
+    regular(path, remedy)
     try:
         yield
     except _BROKEN as error:

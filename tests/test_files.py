@@ -27,7 +27,10 @@ def test_what_is_no_file_is_refused_at_once(tmp_path, kind):
             read(path)
 
 
-@pytest.mark.parametrize("text", ["[" * 100_000, '{"a":' * 100_000, "1" * 5000, '"\\ud800"', b"\xff", "{", ""])
+@pytest.mark.parametrize(
+    "text",
+    ["[" * 100_000, '{"a":' * 100_000, "1" * 5000, '"\\ud800"', '"\\udc80"', b"\xff", "{", "", '{"a": 1, "a": 2}'],
+)
 def test_json_that_cannot_be_used_is_named(tmp_path, text):
     with pytest.raises(InputError, match=r"a\.json .*; restore the file"):
         parse_json(write(tmp_path / "a.json", text))
