@@ -15,7 +15,7 @@ from chebsplat.formats import artifact, heads
 from chebsplat.formats.artifact import Manifest
 from chebsplat.formats.basis import SCHEMA, Basis, read_basis, write_basis
 from chebsplat.pipelines import bases, store
-from chebsplat.pipelines.basis_cli import basis as command
+from chebsplat.pipelines.cli.basis import basis as command
 
 NAMES = ("blocks.0.query", "blocks.0.key")
 SCENES = ("office0", "room0", "office1")
@@ -149,7 +149,7 @@ def test_what_is_exported_starts_scenes_elsewhere(chain, tmp_path, monkeypatch):
     assert (code, out.strip()) == (0, str(tmp_path / "knowledge"))
     assert call("export", "shared", "--out", tmp_path / "knowledge")[0] == 2  # never overwritten
     monkeypatch.setenv("CHEBSPLAT_WORK", str(tmp_path / "elsewhere"))
-    from chebsplat.pipelines.cli import plans
+    from chebsplat.pipelines.cli.runs import plans
 
     (plan,) = plans(scene="toy", sequence=None, settings="", ablation="", basis=f"{tmp_path}/knowledge/")
     train = next(step for step in plan.steps if step.stage == "train")
@@ -160,7 +160,7 @@ def test_what_is_exported_starts_scenes_elsewhere(chain, tmp_path, monkeypatch):
 
 @pytest.mark.parametrize(("asked", "number"), [("shared@2", 2), ("shared", 3)])
 def test_a_scene_starts_from_the_revision_of_a_head_that_is_named_or_the_newest(chain, asked, number):
-    from chebsplat.pipelines.cli import plans
+    from chebsplat.pipelines.cli.runs import plans
 
     (plan,) = plans(scene="toy", sequence=None, settings="", ablation="", basis=asked)
     assert plan.title == f"toy@basis=shared@{number}"

@@ -4,7 +4,7 @@ import pytest
 from shared import ROOT
 
 from chebsplat.errors import ConfigError, InputError
-from chebsplat.pipelines.cli import checked_stage, plans
+from chebsplat.pipelines.cli.runs import checked_stage, plans
 from chebsplat.pipelines.plan import Planner
 from chebsplat.pipelines.run import wanted_steps
 from chebsplat.pipelines.sequences import chain, scenes_of

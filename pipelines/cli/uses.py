@@ -8,7 +8,6 @@ from pathlib import Path
 import click
 
 from chebsplat.errors import ConfigError
-from chebsplat.pipelines.guard import guarded
 
 
 def scene_folder(scene: str) -> Path:
@@ -36,24 +35,19 @@ def scene_folder(scene: str) -> Path:
 @click.option("--top", type=click.IntRange(1), default=8, show_default=True, help="labels in the table")
 def query(scene: str, text: str, against: str, out: Path | None, top: int) -> None:
     """Where in a finished SCENE is TEXT, such as "something to sit on"? Relevancy by Gaussian, and heat maps."""
+    import logging
 
-    def action() -> int:
-        import logging
+    from chebsplat.pipelines.plan import suffix
+    from chebsplat.stages.query import run as answer
 
-        from chebsplat.pipelines.plan import suffix
-        from chebsplat.stages.query import run as answer
-
-        logging.basicConfig(stream=sys.stderr, format="query: %(message)s", level="WARNING", force=True)
-        logging.getLogger("chebsplat").setLevel("INFO")
-        folder = scene_folder(scene)
-        if not text.strip():
-            raise ConfigError("the query is empty; say what to look for")
-        place = (out or folder / "query" / suffix(text.strip())).absolute()
-        answer(folder, text.strip(), [word.strip() for word in against.split(",") if word.strip()], place, top)
-        print(place)
-        return 0
-
-    guarded(action)
+    logging.basicConfig(stream=sys.stderr, format="query: %(message)s", level="WARNING", force=True)
+    logging.getLogger("chebsplat").setLevel("INFO")
+    folder = scene_folder(scene)
+    if not text.strip():
+        raise ConfigError("the query is empty; say what to look for")
+    place = (out or folder / "query" / suffix(text.strip())).absolute()
+    answer(folder, text.strip(), [word.strip() for word in against.split(",") if word.strip()], place, top)
+    print(place)
 
 
 @click.command("check-teacher")
@@ -62,15 +56,10 @@ def query(scene: str, text: str, against: str, out: Path | None, top: int) -> No
 @click.option("--labels", help="text file of labels; default: the teacher's own")
 def check_teacher(model: Path, photo: Path | None, labels: str | None) -> None:
     """Run one image through a teacher MODEL (.onnx): what it is, what it costs, what it sees."""
+    from chebsplat.stages.teacher_check import check
 
-    def action() -> int:
-        from chebsplat.stages.teacher_check import check
-
-        for what, finding in check(model, photo, labels):
-            print(f"{what:9s}{finding}")
-        return 0
-
-    guarded(action)
+    for what, finding in check(model, photo, labels):
+        print(f"{what:9s}{finding}")
 
 
 @click.command()
@@ -81,17 +70,12 @@ def check_teacher(model: Path, photo: Path | None, labels: str | None) -> None:
 @click.option("--box", help="x0,y0,z0,x1,y1,z1 that centres lie in, scene units")
 def extract(scene: Path, out: Path, labels: tuple[str, ...], min_opacity: float, box: str | None) -> None:
     """Write part of a finished scene (an export artifact) as one PLY: by label, opacity, box."""
+    from chebsplat.stages.extract import corners
+    from chebsplat.stages.extract import extract as write
 
-    def action() -> int:
-        from chebsplat.stages.extract import corners
-        from chebsplat.stages.extract import extract as write
-
-        counts = write(scene, out, labels, min_opacity, corners(box))
-        print(", ".join(f"{name} {number:,}" for name, number in counts.items()), file=sys.stderr)
-        print(out)
-        return 0
-
-    guarded(action)
+    counts = write(scene, out, labels, min_opacity, corners(box))
+    print(", ".join(f"{name} {number:,}" for name, number in counts.items()), file=sys.stderr)
+    print(out)
 
 
 @click.command()
@@ -101,16 +85,11 @@ def extract(scene: Path, out: Path, labels: tuple[str, ...], min_opacity: float,
 @click.option("--out", type=click.Path(path_type=Path), required=True, help="the .npz to write")
 def encode(scene: Path, encoder: Path, features: Path | None, out: Path) -> None:
     """Fused features of a finished scene (an export artifact, or a PLY), by onnxruntime, without torch."""
+    from chebsplat.stages.encode import encode as write
 
-    def action() -> int:
-        from chebsplat.stages.encode import encode as write
-
-        figures = write(scene, encoder, features, out)
-        print(", ".join(f"{name} {value}" for name, value in figures.items()), file=sys.stderr)
-        print(out)
-        return 0
-
-    guarded(action)
+    figures = write(scene, encoder, features, out)
+    print(", ".join(f"{name} {value}" for name, value in figures.items()), file=sys.stderr)
+    print(out)
 
 
-USES = (query, check_teacher, extract, encode)
+COMMANDS = (query, check_teacher, extract, encode)

@@ -1,0 +1,40 @@
+"""The `chebsplat` command: runs, plans, studies, upkeep, uses of a finished scene, and every stage as a command."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import click
+
+from chebsplat.pipelines.cli import runs, upkeep, uses
+from chebsplat.pipelines.cli.basis import basis
+from chebsplat.pipelines.cli.group import Guarded
+from chebsplat.stages.registry import STAGES
+
+
+class Commands(Guarded):
+    """Stages are listed from their table and imported only when called, so that --help stays instant."""
+
+    def list_commands(self, context: click.Context) -> list[str]:
+        return [*super().list_commands(context), *STAGES]
+
+    def get_command(self, context: click.Context, name: str) -> click.Command | None:
+        if name in STAGES:  # for the listing, which shows a name and a line
+            return click.Command(name, help=STAGES[name].help)
+        return super().get_command(context, name)
+
+    def resolve_command(self, context: click.Context, args: list[str]) -> Any:
+        if args[0] in STAGES:
+            from importlib import import_module
+
+            return args[0], import_module(f"chebsplat.stages.{args[0]}").main, args[1:]
+        return super().resolve_command(context, args)
+
+
+@click.group(cls=Commands)
+def main() -> None:
+    """Semantic 3D Gaussian Splatting that understands shape."""
+
+
+for _command in (*runs.COMMANDS, *upkeep.COMMANDS, *uses.COMMANDS, basis):
+    main.add_command(_command)

@@ -1,0 +1,5 @@
+"""`python -m chebsplat.pipelines.cli`."""
+
+from chebsplat.pipelines.cli import main
+
+main()

@@ -1,0 +1,135 @@
+"""`chebsplat basis`: the knowledge that scenes leave behind, by NAME[@REVISION] of a sequence or HEAD, or FOLDER/."""
+
+from __future__ import annotations
+
+import csv
+import os
+import shutil
+import sys
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import click
+
+from chebsplat.errors import ConfigError
+from chebsplat.pipelines.cli.group import Guarded
+
+if TYPE_CHECKING:
+    from chebsplat.formats.basis import Basis
+
+
+@click.group(cls=Guarded)
+def basis() -> None:
+    """Knowledge bases: NAME[@REVISION] of a sequence or of a HEAD, or FOLDER/ of an artifact."""
+
+
+def found(name: str) -> tuple[Path, Basis]:
+    from chebsplat.formats.basis import read_basis
+    from chebsplat.pipelines.bases import revisions
+
+    path = revisions(name)[-1]
+    return path, read_basis(path)
+
+
+def show_rows(table: list[list[str]]) -> None:
+    widths = [max(len(row[k]) for row in table) for k in range(len(table[0]))]
+    for row in table:
+        print("  ".join(cell.ljust(width) for cell, width in zip(row, widths, strict=True)).rstrip())
+
+
+@basis.command()
+@click.argument("name")
+@click.option("--out", type=click.Path(path_type=Path), help="folder for lineage.csv and lineage.png")
+def log(name: str, out: Path | None) -> None:
+    """Revisions: the scene, ranks, ρ before and after, energy; means over projections."""
+    from chebsplat.formats.artifact import read_manifest
+    from chebsplat.pipelines import lineage
+
+    path, one = found(name)
+    show_rows(lineage.log_table(one))
+    if out is not None:
+        out.mkdir(parents=True, exist_ok=True)
+        rows = lineage.records(one)
+        with (out / "lineage.csv").open("w", newline="") as handle:
+            writer = csv.DictWriter(handle, list(rows[0]))
+            writer.writeheader()
+            writer.writerows(rows)
+        lineage.draw(out / "lineage.png", one, read_manifest(path).config["cks"]["max_rank"])
+        print(f"{out}: lineage.csv, lineage.png", file=sys.stderr)
+
+
+@basis.command()
+@click.argument("name")
+def show(name: str) -> None:
+    """One revision: each projection, and which scene added which of its columns."""
+    from chebsplat.pipelines import lineage
+
+    path, one = found(name)
+    print(f"{path}: revision {one.revision}, {len(one.weights)} arrays of weights")
+    show_rows(lineage.show_table(one))
+
+
+@basis.command()
+@click.argument("first")
+@click.argument("second")
+def diff(first: str, second: str) -> None:
+    """What two revisions share, and how far their spans and weights lie apart."""
+    from chebsplat.pipelines import lineage
+
+    (_, one), (_, other) = found(first), found(second)
+    count = lineage.common(one, other)
+    print(f"{count} revisions in common")
+    for name, which in ((first, one), (second, other)):
+        own = [entry["scene"] for entry in which.lineage[count:]]
+        print(f"{name} alone: {', '.join(own) or 'none'}")
+    show_rows(lineage.diff_table(one, other))
+    print(f"weights: {lineage.change_of_weights(one, other)}")
+
+
+@basis.command()
+@click.argument("name")
+def verify(name: str) -> None:
+    """Every revision: digests, BᵀB = I, ranks below their ceiling, each the continuation of the one before."""
+    from chebsplat.pipelines import lineage
+
+    path, one = found(name)
+    chain = lineage.ancestors(path)
+    for number, (revision, earlier) in enumerate(zip(chain, [None, *chain], strict=False), start=1):
+        print(f"{number} {one.lineage[number - 1]['scene']}: {lineage.verify(revision, earlier)}")
+
+
+@basis.command()
+@click.argument("name")
+@click.option("--out", type=click.Path(path_type=Path), required=True, help="folder to make; later: basis=FOLDER/")
+def export(name: str, out: Path) -> None:
+    """Copy a revision, to start scenes from it elsewhere (basis=FOLDER/)."""
+    from chebsplat.formats.artifact import verify as check
+
+    path, _ = found(name)
+    check(path)
+    if out.exists():
+        raise ConfigError(f"{out} exists; choose another --out")
+    scratch = out.with_name(f".tmp-{out.name}-{os.getpid()}")
+    shutil.copytree(path, scratch)
+    os.rename(scratch, out)
+    print(out.absolute())
+
+
+@basis.command()
+@click.argument("name")
+@click.argument("scene")
+def extend(name: str, scene: str) -> None:
+    """Add a finished SCENE (its links' name or folder, or a gaussians artifact) to the HEAD called NAME.
+
+    Any number of processes may do so at once, and one that was killed may be repeated.
+    """
+    from chebsplat.formats.artifact import is_published
+    from chebsplat.pipelines import bases, store
+
+    places = [store.work() / scene / "train", Path(scene) / "train", Path(scene)]
+    gaussians = next((place.resolve() for place in places if is_published(place)), None)
+    if gaussians is None:
+        raise ConfigError(f"{scene} is no trained scene in {store.work()}, and no folder of one; run it first")
+    made = bases.extend(name, gaussians, Path(scene).name.partition("@")[0])
+    print(f"{name}@{len(made)}", file=sys.stderr)
+    print(made[-1])

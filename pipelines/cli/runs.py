@@ -1,0 +1,139 @@
+"""Running and planning: scenes, sequences, studies, and the one step that is a job of Snakemake's."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+from typing import Any
+
+import click
+
+from chebsplat.errors import ConfigError
+from chebsplat.stages.registry import STAGES
+
+
+def plans(scene: str | None, sequence: str | None, settings: str, ablation: str, basis: str) -> list[Any]:
+    """The plan of a scene, after those of the scenes that its basis comes from, or the plans of a sequence."""
+    from chebsplat.pipelines import bases, sequences
+    from chebsplat.pipelines.plan import Planner
+
+    if (scene is None) == (sequence is None):
+        raise ConfigError("name one of scene= and sequence=")
+    if sequence is not None and basis:
+        raise ConfigError("a sequence starts from nothing; basis= goes with scene=")
+    planner = Planner()
+    try:
+        if sequence is not None:
+            return sequences.chain(planner, sequence, settings, ablation)
+        if not basis:
+            return [planner.plan(str(scene), settings, ablation)]
+        earlier, path, name = bases.before(planner, basis, settings, ablation)
+        plan = planner.plan(str(scene), settings, ablation, path)
+        plan.title += ("+" if ablation or settings else "@") + f"basis={name}"
+        for found in earlier:
+            found.asked = False
+        return [*earlier, plan]
+    finally:
+        planner.save()
+
+
+def checked_stage(stage: str | None, found: list[Any]) -> str | None:
+    """Raises ConfigError for a stage that does not exist or that this scene leaves out."""
+    if stage is None:
+        return None
+    if stage not in STAGES:
+        import difflib
+
+        near = difflib.get_close_matches(stage, list(STAGES), 1)
+        raise ConfigError(f"no stage is called {stage}" + (f"; did you mean {near[0]}?" if near else ""))
+    for plan in found:
+        if plan.asked and stage not in plan.targets:
+            raise ConfigError(f"{plan.title} leaves out {stage}: {plan.left_out.get(stage, 'not needed')}")
+    return stage
+
+
+OPTIONS = [
+    click.option("--scene", help="a name from `chebsplat scenes`, or a folder"),
+    click.option("--sequence", help="scenes in order, each starting from the knowledge of those before"),
+    click.option("--set", "settings", default="", help="section.key=value,..."),
+    click.option("--ablation", default="", help="a named set of settings"),
+    click.option(
+        "--basis", default="", help="start from this knowledge: NAME[@REVISION] of a sequence or HEAD, FOLDER/"
+    ),
+]
+
+
+def with_scene(command: Any) -> Any:
+    for option in reversed(OPTIONS):
+        command = option(command)
+    return command
+
+
+@click.command()
+@with_scene
+@click.option("--stage", help="stop after this stage")
+@click.option("--cores", type=click.IntRange(1), default=os.cpu_count())
+def run(stage: str | None, cores: int, **choice: Any) -> int:
+    """Bring a scene up to date; recompute only what is stale."""
+    from chebsplat.pipelines.run import execute
+
+    found = plans(**choice)
+    return execute(found, checked_stage(stage or None, found), cores)
+
+
+@click.command()
+@with_scene
+def plan(**choice: Any) -> None:
+    """Show what would run, what is fresh, and what the scene leaves out, and why."""
+    from chebsplat.pipelines.run import wanted_steps
+
+    chosen = plans(**choice)
+    keys = {step.key for found in chosen if found.asked for step in wanted_steps(found, None, chosen)}
+    for found in chosen:
+        print(f"{found.title}: {found.source}")
+        for step in (step for step in found.steps if step.key in keys):
+            print(f"  {'fresh' if step.fresh else 'would run':9s} {step.stage:9s} {step.key}")
+        for what, why in found.left_out.items():
+            print(f"  left out  {what}: {why}")
+
+
+@click.command()
+@click.argument("name")
+@click.option("--cores", type=click.IntRange(1), default=os.cpu_count(), help="shared by the jobs that run at once")
+@click.option("--threads", type=click.IntRange(1), default=2, show_default=True, help="of each job")
+@click.option("--out", type=click.Path(path_type=Path), help="default: build/studies/NAME")
+@click.option("--plan", "only_plan", is_flag=True, help="say what would run, and stop")
+@click.option("--no-run", is_flag=True, help="write the tables of what is there, and run nothing")
+def study(name: str, cores: int, threads: int, out: Path | None, only_plan: bool, no_run: bool) -> int:
+    """Run a study (of pipelines/configs/studies, or a .toml): its table, figure and page; goes on where it stopped."""
+    from chebsplat.pipelines import results, study_page, transfer
+    from chebsplat.pipelines import study as studies
+    from chebsplat.pipelines.run import Outcome, say
+
+    asked = studies.read_study(name)
+    runs = studies.expand(asked)
+    say(f"{name}: {len(runs)} runs, {sum(run.plan.targets['evaluate'].is_dir() for run in runs)} of them done")
+    if only_plan:
+        print(studies.describe(studies.outstanding(runs)))
+        return 0
+    used = min(threads, cores)
+    folder = out or Path("build/studies") / Path(name).stem
+    outcome = Outcome() if no_run else studies.execute(Path(name).stem, runs, cores, used)
+    rows = [results.row_of(run, outcome.failed) for run in runs]
+    command = f"make study={name} cores={cores} threads={used}"
+    more = transfer.sections(folder, asked, rows) if asked.sequences else []
+    print(study_page.write(folder, asked, runs, rows, command, more).absolute())
+    return outcome.code
+
+
+@click.command(hidden=True)
+@click.argument("plan", type=click.Path(path_type=Path))
+@click.argument("key")
+def job(plan: Path, key: str) -> int:
+    """One step of a plan, as Snakemake runs it."""
+    from chebsplat.pipelines.run import job as run_job
+
+    return run_job(plan, key)
+
+
+COMMANDS = (run, plan, study, job)
