@@ -43,3 +43,9 @@ def test_every_stage_reads_known_sections_and_known_stages():
     for stage in STAGES.values():
         config.Config().sections(stage.sections)
         assert set(stage.roles.values()) <= set(STAGES)
+
+
+def test_every_setting_says_what_it_means():
+    sections = {name: field.annotation.model_fields for name, field in config.Config.model_fields.items()}
+    silent = [f"{name}.{key}" for name, fields in sections.items() for key in fields if not fields[key].description]
+    assert not silent
