@@ -23,7 +23,7 @@ from chebsplat.encoding import Given, prepare
 from chebsplat.formats.encoder import DYNAMIC, FLOAT, read_encoder
 from chebsplat.formats.gaussians import read_gaussians
 from chebsplat.formats.scene import read_scene
-from chebsplat.noisy_teacher import decode
+from chebsplat.noisy_teacher import decode_labels
 from chebsplat.stages.command import n_threads
 from chebsplat.stages.encode import CHUNK, gaussians, opened
 from chebsplat.stages.onnx import restored_fusion
@@ -93,7 +93,7 @@ def main() -> None:
 
     wanted = fused(exact)
     assert scene.label_embeddings is not None
-    labels = decode(wanted, scene.label_embeddings)[0]
+    labels = decode_labels(wanted, scene.label_embeddings)
     taken = milliseconds(routes, arguments.repeats)
     rows = []
     for name, route in routes.items():
@@ -106,7 +106,7 @@ def main() -> None:
                 "fastest": f"{min(taken[name]):.1f}",
                 "encodings_error": f"{np.abs(encodings - exact).max():.1e}",
                 "fused_error": f"{np.abs(found - wanted).max():.1e}",
-                "labels_changed": f"{np.mean(decode(found, scene.label_embeddings)[0] != labels):.4%}",
+                "labels_changed": f"{np.mean(decode_labels(found, scene.label_embeddings) != labels):.4%}",
             }
         )
     arguments.out.mkdir(parents=True, exist_ok=True)

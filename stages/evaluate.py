@@ -132,7 +132,7 @@ def seen(
     import numpy as np
 
     from chebsplat.formats.features import read_features
-    from chebsplat.noisy_teacher import decode
+    from chebsplat.noisy_teacher import decode_labels
     from chebsplat.protocols.task import Named, Seen, resized, translated
 
     def as_classes(labels: np.ndarray) -> np.ndarray:
@@ -158,11 +158,11 @@ def seen(
         shown["renders"].append(image)
         if features is None or scene.label_embeddings is None:
             continue
-        view = Seen(name, features, decode(features, scene.label_embeddings)[0])
+        view = Seen(name, features, decode_labels(features, scene.label_embeddings))
         shown.setdefault("predicted", []).append(as_classes(view.labels))
         if teachers is not None:
             view.teacher = teachers[name].astype(np.float32)
-            small = decode(view.teacher, scene.label_embeddings)[0] if told is None else told[name]
+            small = decode_labels(view.teacher, scene.label_embeddings) if told is None else told[name]
             view.teacher_labels = resized(small, view.labels.shape)
             shown.setdefault("teacher", []).append(as_classes(view.teacher_labels))
         if truths is not None:

@@ -14,7 +14,7 @@ def run(job: Job) -> None:
     from chebsplat.formats.features import read_features
     from chebsplat.formats.gaussians import read_gaussians
     from chebsplat.formats.scene import Scene, write_scene
-    from chebsplat.noisy_teacher import decode
+    from chebsplat.noisy_teacher import decode_labels
 
     gaussians = read_gaussians(job.inputs["gaussians"])
     if len(gaussians.parameters["means"]) == 0:
@@ -33,7 +33,7 @@ def run(job: Job) -> None:
     else:
         teacher = read_features(job.inputs["features"])
         parameters["features"] = semantic[order]
-        labels, _ = decode(parameters["features"], teacher.label_embeddings)
+        labels = decode_labels(parameters["features"], teacher.label_embeddings)
         labelled = {
             "labels": labels.astype(np.int32),
             "label_names": teacher.label_names,

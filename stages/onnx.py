@@ -22,16 +22,20 @@ FUSION = ("features", "encodings", "cover", "means", "centers", "quats", "scales
 
 
 def run(job: Job) -> None:
+    import onnx
+
     from chebsplat.encoder import RegionEncoder
     from chebsplat.formats.encoder import DYNAMIC, FLOAT, FUSED, write_encoder
     from chebsplat.formats.gaussians import read_gaussians
+    from chebsplat.stages.onnx_graphs import encoder_model, fusion_model
 
     gaussians = read_gaussians(job.inputs["gaussians"])
     encoder = RegionEncoder.restored(*gaussians.encoder())
     fusion = restored_fusion(gaussians, encoder.n_channels)
     agreed = contract(encoder, trained_with(job.inputs["gaussians"]))
-    export_encoder(encoder, job.out / FLOAT, job.config.onnx.opset)
-    export_fusion(fusion, encoder.n_channels, job.out / FUSED, job.config.onnx.opset)
+    opset = job.config.onnx.opset
+    onnx.save(encoder_model(encoder, opset), job.out / FLOAT)
+    onnx.save(fusion_model(fusion.gate, opset), job.out / FUSED)
     quantize(job.out / FLOAT, job.out / DYNAMIC)
     for name in (FLOAT, FUSED, DYNAMIC):
         annotate(job.out / name, agreed)
@@ -105,50 +109,6 @@ def fusion_example(n_channels: int, n_regions: int, n_gaussians: int, seed: int 
     return dict(zip(FUSION, (*values, normal(m, 3).exp(), torch.tensor(1.5)), strict=True))
 
 
-def export_encoder(encoder: Any, path: Path, opset: int) -> None:
-    """One self-contained file with dynamic region count and size."""
-    export(encoder, example(encoder, 4, 6), dict.fromkeys(ENCODER, ("regions", "members")), "encodings", path, opset)
-
-
-def export_fusion(fusion: Any, n_channels: int, path: Path, opset: int) -> None:
-    """One self-contained file with dynamic counts of regions, of Gaussians, and of regions that reach one."""
-    dynamic: dict[str, tuple[str, ...]] = dict.fromkeys(FUSION, ("regions",))
-    dynamic |= {"features": ("gaussians",), "means": ("gaussians",), "cover": ("gaussians", "covers"), "radius": ()}
-    export(fusion, fusion_example(n_channels, 5, 7), dynamic, "fused gate", path, opset)
-
-
-def export(
-    module: Any, given: dict[str, Any], dynamic: dict[str, tuple[str, ...]], outputs: str, path: Path, opset: int
-) -> None:
-    """Write a module; `dynamic` names the leading dimensions of each input that may be of any size."""
-    import io
-    import logging
-    import warnings
-    from contextlib import redirect_stdout
-
-    import onnx  # noqa: F401  # torch's exporter loads these two; named, their versions are part of the stage's key
-    import onnxscript  # noqa: F401
-    import torch
-
-    logging.getLogger("torch.onnx._internal.exporter._registration").setLevel("ERROR")  # "torchvision is absent"
-    sizes = {name: torch.export.Dim(name, min=1) for names in dynamic.values() for name in names}
-    shapes = tuple({k: sizes[name] for k, name in enumerate(dynamic[argument])} for argument in given)
-    with warnings.catch_warnings(), redirect_stdout(io.StringIO()):
-        warnings.simplefilter("ignore")  # the exporter warns about its own internals
-        torch.onnx.export(
-            module,
-            tuple(given.values()),
-            path,
-            input_names=list(given),
-            output_names=outputs.split(),
-            opset_version=opset,
-            dynamo=True,
-            dynamic_shapes=shapes,
-            external_data=False,
-            verbose=False,
-        )
-
-
 def quantize(source: Path, target: Path) -> None:
     """Weights in 8 bits, activations quantised as they come."""
     import logging
@@ -172,16 +132,8 @@ def annotate(path: Path, agreed: dict[str, Any]) -> None:
     import onnx
 
     model = onnx.load(path)
-    forget_origin(model)
     onnx.helper.set_model_props(model, {"chebsplat.contract": json.dumps(agreed)})
     onnx.save(model, path)
-
-
-def forget_origin(model: Any) -> None:
-    """Take out what the exporter notes of the code that made a model: paths of this machine, no two alike."""
-    for entry in (model.graph, *model.graph.node, *model.graph.value_info, *model.graph.input, *model.graph.output):
-        del entry.metadata_props[:]
-        entry.doc_string = ""
 
 
 def compare(module: Any, path: Path, given: dict[str, Any]) -> float:

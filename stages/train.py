@@ -70,9 +70,9 @@ def agreement(alone: np.ndarray, features: np.ndarray, embeddings: np.ndarray) -
     """
     import numpy as np
 
-    from chebsplat.noisy_teacher import decode
+    from chebsplat.noisy_teacher import decode_labels
 
-    found, wanted = decode(alone, embeddings)[0], decode(features, embeddings)[0]
+    found, wanted = decode_labels(alone, embeddings), decode_labels(features, embeddings)
     return {"agreement": float((found == wanted).mean()), "commonest": float(np.bincount(wanted).max() / len(wanted))}
 
 

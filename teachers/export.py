@@ -8,7 +8,6 @@ from typing import Any
 import numpy as np
 import torch
 
-from chebsplat.stages.onnx import forget_origin
 from chebsplat.teachers.network import MULTIPLE, Encoder
 
 OPSET = 18
@@ -67,3 +66,10 @@ def _halve(path: Path) -> None:
     forget_origin(model)
     onnx.checker.check_model(model)
     onnx.save(model, str(path))
+
+
+def forget_origin(model: Any) -> None:
+    """Take out what the exporter notes of the code that made a model: paths of this machine, no two alike."""
+    for entry in (model.graph, *model.graph.node, *model.graph.value_info, *model.graph.input, *model.graph.output):
+        del entry.metadata_props[:]
+        entry.doc_string = ""

@@ -54,4 +54,4 @@ def test_a_stage_is_known_by_every_kernel_it_runs_and_every_package_it_loads():
     kernels = [path for path in installed()["chebsplat"].rglob("*.py") if "chebsplat.jit import" in path.read_text()]
     assert len(kernels) > 8
     assert not [path for path in kernels if str(path) not in found]
-    assert {"onnx", "onnxscript", "onnxruntime", "torch"} <= set(code.stage("onnx")["packages"])
+    assert {"onnx", "onnxruntime", "torch"} <= set(code.stage("onnx")["packages"])

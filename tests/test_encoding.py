@@ -9,7 +9,7 @@ from chebsplat.encoder import RegionEncoder, Standardize
 from chebsplat.fusion import Gate, propagate, propagation_weights
 from chebsplat.gaussians import activated, covariances, initial_gaussians, local_shape
 from chebsplat.model import SceneModel
-from chebsplat.noisy_teacher import confusable, confuse_segments, decode, noisy_features, reduced
+from chebsplat.noisy_teacher import confusable, confuse_segments, decode, decode_labels, noisy_features, reduced
 from chebsplat.regions import build_regions, covering
 from chebsplat.stages.config import Config
 from chebsplat.stages.train import agreement
@@ -191,6 +191,7 @@ def test_labels_are_told_in_parts_as_they_are_in_one():
     labels, confidence = decode(features, embeddings)
     cosines = features / np.linalg.norm(features, axis=-1, keepdims=True) @ embeddings.T
     assert np.array_equal(labels, cosines.argmax(-1))
+    assert np.array_equal(labels, decode_labels(features, embeddings))
     assert np.allclose(confidence, 1 / np.exp((cosines - cosines.max(-1, keepdims=True)) / 0.1).sum(-1))
 
 

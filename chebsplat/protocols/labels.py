@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 
 from chebsplat.metrics import IGNORE, boundary_band, confusion, segmentation
-from chebsplat.noisy_teacher import decode
+from chebsplat.noisy_teacher import decode_labels
 from chebsplat.protocols.task import Seen, Task, predicted
 from chebsplat.surface import thinned
 
@@ -58,7 +58,7 @@ def _point_mious(points: list[tuple[np.ndarray, ...]], task: Task) -> dict[str, 
     places, truth, *told = (np.concatenate(parts) for parts in zip(*points, strict=True))
     kept, n = thinned(places), len(task.classes)
     features, weights = task.at(places[kept])
-    labels = predicted(decode(features, task.embeddings)[0], task.names, task.classes, n)
+    labels = predicted(decode_labels(features, task.embeddings), task.names, task.classes, n)
     sides = {"scene": np.where(weights > 0, labels, n)}
     if told:
         sides["teacher"] = predicted(told[0][kept], task.names, task.classes, n)

@@ -17,7 +17,7 @@ from typing import Any
 import numpy as np
 
 from chebsplat.errors import DataFailure
-from chebsplat.noisy_teacher import decode
+from chebsplat.noisy_teacher import decode_labels
 from chebsplat.protocols.task import Seen, Task, bilinear, resized
 
 NAME = "replica-f3"
@@ -58,7 +58,7 @@ def _labels(features: np.ndarray, view: Seen, embeddings: np.ndarray) -> np.ndar
     """Merged ids from 1, [119, 159]."""
     if view.labels.shape[1] > FEATURES[1]:
         features = bilinear(features, FEATURES)
-    return resized(merged(decode(features, embeddings)[0] + 1), LABELS)
+    return resized(merged(decode_labels(features, embeddings) + 1), LABELS)
 
 
 def merged(ids: np.ndarray) -> np.ndarray:

@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 
 from chebsplat.metrics import confusion
-from chebsplat.noisy_teacher import decode
+from chebsplat.noisy_teacher import decode_labels
 from chebsplat.protocols.task import Seen, Task, required, resized, translated
 
 NAME = "scannet-open"
@@ -39,7 +39,7 @@ def measure(views: Iterable[Seen], task: Task) -> dict[str, Any]:
         truth = resized(translated(view.truth, task.classes, classes, -1), SIZE, centred=True)
         sides = {"scene": view.features} | ({} if view.teacher is None else {"teacher": view.teacher})
         for side, features in sides.items():
-            found = resized(translated(decode(features, embeddings)[0], names, classes, -1), SIZE, centred=True)
+            found = resized(translated(decode_labels(features, embeddings), names, classes, -1), SIZE, centred=True)
             sums[side] = sums.get(side, 0) + confusion(found, truth, len(classes))
     return {"classes": classes} | {side: summed([matrix]) for side, matrix in sums.items()}
 
