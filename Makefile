@@ -12,11 +12,11 @@ CHOICE := $(if $(scene),--scene '$(scene)') $(if $(sequence),--sequence '$(seque
 .DEFAULT_GOAL := $(if $(study),study,$(if $(scene)$(sequence),run,help))
 .PHONY: help run study plan verify clean-stale setup test test-all malformed stability bench-raster bench-train bench-descriptor bench-encoder bench-layouts bench-refresh bench-cost bench-knowledge bench-shapes bench-store nouns teacher teacher-quality lint lock
 
-run: $(READY)  ## make scene=NAME|FOLDER [stage=] [set=a.b=c,...] [ablation=] [basis=NAME@REVISION] [cores=]; or sequence=NAME
-	@$(CHEBSPLAT) run $(CHOICE) $(if $(stage),--stage '$(stage)') $(if $(cores),--cores '$(cores)')
+run: $(READY)  ## make scene=NAME|FOLDER [stage=] [set=a.b=c,...] [ablation=] [basis=NAME@REVISION] [cores=] [device=]; or sequence=NAME
+	@$(CHEBSPLAT) run $(CHOICE) $(if $(stage),--stage '$(stage)') $(if $(cores),--cores '$(cores)') $(if $(device),--device '$(device)')
 
 study: $(READY)  ## make study=NAME [cores=] [threads=] [args=--no-run]: its runs, then table, figure, page in build/studies
-	@$(CHEBSPLAT) study '$(study)' $(if $(cores),--cores '$(cores)') $(if $(threads),--threads '$(threads)') $(args)
+	@$(CHEBSPLAT) study '$(study)' $(if $(cores),--cores '$(cores)') $(if $(threads),--threads '$(threads)') $(if $(device),--device '$(device)') $(args)
 
 plan: $(READY)  ## make plan scene=NAME (or study=NAME): what would run, what is fresh, what is left out, and why
 	@$(CHEBSPLAT) $(if $(study),study '$(study)' --plan,plan $(CHOICE))

@@ -67,7 +67,7 @@ def publish(out: Path, manifest: Manifest) -> Iterator[Path]:
         if not is_published(out):
             manifest.files = _file_table(tmp)
             _write_synced(tmp / MANIFEST, json.dumps(asdict(manifest), indent=1, sort_keys=True) + "\n")
-            _sync_tree(tmp)
+            _settle_tree(tmp)
             try:
                 os.rename(tmp, out)
             except OSError:
@@ -146,10 +146,15 @@ def _write_synced(path: Path, text: str) -> None:
         os.fsync(handle.fileno())
 
 
-def _sync_tree(root: Path) -> None:
+def _settle_tree(root: Path) -> None:
+    """Make files outlive a power cut, and as readable as the user's umask has made their folder: some writers give a
+    file to its owner alone.
+    """
+    mode = root.stat().st_mode & 0o666
     for path in root.rglob("*"):
         if path.is_file():
             with path.open("rb") as handle:
+                os.fchmod(handle.fileno(), mode)
                 os.fsync(handle.fileno())
     sync_directory(root)
 

@@ -21,6 +21,7 @@ from chebsplat.pipelines.plan import Plan, Step
 
 HERE = Path(__file__).parent
 # Snakemake's own words go to a file; its jobs inherit the real stderr, which may be a terminal.
+# -P here and PYTHONSAFEPATH below: a module in the folder where the user stands, or in the work folder, is never run.
 SNAKEMAKE = "import sys; sys.stderr = open(sys.argv.pop(1), 'w', 1); from snakemake.cli import main; main()"
 
 
@@ -36,7 +37,17 @@ def say(text: str) -> None:
     print(text, file=sys.stderr, flush=True)
 
 
-def execute(plans: list[Plan], stage: str | None, cores: int) -> int:
+def device_of(wanted: str) -> str:
+    """What `--device` means to all jobs of a run; says once why it is not the GPU that is there."""
+    from chebsplat.stages.device import resolve
+
+    device, why = resolve(wanted)
+    if why:
+        say(why)
+    return device
+
+
+def execute(plans: list[Plan], stage: str | None, cores: int, device: str = "cpu") -> int:
     """Bring plans up to date, up to `stage`; prints the last artifact (the report's page) on stdout. Exit code."""
     asked = [plan for plan in plans if plan.asked]
     steps = {step.key: step for plan in asked for step in wanted_steps(plan, stage, plans)}
@@ -48,7 +59,7 @@ def execute(plans: list[Plan], stage: str | None, cores: int) -> int:
     code = 0
     if stale:
         say(f"  to run: {' '.join(step.stage for step in stale)}   fresh: {len(steps) - len(stale)}")
-        code = snakemake(stale, cores).code
+        code = snakemake(stale, cores, device=device).code
     for plan in plans:
         store.link(plan.title, plan.targets)
     if code:
@@ -72,23 +83,23 @@ def wanted_steps(plan: Plan, stage: str | None, others: Iterable[Plan] = ()) -> 
     return [step for step in by_path.values() if step.key in needed]
 
 
-def snakemake(steps: list[Step], cores: int, threads: int | None = None) -> Outcome:
+def snakemake(steps: list[Step], cores: int, threads: int | None = None, device: str = "cpu") -> Outcome:
     """Run these steps; logs of those that fail stay in `work/.plans`.
 
     Args: threads: of one job, so that cores // threads run at once; `evaluate`, where it measures frames per second,
           then runs alone. None: every job may use all cores.
     """
     state = git_state(HERE)
-    entries = [entry(step, state) for step in steps]
+    entries = [entry(step, state, device) for step in steps]
     for item in entries:
         timed = item["stage"] == "evaluate" and item["config"]["evaluate"]["timing_repeats"] > 0
         item["threads"] = 1 if threads is None else cores if timed else threads
     plan = write_plan(entries)
     folder, words = plan.parent, plan.parent / "snakemake.log"
-    command = [sys.executable, "-c", SNAKEMAKE, str(words), "--workflow-profile", "none"]
+    command = [sys.executable, "-P", "-c", SNAKEMAKE, str(words), "--workflow-profile", "none"]
     command += ["--snakefile", str(HERE / "Snakefile"), "--directory", str(store.work())]
     command += ["--profile", str(HERE / "profiles/default"), "--cores", str(cores), "--config", f"plan={plan}"]
-    environment = os.environ | {"CHEBSPLAT_THREADS": str(threads or cores)}
+    environment = os.environ | {"CHEBSPLAT_THREADS": str(threads or cores), "PYTHONSAFEPATH": "1"}
     done = subprocess.run(command, stdout=subprocess.DEVNULL, env=environment)
     if done.returncode == 0:
         shutil.rmtree(folder, ignore_errors=True)
@@ -143,7 +154,7 @@ def git_state(root: Path) -> dict[str, Any]:
     return {"commit": commit, "dirty": bool(status)}
 
 
-def entry(step: Step, state: dict[str, Any]) -> dict[str, Any]:
+def entry(step: Step, state: dict[str, Any], device: str = "cpu") -> dict[str, Any]:
     """A step as the Snakefile and the job read it."""
     return {
         "stage": step.stage,
@@ -152,12 +163,13 @@ def entry(step: Step, state: dict[str, Any]) -> dict[str, Any]:
         "inputs": {role: str(path) for role, path in step.inputs.items()},
         "config": step.sections,
         "code": step.code | state,
+        "device": device,
     }
 
 
 def job_command(plan: Path, step: dict[str, Any]) -> str:
     """The shell line that the Snakefile runs for a step."""
-    return shlex.join([sys.executable, "-m", "chebsplat.pipelines.cli", "job", str(plan), step["key"]])
+    return shlex.join([sys.executable, "-P", "-m", "chebsplat.pipelines.cli", "job", str(plan), step["key"]])
 
 
 def job(plan: Path, key: str) -> int:
@@ -173,7 +185,7 @@ def job(plan: Path, key: str) -> int:
     handler = logging.FileHandler(f"{files}.log")
     logging.getLogger("chebsplat").addHandler(handler)
     arguments = ["--config", f"{files}.json", "--out", step["path"], "--key", key]
-    arguments += ["--code", json.dumps(step["code"])]
+    arguments += ["--code", json.dumps(step["code"]), "--device", step["device"]]
     for role, path in step["inputs"].items():
         arguments += [f"--in-{role}", path]
     code = 0

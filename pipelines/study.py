@@ -187,7 +187,7 @@ def _knowledge(run: Run) -> list[Step]:
     return [step for step in run.plan.steps if step.stage == "cks"]
 
 
-def execute(name: str, runs: list[Run], cores: int, threads: int) -> Outcome:
+def execute(name: str, runs: list[Run], cores: int, threads: int, device: str = "cpu") -> Outcome:
     """Compute what is outstanding, cores // threads jobs at once; links in `work/study-NAME` keep its artifacts.
 
     A scene (or sequence) and seed is finished, and measured, before the next begins: a study cut short has compared
@@ -201,7 +201,7 @@ def execute(name: str, runs: list[Run], cores: int, threads: int) -> Outcome:
         waiting = outstanding(part)
         if waiting:
             say(f"  {scene}, seed {seed}: {describe(waiting)}; {cores // threads} at once, {threads} threads each")
-            found = snakemake(waiting, cores, threads)
+            found = snakemake(waiting, cores, threads, device)
             outcome = Outcome(max(outcome.code, found.code), outcome.failed | found.failed)
         store.link(f"study-{name}", {run.name: run.plan.targets[LAST] for run in runs})
     return outcome

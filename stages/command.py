@@ -18,6 +18,7 @@ from chebsplat.errors import ChebsplatError
 from chebsplat.formats import artifact
 from chebsplat.formats.artifact import Manifest
 from chebsplat.stages import config as configs
+from chebsplat.stages.device import DEVICES, resolve
 from chebsplat.stages.progress import Progress
 from chebsplat.stages.registry import STAGES
 
@@ -67,7 +68,7 @@ def command(name: str, run: Callable[[Job], None]) -> click.Command:
         click.Option(["--out"], type=click.Path(path_type=Path), required=True, help="the artifact's directory"),
         click.Option(["--key"], help="identity given by the planner; the content's digest otherwise"),
         click.Option(["--code"], hidden=True, help="code identity given by the planner (JSON)"),
-        click.Option(["--device"], type=click.Choice(["auto", "cpu", "cuda"]), default="auto"),
+        click.Option(["--device"], type=click.Choice(DEVICES), default="auto", show_default=True),
         click.Option(["--force"], is_flag=True, help="run even if the artifact exists, and replace it"),
         click.Option(["--progress/--no-progress"], default=None, help="default: when stderr is a terminal"),
         click.Option(["--log-level"], default="info",
@@ -111,7 +112,9 @@ def _run(name: str, run: Callable[[Job], None], options: dict[str, Any], out: Pa
     sources = {role: {"key": m.key, "schema": m.schema} for role, m in found.items()}
     key = options["key"] or artifact.digest({"stage": name, "config": settings, "inputs": sources})
     seed = next((settings[s]["seed"] for s in reversed(stage.sections) if "seed" in settings[s]), None)
-    device = resolve_device(options["device"])
+    device, why = resolve(options["device"])
+    if why:
+        log.info("%s", why)
     manifest = Manifest(stage.schema, key, name, sources, settings, seed, device=device, threads=n_threads(),
                         code=json.loads(options["code"] or "{}"))  # fmt: skip
     progress = Progress(options["progress"])
@@ -127,13 +130,6 @@ def _run(name: str, run: Callable[[Job], None], options: dict[str, Any], out: Pa
         manifest.versions = _versions()
     artifact.discard(scratch)
     log.info("done in %.1f s", manifest.seconds)
-
-
-def resolve_device(wanted: str) -> str:
-    """`cpu` or `cuda`; `auto` takes a GPU only where one is present, without importing torch on a CPU machine."""
-    if wanted == "auto":
-        wanted = "cuda" if Path("/proc/driver/nvidia/version").exists() else "cpu"
-    return wanted
 
 
 def n_threads() -> int:

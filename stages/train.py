@@ -6,7 +6,7 @@ import logging
 from functools import partial
 from typing import TYPE_CHECKING, Any
 
-from chebsplat.errors import ConfigError, DataFailure
+from chebsplat.errors import DataFailure
 from chebsplat.stages.command import Job, command, n_threads
 from chebsplat.stages.resume import Saves
 from chebsplat.stages.train_inputs import first_regions, knowledge, trainer_of
@@ -28,8 +28,6 @@ def run(job: Job) -> None:
     from chebsplat.formats.gaussians import Gaussians, write_gaussians
     from chebsplat.formats.points import read_points
 
-    if job.device == "cuda":
-        raise ConfigError("training runs on the CPU in this version; pass --device cpu")
     train, describe = job.config.train.model_dump(), job.config.describe.model_dump()
     capture, points = read_capture(job.inputs["capture"]), read_points(job.inputs["points"])
     features = read_features(job.inputs["features"]) if "features" in job.inputs and train["semantics"] else None

@@ -2,11 +2,13 @@
 
 import os
 
+import numpy as np
 import pytest
 
 from chebsplat.errors import InputError
 from chebsplat.formats import artifact
 from chebsplat.formats.artifact import Manifest
+from chebsplat.formats.tensors import write_tensors
 
 
 def make(path, text="hello"):
@@ -73,3 +75,17 @@ def test_damage_is_named_with_the_remedy(tmp_path, damage):
 def test_wrong_schema_is_an_input_error(tmp_path):
     with pytest.raises(InputError, match="expected"):
         artifact.read_manifest(make(tmp_path / "x"), "chebsplat.points/1")
+
+
+@pytest.mark.parametrize(("umask", "mode"), [(0o022, 0o644), (0o002, 0o664), (0o077, 0o600)])
+def test_files_are_as_readable_as_the_umask_says_whoever_wrote_them(tmp_path, umask, mode):
+    before = os.umask(umask)
+    try:
+        with artifact.publish(tmp_path / "x", Manifest("chebsplat.capture/1", "k", "ingest")) as tmp:
+            write_tensors(tmp / "a.safetensors", {"a": np.zeros(3, np.float32)})  # gives its file to the owner alone
+            (tmp / "b.txt").write_text("b")
+    finally:
+        os.umask(before)
+    files = [path for path in (tmp_path / "x").rglob("*") if path.is_file()]
+    assert len(files) == 3
+    assert {path.stat().st_mode & 0o777 for path in files} == {mode}

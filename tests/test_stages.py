@@ -2,6 +2,7 @@
 
 import copy
 import json
+import os
 import shutil
 
 import numpy as np
@@ -47,6 +48,14 @@ def test_a_finished_artifact_is_whole_and_a_second_call_does_nothing(toy, stage,
     assert run_stage(stage, toy[stage], inputs_of(toy, stage)) == 0
     assert (toy[stage] / "artifact.json").stat().st_mtime_ns == before
     assert capsys.readouterr().out == f"{toy[stage]}\n"
+
+
+@pytest.mark.parametrize("stage", STAGES)
+def test_others_may_read_an_artifact_as_the_umask_says(toy, stage):
+    umask = os.umask(0o077)
+    os.umask(umask)
+    for path in toy[stage].rglob("*"):
+        assert path.stat().st_mode & 0o777 == (0o777 if path.is_dir() else 0o666) & ~umask, path
 
 
 @pytest.mark.parametrize("stage", STAGES)

@@ -9,6 +9,7 @@ from typing import Any
 import click
 
 from chebsplat.errors import ConfigError
+from chebsplat.stages.device import DEVICES
 from chebsplat.stages.registry import STAGES
 
 
@@ -63,6 +64,9 @@ OPTIONS = [
 ]
 
 
+ON_DEVICE = click.option("--device", type=click.Choice(DEVICES), default="auto", show_default=True)
+
+
 def with_scene(command: Any) -> Any:
     for option in reversed(OPTIONS):
         command = option(command)
@@ -73,12 +77,13 @@ def with_scene(command: Any) -> Any:
 @with_scene
 @click.option("--stage", help="stop after this stage")
 @click.option("--cores", type=click.IntRange(1), default=os.cpu_count())
-def run(stage: str | None, cores: int, **choice: Any) -> int:
+@ON_DEVICE
+def run(stage: str | None, cores: int, device: str, **choice: Any) -> int:
     """Bring a scene up to date; recompute only what is stale."""
-    from chebsplat.pipelines.run import execute
+    from chebsplat.pipelines.run import device_of, execute
 
-    found = plans(**choice)
-    return execute(found, checked_stage(stage or None, found), cores)
+    used, found = device_of(device), plans(**choice)
+    return execute(found, checked_stage(stage or None, found), cores, used)
 
 
 @click.command()
@@ -104,13 +109,14 @@ def plan(**choice: Any) -> None:
 @click.option("--out", type=click.Path(path_type=Path), help="default: build/studies/NAME")
 @click.option("--plan", "only_plan", is_flag=True, help="say what would run, and stop")
 @click.option("--no-run", is_flag=True, help="write the tables of what is there, and run nothing")
-def study(name: str, cores: int, threads: int, out: Path | None, only_plan: bool, no_run: bool) -> int:
+@ON_DEVICE
+def study(name: str, cores: int, threads: int, out: Path | None, only_plan: bool, no_run: bool, device: str) -> int:
     """Run a study (of pipelines/configs/studies, or a .toml): its table, figure and page; goes on where it stopped."""
     from chebsplat.pipelines import results, study_page, transfer
     from chebsplat.pipelines import study as studies
-    from chebsplat.pipelines.run import Outcome, say
+    from chebsplat.pipelines.run import Outcome, device_of, say
 
-    asked = studies.read_study(name)
+    computing, asked = device_of(device), studies.read_study(name)
     runs = studies.expand(asked)
     say(f"{name}: {len(runs)} runs, {sum(run.plan.targets['evaluate'].is_dir() for run in runs)} of them done")
     if only_plan:
@@ -118,7 +124,7 @@ def study(name: str, cores: int, threads: int, out: Path | None, only_plan: bool
         return 0
     used = min(threads, cores)
     folder = out or Path("build/studies") / Path(name).stem
-    outcome = Outcome() if no_run else studies.execute(Path(name).stem, runs, cores, used)
+    outcome = Outcome() if no_run else studies.execute(Path(name).stem, runs, cores, used, computing)
     rows = [results.row_of(run, outcome.failed) for run in runs]
     command = f"make study={name} cores={cores} threads={used}"
     more = transfer.sections(folder, asked, rows) if asked.sequences else []
