@@ -51,7 +51,7 @@ def operators(given: Regions, dtype: torch.dtype) -> tuple[list[Tensor], list[Te
 
 
 def paired(angles: list[Tensor], certainty: Tensor) -> Tensor:
-    """The pairs of angles of METHOD section 2.3, as `describe_reference` forms them."""
+    """The pairs of angles of docs/method.md, section 2, as `describe_reference` forms them."""
     fade = certainty[:, None, None]
     rest = []
     for j in range(1, J):

@@ -12,7 +12,7 @@ _C0 = 0.28209479177387814
 
 
 def local_shape(means: np.ndarray, n_neighbors: int, floor: float = 0.05) -> tuple[np.ndarray, np.ndarray]:
-    """Local covariances by PCA over neighbours (METHOD: initial Gaussians).
+    """Local covariances by PCA over neighbours (docs/method.md, section 1).
 
     Args:
       means:       [N, 3] scene units, N >= 2.

@@ -1,4 +1,4 @@
-"""The noisy-labels teacher: a 2D teacher of known error, for controlled studies (METHOD section 9)."""
+"""The noisy-labels teacher: a 2D teacher of known error, for controlled studies (docs/method.md, section 9)."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The projection from a teacher's channels to the few that scenes are trained in (METHOD section 8)."""
+"""The projection from a teacher's channels to the few that scenes are trained in (docs/method.md, section 8)."""
 
 from __future__ import annotations
 

@@ -30,7 +30,7 @@ def build_regions(
     ids: np.ndarray | None = None,
     earlier: Regions | None = None,
 ) -> Regions:
-    """Cover points with regions (METHOD: sampling).
+    """Cover points with regions (docs/method.md, section 2).
 
     Args:
       means:       [N, 3] scene units; float64 where the scene is far from the origin.

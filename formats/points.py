@@ -30,7 +30,7 @@ class Points:
     names:          of the registered views; the others could not be posed.
     Ks:             f64 [V, 3, 3] pixels; cam_from_world: f64 [V, 4, 4].
     means:          f64 [N, 3] scene units; colors: u8 [N, 3]; normals: f32 [N, 3] unit, facing a camera.
-    covariances:    f32 [N, 3, 3] of the neighbourhood, scaled to the local spacing (METHOD: initial Gaussians).
+    covariances:    f32 [N, 3, 3] of the neighbourhood, scaled to the local spacing (docs/method.md, section 1).
     tracks:         i32 [T, 2] (point, view) observations; empty where points come from depth.
     notes:          how the points came about, reprojection errors, counts.
     """

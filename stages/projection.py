@@ -1,4 +1,6 @@
-"""projection: from a teacher's channels to the fewer that scenes are trained in, one for all scenes (METHOD section 8).
+"""projection: from a teacher's channels to the fewer that scenes are trained in, one for all scenes.
+
+See docs/method.md, section 8.
 
 It is computed from the teacher, its words and reference images, and from nothing of a scene, so that what one scene
 learns about shape and meaning carries over to the next.

@@ -88,7 +88,7 @@ class ProjectionSection(Section):
 
 
 class DescribeSection(Section):
-    """METHOD.md section 2; shared by the describe stage and the refresh inside training."""
+    """docs/method.md, section 2; shared by the describe stage and the refresh inside training."""
 
     # with 10 for a, 8 angles are better than 4 and 30 at ghosts and noisy frames (make bench-shapes)
     n_angles: int = setting(8, "rotations of the anisotropic metric (J)", ge=1)

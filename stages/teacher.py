@@ -97,7 +97,10 @@ def from_encoder(job: Job, capture: Capture, settings: TeacherSection) -> None:
 
 
 def from_labels(job: Job, capture: Capture, settings: TeacherSection) -> Features:
-    """Pseudo labels of known error (METHOD section 9). Every view draws from its own generator, seeded by its name."""
+    """Pseudo labels of known error (docs/method.md, section 9).
+
+    Every view draws from its own generator, seeded by its name.
+    """
     import hashlib
 
     import numpy as np

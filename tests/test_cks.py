@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 
 from chebsplat.cks import basis_loss, project, regularizer, update
 
-ORTHONORMAL = 3e-8  # METHOD section 7, for float32 columns measured in float64
+ORTHONORMAL = 3e-8  # docs/method.md, section 7: for float32 columns measured in float64
 
 
 @pytest.fixture(autouse=True, scope="module")

@@ -1,4 +1,4 @@
-"""Regions that break the printed descriptor (Eqs 1-6; METHOD section 2).
+"""Regions that break the printed descriptor (Eqs 1-6; docs/method.md, section 2).
 
 Errors are those of one region's float32 descriptor against 60 digits, relative to the region's largest value.
 """

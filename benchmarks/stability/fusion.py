@@ -1,4 +1,7 @@
-"""Points and regions that break the printed propagation (Eq 8; METHOD section 4). Errors are those of the weights."""
+"""Points and regions that break the printed propagation (Eq 8; docs/method.md, section 4).
+
+Errors are those of the weights.
+"""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Projections that break the printed knowledge space (Eqs 14-15; METHOD section 7).
+"""Projections that break the printed knowledge space (Eqs 14-15; docs/method.md, section 7).
 
 Errors of `update` are those of orthonormality, max |BᵀB − I|; a ρ outside [0, 1] or not finite is one, too.
 """

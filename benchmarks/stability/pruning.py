@@ -1,4 +1,4 @@
-"""Colours and logits that break printed soft histograms (Eq 13; METHOD section 6) and masks (Eqs 11-12; section 5)."""
+"""Colours and logits that break printed soft histograms (Eq 13) and masks (Eqs 11-12; docs/method.md, section 5)."""
 
 from __future__ import annotations
 

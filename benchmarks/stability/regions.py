@@ -1,4 +1,4 @@
-"""Point sets that break naive farthest-point sampling (METHOD section 2, sampling).
+"""Point sets that break naive farthest-point sampling (docs/method.md, section 2).
 
 Errors are the covering radius of our centres over that of exact sampling, minus 1 (from another first point, which
 alone moves it by a tenth). The naive one samples in float32, in scene units.

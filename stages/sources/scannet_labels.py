@@ -1,4 +1,4 @@
-"""ScanNet's label ids as class names, in the two ways of PROTOCOLS: column `cocomapid`, and 40 NYU classes reduced."""
+"""ScanNet's label ids as class names, in the two ways in use: column `cocomapid`, and 40 NYU classes reduced."""
 
 from __future__ import annotations
 

@@ -1,0 +1,70 @@
+"""What the pages name exists: files, what they define, other pages, settings, equations and artifacts."""
+
+import ast
+import re
+
+import pytest
+from shared import ROOT
+
+from chebsplat.stages.config import known_keys
+from chebsplat.stages.registry import STAGES
+
+PAGES = [ROOT / name for name in ("README.md", "CONTRIBUTING.md")] + sorted((ROOT / "docs").glob("*.md"))
+CODE = re.compile(r"`([\w/]+\.py)(?::([\w.]+))?`|\b((?:chebsplat|formats|stages|pipelines)/[\w/]+\.py):(\w+)")
+LINK = re.compile(r"\]\(([^)#:]+)\)")
+
+
+def defined(path):
+    """Top-level names of a module."""
+    found = set()
+    for node in ast.parse(path.read_text()).body:
+        if isinstance(node, ast.FunctionDef | ast.ClassDef):
+            found.add(node.name)
+        targets = node.targets if isinstance(node, ast.Assign) else [getattr(node, "target", None)]
+        found |= {target.id for target in targets if isinstance(target, ast.Name)}
+    return found
+
+
+@pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)
+def test_every_file_function_and_page_that_is_named_exists(page):
+    text = page.read_text()
+    for match in CODE.finditer(text):
+        file, name = match[1] or match[3], match[2] or match[4]
+        if "/" not in file:  # a file of the reader's, or one of the folder that the sentence is about
+            continue
+        assert (ROOT / file).is_file(), match[0]
+        assert name is None or name in defined(ROOT / file), match[0]
+    for target in LINK.findall(text):
+        assert (page.parent / target).exists(), target
+
+
+def test_the_method_names_where_each_equation_is_computed():
+    text = (ROOT / "docs/method.md").read_text()
+    for number in range(1, 16):
+        row = re.search(rf"^\| {number} \|.*\|$", text, re.MULTILINE)
+        assert row, number
+        assert CODE.search(row[0]), number
+    settings = set(re.findall(r"`((?:describe|train|cks)\.\w+)", text))
+    assert len(settings) > 20
+    assert settings <= set(known_keys())
+
+
+def test_the_architecture_names_reader_and_writer_of_each_artifact():
+    text = (ROOT / "docs/architecture.md").read_text()
+    for stage in STAGES.values():
+        if stage.name == "report":  # a page for people
+            continue
+        schema = stage.schema.removeprefix("chebsplat.")
+        row = re.search(rf"^\| `{schema}` \|.*\|$", text, re.MULTILINE)
+        assert row, schema
+        assert len(CODE.findall(row[0])) == 2, schema
+
+
+def test_citations_of_the_method_lead_to_a_section():
+    sections = set(re.findall(r"^## (\d+)\. ", (ROOT / "docs/method.md").read_text(), re.MULTILINE))
+    cited = set()
+    for layer in ("chebsplat", "formats", "stages", "pipelines", "tests", "benchmarks"):
+        for path in (ROOT / layer).rglob("*.py"):
+            cited |= set(re.findall(r"docs/method\.md, section (\d+)", path.read_text()))
+    assert cited
+    assert cited <= sections
