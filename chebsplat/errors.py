@@ -23,3 +23,11 @@ class DataFailure(ChebsplatError):
     """Well-formed data that the method cannot work with, or a numerical failure."""
 
     exit_code = 4
+
+
+class Stopped(BaseException):
+    """The process was asked to end; like KeyboardInterrupt, no `except Exception` takes it for a failure."""
+
+    def __init__(self, number: int, reason: str):
+        super().__init__(reason)
+        self.exit_code = 128 + number  # as shells give it: 130 for SIGINT, 143 for SIGTERM

@@ -23,7 +23,7 @@ def installed() -> dict[str, Path]:
     return {name: Path(module.__path__[0]) for name, module in layers.items()}
 
 
-PLUMBING = {"stages.config", "stages.settings", "stages.registry", "stages.command", "stages.progress"}
+PLUMBING = {f"stages.{name}" for name in ("config", "settings", "registry", "command", "progress", "stopping")}
 LAYERS = ("formats", "stages", "pipelines")
 
 

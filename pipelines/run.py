@@ -16,13 +16,10 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from chebsplat.pipelines import store
+from chebsplat.pipelines import children, store
 from chebsplat.pipelines.plan import Plan, Step
 
 HERE = Path(__file__).parent
-# Snakemake's own words go to a file; its jobs inherit the real stderr, which may be a terminal.
-# -P here and PYTHONSAFEPATH below: a module in the folder where the user stands, or in the work folder, is never run.
-SNAKEMAKE = "import sys; sys.stderr = open(sys.argv.pop(1), 'w', 1); from snakemake.cli import main; main()"
 
 
 @dataclass
@@ -57,11 +54,13 @@ def execute(plans: list[Plan], stage: str | None, cores: int, device: str = "cpu
         for what, why in plan.left_out.items():
             say(f"  left out: {what} ({why})")
     code = 0
-    if stale:
-        say(f"  to run: {' '.join(step.stage for step in stale)}   fresh: {len(steps) - len(stale)}")
-        code = snakemake(stale, cores, device=device).code
-    for plan in plans:
-        store.link(plan.title, plan.targets)
+    try:
+        if stale:
+            say(f"  to run: {' '.join(step.stage for step in stale)}   fresh: {len(steps) - len(stale)}")
+            code = snakemake(stale, cores, device=device).code
+    finally:  # a run that is stopped names what it has finished
+        for plan in plans:
+            store.link(plan.title, plan.targets)
     if code:
         return code
     if stale:
@@ -96,15 +95,15 @@ def snakemake(steps: list[Step], cores: int, threads: int | None = None, device:
         item["threads"] = 1 if threads is None else cores if timed else threads
     plan = write_plan(entries)
     folder, words = plan.parent, plan.parent / "snakemake.log"
-    command = [sys.executable, "-P", "-c", SNAKEMAKE, str(words), "--workflow-profile", "none"]
-    command += ["--snakefile", str(HERE / "Snakefile"), "--directory", str(store.work())]
-    command += ["--profile", str(HERE / "profiles/default"), "--cores", str(cores), "--config", f"plan={plan}"]
-    environment = os.environ | {"CHEBSPLAT_THREADS": str(threads or cores), "PYTHONSAFEPATH": "1"}
-    done = subprocess.run(command, stdout=subprocess.DEVNULL, env=environment)
-    if done.returncode == 0:
-        shutil.rmtree(folder, ignore_errors=True)
-        return Outcome()
-    return failures(steps, folder, words)
+    arguments = ["--workflow-profile", "none", "--profile", str(HERE / "profiles/default"), "--cores", str(cores)]
+    arguments += ["--snakefile", str(HERE / "Snakefile"), "--directory", str(store.work()), "--config", f"plan={plan}"]
+    keep = False
+    try:
+        keep = children.snakemake(words, arguments, {"CHEBSPLAT_THREADS": str(threads or cores)}) != 0
+        return failures(steps, folder, words) if keep else Outcome()
+    finally:
+        if not keep:
+            shutil.rmtree(folder, ignore_errors=True)
 
 
 def write_plan(entries: list[dict[str, Any]]) -> Path:
@@ -128,8 +127,9 @@ def failures(steps: list[Step], folder: Path, words: Path) -> Outcome:
     for step in steps:
         log, exit_file = (folder / f"{step.stage}-{step.key}.{kind}" for kind in ("log", "exit"))
         if exit_file.is_file():
-            failed[step.key] = (int(exit_file.read_text()), last_word(log), log)
-            say(f"{step.stage} failed with exit code {failed[step.key][0]}; log: {log}")
+            code = int(exit_file.read_text())
+            failed[step.key] = (code, last_word(log), log)
+            say(f"{step.stage} {'was stopped' if code > 128 else 'failed'} with exit code {code}; log: {log}")
         elif log.is_file() and not step.fresh:
             failed[step.key] = (1, "killed before it could report", log)
             say(f"{step.stage} was killed before it could report; log: {log}")
@@ -191,6 +191,7 @@ def job(plan: Path, key: str) -> int:
     code = 0
     try:
         with alone(Path(step["path"])):
+            store.remove_half(Path(step["path"]))
             import_module(f"chebsplat.stages.{step['stage']}").main(arguments, prog_name=step["stage"])
     except SystemExit as stop:
         code = stop.code if isinstance(stop.code, int) else 1

@@ -120,6 +120,13 @@ def _in_use(path: Path, running: set[Path]) -> bool:
     return path.with_name(path.name[len(".part-") :]) in running or time.time() - path.stat().st_mtime < 3600
 
 
+def remove_half(path: Path) -> None:
+    """Remove what killed processes have left of an artifact; its lock must be held."""
+    for half in path.parent.glob(f".tmp-{path.name}-*"):
+        if not _owner_lives(half):
+            shutil.rmtree(half, ignore_errors=True)
+
+
 def _owner_lives(path: Path) -> bool:
     """Whether the process whose number ends the folder's name still runs."""
     owner = path.name.rsplit("-", 1)[-1]

@@ -14,13 +14,14 @@ from typing import Any
 
 import click
 
-from chebsplat.errors import ChebsplatError
+from chebsplat.errors import ChebsplatError, Stopped
 from chebsplat.formats import artifact
 from chebsplat.formats.artifact import Manifest
 from chebsplat.stages import config as configs
 from chebsplat.stages.device import DEVICES, resolve
 from chebsplat.stages.progress import Progress
 from chebsplat.stages.registry import STAGES
+from chebsplat.stages.stopping import half_made, heeded
 
 log = logging.getLogger("chebsplat")
 
@@ -88,13 +89,14 @@ def execute(name: str, run: Callable[[Job], None], options: dict[str, Any]) -> i
             artifact.read_manifest(out, STAGES[name].schema)
             log.info("already there")
         else:
-            _run(name, run, options, out)
+            with heeded():
+                _run(name, run, options, out)
     except ChebsplatError as error:
         log.error("%s", error)
         return error.exit_code
-    except KeyboardInterrupt:
-        log.error("interrupted; nothing was published")
-        return 1
+    except Stopped as stop:
+        log.warning("%s", stop)
+        return stop.exit_code
     except Exception:
         log.exception("crashed; nothing was published")
         return 1
@@ -122,7 +124,7 @@ def _run(name: str, run: Callable[[Job], None], options: dict[str, Any], out: Pa
     began = time.perf_counter()
     if options["force"]:
         artifact.discard(out)
-    with artifact.publish(out, manifest) as tmp:
+    with artifact.publish(out, manifest) as tmp, half_made(tmp):
         job = Job(inputs, config, tmp, scratch, device, progress, manifest.facts)
         with progress.log_to(tmp / "log.jsonl"):
             run(job)

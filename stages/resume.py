@@ -47,9 +47,9 @@ class Saves:
             return None
         return dict(held["state"])
 
-    def offer(self, state: Any) -> None:
-        """Save what `state()` returns if the last save is long ago: whole or not at all."""
-        if time.monotonic() - self.saved < SECONDS:
+    def offer(self, state: Any, now: bool = False) -> None:
+        """Save what `state()` returns if the last save is long ago, or `now`: whole or not at all."""
+        if not now and time.monotonic() - self.saved < SECONDS:
             return
         import torch
 

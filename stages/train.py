@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import logging
+from collections import deque
 from functools import partial
 from typing import TYPE_CHECKING, Any
 
 from chebsplat.errors import DataFailure
 from chebsplat.stages.command import Job, command, n_threads
 from chebsplat.stages.resume import Saves
+from chebsplat.stages.stopping import deferred
 from chebsplat.stages.train_inputs import first_regions, knowledge, trainer_of
 
 if TYPE_CHECKING:
@@ -98,6 +100,8 @@ def follow(job: Job, trainer: Trainer, train: dict[str, Any]) -> list[dict[str, 
     A row holds means of the losses since the row before; its seconds count training alone, not the held-in
     measurements.
     """
+    import numpy as np
+
     n_views = len(trainer.views.names)
     watched = list(range(0, n_views, max(n_views // 4, 1)))[:4]
     saves = Saves(job)
@@ -108,24 +112,38 @@ def follow(job: Job, trainer: Trainer, train: dict[str, Any]) -> list[dict[str, 
         trace, since = held["trace"], held["since"]
         job.facts["resumed_at"] = [*held["resumed_at"], trainer.step]
         log.info("resumed at step %d", trainer.step)
-    rounds = trainer.steps()
-    shown = {"psnr": f"{trace[-1]['psnr']:.2f}"} if trace else {}
-    for figures, status in job.progress.track(rounds, lambda: expected(trainer), "train", start=trainer.step):
-        since.append(figures)
-        if trainer.step % train["report_every"] == 0 or trainer.share >= 1:
-            row = {"step": trainer.step, "seconds": trainer.seconds, "n": figures["n"]}
-            for name in {name for entry in since for name in entry} - row.keys():
-                found = [entry[name] for entry in since if name in entry]  # encodings have a loss in some steps only
-                row[name] = sum(found) / len(found)
-            row |= {"psnr": trainer.held_in_psnr(watched), "sh_kept": trainer.model.sh_kept()}
-            since = []
-            trace.append({k: float(v) for k, v in row.items()})
-            job.progress.record(**trace[-1])
-            shown = {"psnr": f"{row['psnr']:.2f}", "sh": f"{row['sh_kept']:.0%}"}
-        status |= {"loss": f"{figures['loss']:.4f}", "gaussians": figures["n"]} | shown
-        saves.offer(partial(state, trainer, trace, since, job))
+    with deferred() as asked:
+        losses: deque[float] = deque(maxlen=train["encode_every"])  # some terms are in one step of so many alone
+        rounds = job.progress.track(trainer.steps(), lambda: expected(trainer), "train", start=trainer.step)
+        for figures, status in rounds:
+            since.append(figures)
+            if trainer.step % train["report_every"] == 0 or trainer.share >= 1:
+                trace.append(measured(trainer, since, watched))
+                since = []
+                job.progress.record(**trace[-1])
+            losses.append(figures["loss"])
+            status |= {"mean loss": f"{np.mean(losses):.4f}", "gaussians": figures["n"]} | shown(trace)
+            saves.offer(partial(state, trainer, trace, since, job), now=asked.stop is not None)
+            if asked.stop is not None:
+                log.info("saved at step %d; the same command goes on from there", trainer.step)
+                break
     columns = sorted({k for row in trace for k in row}, key=lambda k: (k != "step", k != "seconds", k))
     return [{k: row.get(k, 0.0) for k in columns} for row in trace]
+
+
+def measured(trainer: Trainer, since: list[dict[str, float]], watched: list[int]) -> dict[str, float]:
+    """A row of the trace, from the figures of steps since the row before and the PSNR of the training views watched."""
+    row = {"step": trainer.step, "seconds": trainer.seconds, "n": since[-1]["n"]}
+    for name in {name for entry in since for name in entry} - row.keys():
+        found = [entry[name] for entry in since if name in entry]  # encodings have a loss in some steps only
+        row[name] = sum(found) / len(found)
+    row |= {"psnr": trainer.held_in_psnr(watched), "sh_kept": trainer.model.sh_kept()}
+    return {k: float(v) for k, v in row.items()}
+
+
+def shown(trace: list[dict[str, float]]) -> dict[str, str]:
+    """What the progress line says of the last measurement: on views that are trained on, not on test views."""
+    return {"train PSNR": f"{trace[-1]['psnr']:.2f}", "sh": f"{trace[-1]['sh_kept']:.0%}"} if trace else {}
 
 
 def expected(trainer: Trainer) -> int:

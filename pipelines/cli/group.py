@@ -1,24 +1,33 @@
-"""How a command leaves: what it returns is its exit code, and typed errors become a line on stderr and theirs."""
+"""How a command leaves: what it returns is its exit code; a typed error or a stop becomes a line on stderr and a code."""
 
 from __future__ import annotations
 
 import sys
+from contextlib import suppress
 from typing import NoReturn
 
 import click
 
-from chebsplat.errors import ChebsplatError
+from chebsplat.errors import ChebsplatError, Stopped
+from chebsplat.stages.stopping import heeded
+
+KEPT = "what was finished is kept, and the same command goes on from there"
 
 
 class Guarded(click.Group):
     """A group whose commands return an exit code (nothing: 0) and may raise typed errors."""
 
     def invoke(self, context: click.Context) -> NoReturn:
-        try:
-            code = super().invoke(context)
-        except ChebsplatError as error:
-            print(f"chebsplat: {error}", file=sys.stderr)
-            code = error.exit_code
+        with heeded():
+            try:
+                code = super().invoke(context)
+            except ChebsplatError as error:
+                print(f"chebsplat: {error}", file=sys.stderr)
+                code = error.exit_code
+            except Stopped as stop:
+                with suppress(OSError):  # the terminal may be gone
+                    print(f"chebsplat: {stop}; {KEPT}", file=sys.stderr)
+                code = stop.exit_code
         context.exit(code or 0)
 
     def list_commands(self, context: click.Context) -> list[str]:

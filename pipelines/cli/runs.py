@@ -138,7 +138,9 @@ def study(name: str, cores: int, threads: int, out: Path | None, only_plan: bool
 def job(plan: Path, key: str) -> int:
     """One step of a plan, as Snakemake runs it."""
     from chebsplat.pipelines.run import job as run_job
+    from chebsplat.stages.stopping import watch_lifeline
 
+    watch_lifeline()
     return run_job(plan, key)
 
 

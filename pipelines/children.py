@@ -1,0 +1,61 @@
+"""Processes of a run: none of them outlives it, however it ends."""
+
+from __future__ import annotations
+
+import os
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Mapping
+from contextlib import suppress
+from pathlib import Path
+
+from chebsplat.stages.stopping import LIFELINE, PATIENCE
+
+# Snakemake's own words go to a file; its jobs inherit the real stderr, which may be a terminal. Its standard input, and
+# theirs, is the lifeline (stages/stopping.py): without a run it ends at once, and its jobs stop by themselves.
+SNAKEMAKE = """
+import os, sys, threading
+def watch():
+    while os.read(0, 1):
+        pass
+    os._exit(143)
+threading.Thread(target=watch, daemon=True).start()
+sys.stderr = open(sys.argv.pop(1), "w", 1)
+from snakemake.cli import main
+main()
+"""
+
+
+def snakemake(words: Path, arguments: list[str], environment: Mapping[str, str]) -> int:
+    """Run Snakemake; returns its exit code when it and all that it has started are gone.
+
+    Args: words: a file for what it says; environment: variables beside our own.
+    """
+    reader, writer = os.pipe()
+    with open(reader, "rb") as lifeline, open(writer, "wb") as held:
+        environment = {LIFELINE: str(os.fstat(reader).st_ino), "PYTHONSAFEPATH": "1", **environment}
+        # -P and PYTHONSAFEPATH: a module where the user stands, or in the work folder, is never run. A session of its
+        # own: a terminal's Ctrl-C reaches the run alone, which ends its jobs in good order.
+        process = subprocess.Popen([sys.executable, "-P", "-c", SNAKEMAKE, str(words), *arguments],
+                                   stdin=lifeline, stdout=subprocess.DEVNULL, start_new_session=True,
+                                   env=os.environ | environment)  # fmt: skip
+        try:
+            return process.wait()
+        finally:
+            held.close()
+            if process.poll() != 0:
+                end(process)
+
+
+def end(process: subprocess.Popen[bytes]) -> None:
+    """Wait for the session of a process, whose lifeline has ended; kill what is left of it."""
+    until = time.monotonic() + PATIENCE
+    with suppress(ProcessLookupError):
+        while time.monotonic() < until:
+            process.poll()
+            os.killpg(process.pid, 0)
+            time.sleep(0.02)
+        os.killpg(process.pid, signal.SIGKILL)
+    process.wait()

@@ -1,0 +1,95 @@
+"""A run that is stopped or killed takes all its processes with it, leaves nothing half, and says what is kept."""
+
+import os
+import signal
+import subprocess
+import sys
+import time
+
+import click
+import pytest
+from click.testing import CliRunner
+from soak.tiny import Run, artifacts, contents, hidden, kill
+
+from chebsplat.errors import Stopped
+from chebsplat.pipelines.cli.group import Guarded
+from chebsplat.stages import stopping
+
+
+def in_a_job(run, seconds=120):
+    """Wait until a stage is under way."""
+    until = time.monotonic() + seconds
+    while not hidden(run.work):
+        assert run.process.poll() is None, run.stderr
+        assert time.monotonic() < until
+        time.sleep(0.01)
+    return run
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM, signal.SIGHUP])
+def test_a_stopped_command_says_what_is_kept_and_leaves_as_shells_know_it(number):
+    group = Guarded(commands={"wait": click.Command("wait", callback=lambda: os.kill(os.getpid(), number))})
+    result = CliRunner().invoke(group, ["wait"])
+    assert result.exit_code == 128 + number
+    assert f"stopped by {number.name}; what was finished is kept" in result.stderr
+
+
+def test_a_stopped_run_ends_its_jobs_and_leaves_nothing_half(tmp_path):
+    run = in_a_job(Run(tmp_path / "work"))
+    kill(run.process.pid, signal.SIGTERM)
+    assert run.finish(10) == 143
+    assert not run.alive()
+    assert not hidden(run.work)
+    assert "stopped by SIGTERM; what was finished is kept" in run.stderr
+    assert "Traceback" not in run.stderr
+    assert "failed" not in run.stderr
+    contents(run.work)
+
+
+def test_jobs_end_with_a_run_that_is_killed(tmp_path):
+    run = in_a_job(Run(tmp_path / "work"))
+    kill(run.process.pid, signal.SIGKILL)
+    assert run.seconds_to_end() < 5
+    made = artifacts(run.work)
+    contents(run.work)
+    time.sleep(0.5)
+    assert artifacts(run.work) == made
+
+
+BUSY = """
+import hashlib, sys
+from pathlib import Path
+from chebsplat.stages.stopping import half_made, heeded
+folder = Path(sys.argv[1])
+with heeded(), half_made(folder):
+    folder.mkdir()
+    hashlib.pbkdf2_hmac("sha256", b"", b"", 10**9)
+"""
+
+
+def test_a_process_that_cannot_listen_is_ended_and_leaves_nothing_half(tmp_path):
+    process = subprocess.Popen([sys.executable, "-P", "-c", BUSY, tmp_path / "half"])
+    while not (tmp_path / "half").is_dir():
+        time.sleep(0.01)
+    process.send_signal(signal.SIGTERM)
+    assert process.wait(10) == 143
+    assert not (tmp_path / "half").exists()
+
+
+def test_a_signal_is_heeded_where_the_block_looks_for_it():
+    seen = []
+    with pytest.raises(Stopped) as stop, stopping.heeded(), stopping.deferred() as asked:
+        os.kill(os.getpid(), signal.SIGTERM)
+        seen.append(asked.stop)
+    assert stop.value.exit_code == 143
+    assert seen == [stop.value]
+    assert signal.getsignal(signal.SIGTERM) == signal.SIG_DFL
+
+
+def test_an_ignored_signal_stays_ignored():
+    before = signal.signal(signal.SIGHUP, signal.SIG_IGN)
+    try:
+        with stopping.heeded():
+            os.kill(os.getpid(), signal.SIGHUP)
+    finally:
+        signal.signal(signal.SIGHUP, before)
