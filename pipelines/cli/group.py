@@ -1,4 +1,4 @@
-"""How a command leaves: what it returns is its exit code; a typed error or a stop becomes a line on stderr and a code."""
+"""How a command leaves: its return is the exit code; a typed error or a stop becomes a line on stderr and a code."""
 
 from __future__ import annotations
 
