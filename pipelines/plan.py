@@ -9,9 +9,10 @@ import re
 import tomllib
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from chebsplat.errors import ConfigError, InputError
+from chebsplat.formats.names import unprintable
 from chebsplat.formats.teacher_model import TeacherModel, read_teacher
 from chebsplat.pipelines import store
 from chebsplat.pipelines.code import Code, installed
@@ -26,6 +27,9 @@ from chebsplat.pipelines.needs import (
 from chebsplat.stages.projection import reference_files
 from chebsplat.stages.registry import STAGES, Stage
 from chebsplat.teachers import EMBEDDED
+
+if TYPE_CHECKING:
+    from chebsplat.stages.config import Config
 
 CONFIGS = Path(__file__).parent / "configs"
 
@@ -79,7 +83,7 @@ def read_toml(kind: str, name: str) -> dict[str, Any]:
 
 def scene_values(scene: str) -> tuple[str, dict[str, Any]]:
     """(name, config values) of a named scene, or of a folder of photos, a COLMAP model or a transforms.json."""
-    folder = Path(scene).expanduser()
+    folder = Path(os.path.expanduser(scene))
     if "/" in scene or scene in (".", "..") or (scene not in names("scenes") and folder.is_dir()):
         if not folder.is_dir():
             raise InputError(f"{folder} is not a folder; correct scene=")
@@ -95,14 +99,15 @@ def scene_values(scene: str) -> tuple[str, dict[str, Any]]:
     return scene, values
 
 
-def placed(values: dict[str, Any]) -> dict[str, Any]:
-    """Values whose paths are absolute: stages run in another folder than the one that the user means."""
-    values = dict(values)
+def placed(config: Config) -> Config:
+    """A config whose paths are absolute: stages run in another folder than the one that the user means."""
     for section, key in PLACES:
-        path = values.get(section, {}).get(key)
-        if isinstance(path, str):
-            values[section] = values[section] | {key: str(Path(expanded(path)).expanduser().resolve())}
-    return values
+        held = getattr(config, section)
+        path = getattr(held, key)
+        if path is not None:
+            place = os.path.realpath(os.path.expanduser(expanded(path)))
+            config = config.model_copy(update={section: held.model_copy(update={key: place})})
+    return config
 
 
 def expanded(text: str) -> str:
@@ -121,21 +126,27 @@ def merged(base: dict[str, Any], over: dict[str, Any]) -> dict[str, Any]:
 
 
 def overrides(text: str) -> dict[str, Any]:
-    """`a.b=c,d.e=f` as nested values. Raises ConfigError on anything else."""
+    """`a.b=c,d.e=f` as nested values, spaces about them or not. Raises ConfigError on anything else."""
     values: dict[str, Any] = {}
-    for item in filter(None, re.split(r",(?=[\w.]+=)", text)):
-        key, _, value = item.partition("=")
-        parts = key.strip().split(".")
-        if len(parts) != 2 or not value:
-            raise ConfigError(f"set={item}: section.key=value is needed, such as train.steps=500")
-        try:
-            parsed = tomllib.loads(f"v = {value}")["v"]
-        except tomllib.TOMLDecodeError:
-            parsed = {"on": True, "off": False}.get(value, value)
-        if parts[0] == "train" and parts[1] in ("encoder", "densify") and value == "off":
-            parsed = "off"
-        values.setdefault(parts[0], {})[parts[1]] = parsed
+    for item in filter(None, map(str.strip, re.split(r",(?=\s*[\w.]+\s*=)", text))):
+        key, _, value = (part.strip() for part in item.partition("="))
+        section, _, name = key.partition(".")
+        if unprintable(item) or not (section and name and value) or "." in name:
+            raise ConfigError(f"set={item[:60]!a}: section.key=value is needed, such as train.steps=500")
+        if name in values.setdefault(section, {}):
+            raise ConfigError(f"set={item[:60]}: {key} is given twice; leave one")
+        values[section][name] = parsed(key, value)
     return values
+
+
+def parsed(key: str, value: str) -> Any:
+    """A value as TOML reads it, text where it does not; `on` and `off` are switches, where `off` is no choice."""
+    if value == "off" and key in ("train.encoder", "train.densify"):
+        return value
+    try:
+        return tomllib.loads(f"v = {value}")["v"]
+    except (tomllib.TOMLDecodeError, RecursionError):
+        return {"on": True, "off": False}.get(value, value)
 
 
 class Planner:
@@ -176,7 +187,7 @@ class Planner:
         if settings:
             values = merged(values, overrides(settings))
             title += ("+" if ablation else "@") + suffix(settings)
-        config = configs.build(placed(values), f"scene {scene}")
+        config = placed(configs.build(values, f"scene {scene}"))
         asked = config.source
         source = ingest.resolve(name, asked)
         if source.path:  # REPLICA_ROOT may be relative

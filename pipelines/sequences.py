@@ -2,12 +2,16 @@
 
 from __future__ import annotations
 
-import tomllib
+import os
 from pathlib import Path
 
 from chebsplat.errors import ConfigError
+from chebsplat.formats.files import parse_toml
+from chebsplat.formats.names import unprintable
 from chebsplat.pipelines import plan as planning
 from chebsplat.pipelines.plan import Plan, Planner
+
+LONGEST = 1000  # scenes of a sequence
 
 
 def scenes_of(name: str) -> list[str]:
@@ -15,15 +19,17 @@ def scenes_of(name: str) -> list[str]:
 
     Raises: ConfigError naming the file, or the nearest sequence's name.
     """
-    try:
-        text = Path(name).expanduser().read_text() if name.endswith(".toml") else None
-        values = planning.read_toml("sequences", name) if text is None else tomllib.loads(text)
-    except (OSError, tomllib.TOMLDecodeError) as error:
-        raise ConfigError(f"{name}: {error}") from None
+    if name.endswith(".toml"):
+        values = parse_toml(Path(os.path.expanduser(name)), "correct it", ConfigError)
+    else:
+        values = planning.read_toml("sequences", name)
     scenes = values.get("scenes")
-    if set(values) != {"scenes"} or not scenes or not all(isinstance(scene, str) for scene in scenes):
-        raise ConfigError(f'sequence {name}: it says scenes = ["...", ...], and nothing else')
-    return list(scenes)
+    if set(values) != {"scenes"} or not isinstance(scenes, list) or not 0 < len(scenes) <= LONGEST:
+        raise ConfigError(f'sequence {name}: it says scenes = ["...", ...], at most {LONGEST}, and nothing else')
+    for scene in scenes:
+        if not isinstance(scene, str) or not scene or unprintable(scene):
+            raise ConfigError(f"sequence {name}: scenes: {scene!r:.60} is no scene's name")
+    return scenes
 
 
 def chain(planner: Planner, name: str, settings: str = "", ablation: str = "", length: int | None = None) -> list[Plan]:

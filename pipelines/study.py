@@ -3,33 +3,36 @@
 from __future__ import annotations
 
 import itertools
-import tomllib
+import os
 from collections.abc import Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
-from pydantic import BaseModel, ConfigDict, Field, ValidationError
+from pydantic import AfterValidator, Field, model_validator
 
 from chebsplat.errors import ConfigError
+from chebsplat.formats.files import parse_toml
 from chebsplat.pipelines import plan as planning
 from chebsplat.pipelines import store
 from chebsplat.pipelines.plan import Plan, Planner, Step, merged
 from chebsplat.pipelines.run import Outcome, say, snakemake, wanted_steps
 from chebsplat.pipelines.sequences import scenes_of
+from chebsplat.stages.config import checked
+from chebsplat.stages.settings import Section, Text, printable
 
 LAST = "evaluate"  # a study measures; a page and an ONNX file for each of its runs would be waste
 
 
-class _Strict(BaseModel):
-    model_config = ConfigDict(extra="forbid", frozen=True)
+Sections = dict[str, dict[str, Any]]  # of a config; their values are checked where a run is planned
+Name = Annotated[str, Field(max_length=200), AfterValidator(printable)]
 
 
-class Budgets(_Strict):
+class Budgets(Section):
     """What a run may spend. Every budget is a whole training with its own schedule, never a cut of a longer one."""
 
-    steps: list[int] = []
-    seconds: list[float] = []
+    steps: list[Annotated[int, Field(ge=1, le=1_000_000)]] = Field([], max_length=100)
+    seconds: list[Annotated[float, Field(ge=0.1, le=604_800)]] = Field([], max_length=100)
 
     def settings(self) -> dict[str, dict[str, Any]]:
         """train settings by the budget's name; one unnamed budget, the scene's own, where none is given."""
@@ -38,7 +41,7 @@ class Budgets(_Strict):
         return found or {"": {}}
 
 
-class Study(_Strict):
+class Study(Section):
     """A file of `configs/studies`. `settings`, conditions and variants hold config sections.
 
     Conditions are what results are averaged within (a teacher, a noise level); variants are compared, each with
@@ -49,16 +52,32 @@ class Study(_Strict):
 
     title: str
     about: str
-    scenes: list[str] = []
-    sequences: list[str] = []
-    seeds: list[int] = Field([0], min_length=1)
+    scenes: list[Text] = Field([], max_length=1000)
+    sequences: list[Text] = Field([], max_length=1000)
+    seeds: list[Annotated[int, Field(ge=0, lt=2**31)]] = Field([0], min_length=1, max_length=1000)
     budgets: Budgets = Budgets()
     baseline: str
-    settings: dict[str, dict[str, Any]] = {}
-    conditions: dict[str, dict[str, Any]] = {"": {}}
-    variants: dict[str, dict[str, Any]] = Field(min_length=1)
-    pairs: list[tuple[str, str]] = []  # variants to compare besides, the second with the first
+    settings: Sections = Field({})
+    conditions: dict[Name, Sections] = Field({"": {}}, max_length=1000)
+    variants: dict[Name, dict[str, Any]] = Field(min_length=1, max_length=1000)
+    pairs: list[Annotated[tuple[str, str], Field(strict=False)]] = Field(
+        []
+    )  # compared besides, the second with the first
     against: str = ""  # section.key whose value is the figure's horizontal axis, instead of run time
+
+    @model_validator(mode="after")
+    def _fits_together(self) -> Study:
+        if bool(self.scenes) == bool(self.sequences):
+            raise ValueError("name scenes or sequences, one of them")
+        for name in (self.baseline, *(name for pair in self.pairs for name in pair)):
+            if name not in self.variants:
+                raise ValueError(f"{name[:60]!r} is none of its variants: {', '.join(self.variants)}")
+        kinds = {"ablation": str, "knowledge": bool}
+        for name, variant in self.variants.items():
+            for key, value in variant.items():
+                if not isinstance(value, kinds.get(key, dict)):
+                    raise ValueError(f"variants.{name}.{key}: a {kinds.get(key, dict).__name__} is needed")
+        return self
 
 
 @dataclass(frozen=True)
@@ -96,27 +115,13 @@ def read_study(name: str) -> Study:
 
     Raises ConfigError naming the first bad key, or the nearest study's name.
     """
-    if not name.endswith(".toml"):
-        return checked_study(planning.read_toml("studies", name), f"study {name}")
-    try:
-        return checked_study(tomllib.loads(Path(name).read_text()), name)
-    except (OSError, tomllib.TOMLDecodeError) as error:
-        raise ConfigError(f"{name}: {error}") from None
+    if name.endswith(".toml"):
+        return checked_study(parse_toml(Path(os.path.expanduser(name)), "correct it", ConfigError), name)
+    return checked_study(planning.read_toml("studies", name), f"study {name}")
 
 
 def checked_study(values: dict[str, Any], origin: str) -> Study:
-    try:
-        study = Study.model_validate(values)
-    except ValidationError as error:
-        first = error.errors()[0]
-        raise ConfigError(f"{origin}: {'.'.join(str(p) for p in first['loc'])}: {first['msg']}") from None
-    if bool(study.scenes) == bool(study.sequences):
-        raise ConfigError(f"{origin}: name scenes or sequences, one of them")
-    if study.baseline not in study.variants:
-        raise ConfigError(f"{origin}: baseline {study.baseline} is none of its variants: {', '.join(study.variants)}")
-    for name in (name for pair in study.pairs for name in pair if name not in study.variants):
-        raise ConfigError(f"{origin}: pairs: {name} is none of its variants: {', '.join(study.variants)}")
-    return study
+    return checked(Study, values, origin)
 
 
 def expand(study: Study) -> list[Run]:

@@ -3,46 +3,46 @@
 from __future__ import annotations
 
 import difflib
-import json
-import tomllib
+import re
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
-from pydantic import ValidationError
+from pydantic import BaseModel, ValidationError
 
 from chebsplat.errors import ConfigError
-from chebsplat.stages.settings import (
-    CksSection,
-    DescribeSection,
-    EvaluateSection,
-    ExportSection,
-    IngestSection,
-    OnnxSection,
-    ProjectionSection,
-    ReportSection,
-    SceneSection,
-    Section,
-    SfmSection,
-    SourceSection,
-    TeacherSection,
-    TrainSection,
-)
+from chebsplat.formats.files import parse_json, parse_toml
+from chebsplat.stages import settings as parts
+from chebsplat.stages.settings import Section
+
+Model = TypeVar("Model", bound=BaseModel)
+WORDS = {  # pydantic's kinds of error, in a user's words
+    "int_type": "a whole number is needed",
+    "float_type": "a number is needed",
+    "finite_number": "a finite number is needed",
+    "bool_type": "true or false is needed",
+    "string_type": "text is needed",
+    "model_type": "a table of settings is needed",
+    "dict_type": "a table is needed",
+    "list_type": "a list is needed",
+    "tuple_type": "a list is needed",
+    "too_short": "at least one is needed",
+}
 
 
 class Config(Section):
-    scene: SceneSection = SceneSection()
-    source: SourceSection = SourceSection()
-    ingest: IngestSection = IngestSection()
-    sfm: SfmSection = SfmSection()
-    projection: ProjectionSection = ProjectionSection()
-    teacher: TeacherSection = TeacherSection()
-    describe: DescribeSection = DescribeSection()
-    train: TrainSection = TrainSection()
-    export: ExportSection = ExportSection()
-    onnx: OnnxSection = OnnxSection()
-    cks: CksSection = CksSection()
-    evaluate: EvaluateSection = EvaluateSection()
-    report: ReportSection = ReportSection()
+    scene: parts.SceneSection = parts.SceneSection()
+    source: parts.SourceSection = parts.SourceSection()
+    ingest: parts.IngestSection = parts.IngestSection()
+    sfm: parts.SfmSection = parts.SfmSection()
+    projection: parts.ProjectionSection = parts.ProjectionSection()
+    teacher: parts.TeacherSection = parts.TeacherSection()
+    describe: parts.DescribeSection = parts.DescribeSection()
+    train: parts.TrainSection = parts.TrainSection()
+    export: parts.ExportSection = parts.ExportSection()
+    onnx: parts.OnnxSection = parts.OnnxSection()
+    cks: parts.CksSection = parts.CksSection()
+    evaluate: parts.EvaluateSection = parts.EvaluateSection()
+    report: parts.ReportSection = parts.ReportSection()
 
     def sections(self, names: tuple[str, ...]) -> dict[str, Any]:
         """The named sections as plain JSON-able values."""
@@ -50,39 +50,50 @@ class Config(Section):
 
 
 def load(path: Path) -> Config:
-    """A config from a TOML or JSON file; sections that are not given keep their defaults."""
-    try:
-        text = Path(path).read_text()
-        values = json.loads(text) if Path(path).suffix == ".json" else tomllib.loads(text)
-    except OSError as error:
-        raise ConfigError(f"{path}: {error.strerror}; pass --config with a TOML file") from None
-    except ValueError as error:
-        raise ConfigError(f"{path} does not parse: {error}") from None
-    return build(values, str(path))
+    """A config from a TOML or JSON file; sections that are not given keep their defaults. Raises ConfigError."""
+    parse = parse_json if Path(path).suffix == ".json" else parse_toml
+    return build(parse(path, "correct it, or pass another --config", ConfigError), str(path))
 
 
 def build(values: dict[str, Any], origin: str) -> Config:
     """A checked config. Raises ConfigError naming the first bad key, with the nearest known name."""
+    return checked(Config, values, origin)
+
+
+def checked(model: type[Model], values: Any, origin: str) -> Model:
+    """A model of pydantic's from values that somebody wrote. Raises ConfigError: one line about the first bad key."""
     try:
-        return Config.model_validate(values)
+        return model.model_validate(values)
     except ValidationError as error:
-        first = error.errors()[0]
-        where = ".".join(str(part) for part in first["loc"])
-        raise ConfigError(f"{origin}: {where}: {_advice(first)}") from None
+        fault = error.errors()[0]
+        where = ".".join(_shown(part) for part in fault["loc"])
+        raise ConfigError(
+            f"{origin}: {where}{': ' if where else ''}{_advice(fault, list(model.model_fields))}"
+        ) from None
 
 
 def known_keys() -> list[str]:
     return [f"{s}.{k}" for s, f in Config.model_fields.items() for k in f.annotation.model_fields]  # type: ignore[union-attr]
 
 
-def _advice(error: Any) -> str:
+def _shown(part: Any) -> str:
+    """Part of a key as a line of a message can hold it."""
+    return str(part) if re.fullmatch(r"[\w.-]{1,60}", str(part)) else repr(str(part)[:60])
+
+
+def _advice(error: Any, first: list[str]) -> str:
+    if error["type"] == "value_error":
+        return str(error["ctx"]["error"])
     if error["type"] != "extra_forbidden":
-        return f"{error['msg']} (got {error['input']!r})"
+        said = WORDS.get(error["type"]) or error["msg"].replace("Input should be", "it must be")
+        held = error["input"]
+        got = f"a {type(held).__name__}" if isinstance(held, (dict, list, tuple)) else f"{held!r:.60}"
+        return f"{said} (got {got})"
     loc = [str(part) for part in error["loc"]]
     if len(loc) == 1:
-        near = difflib.get_close_matches(loc[0], list(Config.model_fields), 1)
+        near = difflib.get_close_matches(loc[0][:60], first, 1)
     else:
         elsewhere = [key for key in known_keys() if key.endswith("." + loc[-1])]
         own = [key.split(".")[1] for key in known_keys() if key.startswith(loc[0] + ".")]
-        near = elsewhere or [f"{loc[0]}.{key}" for key in difflib.get_close_matches(loc[-1], own, 1)]
+        near = elsewhere or [f"{loc[0]}.{key}" for key in difflib.get_close_matches(loc[-1][:60], own, 1)]
     return "no such key" + (f"; did you mean {near[0]}?" if near else "")

@@ -8,7 +8,7 @@ from typing import Any
 
 from chebsplat.errors import ConfigError, InputError
 from chebsplat.stages.command import Job, command
-from chebsplat.stages.config import IngestSection, SourceSection
+from chebsplat.stages.settings import IngestSection, SourceSection
 
 
 def resolve(name: str, source: SourceSection) -> SourceSection:

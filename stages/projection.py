@@ -19,7 +19,7 @@ if TYPE_CHECKING:
     import numpy as np
 
     from chebsplat.formats.teacher_model import TeacherModel
-    from chebsplat.stages.config import ProjectionSection
+    from chebsplat.stages.settings import ProjectionSection
 
 IMAGES = (".jpeg", ".jpg", ".png")
 ENTRY = 4  # pixels of an image that an entry of its map is wide, at least

@@ -13,7 +13,7 @@ if TYPE_CHECKING:
     import pycolmap
 
     from chebsplat.formats.capture import Capture
-    from chebsplat.stages.config import SfmSection
+    from chebsplat.stages.settings import SfmSection
 
 log = logging.getLogger("chebsplat")
 

@@ -11,7 +11,7 @@ if TYPE_CHECKING:
     import numpy as np
 
     from chebsplat.formats.capture import Capture
-    from chebsplat.stages.config import SfmSection
+    from chebsplat.stages.settings import SfmSection
 
 
 def run(job: Job) -> None:

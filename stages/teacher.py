@@ -12,7 +12,7 @@ from chebsplat.stages.command import Job, command
 if TYPE_CHECKING:
     from chebsplat.formats.capture import Capture
     from chebsplat.formats.features import Features
-    from chebsplat.stages.config import TeacherSection
+    from chebsplat.stages.settings import TeacherSection
 
 log = logging.getLogger("chebsplat")
 

@@ -23,9 +23,9 @@ def check(model: Path, photo: Path | None = None, labels: str | None = None) -> 
 
     from chebsplat.formats.teacher_model import read_teacher
     from chebsplat.stages.command import n_threads
-    from chebsplat.stages.config import TeacherSection
     from chebsplat.stages.image_encoder import ImageEncoder
     from chebsplat.stages.label_space import MAX_CHANNELS, closed_set, label_set, open_vocabulary
+    from chebsplat.stages.settings import TeacherSection
 
     settings = TeacherSection()
     teacher = read_teacher(model)

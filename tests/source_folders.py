@@ -5,7 +5,7 @@ import json
 import numpy as np
 from PIL import Image
 
-from chebsplat.stages.config import IngestSection
+from chebsplat.stages.settings import IngestSection
 
 SETTINGS = IngestSection(max_side=160, min_views=2)
 SMALL = IngestSection(max_side=160, max_views=6, min_views=2)

@@ -19,8 +19,8 @@ from chebsplat.protocols import (
 )
 from chebsplat.protocols.split import every
 from chebsplat.protocols.task import Named, Seen, Task, bilinear, resized
-from chebsplat.stages.config import IngestSection
 from chebsplat.stages.ingest import split
+from chebsplat.stages.settings import IngestSection
 
 ADE = [replica_f3.SPELT.get(k, f"label_{k}") for k in range(1, 151)]
 ADE[0] = "wall"

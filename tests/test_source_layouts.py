@@ -16,7 +16,7 @@ from chebsplat.formats.artifact import Manifest
 from chebsplat.formats.capture import Capture, write_capture
 from chebsplat.formats.points import read_points
 from chebsplat.protocols import scannet_closed, scannet_open
-from chebsplat.stages.config import IngestSection
+from chebsplat.stages.settings import IngestSection
 from chebsplat.stages.sources import colmap, common, generated, replica, scannet, scannet_labels, seven_scenes
 
 KINDS = {"replica": replica, "colmap": colmap, "scannet": scannet, "seven_scenes": seven_scenes}

@@ -9,7 +9,7 @@ from PIL import Image
 from source_folders import SETTINGS, image, save, write_colmap
 
 from chebsplat.errors import DataFailure, InputError
-from chebsplat.stages.config import IngestSection
+from chebsplat.stages.settings import IngestSection
 from chebsplat.stages.sources import colmap, common, photos
 
 SIZE, FOCAL = (240, 180), 200.0

@@ -10,7 +10,7 @@ from source_folders import SETTINGS, SMALL, change_frame, image, write_transform
 
 from chebsplat.cameras import unproject
 from chebsplat.errors import DataFailure, InputError
-from chebsplat.stages.config import IngestSection
+from chebsplat.stages.settings import IngestSection
 from chebsplat.stages.sources import colmap, common, photos, replica, scannet, seven_scenes, transforms
 
 

@@ -144,7 +144,7 @@ def without_gaussians(toy, tmp):
 
 
 def strict_tolerance(toy, tmp):
-    return inputs_of(toy, "onnx"), changed(onnx={"tolerance": 1e-30})
+    return inputs_of(toy, "onnx"), changed(onnx={"tolerance": 1e-12})
 
 
 def encoder_without_projections(toy, tmp):

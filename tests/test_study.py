@@ -360,35 +360,37 @@ def test_a_study_may_be_a_file_of_the_user_s(tmp_path):
 @pytest.mark.slow
 @pytest.mark.xdist_group("cli")
 def test_a_study_goes_on_after_a_failure_and_a_second_call_computes_only_what_failed(tmp_path, work):
-    (tmp_path / "mine.toml").write_text("""
+    (tmp_path / "vgg.safetensors").write_text("no weights")
+    (tmp_path / "mine.toml").write_text(f"""
 title = "Mine"
-about = "Two trainings, of which one breaks."
+about = "Two runs, of which one breaks."
 scenes = ["toy"]
 baseline = "whole"
 [settings]
-teacher = { kind = "labels" }
-sfm = { max_points = 200 }
-describe = { n_regions = 12 }
-train = { steps = 12, n_densify = 1, report_every = 6 }
+teacher = {{ kind = "labels" }}
+sfm = {{ max_points = 200 }}
+describe = {{ n_regions = 12 }}
+train = {{ steps = 12, n_densify = 1, report_every = 6 }}
 [variants.whole]
-[variants.breaks.train]
-lr_means = 1e30
+[variants.breaks]
+evaluate = {{ lpips_weights = "{tmp_path}/vgg.safetensors" }}
+train = {{ sh_degree = 2 }}
 """)
     command = [sys.executable, "-m", "chebsplat.pipelines.cli", "study", str(tmp_path / "mine.toml")]
     command += ["--cores", "2", "--threads", "1", "--out", str(tmp_path / "out")]
     for to_run in (
         "1 ingest, 1 sfm, 1 teacher, 1 describe, 2 train, 2 export, 2 evaluate",
-        "1 train, 1 export, 1 evaluate",
+        "1 evaluate",
     ):
         done = subprocess.run(command, capture_output=True, text=True, cwd=ROOT, env=os.environ)
-        assert done.returncode == 4, done.stderr
+        assert done.returncode == 3, done.stderr
         assert f"toy, seed 0: to run: {to_run}; 2 at once, 1 threads each" in done.stderr
         assert done.stdout.strip() == str(tmp_path / "out/study.html")
         with (tmp_path / "out/results.csv").open() as handle:
             states = {row["variant"]: row["state"] for row in csv.DictReader(handle)}
         assert states["whole"] == "done"
-        assert states["breaks"].startswith("train failed with exit code 4: step ")
-    assert len(list(work.glob("store/train/*/artifact.json"))) == 1
+        assert states["breaks"].startswith("evaluate failed with exit code 3: ")
+    assert len(list(work.glob("store/evaluate/*/artifact.json"))) == 1
 
 
 @pytest.mark.slow

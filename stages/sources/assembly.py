@@ -16,7 +16,7 @@ from chebsplat.stages.sources.label_images import indexed, label_ids
 from chebsplat.stages.sources.pictures import DEEP, GREY, companion, confidences, nearest, open_photo
 
 if TYPE_CHECKING:
-    from chebsplat.stages.config import IngestSection
+    from chebsplat.stages.settings import IngestSection
 
 WORKERS = 4
 

@@ -1,0 +1,31 @@
+"""Names of views and labels: text that can be printed, searched for, and written as UTF-8."""
+
+from __future__ import annotations
+
+import unicodedata
+from collections import Counter
+from typing import Any
+
+from chebsplat.errors import InputError
+
+LONGEST = 200  # characters of a label or of a view's name
+
+
+def unprintable(text: str, allowed: str = "") -> bool:
+    """Whether text holds control characters, line ends or halves of surrogate pairs other than those allowed."""
+    return any(unicodedata.category(c) in ("Cc", "Cs", "Zl", "Zp") and c not in allowed for c in text)
+
+
+def check_names(names: Any, what: str, where: object, remedy: str) -> None:
+    """Raise InputError unless `names` is a list of different names. A line end within one is allowed."""
+    if not isinstance(names, list) or not all(isinstance(name, str) for name in names):
+        raise InputError(f"{where}: {what} are no list of names; {remedy}")
+    for name in names:
+        if not name.strip() or len(name) > LONGEST or unprintable(name, "\n\t"):
+            raise InputError(
+                f"{where}: {what}: {name[:40]!r} is no usable name: empty, longer than {LONGEST} characters, or with "
+                f"characters that cannot be printed; {remedy}"
+            )
+    for name, count in Counter(names).most_common(1):
+        if count > 1:
+            raise InputError(f"{where}: {what}: {name!r} occurs {count} times; {remedy}")
