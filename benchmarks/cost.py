@@ -16,7 +16,7 @@ import chebsplat  # isort: skip  # before torch: a busy machine punishes OpenMP 
 import torch
 from prepared import prepared
 
-from chebsplat.pipelines.plan import read_toml
+from chebsplat.pipelines.scenes import read_toml
 from chebsplat.stages.config import Config
 from chebsplat.trainer import Trainer
 

@@ -15,8 +15,9 @@ from chebsplat.errors import ConfigError
 from chebsplat.formats import artifact, heads
 from chebsplat.formats.basis import SCHEMA, read_lineage
 from chebsplat.pipelines import store
-from chebsplat.pipelines.plan import Plan, Planner, names
+from chebsplat.pipelines.plan import Plan, Planner
 from chebsplat.pipelines.run import HERE, entry, git_state, job, write_plan
+from chebsplat.pipelines.scenes import names
 from chebsplat.pipelines.sequences import chain, scenes_of
 from chebsplat.stages.registry import STAGES
 

@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import difflib
 import hashlib
-import os
 import re
 import tomllib
 from dataclasses import dataclass, field
@@ -14,7 +12,7 @@ from typing import TYPE_CHECKING, Any
 from chebsplat.errors import ConfigError, InputError
 from chebsplat.formats.names import unprintable
 from chebsplat.formats.teacher_model import TeacherModel, read_teacher
-from chebsplat.pipelines import store
+from chebsplat.pipelines import folders, store
 from chebsplat.pipelines.code import Code, installed
 from chebsplat.pipelines.keys import PLACES, content_hash, step_key
 from chebsplat.pipelines.needs import (
@@ -24,14 +22,13 @@ from chebsplat.pipelines.needs import (
     source_sentence,
     teacher_kind,
 )
+from chebsplat.pipelines.scenes import absent, expanded, folder_of, read_toml, scene_values
 from chebsplat.stages.projection import reference_files
 from chebsplat.stages.registry import STAGES, Stage
 from chebsplat.teachers import EMBEDDED
 
 if TYPE_CHECKING:
     from chebsplat.stages.config import Config
-
-CONFIGS = Path(__file__).parent / "configs"
 
 
 @dataclass
@@ -68,37 +65,6 @@ class Plan:
         return {step.stage: step.path for step in self.steps}
 
 
-def names(kind: str) -> list[str]:
-    return sorted(path.stem for path in (CONFIGS / kind).glob("*.toml"))
-
-
-def read_toml(kind: str, name: str) -> dict[str, Any]:
-    """A config of ours. Raises ConfigError with the nearest names."""
-    path = CONFIGS / kind / f"{name}.toml"
-    if not path.is_file():
-        near = difflib.get_close_matches(name, names(kind), 3) or names(kind)
-        raise ConfigError(f"no {kind[:-1]} is called {name}; did you mean {', '.join(near)}?")
-    return tomllib.loads(path.read_text())
-
-
-def scene_values(scene: str) -> tuple[str, dict[str, Any]]:
-    """(name, config values) of a named scene, or of a folder of photos, a COLMAP model or a transforms.json."""
-    folder = Path(os.path.expanduser(scene))
-    if "/" in scene or scene in (".", "..") or (scene not in names("scenes") and folder.is_dir()):
-        if not folder.is_dir():
-            raise InputError(f"{folder} is not a folder; correct scene=")
-        from chebsplat.stages.sources.common import detect
-
-        parts = folder.resolve().parts[1:]
-        words = next((k for k in range(1, len(parts)) if re.search(r"[a-zA-Z]", parts[-k])), 1)  # "dense/0" is no "0"
-        name = re.sub(r"[^\w.-]+", "-", "-".join(parts[-words:])).lstrip(".") or "scene"
-        name += "-scene" if name == "store" else ""  # links lie beside the store
-        return name, {"scene": {"name": name}, "source": {"kind": detect(folder), "path": str(folder)}}
-    values = read_toml("scenes", scene)
-    values.setdefault("scene", {})["name"] = scene
-    return scene, values
-
-
 def placed(config: Config) -> Config:
     """A config whose paths are absolute: stages run in another folder than the one that the user means."""
     for section, key in PLACES:
@@ -108,11 +74,6 @@ def placed(config: Config) -> Config:
             place = os.path.realpath(os.path.expanduser(expanded(path)))
             config = config.model_copy(update={section: held.model_copy(update={key: place})})
     return config
-
-
-def expanded(text: str) -> str:
-    """`${NAME:-default}` by the environment."""
-    return re.sub(r"\$\{(\w+):-([^}]*)\}", lambda m: os.environ.get(m[1]) or m[2], text)
 
 
 def suffix(settings: str) -> str:
@@ -150,11 +111,15 @@ def parsed(key: str, value: str) -> Any:
 
 
 class Planner:
-    """Plans scenes; remembers hashes of code and raw files between runs."""
+    """Plans scenes; remembers hashes of code and raw files between runs.
 
-    def __init__(self, folders: dict[str, Path] | None = None):
+    Args: code: where the layers lie; running: what is planned will run, so that the work folder is made, and a folder
+          gets its name for good.
+    """
+
+    def __init__(self, code: dict[str, Path] | None = None, running: bool = False):
         self.code_memo, self.file_memo = store.Memo("code"), store.Memo("files")
-        self.code = Code(folders or installed(), self.code_memo.values)
+        self.code, self.running = Code(code or installed(), self.code_memo.values), running
 
     def save(self) -> None:
         self.code_memo.save()
@@ -179,8 +144,7 @@ class Planner:
         from chebsplat.stages import ingest
 
         name, own = scene_values(scene)
-        values = merged(own, values or {})
-        title = name
+        values, title = merged(own, values or {}), ""
         if ablation:
             values = merged(values, read_toml("ablations", ablation))
             title += f"@{ablation}"
@@ -192,7 +156,7 @@ class Planner:
         source = ingest.resolve(name, asked)
         if source.path:  # REPLICA_ROOT may be relative
             source = source.model_copy(update={"path": str(Path(source.path).expanduser().resolve())})
-        probe, files = self._probe(source)
+        probe, files = self._probe(source, scene)
         kind, why = teacher_kind(config, probe)
         teacher = config.teacher.model_copy(update={"kind": kind})
         if kind == "onnx" and teacher.model is None:
@@ -218,7 +182,17 @@ class Planner:
                 inputs["basis"] = basis
             keys = {role: path.name for role, path in inputs.items()}
             steps[stage.name] = self.step(stage, config, inputs, keys, raw.get(stage.name))
+        title = self._named(scene) + title
         return Plan(title, source_sentence(name, asked, source), list(steps.values()), left_out)
+
+    def _named(self, scene: str) -> str:
+        """The name of a scene's links."""
+        folder = folder_of(scene)
+        if self.running:
+            store.work().mkdir(parents=True, exist_ok=True)
+        if folder is None:
+            return scene
+        return folders.claim(folder) if self.running else folders.name_of(folder)
 
     def step(
         self, stage: Stage, config: Any, inputs: dict[str, Path], keys: dict[str, str], raw: str | None = None
@@ -228,7 +202,7 @@ class Planner:
         key = step_key(stage, sections, keys, code, raw)
         return Step(stage.name, key, store.artifact_path(stage.name, key), inputs, sections, code)
 
-    def _probe(self, source: Any) -> tuple[dict[str, bool], list[Path]]:
+    def _probe(self, source: Any, scene: str) -> tuple[dict[str, bool], list[Path]]:
         """What the source has, and the raw files its capture depends on."""
         if source.kind == "generated":
             return {"poses": True, "depth": True, "labels": True}, []
@@ -236,7 +210,7 @@ class Planner:
 
         folder = Path(source.path)
         if not folder.is_dir():
-            raise InputError(f"{folder} is not a folder; correct source.path")
+            raise absent(scene, folder)
         module = import_module(f"chebsplat.stages.sources.{source.kind}")
         return module.probe(folder), module.files(folder)
 

@@ -8,8 +8,8 @@ from pathlib import Path
 from chebsplat.errors import ConfigError
 from chebsplat.formats.files import parse_toml
 from chebsplat.formats.names import unprintable
-from chebsplat.pipelines import plan as planning
 from chebsplat.pipelines.plan import Plan, Planner
+from chebsplat.pipelines.scenes import read_toml
 
 LONGEST = 1000  # scenes of a sequence
 
@@ -22,7 +22,7 @@ def scenes_of(name: str) -> list[str]:
     if name.endswith(".toml"):
         values = parse_toml(Path(os.path.expanduser(name)), "correct it", ConfigError)
     else:
-        values = planning.read_toml("sequences", name)
+        values = read_toml("sequences", name)
     scenes = values.get("scenes")
     if set(values) != {"scenes"} or not isinstance(scenes, list) or not 0 < len(scenes) <= LONGEST:
         raise ConfigError(f'sequence {name}: it says scenes = ["...", ...], at most {LONGEST}, and nothing else')

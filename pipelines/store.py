@@ -6,6 +6,7 @@ import json
 import os
 import shutil
 import time
+from collections.abc import Container
 from contextlib import suppress
 from pathlib import Path
 from typing import Any
@@ -39,8 +40,9 @@ class Memo:
         self._before = json.dumps(self.values, sort_keys=True)
 
     def save(self) -> None:
+        """Nothing where there is no work folder: a run makes one, planning does not."""
         text = json.dumps(self.values, sort_keys=True)
-        if text != self._before:
+        if text != self._before and work().is_dir():
             self.path.parent.mkdir(parents=True, exist_ok=True)
             tmp = self.path.with_suffix(f".{os.getpid()}")
             tmp.write_text(text)
@@ -70,14 +72,16 @@ def link(scene: str, targets: dict[str, Path]) -> Path:
     return folder
 
 
-def unnamed() -> list[tuple[Path, int]]:
+def unnamed(without: Container[Path] = ()) -> list[tuple[Path, int]]:
     """Artifacts that no link and no running plan reaches, neither directly nor as an input, and leftovers of runs that
     failed or were killed; with bytes. Raises InputError if a manifest is damaged.
+
+    Args: without: folders whose links count for nothing.
     """
     base = work()
     if not (base / "store").is_dir():
         return []
-    waiting = [p.resolve() for p in base.glob("*/*") if p.is_symlink()]
+    waiting = [p.resolve() for p in base.glob("*/*") if p.is_symlink() and p.parent not in without]
     running = _running(base)
     waiting += [path.resolve() for path in running]
     by_key = {p.name: p.resolve() for p in base.glob("store/*/*") if not p.name.startswith(".")}

@@ -13,10 +13,10 @@ from pydantic import AfterValidator, Field, model_validator
 
 from chebsplat.errors import ConfigError
 from chebsplat.formats.files import parse_toml
-from chebsplat.pipelines import plan as planning
 from chebsplat.pipelines import store
-from chebsplat.pipelines.plan import Plan, Planner, Step, merged
+from chebsplat.pipelines.plan import Plan, Planner, Step, merged, suffix
 from chebsplat.pipelines.run import Outcome, say, snakemake, wanted_steps
+from chebsplat.pipelines.scenes import read_toml, scene_values
 from chebsplat.pipelines.sequences import scenes_of
 from chebsplat.stages.config import checked
 from chebsplat.stages.settings import Section, Text, printable
@@ -107,7 +107,7 @@ class Run:
     def name(self) -> str:
         """For its link, and for people."""
         parts = (self.condition, self.variant, self.budget, self.sequence, self.place or "", self.scene)
-        return planning.suffix("-".join(str(p) for p in parts if p).replace(" ", "")) + f"-seed{self.seed}"
+        return suffix("-".join(str(p) for p in parts if p).replace(" ", "")) + f"-seed{self.seed}"
 
 
 def read_study(name: str) -> Study:
@@ -117,20 +117,22 @@ def read_study(name: str) -> Study:
     """
     if name.endswith(".toml"):
         return checked_study(parse_toml(Path(os.path.expanduser(name)), "correct it", ConfigError), name)
-    return checked_study(planning.read_toml("studies", name), f"study {name}")
+    return checked_study(read_toml("studies", name), f"study {name}")
 
 
 def checked_study(values: dict[str, Any], origin: str) -> Study:
     return checked(Study, values, origin)
 
 
-def expand(study: Study) -> list[Run]:
+def expand(study: Study, running: bool = False) -> list[Run]:
     """Every run, planned; scenes vary slowest and variants fastest, so that a study cut short has compared something.
+
+    Args: running: of `Planner`.
 
     Raises: ConfigError, InputError.
     Choices: all runs of a condition are measured under one protocol, since figures of two must not meet in a mean.
     """
-    planner = Planner()
+    planner = Planner(running=running)
     chains = [("", [scene]) for scene in study.scenes]
     chains += [(Path(name).stem, scenes_of(name)) for name in study.sequences]
     order = list(study.budgets.settings())
@@ -162,7 +164,7 @@ def _chain(
     budgets = study.budgets.settings()
     for place, scene in enumerate(chain, start=1):
         values = merged(study.settings, study.conditions[condition])
-        values = merged(values, planning.read_toml("ablations", ablation) if ablation else {})
+        values = merged(values, read_toml("ablations", ablation) if ablation else {})
         values = merged(values, own)
         earlier = basis
         for budget, spent in budgets.items():
@@ -177,7 +179,7 @@ def _chain(
 
 def seeded(scene: str, values: dict[str, Any], seed: int) -> dict[str, Any]:
     """A seed's settings: training's, and the noise of pseudo labels. A teacher that draws nothing is computed once."""
-    kind = merged(planning.scene_values(scene)[1], values).get("teacher", {}).get("kind")
+    kind = merged(scene_values(scene)[1], values).get("teacher", {}).get("kind")
     return {"train": {"seed": seed}} | ({"teacher": {"seed": seed}} if kind == "labels" else {})
 
 

@@ -46,3 +46,14 @@ def mixed(toy, tmp_path_factory):
     with artifact.publish(path, Manifest(SCHEMA, "k", "test")) as tmp:
         write_scene(tmp, before)
     return checkpoint, path
+
+
+@pytest.fixture
+def quick_plans(tmp_path, monkeypatch):
+    """A work folder that is not there yet, beside where the test stands; planning does not read the code."""
+    from chebsplat.pipelines.code import Code
+
+    monkeypatch.setattr(Code, "stage", lambda self, name: {"hash": name})
+    monkeypatch.setenv("CHEBSPLAT_WORK", str(tmp_path / "work"))
+    monkeypatch.chdir(tmp_path)
+    return tmp_path / "work"

@@ -73,3 +73,20 @@ def run_stage(stage, out, inputs=None, config=None):
     with pytest.raises(SystemExit) as stop:
         import_module(f"chebsplat.stages.{stage}").main(arguments, prog_name=stage)
     return stop.value.code
+
+
+def finish(plan):
+    """Pretend that every step of a plan has run."""
+    for step in plan.steps:
+        step.path.mkdir(parents=True, exist_ok=True)
+        inputs = {role: {"key": path.name} for role, path in step.inputs.items()}
+        (step.path / "artifact.json").write_text(json.dumps({"inputs": inputs, "seconds": 1.0}))
+
+
+def photo_folder(folder):
+    from PIL import Image
+
+    folder.mkdir(parents=True)
+    for k in range(4):
+        Image.new("RGB", (32, 24), (60 * k, 0, 0)).save(folder / f"{k}.jpg")
+    return f"{folder}/"

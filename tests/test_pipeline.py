@@ -7,14 +7,15 @@ import subprocess
 import sys
 
 import pytest
-from shared import ROOT
+from shared import ROOT, finish, photo_folder
 
 from chebsplat.errors import ConfigError, InputError
 from chebsplat.pipelines import store
 from chebsplat.pipelines.code import installed
 from chebsplat.pipelines.keys import content_hash
-from chebsplat.pipelines.plan import CONFIGS, Planner, names, overrides, read_toml, suffix
+from chebsplat.pipelines.plan import Planner, overrides, suffix
 from chebsplat.pipelines.run import failures
+from chebsplat.pipelines.scenes import CONFIGS, names, read_toml
 from chebsplat.stages.registry import STAGES
 
 ALL = [stage for stage in STAGES if stage not in ("projection", "cks")]  # of a scene: a projection is its teacher's
@@ -37,14 +38,6 @@ def source_tree(tmp_path):
         folders[name] = tmp_path / "code" / name
         shutil.copytree(folder, folders[name], ignore=shutil.ignore_patterns("__pycache__"))
     return folders
-
-
-def finish(plan):
-    """Pretend that every step has run."""
-    for step in plan.steps:
-        step.path.mkdir(parents=True, exist_ok=True)
-        inputs = {role: {"key": path.name} for role, path in step.inputs.items()}
-        (step.path / "artifact.json").write_text(json.dumps({"inputs": inputs, "seconds": 1.0}))
 
 
 def stale(folders=None, scene="toy", **options):
@@ -144,15 +137,6 @@ def test_a_change_of_setting_makes_exactly_these_stages_stale(settings, expected
     finish(Planner().plan("toy", settings))
     assert stale() == []
     assert stale(settings=settings) == []
-
-
-def photo_folder(folder):
-    from PIL import Image
-
-    folder.mkdir(parents=True)
-    for k in range(4):
-        Image.new("RGB", (32, 24), (60 * k, 0, 0)).save(folder / f"{k}.jpg")
-    return f"{folder}/"
 
 
 def test_content_of_raw_files_counts_and_their_time_and_place_do_not(tmp_path):
@@ -440,9 +424,11 @@ def test_a_run_makes_the_report_and_a_second_run_does_nothing(work):
     first = chebsplat("run", "--scene", "toy", "--set", FAST)
     assert first.returncode == 0, first.stderr
     page = first.stdout.strip()
-    assert page.endswith("report.html")
+    assert page == str(next(work.glob("toy@*")) / "report/report.html")
     assert os.path.isfile(page)
     assert "to run: ingest" in first.stderr
+    assert [word for word in first.stderr.split() if word in ("Gaussians", "PLY")] == ["Gaussians", "PLY"]
+    assert "its 2D teacher" in first.stderr
     times = {p: p.stat().st_mtime_ns for p in work.glob("store/*/*/artifact.json")}
     assert len(times) == len(ALL)
     second = chebsplat("run", "--scene", "toy", "--set", FAST)
@@ -457,7 +443,7 @@ def test_a_run_makes_the_report_and_a_second_run_does_nothing(work):
     assert "profile" not in first.stderr + only.stderr
     assert not list(work.glob(".plans/*"))
     part = chebsplat("run", "--scene", "toy", "--set", FAST, "--stage", "sfm")
-    assert f"{os.sep}sfm{os.sep}" in part.stdout
+    assert part.stdout.endswith(f"{os.sep}sfm\n")
     assert chebsplat("clean-stale").stdout.split()[:2] == ["0.0", "MB"]
     checked = chebsplat("verify", *(str(p.parent) for p in times))
     assert checked.returncode == 0, checked.stderr
@@ -498,7 +484,8 @@ def test_runs_at_the_same_time_make_every_artifact_once(work):
         (("run", "--scene", "toy", "--stage", "trian"), 2, "train"),
         (("run", "--scene", "toy", "--stage", "cks"), 2, "no sequence"),
         (("plan", "--scene", "./nowhere/"), 3, "not a folder"),
-        (("verify", "nowhere"), 3, "not a finished artifact"),
+        (("verify", "nowhere"), 2, "no finished scene"),
+        (("verify", "./nowhere"), 3, "is missing"),
     ],
 )
 def test_the_command_line_fails_with_documented_codes(arguments, code, message):

@@ -15,8 +15,8 @@ from chebsplat.errors import ConfigError
 from chebsplat.formats.artifact import Manifest, publish
 from chebsplat.formats.capture import Capture, write_capture
 from chebsplat.formats.evaluation import Evaluation, write_evaluation
-from chebsplat.pipelines.plan import names
 from chebsplat.pipelines.results import compare, row_of
+from chebsplat.pipelines.scenes import names
 from chebsplat.pipelines.sequences import scenes_of
 from chebsplat.pipelines.study import Study, checked_study, execute, expand, outstanding, read_study
 from chebsplat.pipelines.study_page import stability, write

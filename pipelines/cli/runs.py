@@ -13,7 +13,9 @@ from chebsplat.stages.device import DEVICES
 from chebsplat.stages.registry import STAGES
 
 
-def plans(scene: str | None, sequence: str | None, settings: str, ablation: str, basis: str) -> list[Any]:
+def plans(
+    scene: str | None, sequence: str | None, settings: str, ablation: str, basis: str, running: bool = False
+) -> list[Any]:
     """The plan of a scene, after those of the scenes that its basis comes from, or the plans of a sequence."""
     from chebsplat.pipelines import bases, sequences
     from chebsplat.pipelines.plan import Planner
@@ -22,7 +24,7 @@ def plans(scene: str | None, sequence: str | None, settings: str, ablation: str,
         raise ConfigError("name one of scene= and sequence=")
     if sequence is not None and basis:
         raise ConfigError("a sequence starts from nothing; basis= goes with scene=")
-    planner = Planner()
+    planner = Planner(running=running)
     try:
         if sequence is not None:
             return sequences.chain(planner, sequence, settings, ablation)
@@ -82,7 +84,7 @@ def run(stage: str | None, cores: int, device: str, **choice: Any) -> int:
     """Bring a scene up to date; recompute only what is stale."""
     from chebsplat.pipelines.run import device_of, execute
 
-    used, found = device_of(device), plans(**choice)
+    used, found = device_of(device), plans(**choice, running=True)
     return execute(found, checked_stage(stage or None, found), cores, used)
 
 
@@ -117,7 +119,7 @@ def study(name: str, cores: int, threads: int, out: Path | None, only_plan: bool
     from chebsplat.pipelines.run import Outcome, device_of, say
 
     computing, asked = device_of(device), studies.read_study(name)
-    runs = studies.expand(asked)
+    runs = studies.expand(asked, running=not (only_plan or no_run))
     say(f"{name}: {len(runs)} runs, {sum(run.plan.targets['evaluate'].is_dir() for run in runs)} of them done")
     if only_plan:
         print(studies.describe(studies.outstanding(runs)))

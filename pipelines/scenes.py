@@ -1,0 +1,89 @@
+"""Scenes: those of ours that have a name and a config, and folders of the user's."""
+
+from __future__ import annotations
+
+import difflib
+import os
+import re
+import tomllib
+from pathlib import Path
+from typing import Any
+
+from chebsplat.errors import ConfigError, InputError
+
+CONFIGS = Path(__file__).parent / "configs"
+ONE = {"scenes": "scene", "ablations": "ablation", "sequences": "sequence", "studies": "study"}
+VARIABLE = re.compile(r"\$\{(\w+):-([^}]*)\}")  # ${NAME:-default}
+
+
+def names(kind: str) -> list[str]:
+    return sorted(path.stem for path in (CONFIGS / kind).glob("*.toml"))
+
+
+def read_toml(kind: str, name: str) -> dict[str, Any]:
+    """A config of ours. Raises ConfigError with the nearest names."""
+    if name not in names(kind):
+        near = difflib.get_close_matches(name[:80], names(kind), 3) or names(kind)
+        raise ConfigError(f"no {ONE[kind]} is called {shown(name)}; did you mean {', '.join(near)}?")
+    return tomllib.loads((CONFIGS / kind / f"{name}.toml").read_text())
+
+
+def shown(text: str) -> str:
+    """Something that a user typed, as one line of a message can hold it."""
+    return text if text.isprintable() and 0 < len(text) <= 200 else f"{text[:80]!a}"
+
+
+def expanded(text: str) -> str:
+    """`${NAME:-default}` by the environment."""
+    return VARIABLE.sub(lambda found: os.environ.get(found[1]) or found[2], text)
+
+
+def folder_of(scene: str) -> Path | None:
+    """The folder that `scene` is, absolute; None of a scene of ours. Raises InputError if there is no such folder."""
+    folder = Path(os.path.expanduser(scene))
+    if "/" not in scene and scene not in (".", "..") and (scene in names("scenes") or not os.path.isdir(folder)):
+        return None
+    if not os.path.isdir(folder):
+        raise InputError(f"{shown(scene)} is not a folder; correct scene=")
+    return Path(os.path.realpath(folder))
+
+
+def scene_values(scene: str) -> tuple[str, dict[str, Any]]:
+    """(name, config values) of a named scene, or of a folder of photos, a COLMAP model or a transforms.json.
+
+    The name is part of what is computed, and the same wherever a folder lies; its links' may be longer (`folders`).
+    """
+    folder = folder_of(scene)
+    if folder is not None:
+        from chebsplat.stages.sources.common import detect
+
+        name = folder_name(folder)
+        return name, {"scene": {"name": name}, "source": {"kind": detect(folder), "path": str(folder)}}
+    values = read_toml("scenes", scene)
+    values.setdefault("scene", {})["name"] = scene
+    return scene, values
+
+
+def folder_name(folder: Path, more: int = 0) -> str:
+    """A folder's name as that of links: its last part, those above it up to one with a letter, and `more` parts."""
+    parts = folder.parts[1:]
+    words = next((k for k in range(1, len(parts)) if re.search(r"[a-zA-Z]", parts[-k])), 1)  # "dense/0" is no "0"
+    name = re.sub(r"[^\w.-]+", "-", "-".join(parts[-words - more :])).lstrip(".") or "scene"
+    return name + ("-scene" if name == "store" else "")  # links lie beside the store
+
+
+def data_of(scene: str) -> tuple[str, Path] | None:
+    """(environment variable, folder) of the data that a scene of ours needs and that is no part of chebsplat."""
+    path = read_toml("scenes", scene).get("source", {}).get("path", "") if scene in names("scenes") else ""
+    if found := VARIABLE.match(path):
+        return found[1], Path(os.path.realpath(os.path.expanduser(expanded(path))))
+    return None
+
+
+def absent(scene: str, folder: Path) -> InputError:
+    """What to do about a source that is not there."""
+    needed = data_of(scene)
+    if needed is None or needed[1] != folder:
+        return InputError(f"{folder} is not a folder; correct source.path")
+    told = f"{scene} needs data that is no part of chebsplat: {folder} is not a folder"
+    return InputError(f"{told}; set {needed[0]} to the folder that holds {folder.name}")
