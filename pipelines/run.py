@@ -16,8 +16,9 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from chebsplat.pipelines import children, store
+from chebsplat.pipelines import children, store, summary
 from chebsplat.pipelines.plan import Plan, Step
+from chebsplat.pipelines.tables import aligned
 
 HERE = Path(__file__).parent
 
@@ -45,7 +46,7 @@ def device_of(wanted: str) -> str:
 
 
 def execute(plans: list[Plan], stage: str | None, cores: int, device: str = "cpu") -> int:
-    """Bring plans up to date, up to `stage`; prints the last artifact (the report's page) on stdout. Exit code."""
+    """Bring plans up to date, up to `stage`; prints where the last artifact (the report's page) is on stdout."""
     asked = [plan for plan in plans if plan.asked]
     steps = {step.key: step for plan in asked for step in wanted_steps(plan, stage, plans)}
     stale = [step for step in steps.values() if not step.fresh]
@@ -66,9 +67,18 @@ def execute(plans: list[Plan], stage: str | None, cores: int, device: str = "cpu
     if stale:
         seconds(list(steps.values()), {step.key for step in stale})
     for plan in asked:
-        last = next(step for step in reversed(plan.steps) if stage in (None, step.stage))
-        print(last.path / "report.html" if last.stage == "report" else last.path)
+        tell(plan, stage)
     return 0
+
+
+def tell(plan: Plan, stage: str | None) -> None:
+    """What a scene has come to, and where it lies: the report's page, or what was asked for last."""
+    last = next(step for step in reversed(plan.steps) if stage in (None, step.stage))
+    if last.stage == "report":
+        for line in aligned(summary.table(plan.targets["evaluate"])):
+            say(f"  {line}")
+    place = store.work() / plan.title / last.stage
+    print(summary.readable(place / "report.html" if last.stage == "report" else place))
 
 
 def wanted_steps(plan: Plan, stage: str | None, others: Iterable[Plan] = ()) -> list[Step]:

@@ -13,6 +13,7 @@ import click
 
 from chebsplat.errors import ConfigError
 from chebsplat.pipelines.cli.group import Guarded
+from chebsplat.pipelines.tables import show_rows
 
 if TYPE_CHECKING:
     from chebsplat.formats.basis import Basis
@@ -29,12 +30,6 @@ def found(name: str) -> tuple[Path, Basis]:
 
     path = revisions(name)[-1]
     return path, read_basis(path)
-
-
-def show_rows(table: list[list[str]]) -> None:
-    widths = [max(len(row[k]) for row in table) for k in range(len(table[0]))]
-    for row in table:
-        print("  ".join(cell.ljust(width) for cell, width in zip(row, widths, strict=True)).rstrip())
 
 
 @basis.command()
@@ -123,13 +118,10 @@ def extend(name: str, scene: str) -> None:
 
     Any number of processes may do so at once, and one that was killed may be repeated.
     """
-    from chebsplat.formats.artifact import is_published
-    from chebsplat.pipelines import bases, store
+    from chebsplat.pipelines import bases, finished
 
-    places = [store.work() / scene / "train", Path(scene) / "train", Path(scene)]
-    gaussians = next((place.resolve() for place in places if is_published(place)), None)
-    if gaussians is None:
-        raise ConfigError(f"{scene} is no trained scene in {store.work()}, and no folder of one; run it first")
-    made = bases.extend(name, gaussians, Path(scene).name.partition("@")[0])
+    gaussians = finished.artifact_of(scene, "train")
+    known = finished.holder(gaussians) or gaussians
+    made = bases.extend(name, gaussians.resolve(), known.name.partition("@")[0])
     print(f"{name}@{len(made)}", file=sys.stderr)
     print(made[-1])

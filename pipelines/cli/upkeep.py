@@ -1,21 +1,74 @@
-"""What there is: names, digests, and what nothing names any more."""
+"""What lies in work: scenes, digests, what nothing names any more, and how to be rid of either."""
 
 from __future__ import annotations
 
-from pathlib import Path
+import sys
 
 import click
 
+from chebsplat.errors import ChebsplatError
+
+
+@click.command("ls")
+def list_scenes() -> None:
+    """List the scenes in work: source, stages done, size, when, and what was measured."""
+    from chebsplat.pipelines import inventory, store
+    from chebsplat.pipelines.tables import show_rows
+
+    found = inventory.scenes()
+    if not found:
+        print(f"no scene in {store.work()}", file=sys.stderr)
+        return
+    heading = ("scene", "source", "done", "MB", "when", "PSNR", "mIoU")
+    show_rows([heading, *(scene.row() for scene in found)])
+    print(f"{store.work()}: artifacts that several scenes share count in each", file=sys.stderr)
+
 
 @click.command()
-@click.argument("folders", nargs=-1, required=True, type=click.Path(path_type=Path))
-def verify(folders: tuple[Path, ...]) -> None:
-    """Recompute every digest of artifacts."""
-    from chebsplat.formats.artifact import verify as check
+@click.argument("scenes", nargs=-1, required=True)
+@click.option("--yes", is_flag=True, help="remove what is listed")
+def rm(scenes: tuple[str, ...], yes: bool) -> None:
+    """Remove SCENES: their links, their queries, and the artifacts that nothing else names."""
+    from chebsplat.pipelines import finished, folders, inventory, store
 
-    for folder in folders:
-        manifest = check(folder)
-        print(f"{folder}: {manifest.schema}, {len(manifest.files)} files, whole")
+    chosen = list(dict.fromkeys(inventory.in_work(finished.scene_folder(scene)) for scene in scenes))
+    found = inventory.only_of(chosen)
+    for folder in chosen:
+        kept = inventory.others(folder)
+        print(f"           {folder}" + (f" (stays, for what is not ours: {', '.join(kept)})" if kept else ""))
+    show_sizes(found, yes, "--yes removes them")
+    if not yes:
+        return
+    for folder in chosen:
+        inventory.unlink(folder)
+        folders.release(folder.name.partition("@")[0])
+    for path, _ in found:
+        store.remove(path)
+
+
+def show_sizes(found: list, done: bool, advice: str) -> None:
+    for path, size in found:
+        print(f"{size / 2**20:9.1f} MB  {path}")
+    total = sum(size for _, size in found) / 2**20
+    print(f"{total:9.1f} MB  in {len(found)} folders" + ("" if done else f"; {advice}"))
+
+
+@click.command()
+@click.argument("scenes", nargs=-1, required=True)
+def verify(scenes: tuple[str, ...]) -> int:
+    """Recompute every digest of SCENES' artifacts, or of artifacts."""
+    from chebsplat.formats.artifact import verify as check
+    from chebsplat.pipelines.finished import artifacts
+
+    codes = [0]
+    for path in [path for scene in scenes for path in artifacts(scene)]:
+        try:
+            manifest = check(path)
+            print(f"{path}: {manifest.schema}, {len(manifest.files)} files, whole")
+        except ChebsplatError as error:
+            print(f"chebsplat: {error}", file=sys.stderr)
+            codes.append(error.exit_code)
+    return max(codes)
 
 
 @click.command("clean-stale")
@@ -25,24 +78,10 @@ def clean_stale(yes: bool) -> None:
     from chebsplat.pipelines import store
 
     found = store.unnamed()
-    for path, size in found:
-        print(f"{size / 2**20:9.1f} MB  {path}")
-    total = sum(size for _, size in found) / 2**20
-    print(f"{total:9.1f} MB  in {len(found)} folders" + ("" if yes or not found else "; yes=1 (--yes) removes them"))
+    show_sizes(found, yes or not found, "yes=1 (--yes) removes them")
     if yes:
         for path, _ in found:
             store.remove(path)
 
 
-@click.command()
-def scenes() -> None:
-    """List the scenes, ablations, sequences and studies that have a name."""
-    from chebsplat.pipelines.bases import head_names
-    from chebsplat.pipelines.plan import names
-
-    for kind in ("scenes", "ablations", "sequences", "studies"):
-        print(f"{kind}: {' '.join(names(kind))}")
-    print(f"HEADs: {' '.join(head_names()) or 'none'}")
-
-
-COMMANDS = (scenes, verify, clean_stale)
+COMMANDS = (list_scenes, rm, verify, clean_stale)

@@ -10,23 +10,6 @@ import click
 from chebsplat.errors import ConfigError
 
 
-def scene_folder(scene: str) -> Path:
-    """The folder of a finished scene, given itself or by the name of its links. Raises ConfigError with near names."""
-    from chebsplat.pipelines import store
-
-    for folder in (store.work() / scene, Path(scene)):
-        if store.is_fresh(folder / "export"):
-            return folder
-    import difflib
-
-    known = sorted(path.parent.parent.name for path in store.work().glob("*/export/artifact.json"))
-    near = difflib.get_close_matches(scene, known, 3) or known
-    raise ConfigError(
-        f"{scene} is no finished scene in {store.work()}, and no folder of one; "
-        + (f"there is {', '.join(near)}" if near else f"run it first: make scene={scene}")
-    )
-
-
 @click.command()
 @click.argument("scene")
 @click.argument("text")
@@ -37,6 +20,7 @@ def query(scene: str, text: str, against: str, out: Path | None, top: int) -> No
     """Where in a finished SCENE is TEXT, such as "something to sit on"? Relevancy by Gaussian, and heat maps."""
     import logging
 
+    from chebsplat.pipelines.finished import scene_folder
     from chebsplat.pipelines.plan import suffix
     from chebsplat.stages.query import run as answer
 
@@ -63,31 +47,41 @@ def check_teacher(model: Path, photo: Path | None, labels: str | None) -> None:
 
 
 @click.command()
-@click.argument("scene", type=click.Path(path_type=Path))
+@click.argument("scene")
 @click.option("--out", type=click.Path(path_type=Path), required=True, help="the .ply to write")
 @click.option("--keep-label", "labels", multiple=True, help="a name of labels.json; may be given again")
 @click.option("--min-opacity", type=click.FloatRange(0, 1), default=0.0, help="activated")
 @click.option("--box", help="x0,y0,z0,x1,y1,z1 that centres lie in, scene units")
-def extract(scene: Path, out: Path, labels: tuple[str, ...], min_opacity: float, box: str | None) -> None:
-    """Write part of a finished scene (an export artifact) as one PLY: by label, opacity, box."""
+def extract(scene: str, out: Path, labels: tuple[str, ...], min_opacity: float, box: str | None) -> None:
+    """Write part of a finished scene as one PLY: by label, opacity, box."""
+    from chebsplat.pipelines.finished import artifact_of
     from chebsplat.stages.extract import corners
     from chebsplat.stages.extract import extract as write
 
-    counts = write(scene, out, labels, min_opacity, corners(box))
+    counts = write(artifact_of(scene, "export"), out, labels, min_opacity, corners(box))
     print(", ".join(f"{name} {number:,}" for name, number in counts.items()), file=sys.stderr)
     print(out)
 
 
 @click.command()
-@click.argument("scene", type=click.Path(path_type=Path))
-@click.option("--encoder", type=click.Path(path_type=Path), required=True, help="an onnx artifact, or a model in it")
+@click.argument("scene")
+@click.option("--encoder", help="an onnx artifact, or a model in it; default: the scene's")
 @click.option("--features", type=click.Path(path_type=Path), help="of a PLY: .npy [N, C], float32, before fusion")
 @click.option("--out", type=click.Path(path_type=Path), required=True, help="the .npz to write")
-def encode(scene: Path, encoder: Path, features: Path | None, out: Path) -> None:
-    """Fused features of a finished scene (an export artifact, or a PLY), by onnxruntime, without torch."""
+def encode(scene: str, encoder: str | None, features: Path | None, out: Path) -> None:
+    """Fused features of a finished SCENE (or a .ply), by onnxruntime, without torch."""
+    from chebsplat.pipelines.finished import artifact_of, scene_folder
     from chebsplat.stages.encode import encode as write
 
-    figures = write(scene, encoder, features, out)
+    if scene.endswith(".ply"):
+        if encoder is None:
+            raise ConfigError(f"{scene} is a PLY, which has no encoder of its own; add --encoder")
+        held = Path(scene)
+    else:
+        held = artifact_of(scene, "export")
+        encoder = encoder or str(scene_folder(scene) / "onnx")
+    model = Path(encoder) if encoder.endswith(".onnx") else artifact_of(encoder, "onnx")
+    figures = write(held, model, features, out)
     print(", ".join(f"{name} {value}" for name, value in figures.items()), file=sys.stderr)
     print(out)
 

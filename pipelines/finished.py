@@ -1,0 +1,104 @@
+"""Finished scenes by what a user calls them: a name, the folder of photos, a folder of links in work, an artifact."""
+
+from __future__ import annotations
+
+import difflib
+import os
+from pathlib import Path
+
+from chebsplat.errors import ConfigError, InputError
+from chebsplat.pipelines import folders, store
+from chebsplat.pipelines.scenes import names, shown
+from chebsplat.stages.registry import STAGES
+
+
+def is_artifact(path: Path) -> bool:
+    return os.path.isfile(path / "artifact.json")
+
+
+def links(folder: Path) -> dict[str, Path]:
+    """Artifacts that a folder names, stages in their order; whatever else lies there is none of ours."""
+    try:
+        found = [entry.name for entry in os.scandir(folder) if is_artifact(Path(entry.path))]
+    except OSError:
+        return {}
+    order = list(STAGES)
+    found.sort(key=lambda name: (order.index(name) if name in order else len(order), name))
+    return {name: folder / name for name in found}
+
+
+def titles() -> list[str]:
+    """Names of the folders of links in work: of scenes, with their settings, of sequences, studies and HEADs."""
+    base = store.work()
+    there = sorted(os.listdir(base)) if os.path.isdir(base) else []
+    return [name for name in there if not name.startswith(".") and name != "store" and links(base / name)]
+
+
+def scene_folder(scene: str) -> Path:
+    """The folder of a finished scene's links.
+
+    Raises: ConfigError with the nearest names, or if several are meant; InputError for a path that leads to none.
+    """
+    place = Path(os.path.expanduser(scene))
+    if "/" not in scene and links(store.work() / scene):
+        return store.work() / scene
+    if is_artifact(place):
+        if found := holder(place):
+            return found
+        raise InputError(f"{place} belongs to no scene in {store.work()}; name the scene")
+    if links(place):
+        return place
+    name = folders.known(Path(os.path.realpath(place))) if os.path.isdir(place) else scene
+    runs = [title for title in titles() if title.partition("@")[0] == name]
+    if len(runs) == 1 or name in runs:
+        return store.work() / (name if name in runs else runs[0])
+    if runs:
+        raise ConfigError(f"{shown(scene)} was run with different settings: name one of {', '.join(runs)}")
+    raise unknown(scene, name)
+
+
+def holder(artifact: Path) -> Path | None:
+    """The scene that an artifact belongs to; None if no links of a scene name it."""
+    if artifact.is_symlink() and artifact.name in STAGES:
+        return artifact.parent
+    real = artifact.resolve()
+    for title in titles():
+        if any(link.resolve() == real for stage, link in links(store.work() / title).items() if stage in STAGES):
+            return store.work() / title
+    return None
+
+
+def unknown(scene: str, name: str | None) -> ConfigError | InputError:
+    where = f"no finished scene in {store.work()}"
+    if os.path.isdir(os.path.expanduser(scene)):
+        return InputError(f"{shown(scene)} is {where}, nor the folder of one; run it first: make scene={shown(scene)}")
+    if "/" in scene:
+        return InputError(f"{shown(scene)} is missing: neither a scene, its folder nor an artifact; correct the path")
+    known = titles()
+    near = difflib.get_close_matches(scene[:80], known, 3) or known[:8]
+    if near and scene not in names("scenes"):
+        return ConfigError(f"{shown(scene)} is {where}, and no folder of one; there is {', '.join(near)}")
+    return ConfigError(f"{shown(scene)} is {where}, and no folder of one; run it first: make scene={shown(scene)}")
+
+
+def artifact_of(scene: str, stage: str) -> Path:
+    """A scene's artifact of a stage; an artifact is taken as it is, and its reader says if it is of another kind.
+
+    Raises: as `scene_folder`; ConfigError if the scene has no such artifact.
+    """
+    place = Path(os.path.expanduser(scene))
+    if ("/" in scene or not links(store.work() / scene)) and is_artifact(place):
+        return place
+    folder = scene_folder(scene)
+    if not is_artifact(folder / stage):
+        run = f"run it to its end: make scene={shown(folder.name.partition('@')[0])}"
+        raise ConfigError(f"{folder} has no {stage}: it is not finished, or leaves that out; {run}")
+    return folder / stage
+
+
+def artifacts(scene: str) -> list[Path]:
+    """All that a scene's links name, or the artifact alone that is named."""
+    place = Path(os.path.expanduser(scene))
+    if ("/" in scene or not links(store.work() / scene)) and is_artifact(place):
+        return [place]
+    return list(links(scene_folder(scene)).values())

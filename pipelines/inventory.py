@@ -1,0 +1,105 @@
+"""What lies in work, by scene: what was done, how much it takes, and what only one scene names."""
+
+from __future__ import annotations
+
+import json
+import os
+import shutil
+import time
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from chebsplat.errors import InputError
+from chebsplat.pipelines import folders, store, summary
+from chebsplat.pipelines.finished import links, titles
+from chebsplat.stages.registry import STAGES
+
+QUERIES = "query"  # answers of `chebsplat query`, in a scene's folder
+
+
+@dataclass(frozen=True)
+class Scene:
+    """One folder of links. size: bytes of the artifacts that it names; when: the newest of them, seconds since 1970."""
+
+    title: str
+    source: str
+    stages: list[str]
+    size: int
+    when: float
+    psnr: str
+    miou: str
+
+    def row(self) -> tuple[str, ...]:
+        done = "all" if "report" in self.stages else " ".join(self.stages)
+        day = time.strftime("%Y-%m-%d %H:%M", time.localtime(self.when))
+        return self.title, self.source, done, f"{self.size / 1e6:.1f}", day, self.psnr, self.miou
+
+
+def scenes() -> list[Scene]:
+    """Those in work, each as far as it can be read; what is damaged counts nothing."""
+    found = []
+    for title in titles():
+        held = {stage: path for stage, path in links(store.work() / title).items() if stage in STAGES}
+        if not held:
+            continue
+        manifests = {stage: _manifest(path) for stage, path in held.items()}
+        size = sum(_size(manifest) for manifest in manifests.values())
+        when = max((path / "artifact.json").stat().st_mtime for path in held.values())
+        psnr, miou, _ = summary.quality(summary.figures(held["evaluate"]) if "evaluate" in held else None)
+        found.append(Scene(title, _source(title, manifests.get("ingest")), list(held), size, when, psnr, miou))
+    return found
+
+
+def _manifest(path: Path) -> Any:
+    try:
+        return json.loads((path / "artifact.json").read_text())
+    except (OSError, ValueError, RecursionError):
+        return None
+
+
+def _size(manifest: Any) -> int:
+    try:
+        return sum(int(entry["bytes"]) for entry in manifest["files"].values())
+    except (TypeError, KeyError, AttributeError, ValueError):
+        return 0
+
+
+def _source(title: str, ingest: Any) -> str:
+    """Where a scene comes from: the folder that its name stands for, or what its capture was made of."""
+    try:
+        if folders.place(name := title.partition("@")[0]).exists():
+            return folders.owner(name) or ""
+        source = ingest["config"]["source"]
+        return source["path"] or f"generated {source['preset']}, seed {source['seed']}"
+    except (InputError, TypeError, KeyError):
+        return "damaged"
+
+
+def in_work(folder: Path) -> Path:
+    """A scene's folder of links. Raises InputError if it lies elsewhere: nothing is removed there."""
+    if folder.absolute().parent.resolve() != store.work().resolve() or folder.is_symlink():
+        raise InputError(f"{folder} does not lie in {store.work()}: nothing is removed there")
+    return store.work() / folder.name
+
+
+def only_of(chosen: list[Path]) -> list[tuple[Path, int]]:
+    """Artifacts, with bytes, that nothing would name without the links in `chosen`."""
+    before = {path for path, _ in store.unnamed()}
+    return [(path, size) for path, size in store.unnamed(set(chosen)) if path not in before]
+
+
+def others(folder: Path) -> list[str]:
+    """What lies in a scene's folder and is none of ours; it is never removed."""
+    return sorted(e.name for e in os.scandir(folder) if not e.is_symlink() and e.name != QUERIES)
+
+
+def unlink(folder: Path) -> None:
+    """Remove a scene's links and queries, and the folder if that leaves it empty."""
+    for entry in list(os.scandir(folder)):
+        if entry.is_symlink():
+            os.unlink(entry.path)
+    if not (folder / QUERIES).is_symlink():
+        shutil.rmtree(folder / QUERIES, ignore_errors=True)
+    if not others(folder):
+        folder.rmdir()

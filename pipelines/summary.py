@@ -1,0 +1,64 @@
+"""What a scene has come to, in a few lines: read from manifests and figures, without torch."""
+
+from __future__ import annotations
+
+import math
+import os
+from pathlib import Path
+from typing import Any
+
+from chebsplat.errors import InputError
+from chebsplat.formats import artifact
+from chebsplat.formats.documents import read_document
+
+
+def figures(evaluation: Path) -> Any:
+    """What an evaluation measured; None where there is none, or it is damaged (`chebsplat verify` says how)."""
+    try:
+        return read_document(evaluation, artifact.read_manifest(evaluation), "figures.json")
+    except InputError:
+        return None
+
+
+def number(found: Any, *keys: str) -> float | None:
+    """A figure by its keys; None if it was not measured."""
+    for key in keys:
+        found = found.get(key) if isinstance(found, dict) else None
+    return found if isinstance(found, int | float) and math.isfinite(found) else None
+
+
+def text(form: str, value: float | None) -> str:
+    return "" if value is None else form.format(value)
+
+
+def quality(found: Any) -> tuple[str, str, str]:
+    """(test PSNR, mIoU, its 2D teacher's mIoU); empty where they were not measured."""
+    shares = (number(found, "segmentation", whose, "miou") for whose in ("scene", "teacher"))
+    miou, teacher = (text("{:.1%}", share) for share in shares)
+    return text("{:.1f} dB", number(found, "image", "psnr")), miou, teacher
+
+
+def table(evaluation: Path) -> list[tuple[str, str, str]]:
+    """(what, value, beside it) of a scene that was evaluated; what was not measured is not there."""
+    found = figures(evaluation)
+    psnr, miou, teacher = quality(found)
+    size = {name: text("{:.1f} MB", scaled(number(found, "bytes", name))) for name in ("ply", "split", "ragged")}
+    others = ", ".join(f"{name} {shown}" for name, shown in size.items() if shown and name != "ply")
+    rows = [
+        ("test PSNR", psnr, text("SSIM {:.3f}", number(found, "image", "ssim"))),
+        ("mIoU", miou, f"its 2D teacher {teacher}" if teacher else ""),
+        ("Gaussians", text("{:,}", number(found, "n_gaussians")), ""),
+        ("PLY", size["ply"], others),
+        ("frames/s", text("{:.0f}", number(found, "frames_per_second", "color")), "colour alone"),
+    ]
+    return [row for row in rows if row[1]]
+
+
+def scaled(size: float | None) -> float | None:
+    return None if size is None else size / 1e6
+
+
+def readable(path: Path) -> str:
+    """A path as a user who stands here would type it."""
+    here = Path.cwd()
+    return os.path.relpath(path, here) if path.is_relative_to(here) else str(path)

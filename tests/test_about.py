@@ -1,0 +1,108 @@
+"""What there is before anything runs: names, settings, versions; and nothing is written to say so."""
+
+import subprocess
+import sys
+
+import pytest
+from click.testing import CliRunner
+from shared import ROOT, photo_folder
+
+from chebsplat.errors import ConfigError, InputError
+from chebsplat.pipelines.cli import main
+from chebsplat.pipelines.plan import Planner
+from chebsplat.pipelines.scenes import ONE, names, read_toml
+from chebsplat.stages.config import known_keys
+
+
+def asked(*arguments):
+    return CliRunner().invoke(main, list(arguments))
+
+
+def test_settings_lists_every_setting_with_its_default_range_and_meaning():
+    lines = asked("settings").stdout.splitlines()
+    assert [line.split()[0] for line in lines] == ["setting", *known_keys()]
+    assert not [line for line in lines if "<class" in line or len(line) > 250]
+    told = asked("settings", "train.sh_degree").stdout.splitlines()[1]
+    assert told.split()[:6] == ["train.sh_degree", "3", "integer,", "0", "to", "3"]
+    assert "mixed | region | classic | off" in asked("settings", "train").stdout
+    wrong = asked("settings", "trian")
+    assert (wrong.exit_code, "did you mean train" in wrong.stderr) == (2, True)
+
+
+def test_version_names_chebsplat_and_what_it_computes_with_and_imports_none_of_it():
+    script = "import sys\nfrom chebsplat.pipelines.cli import main\ntry: main(['--version'])\n"
+    script += "except SystemExit as stop: assert not stop.code\nassert not {'torch', 'numba'} & set(sys.modules)"
+    done = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr
+    assert all(f"{name} " in done.stdout for name in ("chebsplat", "torch", "numba", "Python"))
+
+
+def test_scenes_of_private_data_are_listed_apart_and_say_what_to_set(quick_plans, tmp_path, monkeypatch):
+    monkeypatch.setenv("CHEBSPLAT_TEST_DATA", str(tmp_path / "data"))
+    ours, apart = asked("scenes").stdout.split("scenes of data")
+    assert "office0" in ours and "fox" not in ours
+    assert f"{tmp_path}/data/fox" in apart and "set CHEBSPLAT_TEST_DATA" in apart
+    with pytest.raises(InputError, match=f"{tmp_path}/data/fox.*set CHEBSPLAT_TEST_DATA"):
+        Planner().plan("fox")
+    photo_folder(tmp_path / "data/fox")
+    assert "there" in asked("scenes").stdout.split("data/fox")[1].splitlines()[0]
+
+
+def test_a_scene_whose_data_is_absent_can_be_given_another_folder(quick_plans, tmp_path, monkeypatch):
+    monkeypatch.setenv("CHEBSPLAT_TEST_DATA", str(tmp_path / "data"))
+    plan = Planner().plan("fox", f"source.kind=photos,source.path={photo_folder(tmp_path / 'photos')}")
+    assert plan.title.startswith("fox@")
+    with pytest.raises(InputError, match=r"nowhere is not a folder; correct source\.path"):
+        Planner().plan("fox", f"source.path={tmp_path}/nowhere")
+
+
+@pytest.mark.parametrize("kind", sorted(ONE))
+def test_what_has_no_name_is_called_by_its_kind(kind):
+    with pytest.raises(ConfigError, match=f"no {ONE[kind]} is called nothing of the kind"):
+        read_toml(kind, "nothing of the kind")
+    assert names(kind)
+
+
+@pytest.mark.parametrize(
+    "command",
+    [
+        "scenes",
+        "ls",
+        "clean-stale --yes",
+        "settings",
+        "plan --scene toy",
+        "plan --sequence toys",
+        "study toys --plan",
+        "basis log toys",
+        "query toy sofa",
+        "verify toy",
+    ],
+)
+def test_a_command_that_only_looks_makes_no_folder(command, quick_plans, tmp_path, monkeypatch):
+    monkeypatch.delenv("CHEBSPLAT_WORK")
+    assert asked(*command.split()).exit_code in (0, 2)
+    assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize(
+    ("call", "code", "message"),
+    [
+        (["run", "--scene", "ofice0"], 2, "office0"),
+        (["run", "--scene", "./nowhere/"], 3, "not a folder"),
+        (["study", "methd"], 2, "no study is called methd; did you mean method"),
+        (["basis", "show", "ofices"], 2, "offices"),
+        (["encode", "x.ply", "--out", "x.npz"], 2, "--encoder"),
+        (["run", "--nonsense"], 2, "No such option"),
+    ],
+)
+def test_commands_leave_with_the_documented_codes(quick_plans, call, code, message):
+    found = asked(*call)
+    assert (found.exit_code, message in found.stderr) == (code, True), found.stderr
+
+
+def test_make_says_the_code_that_it_cannot_leave_with():
+    done = subprocess.run(
+        ["make", "-o", ".venv/.ready", "plan", "scene=./nowhere/"], cwd=ROOT, capture_output=True, text=True
+    )
+    assert done.returncode == 2  # GNU make's own, whatever failed
+    assert "not a folder" in done.stderr and "Error 3" in done.stderr
