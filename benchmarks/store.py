@@ -151,7 +151,7 @@ def clock(action: Callable[[], object]) -> float:
 
 
 def write(out: Path, names: list[str], views: Iterator[np.ndarray], shape: tuple[int, int, int]) -> None:
-    with publish(out, Manifest(SCHEMA, "k", "teacher")) as tmp:
+    with publish(out, Manifest(SCHEMA, "0" * 16, "teacher")) as tmp:
         writer = FeatureWriter(out.parent / "writer", names, shape)
         for k, view in enumerate(views):
             writer.add(k, view)

@@ -10,34 +10,16 @@ import hashlib
 import json
 import os
 import shutil
+import stat
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict
+from errno import EDQUOT, ENOSPC, EROFS
 from pathlib import Path
 from typing import Any
 
-from chebsplat.errors import InputError
-
-MANIFEST = "artifact.json"
-
-
-@dataclass
-class Manifest:
-    """What `artifact.json` holds. `files` maps relative POSIX paths to {"sha256", "bytes"}."""
-
-    schema: str  # "chebsplat.<name>/<n>"
-    key: str
-    stage: str
-    inputs: dict[str, dict[str, str]] = field(default_factory=dict)  # role -> {"key", "schema"}
-    config: dict[str, Any] = field(default_factory=dict)
-    seed: int | None = None
-    facts: dict[str, Any] = field(default_factory=dict)  # what the stage found, chose and left out
-    code: dict[str, Any] = field(default_factory=dict)  # {"hash", "commit", "dirty"}
-    versions: dict[str, str] = field(default_factory=dict)
-    device: str = "cpu"
-    threads: int = 1
-    seconds: float = 0.0
-    files: dict[str, dict[str, Any]] = field(default_factory=dict)
+from chebsplat.errors import ConfigError, InputError
+from chebsplat.formats.manifest import MANIFEST, Manifest, parse_manifest, remedy
 
 
 def sha256_file(path: Path) -> str:
@@ -46,36 +28,100 @@ def sha256_file(path: Path) -> str:
 
 
 def is_published(path: Path) -> bool:
-    return (path / MANIFEST).is_file()
+    return os.path.isfile(path / MANIFEST)
+
+
+def copy(path: Path, out: Path, manifest: Manifest) -> None:
+    """Publish the artifact `path`, whose manifest was read, at `out` as well. Raises InputError if it has changed."""
+    expected = manifest.files
+    with publish(out, manifest) as tmp:
+        for name in expected:
+            (tmp / name).parent.mkdir(parents=True, exist_ok=True)
+            shutil.copyfile(path / name, tmp / name)
+        changed = [name for name, entry in _file_table(tmp).items() if entry != expected[name]]
+        if changed:
+            raise InputError(f"{path / changed[0]} has changed while it was copied; run again")
+
+
+def is_whole(path: Path, schema: str | None = None) -> bool:
+    """Published, and every member there in its size; `verify` recomputes digests too."""
+    try:
+        read_manifest(path, schema)
+    except InputError:
+        return False
+    return True
 
 
 @contextmanager
-def publish(out: Path, manifest: Manifest) -> Iterator[Path]:
+def publish(out: Path, manifest: Manifest, force: bool = False) -> Iterator[Path]:
     """Yield a scratch directory that becomes `out`, whole, when the block ends without an error.
 
     `manifest` may be completed inside the block (facts, seconds); its file table is filled in here.
-    If `out` was published meanwhile by a twin, the twin's artifact is kept and ours is discarded.
-    Raises: InputError if `out` exists and is not an artifact (nothing of the user's is ever overwritten).
+    A whole artifact that stands there, such as a twin's that was faster, is kept and ours is discarded, unless `force`
+    asks for ours. Until the block has ended, what stands at `out` stays.
+    Raises: InputError as `check_place`; ConfigError if `out` cannot be written.
     """
     out = Path(out)
     tmp = out.parent / f".tmp-{out.name}-{os.getpid()}"
-    if tmp.exists():
-        shutil.rmtree(tmp)
-    tmp.mkdir(parents=True)
+    try:
+        if tmp.exists():
+            shutil.rmtree(tmp)
+        tmp.mkdir(parents=True)
+    except OSError as error:
+        if error.errno in (ENOSPC, EDQUOT, EROFS):
+            raise
+        raise ConfigError(f"{out} cannot be written ({error.strerror}); choose another --out") from None
     try:
         yield tmp
-        if not is_published(out):
+        if force or not is_whole(out, manifest.schema):
             manifest.files = _file_table(tmp)
             _write_synced(tmp / MANIFEST, json.dumps(asdict(manifest), indent=1, sort_keys=True) + "\n")
             _settle_tree(tmp)
-            try:
-                os.rename(tmp, out)
-            except OSError:
-                if not is_published(out):
-                    raise InputError(f"{out} exists and is not an artifact; choose another --out") from None
+            _put(tmp, out, manifest, force)
             sync_directory(out.parent)
     finally:
         shutil.rmtree(tmp, ignore_errors=True)
+
+
+def _put(tmp: Path, out: Path, manifest: Manifest, force: bool) -> None:
+    """Rename `tmp` to `out`; what `check_place` lets go stands aside for it: no one ever sees half of either."""
+    aside = tmp.with_name(f".tmp-{out.name}-old-{os.getpid()}")
+    try:
+        os.rename(tmp, out)
+    except OSError:
+        if not force and is_whole(out, manifest.schema):
+            return  # a twin was faster
+        check_place(out, manifest.schema, manifest.key, force)
+        os.rename(out, aside)
+        try:
+            os.rename(tmp, out)
+        except OSError:
+            if not is_whole(out, manifest.schema):
+                raise
+    finally:
+        shutil.rmtree(aside, ignore_errors=True)
+
+
+def check_place(out: Path, schema: str, key: str, force: bool = False) -> None:
+    """Whether a stage may put its artifact at `out`, where nothing whole of it stands, or where `force` replaces it.
+
+    Choices: a folder that bears the artifact's key is its own, whatever a crash has left of it. Elsewhere only an
+      artifact of the same schema goes, by `force`, and with nothing beside what its manifest lists.
+    Raises: InputError saying what stands there; nothing is removed.
+    """
+    if out.is_symlink():
+        raise InputError(f"{out} is a link to {os.readlink(out)}: nothing was replaced; name that, or another --out")
+    if not os.path.lexists(out) or (out.is_dir() and (out.name == key or not any(out.iterdir()))):
+        return
+    if not is_published(out):
+        raise InputError(f"{out} exists and is not an artifact: nothing was replaced; choose another --out")
+    found = parse_manifest(out)
+    if found.schema != schema:
+        raise InputError(f"{out} holds {found.schema}, not {schema}: nothing was replaced; choose another --out")
+    if extra := _unlisted(out, found):
+        raise InputError(f"{out / extra[0]} is no part of the artifact: nothing was replaced; move it away")
+    if not force:
+        read_manifest(out, schema)
 
 
 def read_manifest(path: Path, schema: str | None = None) -> Manifest:
@@ -84,22 +130,21 @@ def read_manifest(path: Path, schema: str | None = None) -> Manifest:
     Raises: InputError naming the damaged or missing file and the remedy.
     """
     path = Path(path)
-    file = path / MANIFEST
-    if not file.is_file():
-        raise InputError(f"{file} is missing: not a finished artifact; run the stage that makes it again")
-    try:
-        manifest = Manifest(**json.loads(file.read_text()))
-        entries = {name: int(entry["bytes"]) for name, entry in manifest.files.items()}
-    except (ValueError, TypeError, KeyError, AttributeError) as error:
-        raise InputError(f"{file} is damaged ({error}); {remedy(path)}") from None
+    if not is_published(path):
+        raise InputError(f"{path / MANIFEST} is missing: not a finished artifact; run the stage that makes it again")
+    manifest = parse_manifest(path)
     if schema is not None and manifest.schema != schema:
-        raise InputError(f"{file} has schema {manifest.schema}, expected {schema}; pass the right artifact")
-    for name, size in entries.items():
-        member = path / name
-        if not member.is_file():
+        raise InputError(f"{path / MANIFEST} has schema {manifest.schema}, expected {schema}; pass the right artifact")
+    for name, entry in manifest.files.items():
+        member = os.path.join(path, name)
+        try:
+            state = os.stat(member)
+        except OSError:
+            state = None
+        if state is None or not stat.S_ISREG(state.st_mode):
             raise InputError(f"{member} is missing; {remedy(path)}")
-        if member.stat().st_size != size:
-            raise InputError(f"{member} has {member.stat().st_size} bytes, expected {size}; {remedy(path)}")
+        if state.st_size != entry["bytes"]:
+            raise InputError(f"{member} has {state.st_size} bytes, expected {entry['bytes']}; {remedy(path)}")
     return manifest
 
 
@@ -109,8 +154,7 @@ def verify(path: Path, schema: str | None = None) -> Manifest:
     manifest = read_manifest(path, schema)
     for name in manifest.files:
         checked(path, manifest, name)
-    extra = sorted(set(_file_table(path, hashed=False)) - set(manifest.files) - {MANIFEST})
-    if extra:
+    if extra := _unlisted(path, manifest):
         raise InputError(f"{path / extra[0]} is not listed in {MANIFEST} ({len(extra)} such); {remedy(path)}")
     return manifest
 
@@ -125,18 +169,16 @@ def checked(path: Path, manifest: Manifest, name: str) -> Path:
     return path / name
 
 
-def remedy(path: Path) -> str:
-    return f"delete {path} and run its stage again"
+def _members(root: Path) -> dict[str, Path]:
+    return {p.relative_to(root).as_posix(): p for p in sorted(root.rglob("*")) if p.is_file()}
 
 
-def _file_table(root: Path, hashed: bool = True) -> dict[str, dict[str, Any]]:
-    members = sorted(p for p in root.rglob("*") if p.is_file())
-    return {
-        p.relative_to(root).as_posix(): (
-            {"sha256": sha256_file(p), "bytes": p.stat().st_size} if hashed else {"bytes": p.stat().st_size}
-        )
-        for p in members
-    }
+def _unlisted(path: Path, manifest: Manifest) -> list[str]:
+    return sorted(_members(path).keys() - manifest.files.keys() - {MANIFEST})
+
+
+def _file_table(root: Path) -> dict[str, dict[str, Any]]:
+    return {name: {"sha256": sha256_file(p), "bytes": p.stat().st_size} for name, p in _members(root).items()}
 
 
 def _write_synced(path: Path, text: str) -> None:
@@ -174,15 +216,9 @@ def digest(value: Mapping[str, Any]) -> str:
     return hashlib.sha256(text.encode()).hexdigest()[:16]
 
 
-def discard(path: Path) -> None:
-    """Remove an artifact or a scratch directory; the manifest goes first, so that no half artifact looks whole.
-
-    Raises: InputError if `path` is a directory that is neither.
-    """
-    path = Path(path)
-    if not path.exists():
-        return
-    if not (is_published(path) or path.name.startswith((".part-", ".tmp-"))):
-        raise InputError(f"{path} exists and is not an artifact; nothing was removed")
-    (path / MANIFEST).unlink(missing_ok=True)
-    shutil.rmtree(path)
+def discard(scratch: Path) -> None:
+    """Remove a scratch directory. Raises ValueError if it is none: nothing of the user's is ever removed."""
+    if not scratch.name.startswith((".part-", ".tmp-")):
+        raise ValueError(f"{scratch} is no scratch directory")
+    if scratch.exists():
+        shutil.rmtree(scratch)

@@ -7,23 +7,31 @@ compare-and-swap, without a lock or a half-written file that a killed process co
 from __future__ import annotations
 
 import os
+import re
 from collections.abc import Callable
 from pathlib import Path
 
 from chebsplat.errors import InputError
 from chebsplat.formats import artifact
 
+NUMBER = re.compile(r"[1-9][0-9]{0,8}")  # of a revision
+
 
 def revisions(folder: Path) -> list[Path]:
     """Artifacts of all revisions, the oldest first; none for a folder that is not there.
 
-    Raises: InputError naming a revision that is missing or whose artifact is.
+    Raises: InputError naming a revision that is missing or whose artifact is, or a link that is out of order.
     """
-    numbers = [int(name) for name in (os.listdir(folder) if folder.is_dir() else []) if name.isdigit()]
-    found = [folder / str(number) for number in range(1, max(numbers, default=0) + 1)]
+    numbers = [name for name in (os.listdir(folder) if folder.is_dir() else []) if NUMBER.fullmatch(name)]
+    found = [folder / str(number) for number in range(1, len(numbers) + 1)]
+    for name in numbers:
+        if folder / name not in found:
+            raise InputError(f"{folder / name} follows no revision {int(name) - 1}: restore that, or delete the link")
     for link in found:
         if not artifact.is_published(link):
             raise InputError(f"{link} is no finished revision: restore its artifact, or delete {folder} and begin anew")
+        if link.resolve().name != (key := artifact.read_manifest(link).key):
+            raise InputError(f"{link} leads to no folder that is called {key}, as its artifact is; link that")
     return [link.resolve() for link in found]
 
 

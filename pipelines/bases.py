@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import difflib
 import io
-import os
 import shutil
 import sys
 from contextlib import redirect_stdout
@@ -37,12 +36,15 @@ def parse(text: str) -> Reference:
     name, at, number = text.rpartition("@")
     if not at:
         return Reference(text, None)
-    if not name or not number.isdigit() or int(number) < 1:
+    if not name or not heads.NUMBER.fullmatch(number):
         raise ConfigError(f"basis={text}: NAME@REVISION is needed, such as offices@2")
     return Reference(name, int(number))
 
 
 def head_folder(name: str) -> Path:
+    """Raises ConfigError on a name that would lead elsewhere."""
+    if not store.is_name(name):
+        raise ConfigError(f"no basis can be called {name!r}: no / in it, and no . at its beginning")
     return store.work() / f"{PREFIX}{name}"
 
 
@@ -123,18 +125,11 @@ def revisions(text: str) -> list[Path]:
 
 
 def taken_in(folder: Path) -> Path:
-    """The artifact in the store; one from elsewhere is verified and copied there, under its own key."""
+    """The artifact in the store; one from elsewhere is copied there, under its own key, and the copy verified."""
     manifest = artifact.verify(folder, SCHEMA)
     path = store.artifact_path("cks", manifest.key)
     if not store.is_fresh(path):
-        scratch = path.with_name(f".tmp-{path.name}-{os.getpid()}")
-        shutil.copytree(folder, scratch)
-        try:
-            os.rename(scratch, path)
-        except OSError:
-            shutil.rmtree(scratch)
-            if not store.is_fresh(path):
-                raise
+        artifact.copy(folder, path, manifest)
     return path
 
 
@@ -144,8 +139,8 @@ def extend(name: str, gaussians: Path, scene: str) -> list[Path]:
     A scene that the HEAD knows already is not added again, so that a command that was killed may simply be repeated.
     Raises: ConfigError, InputError; SystemExit with the stage's exit code if it fails.
     """
-    if is_sequence(name) or not name or set(name) & set("/@"):
-        raise ConfigError(f"a HEAD cannot be called {name!r}: a sequence is, or it holds a / or @")
+    if is_sequence(name) or not store.is_name(name) or "@" in name:
+        raise ConfigError(f"a HEAD cannot be called {name!r}: a sequence is, or it holds a / or @, or begins with a .")
     from chebsplat.stages import config as configs
 
     manifest, planner = artifact.read_manifest(gaussians, STAGES["train"].schema), Planner()

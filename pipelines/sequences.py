@@ -10,6 +10,7 @@ from chebsplat.formats.files import parse_toml
 from chebsplat.formats.names import unprintable
 from chebsplat.pipelines.plan import Plan, Planner
 from chebsplat.pipelines.scenes import read_toml
+from chebsplat.pipelines.store import is_name
 
 LONGEST = 1000  # scenes of a sequence
 
@@ -19,6 +20,8 @@ def scenes_of(name: str) -> list[str]:
 
     Raises: ConfigError naming the file, or the nearest sequence's name.
     """
+    if not is_name(Path(name).stem):
+        raise ConfigError(f"no sequence can be called {name}: its links lie in the work folder")
     if name.endswith(".toml"):
         values = parse_toml(Path(os.path.expanduser(name)), "correct it", ConfigError)
     else:

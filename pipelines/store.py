@@ -11,7 +11,9 @@ from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
-from chebsplat.errors import InputError
+from chebsplat.errors import ConfigError
+from chebsplat.formats import artifact
+from chebsplat.formats.manifest import parse_manifest
 
 
 def work() -> Path:
@@ -24,8 +26,13 @@ def artifact_path(stage: str, key: str) -> Path:
 
 
 def is_fresh(path: Path) -> bool:
-    """Finished; damage inside is found by the stage that reads it, or by `chebsplat verify`."""
-    return (path / "artifact.json").is_file()
+    """Finished, every member there in its size. Other damage is found by the stage that reads it, or by `verify`."""
+    return artifact.is_whole(path)
+
+
+def is_name(text: str) -> bool:
+    """Whether a text can be the name of something in a folder, and lead nowhere else."""
+    return text != "" and not text.startswith(".") and not set(text) & set("/\0")
 
 
 class Memo:
@@ -34,9 +41,10 @@ class Memo:
     def __init__(self, name: str):
         self.path = work() / ".cache" / f"{name}.json"
         try:
-            self.values: dict[str, Any] = json.loads(self.path.read_text())
-        except (OSError, ValueError):
-            self.values = {}
+            values = json.loads(self.path.read_text())
+        except (OSError, ValueError, RecursionError):
+            values = {}
+        self.values: dict[str, Any] = values if isinstance(values, dict) else {}
         self._before = json.dumps(self.values, sort_keys=True)
 
     def save(self) -> None:
@@ -52,7 +60,11 @@ class Memo:
 def link(scene: str, targets: dict[str, Path]) -> Path:
     """Point `work/<scene>/<stage>` at the finished of `targets`. Stages that the scene leaves out lose their link;
     those that are still to run keep it, and with it the artifact that it names.
+
+    Raises: ConfigError on a name that would lead out of the work folder.
     """
+    if not is_name(scene):
+        raise ConfigError(f"{scene!r} cannot name a folder of links: no / in it, and no . at its beginning")
     folder = work() / scene
     folder.mkdir(parents=True, exist_ok=True)
     for old in folder.iterdir():
@@ -81,25 +93,26 @@ def unnamed(without: Container[Path] = ()) -> list[tuple[Path, int]]:
     base = work()
     if not (base / "store").is_dir():
         return []
-    waiting = [p.resolve() for p in base.glob("*/*") if p.is_symlink() and p.parent not in without]
+    waiting = [_real(p) for p in base.glob("*/*") if p.is_symlink() and p.parent not in without]
     running = _running(base)
-    waiting += [path.resolve() for path in running]
-    by_key = {p.name: p.resolve() for p in base.glob("store/*/*") if not p.name.startswith(".")}
+    waiting += map(_real, running)
+    by_key = {p.name: _real(p) for p in base.glob("store/*/*") if not p.name.startswith(".")}
     named: set[Path] = set()
     while waiting:
         path = waiting.pop()
-        if path in named or not is_fresh(path):
+        if path in named or not artifact.is_published(path):
             continue
         named.add(path)
-        try:
-            inputs = json.loads((path / "artifact.json").read_text())["inputs"]
-            keys = [entry["key"] for entry in inputs.values()]
-        except (ValueError, KeyError, TypeError, AttributeError):
-            raise InputError(f"{path / 'artifact.json'} is damaged; delete {path} and run its stage again") from None
+        keys = [entry["key"] for entry in parse_manifest(path).inputs.values()]
         waiting += [by_key[key] for key in keys if key in by_key]
-    found = [p for p in sorted(base.glob("store/*/*")) if p.resolve() not in named and not _in_use(p, running)]
+    found = [p for p in sorted(base.glob("store/*/*")) if _real(p) not in named and not _in_use(p, running)]
     found += [p for p in sorted(base.glob(".plans/*")) if not _owner_lives(p)]
     return [(p, sum(f.stat().st_size for f in p.rglob("*") if f.is_file())) for p in found]
+
+
+def _real(path: Path) -> Path:
+    """Where a path leads; unlike `Path.resolve`, it takes links that lead in a circle for what they are."""
+    return Path(os.path.realpath(path))
 
 
 def _running(base: Path) -> set[Path]:
@@ -121,7 +134,7 @@ def _in_use(path: Path, running: set[Path]) -> bool:
         return True
     if not path.name.startswith(".part-"):
         return False
-    return path.with_name(path.name[len(".part-") :]) in running or time.time() - path.stat().st_mtime < 3600
+    return path.with_name(path.name[len(".part-") :]) in running or time.time() - path.lstat().st_mtime < 3600
 
 
 def remove_half(path: Path) -> None:
@@ -146,5 +159,9 @@ def _owner_lives(path: Path) -> bool:
 
 
 def remove(path: Path) -> None:
+    """Remove what `unnamed` found; of a link, the link alone."""
+    if path.is_symlink() or not path.is_dir():
+        path.unlink(missing_ok=True)
+        return
     (path / "artifact.json").unlink(missing_ok=True)
     shutil.rmtree(path, ignore_errors=True)

@@ -115,6 +115,8 @@ def read_study(name: str) -> Study:
 
     Raises ConfigError naming the first bad key, or the nearest study's name.
     """
+    if not store.is_name(Path(name).stem):
+        raise ConfigError(f"no study can be called {name}: its links lie in the work folder")
     if name.endswith(".toml"):
         return checked_study(parse_toml(Path(os.path.expanduser(name)), "correct it", ConfigError), name)
     return checked_study(read_toml("studies", name), f"study {name}")

@@ -14,9 +14,9 @@ from typing import Any
 
 import click
 
-from chebsplat.errors import ChebsplatError, Stopped
+from chebsplat.errors import ChebsplatError, ConfigError, Stopped
 from chebsplat.formats import artifact
-from chebsplat.formats.artifact import Manifest
+from chebsplat.formats.manifest import Manifest, is_key
 from chebsplat.stages import config as configs
 from chebsplat.stages.device import DEVICES, resolve
 from chebsplat.stages.progress import Progress
@@ -70,7 +70,7 @@ def command(name: str, run: Callable[[Job], None]) -> click.Command:
         click.Option(["--key"], help="identity given by the planner; the content's digest otherwise"),
         click.Option(["--code"], hidden=True, help="code identity given by the planner (JSON)"),
         click.Option(["--device"], type=click.Choice(DEVICES), default="auto", show_default=True),
-        click.Option(["--force"], is_flag=True, help="run even if the artifact exists, and replace it"),
+        click.Option(["--force"], is_flag=True, help="run even if the artifact exists, and replace it; nothing else"),
         click.Option(["--progress/--no-progress"], default=None, help="default: when stderr is a terminal"),
         click.Option(["--log-level"], default="info",
                      type=click.Choice(["debug", "info", "warning", "error"])),
@@ -85,8 +85,7 @@ def execute(name: str, run: Callable[[Job], None], options: dict[str, Any]) -> i
     log.setLevel(options["log_level"].upper())
     out = Path(options["out"]).absolute()
     try:
-        if artifact.is_published(out) and not options["force"]:
-            artifact.read_manifest(out, STAGES[name].schema)
+        if not options["force"] and artifact.is_whole(out, STAGES[name].schema):
             log.info("already there")
         else:
             with heeded():
@@ -112,7 +111,10 @@ def _run(name: str, run: Callable[[Job], None], options: dict[str, Any], out: Pa
     found = {role: artifact.read_manifest(path, schemas[role]) for role, path in inputs.items()}
     settings = config.sections(stage.sections)
     sources = {role: {"key": m.key, "schema": m.schema} for role, m in found.items()}
+    if options["key"] and not is_key(options["key"]):
+        raise ConfigError(f"--key {options['key']}: a key is 16 hexadecimal digits; leave it away, or correct it")
     key = options["key"] or artifact.digest({"stage": name, "config": settings, "inputs": sources})
+    artifact.check_place(out, stage.schema, key, options["force"])
     seed = next((settings[s]["seed"] for s in reversed(stage.sections) if "seed" in settings[s]), None)
     device, why = resolve(options["device"])
     if why:
@@ -122,9 +124,7 @@ def _run(name: str, run: Callable[[Job], None], options: dict[str, Any], out: Pa
     progress = Progress(options["progress"])
     scratch = out.parent / f".part-{out.name}"
     began = time.perf_counter()
-    if options["force"]:
-        artifact.discard(out)
-    with artifact.publish(out, manifest) as tmp, half_made(tmp):
+    with artifact.publish(out, manifest, options["force"]) as tmp, half_made(tmp):
         job = Job(inputs, config, tmp, scratch, device, progress, manifest.facts)
         with progress.log_to(tmp / "log.jsonl"):
             run(job)

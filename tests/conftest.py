@@ -2,7 +2,7 @@
 
 import chebsplat  # noqa: F401  # isort: skip  # before torch: OpenMP threads that spin slow parallel tests down
 import pytest
-from shared import INPUTS, TOY, run_stage
+from shared import INPUTS, KEY, TOY, run_stage
 from tiny_teachers import color_reference, color_teacher
 
 
@@ -43,7 +43,7 @@ def mixed(toy, tmp_path_factory):
     before.parameters |= {name: p[name][order] for name in ("degrees", "shN")}
     before.labels, before.order = before.labels[back][order], order
     path = tmp_path_factory.mktemp("mixed") / "scene"
-    with artifact.publish(path, Manifest(SCHEMA, "k", "test")) as tmp:
+    with artifact.publish(path, Manifest(SCHEMA, KEY, "test")) as tmp:
         write_scene(tmp, before)
     return checkpoint, path
 

@@ -1,5 +1,6 @@
 """What tests share: the toy scene's settings, how stages feed one another, third-party data."""
 
+import hashlib
 import json
 import os
 from pathlib import Path
@@ -7,6 +8,7 @@ from pathlib import Path
 import pytest
 
 ROOT = Path(__file__).parents[1]
+KEY = "0" * 16  # of artifacts whose identity is no matter
 DATA = Path(os.environ.get("CHEBSPLAT_TEST_DATA", ROOT / "../shared/data"))
 
 TOY = {
@@ -36,6 +38,11 @@ INPUTS = {
         "features": "teacher",
     },
 }
+
+
+def key_of(name):
+    """A key that a test can tell from another."""
+    return hashlib.sha256(str(name).encode()).hexdigest()[:16]
 
 
 def gaussian_parameters(n=6, seed=0):
@@ -77,10 +84,14 @@ def run_stage(stage, out, inputs=None, config=None):
 
 def finish(plan):
     """Pretend that every step of a plan has run."""
+    from chebsplat.formats import artifact
+    from chebsplat.formats.manifest import Manifest
+    from chebsplat.stages.registry import STAGES
+
     for step in plan.steps:
-        step.path.mkdir(parents=True, exist_ok=True)
-        inputs = {role: {"key": path.name} for role, path in step.inputs.items()}
-        (step.path / "artifact.json").write_text(json.dumps({"inputs": inputs, "seconds": 1.0}))
+        inputs = {role: {"key": path.name, "schema": "s/1"} for role, path in step.inputs.items()}
+        with artifact.publish(step.path, Manifest(STAGES[step.stage].schema, step.key, step.stage, inputs)):
+            pass
 
 
 def photo_folder(folder):

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 import torch
 from click.testing import CliRunner
-from shared import ROOT
+from shared import ROOT, key_of
 
 from chebsplat.cks import update
 from chebsplat.formats import artifact, heads
@@ -50,8 +50,8 @@ def chain():
             held, reports[name] = update(torch.from_numpy(grown[name]) if name in grown else None, W, energy=0.9999)
             grown[name], weights[f"{name}.weight"] = held.numpy(), W.numpy()
         lineage.append({"scene": scene, "gaussians": f"g{number}", "projections": reports})
-        earlier = f"k{number - 1}" if number > 1 else None
-        found.append(publish(f"k{number}", Basis(dict(grown), weights, list(lineage)), earlier))
+        earlier = key_of(number - 1) if number > 1 else None
+        found.append(publish(key_of(number), Basis(dict(grown), weights, list(lineage)), earlier))
         assert heads.advance(bases.head_folder("shared"), number - 1, found[-1])
     return found
 
@@ -128,7 +128,7 @@ def too_wide(basis):
 def test_a_revision_that_is_no_continuation_is_an_input_error(chain, damage, message):
     forged = read_basis(chain[1])
     damage(forged)
-    path = publish("forged", forged, "k1")
+    path = publish(key_of("forged"), forged, key_of(1))
     code, _, said = call("verify", f"{path}/")
     assert code == 3
     assert message in said
@@ -153,8 +153,8 @@ def test_what_is_exported_starts_scenes_elsewhere(chain, tmp_path, monkeypatch):
 
     (plan,) = plans(scene="toy", sequence=None, settings="", ablation="", basis=f"{tmp_path}/knowledge/")
     train = next(step for step in plan.steps if step.stage == "train")
-    assert train.inputs["basis"] == store.artifact_path("cks", "k2")
-    assert plan.title == "toy@basis=k2"
+    assert train.inputs["basis"] == store.artifact_path("cks", key_of(2))
+    assert plan.title == f"toy@basis={key_of(2)}"
     assert read_basis(train.inputs["basis"]).lineage == read_basis(chain[1]).lineage
 
 

@@ -5,6 +5,7 @@ import logging
 
 import pytest
 from click.testing import CliRunner
+from shared import KEY
 
 from chebsplat.errors import DataFailure
 from chebsplat.formats import artifact
@@ -29,10 +30,10 @@ def good(job):
 
 
 def test_artifact_is_published_and_its_path_printed(tmp_path):
-    result = invoke(good, "--out", tmp_path / "x", "--key", "abc")
+    result = invoke(good, "--out", tmp_path / "x", "--key", KEY)
     assert (result.exit_code, result.stdout) == (0, f"{tmp_path / 'x'}\n")
     manifest = artifact.verify(tmp_path / "x", "chebsplat.capture/1")
-    assert (manifest.key, manifest.facts) == ("abc", {"left_out": {"depth": "none given"}})
+    assert (manifest.key, manifest.facts) == (KEY, {"left_out": {"depth": "none given"}})
     assert set(manifest.config) == {"scene", "source", "ingest"}
 
 
@@ -77,7 +78,7 @@ def test_missing_or_wrong_input_of_every_stage_exits_3(tmp_path, stage):
     inputs = [a for role, _ in STAGES[stage].inputs for a in (f"--in-{role}", tmp_path / role)]
     assert invoke(good, *inputs, "--out", tmp_path / "x", stage=stage).exit_code == 3
     for role, _ in STAGES[stage].inputs:
-        with artifact.publish(tmp_path / role, Manifest("chebsplat.other/1", "k", "other")):
+        with artifact.publish(tmp_path / role, Manifest("chebsplat.other/1", KEY, "other")):
             pass
     assert invoke(good, *inputs, "--out", tmp_path / "x", stage=stage).exit_code == 3
     assert not (tmp_path / "x").exists()

@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from shared import KEY
 
 from chebsplat.errors import InputError
 from chebsplat.formats import artifact, features
@@ -158,7 +159,7 @@ def test_a_store_that_lacks_a_view_or_its_labels_is_not_finished(tmp_path):
 def test_any_patch_of_any_size_reads_back(tmp_path_factory, h, w, c, data):
     path = tmp_path_factory.mktemp("any") / "features"
     stack = np.random.default_rng(h * w).normal(size=(2, h, w, c)).astype(np.float16)
-    with artifact.publish(path, Manifest(features.SCHEMA, "k", "s")) as tmp:
+    with artifact.publish(path, Manifest(features.SCHEMA, KEY, "s")) as tmp:
         features.write_features(tmp, Features(["a", "b"], stack, ["x"], np.eye(1, c, dtype=np.float32)))
     found = features.read_features(path).features
     (top, bottom), (left, right) = (
@@ -172,7 +173,7 @@ def test_any_patch_of_any_size_reads_back(tmp_path_factory, h, w, c, data):
 def test_a_patch_is_read_without_decoding_the_rest_of_its_view(tmp_path):
     path = tmp_path / "f"
     stack = np.random.default_rng(0).normal(size=(1, 128, 128, 4)).astype(np.float16)
-    with artifact.publish(path, Manifest(features.SCHEMA, "k", "s")) as tmp:
+    with artifact.publish(path, Manifest(features.SCHEMA, KEY, "s")) as tmp:
         features.write_features(tmp, Features(["a"], stack, ["x"], np.eye(1, 4, dtype=np.float32)))
     shard = path / "features/c/0/0/0/0"
     good = shard.read_bytes()
@@ -186,7 +187,7 @@ def test_a_patch_is_read_without_decoding_the_rest_of_its_view(tmp_path):
 def test_every_bit_of_a_shard_is_guarded(tmp_path):
     path = tmp_path / "f"
     stack = np.zeros((1, 65, 65, 1), np.float16)  # compresses well: few bytes to try
-    with artifact.publish(path, Manifest(features.SCHEMA, "k", "s")) as tmp:
+    with artifact.publish(path, Manifest(features.SCHEMA, KEY, "s")) as tmp:
         features.write_features(tmp, Features(["a"], stack, ["x"], np.eye(1, 1, dtype=np.float32)))
     shard = path / "features/c/0/0/0/0"
     good = shard.read_bytes()
@@ -201,7 +202,7 @@ def test_every_bit_of_a_shard_is_guarded(tmp_path):
 
 def test_a_shard_dropped_from_the_manifest_is_not_read_as_fill_values(tmp_path):
     path = tmp_path / "f"
-    with artifact.publish(path, Manifest(features.SCHEMA, "k", "s")) as tmp:
+    with artifact.publish(path, Manifest(features.SCHEMA, KEY, "s")) as tmp:
         writer = written(tmp_path / "w", range(4))
         writer.finish(tmp, *LABELS)
     (path / "features/c/2/0/0/0").unlink()
@@ -214,7 +215,7 @@ def test_a_shard_dropped_from_the_manifest_is_not_read_as_fill_values(tmp_path):
 
 def test_embeddings_longer_than_one_are_refused_on_reading(tmp_path):
     path = tmp_path / "f"
-    with artifact.publish(path, Manifest(features.SCHEMA, "k", "s")) as tmp:
+    with artifact.publish(path, Manifest(features.SCHEMA, KEY, "s")) as tmp:
         written(tmp_path / "w", range(4)).finish(tmp, LABELS[0], 2 * LABELS[1], {})
     with pytest.raises(InputError, match="an embedding is 2 long"):
         features.read_features(path)

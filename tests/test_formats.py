@@ -5,7 +5,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from shared import gaussian_parameters
+from shared import KEY, gaussian_parameters
 
 from chebsplat.errors import InputError
 from chebsplat.formats import artifact, capture, descriptors, evaluation, features, ply, points, scene
@@ -122,7 +122,7 @@ CASES = {
 def case(request, tmp_path):
     make, write, read, schema = CASES[request.param]
     record, path = make(), tmp_path / request.param
-    with artifact.publish(path, Manifest(schema, "k", "s")) as tmp:
+    with artifact.publish(path, Manifest(schema, KEY, "s")) as tmp:
         write(tmp, record)
     return record, read, path
 
@@ -190,7 +190,7 @@ def test_a_chunk_dropped_from_the_manifest_is_not_read_as_fill_value(case):
 def test_non_finite_values_are_never_published(tmp_path):
     record = make_points()
     record.means[2, 1] = np.nan
-    with pytest.raises(ValueError, match="non-finite"), artifact.publish(tmp_path / "p", Manifest("s", "k", "s")) as t:
+    with pytest.raises(ValueError, match="non-finite"), artifact.publish(tmp_path / "p", Manifest("s", KEY, "s")) as t:
         points.write_points(t, record)
     assert not (tmp_path / "p").exists()
 
@@ -262,7 +262,7 @@ def test_tags_follow_the_62_floats_as_floats_and_names_are_comments(tmp_path):
 def test_fixed_point_features_are_within_half_a_step(tmp_path):
     record = make_scene()
     record.parameters["features"] = np.random.default_rng(0).normal(size=(6, 4)).astype(np.float32)
-    with artifact.publish(tmp_path / "s", Manifest(scene.SCHEMA, "k", "s")) as tmp:
+    with artifact.publish(tmp_path / "s", Manifest(scene.SCHEMA, KEY, "s")) as tmp:
         scene.write_scene(tmp, record)
     wanted = record.parameters["features"]
     found = scene.read_scene(tmp_path / "s").parameters["features"]
@@ -322,7 +322,7 @@ def test_a_compressed_ply_is_refused_with_advice():
 
 @pytest.mark.parametrize("damage", ["truncate", "flip", "remove"])
 def test_verify_names_a_damaged_ply_of_a_scene(tmp_path, damage):
-    with artifact.publish(tmp_path / "scene", Manifest(scene.SCHEMA, "k", "s")) as tmp:
+    with artifact.publish(tmp_path / "scene", Manifest(scene.SCHEMA, KEY, "s")) as tmp:
         scene.write_scene(tmp, make_scene())
     file = tmp_path / "scene/scene.ply"
     good = file.read_bytes()

@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 from safetensors.numpy import load_file
+from shared import KEY
 
 from chebsplat.errors import InputError
 from chebsplat.formats import artifact
@@ -25,13 +26,13 @@ def example(n=5, seed=0, top=3):
 
 
 def publish_gaussians(path, gaussians):
-    with artifact.publish(path, Manifest("chebsplat.gaussians/1", "k", "train")) as tmp:
+    with artifact.publish(path, Manifest("chebsplat.gaussians/1", KEY, "train")) as tmp:
         write_gaussians(tmp, gaussians)
     return path
 
 
 def publish_basis(path, basis):
-    with artifact.publish(path, Manifest("chebsplat.basis/2", "k", "cks")) as tmp:
+    with artifact.publish(path, Manifest("chebsplat.basis/2", KEY, "cks")) as tmp:
         write_basis(tmp, basis)
     return path
 

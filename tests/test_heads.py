@@ -9,7 +9,7 @@ import time
 
 import numpy as np
 import pytest
-from shared import ROOT, gaussian_parameters
+from shared import ROOT, gaussian_parameters, key_of
 
 from chebsplat.errors import ConfigError, InputError
 from chebsplat.formats import artifact, heads
@@ -20,6 +20,7 @@ from chebsplat.formats.gaussians import SCHEMA, Gaussians, write_gaussians
 
 COUNTING = """
 import sys
+from hashlib import sha256
 from pathlib import Path
 from chebsplat.formats import artifact, heads
 from chebsplat.formats.basis import SCHEMA, Basis, read_lineage, write_basis
@@ -32,7 +33,7 @@ for number in range(int(sys.argv[3])):
         lineage = [] if head is None else read_lineage(head)
         if name in {entry["gaussians"] for entry in lineage}:
             return None
-        out = root / "store/cks" / f"{len(lineage) + 1}-{name}"
+        out = root / "store/cks" / sha256(f"{len(lineage)} {name}".encode()).hexdigest()[:16]
         with artifact.publish(out, artifact.Manifest(SCHEMA, out.name, "cks")) as tmp:
             write_basis(tmp, Basis({}, {}, [*lineage, {"scene": who, "gaussians": name, "projections": {}}]))
         return out
@@ -76,14 +77,14 @@ def race(script, root, n_processes, n_updates, n_kills, pause, watch):
     return killed
 
 
-def nothing_is_lost(root, n_processes, n_updates):
+def nothing_is_lost(root, n_processes, n_updates, name=str):
     """All revisions, each the continuation of the one before, each update in them once."""
     found = heads.revisions(root / "basis-shared")
     assert len(found) == n_processes * n_updates
     lineages = [read_lineage(path) for path in found]
     assert all(later[:-1] == earlier for earlier, later in itertools.pairwise(lineages))
     names = [entry["gaussians"] for entry in lineages[-1]]
-    assert sorted(names) == sorted(f"{who}-{k}" for who in range(n_processes) for k in range(n_updates))
+    assert sorted(names) == sorted(name(f"{who}-{k}") for who in range(n_processes) for k in range(n_updates))
     return found
 
 
@@ -121,10 +122,10 @@ def trained(path, key, seed):
 def test_eighty_updates_by_eight_killed_processes_are_all_there_and_orthonormal(tmp_path):
     for who in range(8):
         for number in range(10):
-            trained(tmp_path / f"trained/{who}-{number}", f"{who}-{number}", 10 * who + number)
+            trained(tmp_path / f"trained/{who}-{number}", key_of(f"{who}-{number}"), 10 * who + number)
     killed = race(EXTENDING, tmp_path, 8, 10, n_kills=24, pause=0.8, watch=lambda: read_all(tmp_path))
     assert killed >= 8
-    for path in nothing_is_lost(tmp_path, 8, 10):
+    for path in nothing_is_lost(tmp_path, 8, 10, key_of):
         assert all(off_orthonormal(columns) <= 1e-6 for columns in read_basis(path).bases.values())
 
 
@@ -140,7 +141,7 @@ def test_a_head_grows_by_scenes_and_a_scene_it_knows_adds_nothing(work):
     from chebsplat.pipelines import bases, store
 
     for seed in range(3):
-        found = bases.extend("shared", trained(work / f"trained/{seed}", f"k{seed}", seed), f"room{seed}")
+        found = bases.extend("shared", trained(work / f"trained/{seed}", key_of(seed), seed), f"room{seed}")
         assert len(found) == seed + 1
     again = bases.extend("shared", work / "trained/1", "room1")
     assert again == found
@@ -159,14 +160,15 @@ def test_a_head_grows_by_scenes_and_a_scene_it_knows_adds_nothing(work):
 
 
 def test_a_head_moves_only_from_the_revision_that_was_read(tmp_path):
-    for name in "ab":
-        with artifact.publish(tmp_path / name, Manifest("chebsplat.basis/2", name, "cks")) as tmp:
+    first, second = (tmp_path / key_of(name) for name in "ab")
+    for path in (first, second):
+        with artifact.publish(path, Manifest("chebsplat.basis/2", path.name, "cks")) as tmp:
             write_basis(tmp, Basis({}, {}, []))
     folder = tmp_path / "basis-x"
-    assert heads.advance(folder, 0, tmp_path / "a")
-    assert not heads.advance(folder, 0, tmp_path / "b")
-    assert heads.revisions(folder) == [tmp_path / "a"]
-    assert heads.advance(folder, 1, tmp_path / "b")
+    assert heads.advance(folder, 0, first)
+    assert not heads.advance(folder, 0, second)
+    assert heads.revisions(folder) == [first]
+    assert heads.advance(folder, 1, second)
     with pytest.raises(InputError, match="missing"):
         heads.advance(folder, 2, tmp_path / "nothing")
     (folder / "1").unlink()

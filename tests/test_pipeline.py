@@ -10,6 +10,8 @@ import pytest
 from shared import ROOT, finish, photo_folder
 
 from chebsplat.errors import ConfigError, InputError
+from chebsplat.formats import artifact
+from chebsplat.formats.artifact import Manifest
 from chebsplat.pipelines import store
 from chebsplat.pipelines.code import installed
 from chebsplat.pipelines.keys import content_hash

@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from shared import KEY
 
 from chebsplat.errors import InputError
 from chebsplat.formats import artifact
@@ -125,7 +126,7 @@ def made(path):
     matrix, energy = projection(moments(low_rank(8, 12)), words(12), 5)
     matrix32 = matrix.astype(np.float32)
     record = Projection(matrix32, matrix32.T.copy(), energy.astype(np.float32), "lseg", {"n_pixels": 400})
-    with artifact.publish(path, Manifest(SCHEMA, "k", "projection")) as tmp:
+    with artifact.publish(path, Manifest(SCHEMA, KEY, "projection")) as tmp:
         write_projection(tmp, record)
     return record
 

@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 from click.testing import CliRunner
 from PIL import Image
+from shared import KEY
 
 from chebsplat.formats import artifact
 from chebsplat.formats.artifact import Manifest, sha256_file
@@ -41,7 +42,7 @@ def vectors(names):
 
 
 def published(path, schema, write, record, **facts):
-    with artifact.publish(path, Manifest(f"chebsplat.{schema}", "k", "test", **facts)) as tmp:
+    with artifact.publish(path, Manifest(f"chebsplat.{schema}", KEY, "test", **facts)) as tmp:
         write(tmp, record)
 
 

@@ -9,7 +9,7 @@ from html.parser import HTMLParser
 import numpy as np
 import pytest
 from browser import BROWSER, browsed
-from shared import run_stage
+from shared import KEY, run_stage
 
 from chebsplat.errors import InputError
 from chebsplat.formats.artifact import Manifest, publish
@@ -70,7 +70,7 @@ def test_the_page_s_pictures_are_those_of_the_evaluation(toy):
 
 
 def test_labels_are_named_by_the_capture_and_otherwise_by_the_scene(toy, tmp_path):
-    manifest = Manifest("chebsplat.scene/1", "k", "export", {}, {}, 0)
+    manifest = Manifest("chebsplat.scene/1", KEY, "export", {}, {}, 0)
     with publish(tmp_path / "scene", manifest) as out:
         (out / "labels.json").write_text(json.dumps({"0": "sofa", "1": "lamp"}))
     inputs = {"scene": tmp_path / "scene"}

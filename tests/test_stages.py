@@ -7,7 +7,7 @@ import shutil
 
 import numpy as np
 import pytest
-from shared import INPUTS, TOY, run_stage
+from shared import INPUTS, KEY, TOY, run_stage
 
 from chebsplat.formats import artifact
 from chebsplat.formats.artifact import Manifest
@@ -33,7 +33,7 @@ def inputs_of(toy, stage):
 
 
 def published(path, schema, write, record, *arguments):
-    with artifact.publish(path, Manifest(schema, "k", "test")) as tmp:
+    with artifact.publish(path, Manifest(schema, KEY, "test")) as tmp:
         write(tmp, record, *arguments)
     return path
 

@@ -12,7 +12,7 @@ import numpy as np
 import onnx
 import pytest
 from onnx import TensorProto, helper
-from shared import ROOT, run_stage
+from shared import KEY, ROOT, run_stage
 from tiny_teachers import COLORS, color_teacher, write_model, write_settings, write_table
 
 from chebsplat.errors import InputError
@@ -48,7 +48,7 @@ def published_capture(path, images, labels=None, class_names=tuple(COLORS)):
         [f"view_{k:03d}" for k in range(n)], images, np.tile(np.eye(3), (n, 1, 1)), None, np.arange(n) % 4 == 0,
         labels=None if labels is None else labels.astype(np.int16), class_names=list(class_names) or None,
     )  # fmt: skip
-    with artifact.publish(path, Manifest("chebsplat.capture/1", "k", "ingest")) as tmp:
+    with artifact.publish(path, Manifest("chebsplat.capture/1", KEY, "ingest")) as tmp:
         write_capture(tmp, record)
     return path
 
@@ -140,7 +140,7 @@ def test_a_projection_is_applied_to_every_view_and_the_labels_are_the_teacher_s(
     write_table(tmp_path / "tiny.npz", embeddings=np.array(list(COLORS.values())) @ wide.T)
     matrix = np.linalg.qr(np.concatenate([wide, rng.normal(size=(100, 5))], 1))[0].astype(np.float32)
     record = Projection(matrix, matrix.T.copy(), np.ones(100, np.float32), "tiny", {})
-    with artifact.publish(tmp_path / "projection", Manifest("chebsplat.projection/1", "p", "projection")) as tmp:
+    with artifact.publish(tmp_path / "projection", Manifest("chebsplat.projection/1", KEY, "projection")) as tmp:
         write_projection(tmp, record)
     code, found = encoded(tmp_path, capture, tmp_path / "tiny.onnx", {"projection": tmp_path / "projection"})
     assert code == 0

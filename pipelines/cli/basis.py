@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import csv
 import os
-import shutil
 import sys
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -98,15 +97,12 @@ def verify(name: str) -> None:
 @click.option("--out", type=click.Path(path_type=Path), required=True, help="folder to make; later: basis=FOLDER/")
 def export(name: str, out: Path) -> None:
     """Copy a revision, to start scenes from it elsewhere (basis=FOLDER/)."""
-    from chebsplat.formats.artifact import verify as check
+    from chebsplat.formats import artifact
 
     path, _ = found(name)
-    check(path)
-    if out.exists():
+    if os.path.lexists(out):
         raise ConfigError(f"{out} exists; choose another --out")
-    scratch = out.with_name(f".tmp-{out.name}-{os.getpid()}")
-    shutil.copytree(path, scratch)
-    os.rename(scratch, out)
+    artifact.copy(path, out, artifact.verify(path))
     print(out.absolute())
 
 
