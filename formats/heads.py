@@ -26,7 +26,9 @@ def revisions(folder: Path) -> list[Path]:
     found = [folder / str(number) for number in range(1, len(numbers) + 1)]
     for name in numbers:
         if folder / name not in found:
-            raise InputError(f"{folder / name} follows no revision {int(name) - 1}: restore that, or delete the link")
+            raise InputError(
+                f"{folder / name} follows no finished revision {int(name) - 1}: restore that, or delete the link"
+            )
     for link in found:
         if not artifact.is_published(link):
             raise InputError(f"{link} is no finished revision: restore its artifact, or delete {folder} and begin anew")

@@ -44,7 +44,7 @@ def parse(text: str) -> Reference:
 def head_folder(name: str) -> Path:
     """Raises ConfigError on a name that would lead elsewhere."""
     if not store.is_name(name):
-        raise ConfigError(f"no basis can be called {name!r}: no / in it, and no . at its beginning")
+        raise ConfigError(f"no basis is called {name}, and no folder: a HEAD has no / in it, and no . at its beginning")
     return store.work() / f"{PREFIX}{name}"
 
 

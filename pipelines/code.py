@@ -10,21 +10,25 @@ from __future__ import annotations
 import ast
 import hashlib
 import sys
+from collections.abc import Iterable
 from importlib import metadata
 from pathlib import Path
+from typing import Any
 
 
 def installed() -> dict[str, Path]:
     """Where the layers lie, in a checkout or in site-packages."""
     import chebsplat
-    from chebsplat import formats, pipelines, stages
+    from chebsplat import formats, pipelines, stages, teachers
 
     layers = {"chebsplat": chebsplat, "formats": formats, "stages": stages, "pipelines": pipelines}
+    layers["teachers"] = teachers
     return {name: Path(module.__path__[0]) for name, module in layers.items()}
 
 
 PLUMBING = {f"stages.{name}" for name in ("config", "settings", "registry", "command", "progress", "stopping")}
-LAYERS = ("formats", "stages", "pipelines")
+LAYERS = ("formats", "stages", "pipelines", "teachers")
+OPTIONAL = {"gsplat", "tokenizers", "transformers"}  # of extras: their versions count only where a scene uses them
 
 
 class Code:
@@ -36,15 +40,19 @@ class Code:
         self.folders, self.memo = folders, memo
         self.read_now = 0  # files parsed in this process
         self._versions: dict[str, str | None] = {}
-        self._stages: dict[str, dict[str, object]] = {}
+        self._stages: dict[str, dict[str, Any]] = {}
 
-    def stage(self, name: str) -> dict[str, object]:
-        """{"hash": ..., "packages": {name: version}} of stage `name`; read once in this object's life."""
+    def stage(self, name: str, used: tuple[str, ...] = ()) -> dict[str, Any]:
+        """{"hash": ..., "packages": {name: version}} of stage `name`; read once in this object's life.
+
+        Args: used: packages of extras that the configuration uses; others of OPTIONAL are no part of the identity.
+        """
         if name not in self._stages:
             self._stages[name] = self._identity(name)
-        return self._stages[name]
+        found = self._stages[name]
+        return found | {"packages": found["packages"] | self._versions_of(used)}
 
-    def _identity(self, name: str) -> dict[str, object]:
+    def _identity(self, name: str) -> dict[str, Any]:
         seen: dict[str, str] = {}
         packages: set[str] = set()
         waiting = [f"stages.{name}"]
@@ -62,8 +70,11 @@ class Code:
                 elif first not in sys.stdlib_module_names:
                     packages.add(first)
         text = "\n".join(f"{module} {digest}" for module, digest in sorted(seen.items()))
-        versions = {name: version for name in sorted(packages) if (version := self._version(name))}
+        versions = self._versions_of(packages - OPTIONAL)
         return {"hash": hashlib.sha256(text.encode()).hexdigest()[:16], "packages": versions}
+
+    def _versions_of(self, packages: Iterable[str]) -> dict[str, str]:
+        return {name: version for name in sorted(packages) if (version := self._version(name))}
 
     def _modules(self, dotted: str) -> list[str]:
         """Modules that `import chebsplat.<dotted>` runs: the packages on the way, and the module itself."""
@@ -89,7 +100,7 @@ class Code:
         state, key = path.stat(), str(path)
         stamp = [state.st_mtime_ns, state.st_size]
         held = self.memo.get(key)
-        if held is None or held[0] != stamp:
+        if held is None or not _remembers(held, stamp):
             self.read_now += 1
             held = self.memo[key] = [stamp, *parsed(path.read_text(), key)]
         return held[1], held[2]
@@ -102,6 +113,13 @@ class Code:
             except metadata.PackageNotFoundError:
                 self._versions[package] = None
         return self._versions[package]
+
+
+def _remembers(held: Any, stamp: list[int]) -> bool:
+    """Whether an entry of the memo, which is a file that anything may have happened to, is of this stamp."""
+    if not (isinstance(held, list) and len(held) == 3 and held[0] == stamp and isinstance(held[1], str)):
+        return False
+    return isinstance(held[2], list) and all(isinstance(name, str) for name in held[2])
 
 
 def parsed(text: str, name: str) -> tuple[str, list[str]]:

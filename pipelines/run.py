@@ -18,6 +18,7 @@ from typing import Any
 
 from chebsplat.pipelines import children, store, summary
 from chebsplat.pipelines.plan import Plan, Step
+from chebsplat.pipelines.raw import unchanged
 from chebsplat.pipelines.tables import aligned
 
 HERE = Path(__file__).parent
@@ -119,12 +120,15 @@ def snakemake(steps: list[Step], cores: int, threads: int | None = None, device:
 def write_plan(entries: list[dict[str, Any]]) -> Path:
     """The plan of a run, in a folder of its own with each job's config; as long as this process lives, `clean-stale`
     spares what it names."""
+    raw = {f"{item['stage']}-{item['key']}.raw.json": item.pop("raw") for item in entries}
     text = json.dumps({"steps": entries}, indent=1)
     folder = store.work() / ".plans" / f"{hashlib.sha256(text.encode()).hexdigest()[:16]}-{os.getpid()}"
     shutil.rmtree(folder, ignore_errors=True)
     folder.mkdir(parents=True)
     for item in entries:
         (folder / f"{item['stage']}-{item['key']}.json").write_text(json.dumps(item["config"], indent=1))
+    for name, hashes in raw.items():
+        (folder / name).write_text(json.dumps(hashes))
     plan = folder / "plan.json"
     plan.with_suffix(".part").write_text(text)
     os.replace(plan.with_suffix(".part"), plan)
@@ -173,6 +177,7 @@ def entry(step: Step, state: dict[str, Any], device: str = "cpu") -> dict[str, A
         "inputs": {role: str(path) for role, path in step.inputs.items()},
         "config": step.sections,
         "code": step.code | state,
+        "raw": step.raw,
         "device": device,
     }
 
@@ -202,7 +207,8 @@ def job(plan: Path, key: str) -> int:
     try:
         with alone(Path(step["path"])):
             store.remove_half(Path(step["path"]))
-            import_module(f"chebsplat.stages.{step['stage']}").main(arguments, prog_name=step["stage"])
+            watch = unchanged(step["stage"], step["config"], json.loads(Path(f"{files}.raw.json").read_text()))
+            import_module(f"chebsplat.stages.{step['stage']}").main(arguments, prog_name=step["stage"], obj=watch)
     except SystemExit as stop:
         code = stop.code if isinstance(stop.code, int) else 1
     finally:

@@ -147,7 +147,7 @@ def remove_half(path: Path) -> None:
 def _owner_lives(path: Path) -> bool:
     """Whether the process whose number ends the folder's name still runs."""
     owner = path.name.rsplit("-", 1)[-1]
-    if not owner.isdigit():
+    if not owner.isdecimal():
         return False
     try:
         os.kill(int(owner), 0)

@@ -8,6 +8,7 @@ import os
 import sys
 import time
 from collections.abc import Callable
+from contextlib import nullcontext
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -49,11 +50,15 @@ class Job:
 
 
 def command(name: str, run: Callable[[Job], None]) -> click.Command:
-    """The click command of stage `name`: explicit inputs, one config, one output."""
+    """The click command of stage `name`: explicit inputs, one config, one output.
+
+    The context's object may be a context manager that the stage reads and computes within; what it raises at the end
+    keeps the artifact from being published.
+    """
     stage = STAGES[name]
 
     def invoke(**options: Any) -> None:
-        sys.exit(execute(name, run, options))
+        sys.exit(execute(name, run, options | {"within": click.get_current_context().obj or nullcontext()}))
 
     params: list[click.Parameter] = [
         click.Option(
@@ -124,7 +129,7 @@ def _run(name: str, run: Callable[[Job], None], options: dict[str, Any], out: Pa
     progress = Progress(options["progress"])
     scratch = out.parent / f".part-{out.name}"
     began = time.perf_counter()
-    with artifact.publish(out, manifest, options["force"]) as tmp, half_made(tmp):
+    with artifact.publish(out, manifest, options["force"]) as tmp, half_made(tmp), options["within"]:
         job = Job(inputs, config, tmp, scratch, device, progress, manifest.facts)
         with progress.log_to(tmp / "log.jsonl"):
             run(job)

@@ -1,9 +1,23 @@
 """Toy artifacts of every stage, made once by the real commands; tests that use them share one worker."""
 
 import chebsplat  # noqa: F401  # isort: skip  # before torch: OpenMP threads that spin slow parallel tests down
+import json
+
 import pytest
 from shared import INPUTS, KEY, TOY, run_stage
 from tiny_teachers import color_reference, color_teacher
+
+
+@pytest.fixture(scope="session")
+def code_memo():
+    """What `work/.cache/code.json` holds once every stage's code has been read: a planner is then quick."""
+    from chebsplat.pipelines.code import Code, installed
+    from chebsplat.stages.registry import STAGES
+
+    code = Code(installed(), {})
+    for stage in STAGES:
+        code.stage(stage)
+    return json.dumps(code.memo)
 
 
 @pytest.fixture(scope="session")

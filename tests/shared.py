@@ -45,6 +45,13 @@ def key_of(name):
     return hashlib.sha256(str(name).encode()).hexdigest()[:16]
 
 
+def remember(work, code_memo):
+    """Spare a planner the reading of code that it has read before; returns the work folder."""
+    (work / ".cache").mkdir(parents=True, exist_ok=True)
+    (work / ".cache/code.json").write_text(code_memo)
+    return work
+
+
 def gaussian_parameters(n=6, seed=0):
     """Random raw parameters, sorted by degree, zero above it."""
     import numpy as np

@@ -7,15 +7,13 @@ import subprocess
 import sys
 
 import pytest
-from shared import ROOT, finish, photo_folder
+from shared import ROOT, finish, photo_folder, remember
 
 from chebsplat.errors import ConfigError, InputError
-from chebsplat.formats import artifact
-from chebsplat.formats.artifact import Manifest
 from chebsplat.pipelines import store
 from chebsplat.pipelines.code import installed
-from chebsplat.pipelines.keys import content_hash
 from chebsplat.pipelines.plan import Planner, overrides, suffix
+from chebsplat.pipelines.raw import content_hash, hashes
 from chebsplat.pipelines.run import failures
 from chebsplat.pipelines.scenes import CONFIGS, names, read_toml
 from chebsplat.stages.registry import STAGES
@@ -25,11 +23,11 @@ AFTER_TRAIN = ["train", "export", "onnx", "evaluate", "report"]
 
 
 @pytest.fixture(autouse=True)
-def work(tmp_path, monkeypatch):
+def work(tmp_path, monkeypatch, code_memo):
     monkeypatch.setenv("CHEBSPLAT_WORK", str(tmp_path / "work folder"))
     monkeypatch.delenv("REPLICA_ROOT", raising=False)
     monkeypatch.chdir(ROOT)
-    return tmp_path / "work folder"
+    return remember(tmp_path / "work folder", code_memo)
 
 
 @pytest.fixture
@@ -159,7 +157,8 @@ def test_a_raw_file_under_another_folder_is_other_content(tmp_path):
     for part in ("semantic", "instance"):
         (tmp_path / part).mkdir()
         (tmp_path / part / "0.png").write_bytes(b"same")
-    semantic, instance = (content_hash([tmp_path / p / "0.png"], tmp_path, {}) for p in ("semantic", "instance"))
+    found = [hashes([tmp_path / part / "0.png"], {}) for part in ("semantic", "instance")]
+    semantic, instance = (content_hash(some, tmp_path) for some in found)
     assert semantic != instance
 
 

