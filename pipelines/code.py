@@ -19,11 +19,11 @@ from typing import Any
 def installed() -> dict[str, Path]:
     """Where the layers lie, in a checkout or in site-packages."""
     import chebsplat
-    from chebsplat import formats, pipelines, stages, teachers
+    from chebsplat import formats, pipelines, stages
+    from chebsplat.teachers import EMBEDDED
 
     layers = {"chebsplat": chebsplat, "formats": formats, "stages": stages, "pipelines": pipelines}
-    layers["teachers"] = teachers
-    return {name: Path(module.__path__[0]) for name, module in layers.items()}
+    return {name: Path(module.__path__[0]) for name, module in layers.items()} | {"teachers": EMBEDDED.parent}
 
 
 PLUMBING = {f"stages.{name}" for name in ("config", "settings", "registry", "command", "progress", "stopping")}

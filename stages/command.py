@@ -116,7 +116,7 @@ def _run(name: str, run: Callable[[Job], None], options: dict[str, Any], out: Pa
     found = {role: artifact.read_manifest(path, schemas[role]) for role, path in inputs.items()}
     settings = config.sections(stage.sections)
     sources = {role: {"key": m.key, "schema": m.schema} for role, m in found.items()}
-    if options["key"] and not is_key(options["key"]):
+    if options["key"] is not None and not is_key(options["key"]):
         raise ConfigError(f"--key {options['key']}: a key is 16 hexadecimal digits; leave it away, or correct it")
     key = options["key"] or artifact.digest({"stage": name, "config": settings, "inputs": sources})
     artifact.check_place(out, stage.schema, key, options["force"])
