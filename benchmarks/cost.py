@@ -18,7 +18,7 @@ from prepared import prepared
 
 from chebsplat.pipelines.scenes import read_toml
 from chebsplat.stages.config import Config
-from chebsplat.trainer import Trainer
+from chebsplat.training.trainer import Trainer
 
 BAR, TURN, REHEARSAL = 1.6, 50, 100
 

@@ -7,9 +7,9 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from chebsplat.gaussians import activated, initial_gaussians, local_shape
-from chebsplat.rasterize.projection import rotation_matrices
-from chebsplat.regions import build_regions
+from chebsplat.shape.regions import build_regions
+from chebsplat.splats.gaussians import activated, initial_gaussians, local_shape
+from chebsplat.splats.rotations import rotation_matrices
 from chebsplat.synthetic import layout
 
 J, D, K = 4, 8, 16

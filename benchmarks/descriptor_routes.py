@@ -18,8 +18,8 @@ import torch
 from descriptor_cases import ANISOTROPY, BANDWIDTH, D, J, K, Regions
 from torch import Tensor
 
-from chebsplat.albo import canonicalize, metric_factors, rotations_about, tangent_axis
-from chebsplat.descriptor import describe_compiled, describe_reference
+from chebsplat.shape.albo import canonicalize, metric_factors, rotations_about, tangent_axis
+from chebsplat.shape.descriptor import describe_compiled, describe_reference
 
 
 @dataclass

@@ -15,7 +15,7 @@ import numpy as np
 
 from chebsplat.formats import artifact
 from chebsplat.formats.points import SCHEMA, Points, write_points
-from chebsplat.regions import build_regions, covering, farthest_points
+from chebsplat.shape.regions import build_regions, covering, farthest_points
 
 
 def best(action: Callable[[], object], repeats: int = 3) -> float:

@@ -18,12 +18,12 @@ from typing import Any
 import numpy as np
 import torch
 
-from chebsplat.encoder import RegionEncoder
-from chebsplat.encoding import Given, prepare
 from chebsplat.formats.encoder import DYNAMIC, FLOAT, read_encoder
 from chebsplat.formats.gaussians import read_gaussians
 from chebsplat.formats.scene import read_scene
-from chebsplat.noisy_teacher import decode_labels
+from chebsplat.labels.decode import decode_labels
+from chebsplat.shape.encoder import RegionEncoder
+from chebsplat.shape.encoding import Given, prepare
 from chebsplat.stages.command import n_threads
 from chebsplat.stages.encode import CHUNK, gaussians, opened
 from chebsplat.stages.onnx import restored_fusion

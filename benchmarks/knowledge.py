@@ -19,7 +19,7 @@ import chebsplat  # isort: skip  # before torch: a busy machine punishes OpenMP 
 import torch
 from prepared import prepared
 
-from chebsplat import cks
+from chebsplat.shape import cks
 from chebsplat.stages.config import Config
 
 BAR = 3.0  # per cent of the time of training

@@ -26,9 +26,9 @@ from chebsplat.formats.capture import read_capture
 from chebsplat.formats.gaussians import read_gaussians
 from chebsplat.formats.ply import read_ply
 from chebsplat.formats.scene import read_scene
-from chebsplat.gaussians import activated
 from chebsplat.rasterize import rasterize
-from chebsplat.sh import eval_sh
+from chebsplat.splats.gaussians import activated
+from chebsplat.splats.sh import eval_sh
 from chebsplat.stages.evaluate import camera
 from chebsplat.views import View
 

@@ -9,7 +9,7 @@ from chebsplat.formats.capture import read_capture
 from chebsplat.formats.features import read_features
 from chebsplat.formats.points import read_points
 from chebsplat.stages.train_inputs import trainer_of
-from chebsplat.trainer import Trainer
+from chebsplat.training.trainer import Trainer
 
 
 def prepared(work: Path, train: dict[str, Any], describe: dict[str, Any]) -> Trainer:

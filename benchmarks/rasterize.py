@@ -27,8 +27,8 @@ import numpy as np
 import torch
 from raster_memory import camera, measured, scene
 
-from chebsplat.losses import feature_distance, photometric
 from chebsplat.rasterize import binning, ellipses, rasterize, reference, tiles
+from chebsplat.training.losses import feature_distance, photometric
 
 SIZE, N, CHANNELS = (320, 240), 20_000, 19
 THREADS = 4

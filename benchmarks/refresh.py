@@ -19,13 +19,13 @@ import chebsplat  # isort: skip  # before torch: a busy machine punishes OpenMP 
 import numba
 import torch
 
-from chebsplat.descriptor import describe_members
 from chebsplat.formats.capture import read_capture
 from chebsplat.formats.features import read_features
 from chebsplat.formats.points import read_points
+from chebsplat.shape.descriptor import describe_members
 from chebsplat.stages.config import Config
 from chebsplat.stages.train_inputs import trainer_of
-from chebsplat.trainer import Trainer
+from chebsplat.training.trainer import Trainer
 
 INTERVALS = (25, 50, 100, 200, 400)
 

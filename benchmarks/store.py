@@ -28,7 +28,7 @@ from scipy.ndimage import gaussian_filter
 
 from chebsplat.formats.artifact import Manifest, publish
 from chebsplat.formats.features import PATCH, SCHEMA, FeatureWriter, read_features
-from chebsplat.projection import ROWS, Moments, projection
+from chebsplat.labels.channels import ROWS, Moments, projection
 from chebsplat.teachers import EMBEDDED
 
 SIZE, N_CHANNELS, N_WORDS = (360, 480), 512, 150

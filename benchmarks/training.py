@@ -44,7 +44,7 @@ def train(work: Path, backend: str, steps: int, seed: int) -> dict[str, Any]:
     settings, describe = config.train.model_dump(), config.describe.model_dump()
     settings |= {"steps": steps, "seed": seed, "encoder": "off", "max_gaussians": 20_000, "refresh_every": 10**9}
     trainer = prepared(work, settings, describe)
-    with mock.patch("chebsplat.model.rasterize", partial(rasterize, backend=backend)):
+    with mock.patch("chebsplat.training.model.rasterize", partial(rasterize, backend=backend)):
         trainer.refresh()
         began = time.perf_counter()
         for _ in trainer.steps():

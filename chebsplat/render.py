@@ -6,9 +6,9 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from chebsplat.gaussians import activated
 from chebsplat.rasterize import rasterize
-from chebsplat.sh import eval_sh
+from chebsplat.splats.gaussians import activated
+from chebsplat.splats.sh import eval_sh
 from chebsplat.views import View, in_frustum
 
 

@@ -19,7 +19,7 @@ SHAPES: dict[str, Shape] = {"matrix": ("C", "d"), "inverse": ("d", "C"), "energy
 
 @dataclass
 class Projection:
-    """A teacher's projection from C to d channels; one for all scenes, computed by `chebsplat.projection`.
+    """A teacher's projection from C to d channels; one for all scenes, computed by `chebsplat.labels.channels`.
 
     matrix:  f32 [C, d] orthonormal columns, of falling weight.
     inverse: f32 [d, C], back to the teacher's channels.

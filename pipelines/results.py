@@ -6,12 +6,12 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from chebsplat import protocols
+from chebsplat.evaluation import protocols
+from chebsplat.evaluation.statistics import Difference, Summary, paired_difference, summarize
 from chebsplat.formats import artifact
 from chebsplat.formats.documents import read_document
 from chebsplat.formats.gaussians import read_trace
 from chebsplat.pipelines.study import Run
-from chebsplat.statistics import Difference, Summary, paired_difference, summarize
 
 Row = dict[str, Any]
 

@@ -9,13 +9,13 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from chebsplat import protocols
 from chebsplat.errors import DataFailure
+from chebsplat.evaluation import protocols
+from chebsplat.evaluation.statistics import Difference, Summary, summarize
 from chebsplat.formats import artifact
 from chebsplat.pipelines import study_figures
 from chebsplat.pipelines.results import COLUMNS, FIGURES, Figure, Line, Row, compare, counted, groups, traces
 from chebsplat.pipelines.study import Run, Study
-from chebsplat.statistics import Difference, Summary, summarize
 
 if TYPE_CHECKING:
     from chebsplat.pipelines.transfer import Section

@@ -11,11 +11,11 @@ from chebsplat.stages.command import Job, command
 def run(job: Job) -> None:
     import torch
 
-    from chebsplat.cks import update
-    from chebsplat.encoder import RegionEncoder
     from chebsplat.formats.artifact import read_manifest
     from chebsplat.formats.basis import Basis, read_basis, write_basis
     from chebsplat.formats.gaussians import read_gaussians
+    from chebsplat.shape.cks import update
+    from chebsplat.shape.encoder import RegionEncoder
 
     settings = job.config.cks
     encoder = RegionEncoder.restored(*read_gaussians(job.inputs["gaussians"]).encoder())

@@ -14,11 +14,11 @@ def run(job: Job) -> None:
     import numpy as np
     import torch
 
-    from chebsplat.descriptor import describe_members
     from chebsplat.formats.descriptors import Descriptors, write_descriptors
     from chebsplat.formats.points import read_points
-    from chebsplat.gaussians import activated, initial_gaussians
-    from chebsplat.regions import build_regions
+    from chebsplat.shape.descriptor import describe_members
+    from chebsplat.shape.regions import build_regions
+    from chebsplat.splats.gaussians import activated, initial_gaussians
 
     settings = job.config.describe
     points = read_points(job.inputs["points"])

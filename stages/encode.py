@@ -12,7 +12,7 @@ from chebsplat.errors import ConfigError, InputError
 if TYPE_CHECKING:
     import numpy as np
 
-    from chebsplat.encoding import Given
+    from chebsplat.shape.encoding import Given
 
 CHUNK = 256  # regions that the encoder sees at once
 
@@ -31,8 +31,8 @@ def encode(scene: Path, encoder: Path, features: Path | None, out: Path) -> dict
     """
     import numpy as np
 
-    from chebsplat.encoding import prepare
     from chebsplat.formats.encoder import DYNAMIC, FLOAT, FUSED, read_encoder
+    from chebsplat.shape.encoding import prepare
 
     if out.suffix != ".npz":
         raise ConfigError(f"{out}: the result is a .npz; name it so")

@@ -12,9 +12,9 @@ from chebsplat.stages.command import Job, command
 if TYPE_CHECKING:
     import numpy as np
 
+    from chebsplat.evaluation.protocols.task import Seen
     from chebsplat.formats.capture import Capture
     from chebsplat.formats.scene import Scene
-    from chebsplat.protocols.task import Seen
     from chebsplat.render import SceneRenderer
     from chebsplat.views import View
 
@@ -22,11 +22,11 @@ if TYPE_CHECKING:
 def run(job: Job) -> None:
     import numpy as np
 
-    from chebsplat import protocols
+    from chebsplat.evaluation import protocols
+    from chebsplat.evaluation.lpips import NET, NORMALIZE
     from chebsplat.formats.capture import read_capture
     from chebsplat.formats.evaluation import Evaluation, write_evaluation
     from chebsplat.formats.scene import read_scene
-    from chebsplat.lpips import NET, NORMALIZE
     from chebsplat.render import SceneRenderer
     from chebsplat.stages.fidelity import frame_split, image_figures, perceptual, timing
 
@@ -107,8 +107,8 @@ def placed(depth: np.ndarray, view: View) -> np.ndarray:
 
 
 def task(job: Job, capture: Capture, scene: Scene, renderer: SceneRenderer) -> Any:
-    from chebsplat.protocols.task import Task
-    from chebsplat.surface import features_at
+    from chebsplat.evaluation.protocols.task import Task
+    from chebsplat.evaluation.surface import features_at
 
     def at(points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         parts = (renderer.means, renderer.quats, renderer.scales, renderer.opacities)
@@ -131,9 +131,9 @@ def seen(
     """Render one view after another; `shown` collects the pictures. Everything is joined on the view's name."""
     import numpy as np
 
+    from chebsplat.evaluation.protocols.task import Named, Seen, resized, translated
     from chebsplat.formats.features import read_features
-    from chebsplat.noisy_teacher import decode_labels
-    from chebsplat.protocols.task import Named, Seen, resized, translated
+    from chebsplat.labels.decode import decode_labels
 
     def as_classes(labels: np.ndarray) -> np.ndarray:
         """A picture whose labels are numbered as the truth's, -1 where the truth has no such class."""

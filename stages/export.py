@@ -14,7 +14,7 @@ def run(job: Job) -> None:
     from chebsplat.formats.features import read_features
     from chebsplat.formats.gaussians import read_gaussians
     from chebsplat.formats.scene import Scene, write_scene
-    from chebsplat.noisy_teacher import decode_labels
+    from chebsplat.labels.decode import decode_labels
 
     gaussians = read_gaussians(job.inputs["gaussians"])
     if len(gaussians.parameters["means"]) == 0:

@@ -11,7 +11,7 @@ from chebsplat.errors import InputError
 if TYPE_CHECKING:
     import numpy as np
 
-    from chebsplat.lpips import Lpips
+    from chebsplat.evaluation.lpips import Lpips
     from chebsplat.render import SceneRenderer
     from chebsplat.views import View
 
@@ -27,8 +27,8 @@ def image_figures(
     """
     import numpy as np
 
-    from chebsplat.losses import ssim
-    from chebsplat.metrics import psnr
+    from chebsplat.evaluation.metrics import psnr
+    from chebsplat.training.losses import ssim
 
     per_view: dict[str, list[float]] = {name: [] for name in ("psnr", "ssim", *(["lpips"] if lpips else []))}
     for k, (render, true) in enumerate(zip(renders, truth, strict=True)):
@@ -50,7 +50,7 @@ def perceptual(path: Path) -> Lpips:
     from safetensors import SafetensorError
     from safetensors.torch import load_file
 
-    from chebsplat.lpips import Lpips
+    from chebsplat.evaluation.lpips import Lpips
 
     if not path.is_file():
         raise InputError(f"{path} is missing; correct evaluate.lpips_weights")
@@ -83,7 +83,7 @@ def frame_split(renderer: SceneRenderer, cameras: list[View], repeats: int) -> d
     """Milliseconds of a frame in colour by part, the best sweep of `repeats` over all views, and under what."""
     import numba
 
-    from chebsplat.frame_parts import PARTS, frame_parts
+    from chebsplat.evaluation.frame_parts import PARTS, frame_parts
 
     sweeps = []
     for _ in range(repeats):

@@ -102,7 +102,7 @@ class ImageEncoder:
         """
         import numpy as np
 
-        from chebsplat.tiling import blended
+        from chebsplat.labels.tiling import blended
 
         total = np.zeros(0)
         for scale in scales:

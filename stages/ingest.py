@@ -57,8 +57,8 @@ def split(names: list[str], own: Any, settings: IngestSection) -> tuple[Any, dic
     """
     import numpy as np
 
-    from chebsplat import protocols
-    from chebsplat.protocols.split import every
+    from chebsplat.evaluation import protocols
+    from chebsplat.evaluation.protocols.split import every
 
     rule = protocols.ALL[settings.protocol]
     given = {"test_every": settings.test_every, "test_offset": settings.test_offset}

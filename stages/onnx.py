@@ -24,9 +24,9 @@ FUSION = ("features", "encodings", "cover", "means", "centers", "quats", "scales
 def run(job: Job) -> None:
     import onnx
 
-    from chebsplat.encoder import RegionEncoder
     from chebsplat.formats.encoder import DYNAMIC, FLOAT, FUSED, write_encoder
     from chebsplat.formats.gaussians import read_gaussians
+    from chebsplat.shape.encoder import RegionEncoder
     from chebsplat.stages.onnx_graphs import encoder_model, fusion_model
 
     gaussians = read_gaussians(job.inputs["gaussians"])
@@ -68,7 +68,7 @@ def restored_fusion(gaussians: Any, n_channels: int) -> Any:
     """`fusion.Fusion` with the checkpoint's gate."""
     import torch
 
-    from chebsplat.fusion import Fusion, Gate
+    from chebsplat.shape.fusion import Fusion, Gate
 
     prefix, gate = "shape.gate.", Gate(n_channels)
     gate.load_state_dict(

@@ -15,8 +15,8 @@ from onnx import GraphProto, ModelProto, NodeProto, TensorProto, helper, numpy_h
 if TYPE_CHECKING:
     from torch import nn
 
-    from chebsplat.encoder import Attention, Block, RegionEncoder
-    from chebsplat.fusion import Gate
+    from chebsplat.shape.encoder import Attention, Block, RegionEncoder
+    from chebsplat.shape.fusion import Gate
 
 Value = Any  # the name of what a node makes, a torch tensor, or a NumPy constant
 
@@ -88,7 +88,7 @@ def whole(*values: int) -> np.ndarray:
 
 def encoder_model(encoder: RegionEncoder, opset: int) -> ModelProto:
     """`RegionEncoder.forward`: inputs [regions, members, n_inputs], positions, mask -> encodings [regions, C]."""
-    from chebsplat.encoder import N_FREQUENCIES
+    from chebsplat.shape.encoder import N_FREQUENCIES
 
     region: list[int | str] = ["regions", "members"]
     graph = Graph(
@@ -187,7 +187,7 @@ def _propagation_weights(graph: Graph, index: str) -> str:
     """`fusion.propagation_weights` [gaussians, covers] (Eq 8), with its default inflation and temperature."""
     from inspect import signature
 
-    from chebsplat.fusion import propagation_weights
+    from chebsplat.shape.fusion import propagation_weights
 
     settings = {name: entry.default for name, entry in signature(propagation_weights).parameters.items()}
     away = graph.add("Sub", graph.add("Unsqueeze", "means", whole(1)), graph.add("Gather", "centers", index))

@@ -30,9 +30,9 @@ CHECKED = 20_000  # pixels whose labels before and after are compared
 def run(job: Job) -> None:
     import numpy as np
 
-    from chebsplat import projection as maths
     from chebsplat.formats.projection import Projection, write_projection
     from chebsplat.formats.teacher_model import read_teacher
+    from chebsplat.labels import channels as maths
     from chebsplat.stages.image_encoder import ImageEncoder
     from chebsplat.teachers import EMBEDDED
 

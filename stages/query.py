@@ -40,7 +40,7 @@ def run(folder: Path, text: str, phrases: list[str], out: Path, n_rows: int) -> 
     import numpy as np
 
     from chebsplat.formats.scene import read_scene
-    from chebsplat.relevancy import relevancy
+    from chebsplat.labels.relevancy import relevancy
 
     for name in ("ingest", "export", "teacher"):
         if not (folder / name).is_dir():
@@ -148,7 +148,7 @@ def draw(scene: Scene, views: list[int], query: Query, out: Path) -> None:
     """`heat/<view>.png` of every view, and `sheet.png` of renders beside heat maps."""
     import numpy as np
 
-    from chebsplat.relevancy import relevancy
+    from chebsplat.labels.relevancy import relevancy
     from chebsplat.render import SceneRenderer
     from chebsplat.stages.evaluate import camera
     from chebsplat.stages.figures import heat, heat_scale, png

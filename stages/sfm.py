@@ -20,7 +20,7 @@ def run(job: Job) -> None:
     from chebsplat.cameras import centers
     from chebsplat.formats.capture import read_capture
     from chebsplat.formats.points import Points, write_points
-    from chebsplat.gaussians import local_shape
+    from chebsplat.splats.gaussians import local_shape
 
     settings, capture = job.config.sfm, read_capture(job.inputs["capture"])
     if capture.cam_from_world is not None and capture.points is not None:

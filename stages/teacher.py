@@ -105,9 +105,10 @@ def from_labels(job: Job, capture: Capture, settings: TeacherSection) -> Feature
 
     import numpy as np
 
-    from chebsplat import noisy_teacher as model
-    from chebsplat.codes import class_codes
     from chebsplat.formats.features import Features
+    from chebsplat.labels import noisy_teacher as model
+    from chebsplat.labels.codes import class_codes
+    from chebsplat.labels.decode import decode
 
     if capture.labels is None or not capture.class_names:
         raise DataFailure("the capture has no labels; use teacher.kind = auto (the embedded teacher, or teacher.model)")
@@ -123,7 +124,7 @@ def from_labels(job: Job, capture: Capture, settings: TeacherSection) -> Feature
         confused = model.confuse_segments(small, probabilities, settings.confusion, generator)
         rows.append(model.noisy_features(confused, codes, settings.blur, settings.noise, generator).astype(np.float16))
     features = np.stack(rows)
-    pseudo, confidence = model.decode(features.astype(np.float32), codes)
+    pseudo, confidence = decode(features.astype(np.float32), codes)
     convention = {"kind": "labels", "normalized": True, "n_scales": 1, "flips": False} | settings.model_dump(
         mode="json", include={"downscale", "confusion", "blur", "noise", "seed", "n_channels"}
     )
@@ -134,9 +135,9 @@ def from_pseudo_labels(job: Job, capture: Capture, settings: TeacherSection) -> 
     """What a 2D network took the views for, as the source brings it; a pixel weighs as much as it is sure."""
     import numpy as np
 
-    from chebsplat.codes import class_codes
     from chebsplat.formats.features import Features
-    from chebsplat.pseudo_labels import voted
+    from chebsplat.labels.codes import class_codes
+    from chebsplat.labels.pseudo_labels import voted
 
     if capture.pseudo_labels is None or capture.confidence is None or not capture.class_names:
         raise DataFailure("the capture has no pseudo labels with confidences; use teacher.kind = auto")

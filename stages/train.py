@@ -16,7 +16,7 @@ from chebsplat.stages.train_inputs import first_regions, knowledge, trainer_of
 if TYPE_CHECKING:
     import numpy as np
 
-    from chebsplat.trainer import Trainer
+    from chebsplat.training.trainer import Trainer
 
 log = logging.getLogger("chebsplat")
 
@@ -70,7 +70,7 @@ def agreement(alone: np.ndarray, features: np.ndarray, embeddings: np.ndarray) -
     """
     import numpy as np
 
-    from chebsplat.noisy_teacher import decode_labels
+    from chebsplat.labels.decode import decode_labels
 
     found, wanted = decode_labels(alone, embeddings), decode_labels(features, embeddings)
     return {"agreement": float((found == wanted).mean()), "commonest": float(np.bincount(wanted).max() / len(wanted))}

@@ -11,7 +11,7 @@ if TYPE_CHECKING:
     from chebsplat.formats.capture import Capture
     from chebsplat.formats.features import Features
     from chebsplat.formats.points import Points
-    from chebsplat.trainer import Trainer
+    from chebsplat.training.trainer import Trainer
     from chebsplat.views import Views
 
 FEATURE_BYTES = 64 << 20  # of features that are kept in memory; what is beyond is read when its view is looked at
@@ -62,9 +62,9 @@ def trainer_of(
     import torch
 
     from chebsplat.cameras import extent
-    from chebsplat.gaussians import initial_gaussians
-    from chebsplat.model import SceneModel
-    from chebsplat.trainer import Trainer
+    from chebsplat.splats.gaussians import initial_gaussians
+    from chebsplat.training.model import SceneModel
+    from chebsplat.training.trainer import Trainer
 
     torch.manual_seed(train["seed"])
     raw = initial_gaussians(points.means, points.colors, points.covariances)
@@ -101,7 +101,7 @@ def first_regions(job: Job, trainer: Trainer, n_points: int) -> None:
     import torch
 
     from chebsplat.formats.descriptors import read_descriptors
-    from chebsplat.regions import Regions
+    from chebsplat.shape.regions import Regions
 
     if "descriptors" not in job.inputs:
         trainer.refresh()

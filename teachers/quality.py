@@ -17,8 +17,8 @@ from typing import Any
 import click
 import numpy as np
 
+from chebsplat.evaluation.metrics import IGNORE, confusion, segmentation
 from chebsplat.formats.teacher_model import read_teacher
-from chebsplat.metrics import IGNORE, confusion, segmentation
 from chebsplat.stages.image_encoder import ImageEncoder
 from chebsplat.stages.text import text_embeddings
 from chebsplat.synthetic import CLASS_NAMES

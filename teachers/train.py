@@ -20,7 +20,7 @@ import torch
 from torch import Tensor
 from torch.nn import functional as F
 
-from chebsplat.metrics import confusion, segmentation
+from chebsplat.evaluation.metrics import confusion, segmentation
 from chebsplat.stages.progress import Progress
 from chebsplat.synthetic import CLASS_NAMES
 from chebsplat.synthetic.seeds import TRAINING

@@ -5,7 +5,7 @@ import json
 import numpy as np
 from source_folders import save
 
-from chebsplat.protocols import scannet_closed, scannet_open
+from chebsplat.evaluation.protocols import scannet_closed, scannet_open
 
 
 def matrix_text(matrix):

@@ -2,7 +2,7 @@
 
 import torch
 
-from chebsplat.rasterize.projection import rotation_matrices
+from chebsplat.splats.rotations import rotation_matrices
 
 
 def region(n=24, seed=0, m=3):

@@ -7,8 +7,8 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from chebsplat import adapt, growth
-from chebsplat.rasterize.projection import rotation_matrices
+from chebsplat.splats.rotations import rotation_matrices
+from chebsplat.training import densify, optimizer_rows, prune
 
 
 def raw(n=200, seed=0):
@@ -28,7 +28,7 @@ def seeded(seed=0):
 
 
 def grow(parameters, members, gradient, budget=50, threshold=1e-4, seed=0, **options):
-    return adapt.densify(parameters, members, gradient, threshold, budget, seeded(seed), **options)
+    return densify.densify(parameters, members, gradient, threshold, budget, seeded(seed), **options)
 
 
 # masks
@@ -37,17 +37,17 @@ def grow(parameters, members, gradient, budget=50, threshold=1e-4, seed=0, **opt
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
 def test_mask_is_exactly_binary_forward_and_soft_backward(dtype):
     logits = torch.linspace(-8, 8, 333, dtype=dtype, requires_grad=True)
-    soft = adapt.soft_mask(logits, None)
-    hard = adapt.hard_mask(soft)
+    soft = prune.soft_mask(logits, None)
+    hard = prune.hard_mask(soft)
     assert set(hard.detach().tolist()) == {0.0, 1.0}
-    assert torch.equal(hard.detach() == 1, soft.detach() > adapt.THRESHOLD)
+    assert torch.equal(hard.detach() == 1, soft.detach() > prune.THRESHOLD)
     hard.sum().backward()
     assert torch.allclose(logits.grad, (soft * (1 - soft)).detach())
 
 
 def test_extreme_logits_keep_a_gradient_inside_the_clamp_and_stay_finite():
     logits = torch.tensor([-1e30, -9.9, 9.9, 1e30], requires_grad=True)
-    soft = adapt.soft_mask(logits, logits.detach())
+    soft = prune.soft_mask(logits, logits.detach())
     soft.sum().backward()
     assert ((soft > 0) & (soft < 1)).all()
     assert torch.isfinite(logits.grad).all()
@@ -57,22 +57,22 @@ def test_extreme_logits_keep_a_gradient_inside_the_clamp_and_stay_finite():
 def test_either_gate_alone_can_remove_a_gaussian():
     shut, neutral = torch.tensor([-5.0]), torch.tensor([5.0])
     for pair in ((shut, neutral), (neutral, shut)):
-        assert adapt.hard_mask(adapt.soft_mask(*pair)).item() == 0
-    assert adapt.hard_mask(adapt.soft_mask(neutral, neutral)).item() == 1
+        assert prune.hard_mask(prune.soft_mask(*pair)).item() == 0
+    assert prune.hard_mask(prune.soft_mask(neutral, neutral)).item() == 1
 
 
 def test_semantic_gate_starts_open_and_alike_and_can_learn():
-    gate = adapt.SemanticGate(5)
+    gate = prune.SemanticGate(5)
     features = torch.randn(40, 5, generator=seeded())
     logits = gate(features)
     assert (logits == 1).all()
-    adapt.soft_mask(torch.ones(40), logits).mean().backward()
+    prune.soft_mask(torch.ones(40), logits).mean().backward()
     assert gate.linear.bias.grad.abs() > 0
     assert gate.linear.weight.grad.abs().max() > 0
 
 
 def test_a_masked_gaussian_has_no_opacity_and_no_size_but_keeps_its_parameters():
-    scales, opacities = adapt.apply_mask(torch.tensor([1.0, 0.0]), torch.ones(2, 3), torch.full((2,), 0.5))
+    scales, opacities = prune.apply_mask(torch.tensor([1.0, 0.0]), torch.ones(2, 3), torch.full((2,), 0.5))
     assert scales.tolist() == [[1, 1, 1], [0, 0, 0]]
     assert opacities.tolist() == [0.5, 0.0]
 
@@ -83,12 +83,12 @@ def test_a_masked_gaussian_has_no_opacity_and_no_size_but_keeps_its_parameters()
 def test_region_gradient_is_the_mean_over_members_not_over_padding():
     gradient = torch.tensor([1.0, 3.0, 5.0])
     members = torch.tensor([[0, 1, -1], [2, -1, -1], [-1, -1, -1]])
-    assert adapt.region_gradients(gradient, members).tolist() == [2.0, 5.0, 0.0]
-    assert adapt.region_gradients(torch.zeros(0), members[2:]).tolist() == [0.0]
+    assert densify.region_gradients(gradient, members).tolist() == [2.0, 5.0, 0.0]
+    assert densify.region_gradients(torch.zeros(0), members[2:]).tolist() == [0.0]
 
 
 def test_a_gradient_that_is_nan_outside_a_region_does_not_reach_it():
-    found = adapt.region_gradients(torch.tensor([torch.nan, 2.0]), torch.tensor([[1, -1], [0, 1]]))
+    found = densify.region_gradients(torch.tensor([torch.nan, 2.0]), torch.tensor([[1, -1], [0, 1]]))
     assert found[0] == 2
     assert len(grow(raw(), torch.arange(16)[None], found[1:]).parents) == 0
 
@@ -235,18 +235,18 @@ def test_opacity_at_the_old_centre_stays_whatever_the_offset():
     log_scales = torch.randn(21, 3, generator=seeded(1), dtype=torch.float64)
     for size in (0.0, 0.5, 2.0, 1e6):
         offsets = size * torch.randn(21, 3, generator=seeded(2), dtype=torch.float64)
-        shared = growth.shared_opacity(logits, log_scales, quats, offsets).sigmoid()
+        shared = densify.shared_opacity(logits, log_scales, quats, offsets).sigmoid()
         local = torch.einsum("nji,nj->ni", rotation_matrices(quats), offsets) / log_scales.exp()
         falloff = torch.exp(-0.5 * (local**2).sum(1))
         assert torch.allclose(1 - (1 - shared) * (1 - falloff * shared), logits.sigmoid(), atol=1e-6)
-    in_place = growth.shared_opacity(logits, log_scales, quats, 0 * offsets).sigmoid()
+    in_place = densify.shared_opacity(logits, log_scales, quats, 0 * offsets).sigmoid()
     assert torch.allclose(in_place, 1 - (1 - logits.sigmoid()).sqrt())
 
 
 def test_scales_shrink_only_along_the_offset_and_keep_the_second_moment():
     log_scales = torch.tensor([[0.0, 0.0, -2.0]], dtype=torch.float64)
     quats = torch.tensor([[1.0, 0.0, 0.0, 0.0]], dtype=torch.float64)
-    shared = growth.shared_scales(log_scales, quats, torch.tensor([[1.0, 0.0, 0.0]], dtype=torch.float64)).exp()
+    shared = densify.shared_scales(log_scales, quats, torch.tensor([[1.0, 0.0, 0.0]], dtype=torch.float64)).exp()
     assert shared[0, 0] ** 2 + 0.25 == pytest.approx(1.0)
     assert shared[0, 1:].tolist() == pytest.approx([1.0, math.exp(-2)])
 
@@ -259,10 +259,10 @@ def test_sharing_stays_finite_for_any_offset_scale_and_quaternion(size):
     log_scales = torch.linspace(-80, 80, 3 * n).reshape(n, 3)
     logits = torch.linspace(-100, 100, n)
     offsets = size * torch.randn(n, 3, generator=seeded(1))
-    assert torch.isfinite(growth.shared_opacity(logits, log_scales, quats, offsets)).all()
-    scales = growth.shared_scales(log_scales, quats, offsets)
+    assert torch.isfinite(densify.shared_opacity(logits, log_scales, quats, offsets)).all()
+    scales = densify.shared_scales(log_scales, quats, offsets)
     assert torch.isfinite(scales).all()
-    assert (log_scales - scales).max() <= math.log(growth.SHRINK) + 1e-4
+    assert (log_scales - scales).max() <= math.log(densify.SHRINK) + 1e-4
 
 
 # the classic baseline
@@ -273,7 +273,7 @@ def test_classic_candidates_are_steep_and_parted_by_size():
     parameters["log_scales"][3] = 0.0
     gradients = torch.tensor([0.0, 2, 3, 4, 0, 1, 0, 0, 0, 5])
     parameters["means"][9] = torch.nan
-    clones, splits = adapt.classic_candidates(parameters, gradients, 0.5, 0.5)
+    clones, splits = densify.classic_candidates(parameters, gradients, 0.5, 0.5)
     assert clones.tolist() == [2, 1, 5]
     assert splits.tolist() == [3]
 
@@ -283,7 +283,7 @@ def test_clone_keeps_and_split_shrinks():
     parameters["log_scales"][0] = 0.0
     gradient = torch.zeros(200)
     gradient[:2] = 1.0
-    found = adapt.clone_or_split(parameters, gradient, 0.5, 0.5, 10, seeded())
+    found = densify.clone_or_split(parameters, gradient, 0.5, 0.5, 10, seeded())
     by_parent = {int(p): k for k, p in enumerate(found.parents)}
     assert set(by_parent) == {0, 1}
     for name, value in found.rows.items():
@@ -295,7 +295,7 @@ def test_clone_keeps_and_split_shrinks():
 def test_halves_of_splits_are_drawn_from_the_gaussian_that_is_split():
     parameters = {name: value[:1].expand(20_000, *value.shape[1:]).clone() for name, value in raw().items()}
     parameters["log_scales"][:] = torch.tensor([-1.0, -2.0, -3.0])
-    found = adapt.clone_or_split(parameters, torch.ones(20_000), 0.5, 0.01, 20_000, seeded())
+    found = densify.clone_or_split(parameters, torch.ones(20_000), 0.5, 0.01, 20_000, seeded())
     frame = rotation_matrices(parameters["quats"][:1])[0]
     for means in (found.rows["means"], found.changed["means"]):
         local = (means - parameters["means"]) @ frame
@@ -304,9 +304,9 @@ def test_halves_of_splits_are_drawn_from_the_gaussian_that_is_split():
 
 def test_classic_takes_the_steepest_within_budget():
     gradient = torch.arange(200.0)
-    found = adapt.clone_or_split(raw(), gradient, 0.5, 0.06, 7, seeded())
+    found = densify.clone_or_split(raw(), gradient, 0.5, 0.06, 7, seeded())
     assert sorted(found.parents.tolist()) == list(range(193, 200))
-    assert len(adapt.clone_or_split(raw(), gradient, 0.5, 0.06, 0, seeded()).parents) == 0
+    assert len(densify.clone_or_split(raw(), gradient, 0.5, 0.06, 0, seeded()).parents) == 0
 
 
 # rows of parameters and optimizer
@@ -331,7 +331,7 @@ def test_pruning_keeps_the_moments_of_the_rows_that_stay(options):
     before = {k: dict(optimizer.state[v]) for k, v in parameters.items()}
     weight = optimizer.param_groups[-1]["params"][0]
     keep = torch.arange(10) % 2 == 0
-    adapt.prune_optimizer(optimizer, parameters, keep)
+    optimizer_rows.prune_optimizer(optimizer, parameters, keep)
     for index, (name, value) in enumerate(parameters.items()):
         assert len(value) == 5
         assert value.is_leaf
@@ -350,7 +350,7 @@ def test_extending_keeps_old_moments_and_starts_new_ones_at_zero(options):
     optimizer = stepped(parameters, **options)
     before = {k: dict(optimizer.state[v]) for k, v in parameters.items()}
     rows = {k: v.detach()[:3] + 1 for k, v in parameters.items()}
-    adapt.extend_optimizer(optimizer, parameters, rows)
+    optimizer_rows.extend_optimizer(optimizer, parameters, rows)
     for name, value in parameters.items():
         assert torch.equal(value[10:], rows[name])
         for key, state in optimizer.state[value].items():
@@ -366,8 +366,8 @@ def test_rows_can_come_and_go_before_the_first_step_and_down_to_none():
     for value in parameters.values():
         value.requires_grad_(True)
     optimizer = torch.optim.Adam([{"params": [v], "name": k} for k, v in parameters.items()])
-    adapt.extend_optimizer(optimizer, parameters, {k: v.detach()[:2] for k, v in parameters.items()})
-    adapt.prune_optimizer(optimizer, parameters, torch.zeros(6, dtype=torch.bool))
+    optimizer_rows.extend_optimizer(optimizer, parameters, {k: v.detach()[:2] for k, v in parameters.items()})
+    optimizer_rows.prune_optimizer(optimizer, parameters, torch.zeros(6, dtype=torch.bool))
     assert all(len(v) == 0 and v.requires_grad for v in parameters.values())
 
 
@@ -376,18 +376,18 @@ def test_a_parameter_that_is_not_optimised_keeps_pace():
     frozen = torch.arange(6)
     optimizer = stepped(parameters)
     parameters["ids"] = frozen
-    adapt.prune_optimizer(optimizer, parameters, torch.tensor([True, False, True, True, False, True]))
+    optimizer_rows.prune_optimizer(optimizer, parameters, torch.tensor([True, False, True, True, False, True]))
     assert parameters["ids"].tolist() == [0, 2, 3, 5]
     assert not parameters["ids"].requires_grad
 
 
 def test_selecting_what_was_appended_gives_it_back():
     parameters, more = raw(5), raw(3, seed=1)
-    both = adapt.append(parameters, more)
-    first, last = adapt.select(both, torch.arange(8) < 5), adapt.select(both, torch.arange(5, 8))
+    both = optimizer_rows.append(parameters, more)
+    first, last = optimizer_rows.select(both, torch.arange(8) < 5), optimizer_rows.select(both, torch.arange(5, 8))
     assert all(torch.equal(first[k], parameters[k]) and torch.equal(last[k], more[k]) for k in parameters)
     with pytest.raises(ValueError, match="do not fit"):
-        adapt.append(parameters, {"means": more["means"]})
+        optimizer_rows.append(parameters, {"means": more["means"]})
 
 
 def test_added_rows_and_changed_parents_start_with_zero_moments():
@@ -396,7 +396,7 @@ def test_added_rows_and_changed_parents_start_with_zero_moments():
     parents = torch.tensor([3, 7])
     rows = {k: v.detach()[parents].clone() for k, v in parameters.items()}
     changed = {"logit_opacities": torch.tensor([-1.0, -2.0]), "quats": rows["quats"].clone()}
-    adapt.apply_additions(optimizer, parameters, adapt.Additions(parents, rows, changed))
+    optimizer_rows.apply_additions(optimizer, parameters, densify.Additions(parents, rows, changed))
     assert all(len(v) == 12 for v in parameters.values())
     assert parameters["logit_opacities"][parents].tolist() == [-1.0, -2.0]
     opacity = optimizer.state[parameters["logit_opacities"]]["exp_avg"]

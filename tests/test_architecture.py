@@ -14,6 +14,20 @@ MAY_IMPORT = {
     "pipelines": {"pipelines", "stages", "chebsplat", "formats"},
     "teachers": {"teachers", "stages", "chebsplat", "formats"},
 }
+# Packages of chebsplat/ in their order: each may import those before it that it names, and errors.
+PACKAGES = {
+    "kernels": set(),
+    "cameras": set(),
+    "synthetic": set(),
+    "labels": set(),
+    "splats": {"kernels"},
+    "views": set(),
+    "rasterize": {"kernels", "splats"},
+    "render": {"rasterize", "splats", "views"},
+    "shape": {"kernels", "splats"},
+    "evaluation": {"labels", "rasterize", "render", "views"},
+    "training": {"evaluation", "kernels", "rasterize", "shape", "splats", "views"},
+}
 SOURCES = [p for layer in LAYERS for p in sorted((ROOT / layer).rglob("*.py"))]
 
 
@@ -40,6 +54,20 @@ def test_imports_run_one_way(path):
             assert target in MAY_IMPORT[layer], f"{path}: {layer} must not import {name}"
 
 
+def test_packages_of_the_maths_import_one_another_one_way():
+    order = list(PACKAGES)
+    assert all(order.index(below) < order.index(name) for name, allowed in PACKAGES.items() for below in allowed)
+    folder = ROOT / "chebsplat"
+    assert len(list(folder.glob("*.py"))) <= 6
+    found = {}
+    for path in folder.rglob("*.py"):
+        own = path.relative_to(folder).with_suffix("").parts[0]
+        names = [name.split(".") for name in imported_modules(path) if name.startswith("chebsplat.")]
+        found.setdefault(own, set()).update(parts[1] for parts in names if parts[1] not in (own, "errors"))
+    found = {own: imported for own, imported in found.items() if own not in ("__init__", "errors")}
+    assert found == PACKAGES
+
+
 def test_formats_know_no_torch():
     for path in (ROOT / "formats").rglob("*.py"):
         assert not any(name.split(".")[0] == "torch" for name in imported_modules(path)), path
@@ -51,7 +79,9 @@ def test_a_stage_is_known_by_every_kernel_it_runs_and_every_package_it_loads():
     found: dict[str, list] = {}
     code = Code(installed(), found)
     code.stage("train")
-    kernels = [path for path in installed()["chebsplat"].rglob("*.py") if "chebsplat.jit import" in path.read_text()]
+    kernels = [
+        path for path in installed()["chebsplat"].rglob("*.py") if "chebsplat.kernels.jit import" in path.read_text()
+    ]
     assert len(kernels) > 8
     assert not [path for path in kernels if str(path) not in found]
     assert {"onnx", "onnxruntime", "torch"} <= set(code.stage("onnx")["packages"])

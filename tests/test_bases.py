@@ -10,12 +10,12 @@ import torch
 from click.testing import CliRunner
 from shared import ROOT, key_of
 
-from chebsplat.cks import update
 from chebsplat.formats import artifact, heads
 from chebsplat.formats.artifact import Manifest
 from chebsplat.formats.basis import SCHEMA, Basis, read_basis, write_basis
 from chebsplat.pipelines import bases, store
 from chebsplat.pipelines.cli.basis import basis as command
+from chebsplat.shape.cks import update
 
 NAMES = ("blocks.0.query", "blocks.0.key")
 SCENES = ("office0", "room0", "office1")

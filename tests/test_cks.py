@@ -7,7 +7,7 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from chebsplat.cks import basis_loss, project, regularizer, update
+from chebsplat.shape.cks import basis_loss, project, regularizer, update
 
 ORTHONORMAL = 3e-8  # docs/method.md, section 7: for float32 columns measured in float64
 

@@ -4,8 +4,8 @@ import pytest
 import torch
 from shared_regions import region
 
-from chebsplat.descriptor import chebyshev_diagonals, describe_regions
-from chebsplat.rasterize.projection import rotation_matrices
+from chebsplat.shape.descriptor import chebyshev_diagonals, describe_regions
+from chebsplat.splats.rotations import rotation_matrices
 
 
 def describe(given, **options):

@@ -8,8 +8,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from shared_regions import CASES, region, turned
 
-from chebsplat.descriptor import describe_compiled, describe_members, describe_reference
-from chebsplat.rasterize.projection import rotation_matrices
+from chebsplat.shape.descriptor import describe_compiled, describe_members, describe_reference
+from chebsplat.splats.rotations import rotation_matrices
 
 WORST, MEDIAN = 5e-6, 5e-7  # issue bars, relative to the region's maximum
 

@@ -37,7 +37,7 @@ def test_the_rank_of_its_features_is_small(encoder):
 
 
 def test_a_held_out_room_is_told_about_as_well_as_the_published_figures_say():
-    from chebsplat.metrics import confusion, segmentation
+    from chebsplat.evaluation.metrics import confusion, segmentation
     from chebsplat.stages.text import text_embeddings
     from chebsplat.teachers.quality import held_out_room, labelled, runner
 

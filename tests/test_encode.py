@@ -36,7 +36,7 @@ def opened(path):
 
 
 def restored(toy):
-    from chebsplat.encoder import RegionEncoder
+    from chebsplat.shape.encoder import RegionEncoder
     from chebsplat.stages.onnx import restored_fusion
 
     held = read_gaussians(toy["train"])
@@ -183,7 +183,7 @@ def test_arguments_that_do_not_fit_are_errors_that_name_the_remedy(toy, tmp_path
 
 
 def test_a_cut_spectrum_and_an_empty_scene_are_refused_by_name():
-    from chebsplat.encoding import prepare
+    from chebsplat.shape.encoding import prepare
 
     describe = {"n_regions": 2, "region_size": 4, "seed": 0, "spectrum": "taper"}
     settings = {"describe": describe, "described": True, "context": False, "n_covers": 2}
@@ -200,7 +200,7 @@ def test_every_kind_of_encoder_exports_and_keeps_its_contract(tmp_path, variant)
     import onnx
     import torch
 
-    from chebsplat.encoder import RegionEncoder
+    from chebsplat.shape.encoder import RegionEncoder
     from chebsplat.stages.config import Config
     from chebsplat.stages.contract import contract
     from chebsplat.stages.onnx import compare, example, quantize

@@ -4,15 +4,16 @@ import numpy as np
 import pytest
 import torch
 
-from chebsplat.codes import VOCABULARY, class_codes
-from chebsplat.encoder import RegionEncoder, Standardize
-from chebsplat.fusion import Gate, propagate, propagation_weights
-from chebsplat.gaussians import activated, covariances, initial_gaussians, local_shape
-from chebsplat.model import SceneModel
-from chebsplat.noisy_teacher import confusable, confuse_segments, decode, decode_labels, noisy_features, reduced
-from chebsplat.regions import build_regions, covering
+from chebsplat.labels.codes import VOCABULARY, class_codes
+from chebsplat.labels.decode import decode, decode_labels
+from chebsplat.labels.noisy_teacher import confusable, confuse_segments, noisy_features, reduced
+from chebsplat.shape.encoder import RegionEncoder, Standardize
+from chebsplat.shape.fusion import Gate, propagate, propagation_weights
+from chebsplat.shape.regions import build_regions, covering
+from chebsplat.splats.gaussians import activated, covariances, initial_gaussians, local_shape
 from chebsplat.stages.config import Config
 from chebsplat.stages.train import agreement
+from chebsplat.training.model import SceneModel
 
 
 def cloud(n=600, seed=0):

@@ -8,12 +8,12 @@ from shared import INPUTS, run_stage
 from test_stages import changed, inputs_of, published
 
 from chebsplat.errors import InputError
+from chebsplat.evaluation.lpips import BLOCKS, SCALE, SHIFT, Lpips
 from chebsplat.formats import artifact
 from chebsplat.formats.capture import read_capture, write_capture
 from chebsplat.formats.evaluation import read_evaluation
 from chebsplat.formats.features import read_features, write_features
 from chebsplat.formats.scene import read_scene
-from chebsplat.lpips import BLOCKS, SCALE, SHIFT, Lpips
 from chebsplat.stages.fidelity import image_figures, perceptual
 
 
@@ -140,7 +140,7 @@ def test_lpips_given_weights_and_the_time_by_part_are_in_the_evaluation(toy, wei
 
 @pytest.mark.xdist_group("toy")
 def test_the_clocked_steps_render_the_same_frame(toy):
-    from chebsplat.frame_parts import frame_parts
+    from chebsplat.evaluation.frame_parts import frame_parts
     from chebsplat.render import SceneRenderer
     from chebsplat.stages.evaluate import camera
 
@@ -204,7 +204,7 @@ def test_a_scannet_scene_runs_from_its_folder_to_the_figures_of_scannet_open(tmp
     import layouts
 
     from chebsplat.cameras import unproject
-    from chebsplat.protocols import scannet_open
+    from chebsplat.evaluation.protocols import scannet_open
     from chebsplat.stages.sources import generated
 
     fields = generated.capture("toy", 1, "toy")
@@ -249,8 +249,8 @@ def test_the_content_of_the_weights_is_part_of_what_an_evaluation_is(tmp_path, m
 def test_a_scannet_folder_is_planned_without_the_stages_it_does_not_need(tmp_path, monkeypatch):
     import layouts
 
+    from chebsplat.evaluation.protocols import scannet_closed
     from chebsplat.pipelines.plan import Planner
-    from chebsplat.protocols import scannet_closed
 
     monkeypatch.chdir(tmp_path)
     monkeypatch.setenv("CHEBSPLAT_WORK", str(tmp_path / "work"))

@@ -19,9 +19,9 @@ def rendered(parameters, cameras, index):
     """Float image of raw parameters, every band of every Gaussian evaluated."""
     import torch
 
-    from chebsplat.gaussians import activated
     from chebsplat.rasterize import rasterize
-    from chebsplat.sh import eval_sh
+    from chebsplat.splats.gaussians import activated
+    from chebsplat.splats.sh import eval_sh
 
     raw = {name: torch.from_numpy(np.ascontiguousarray(values)) for name, values in parameters.items()}
     means, quats, scales, opacities = activated(raw)

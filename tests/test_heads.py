@@ -103,7 +103,7 @@ def trained(path, key, seed):
     """A checkpoint whose encoder is random and its projections of rank 1, so that many scenes have news."""
     import torch
 
-    from chebsplat.encoder import RegionEncoder
+    from chebsplat.shape.encoder import RegionEncoder
 
     torch.manual_seed(seed)
     encoder = RegionEncoder(4, 3, width=32, n_layers=1)

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 import torch
 
-from chebsplat.losses import (
+from chebsplat.training.losses import (
     feature_distance,
     feature_distance_reference,
     photometric,

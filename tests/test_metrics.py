@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from chebsplat.metrics import boundary_band, confusion, psnr, segmentation
+from chebsplat.evaluation.metrics import boundary_band, confusion, psnr, segmentation
 
 
 def test_psnr_of_one_grey_level_is_48_13_db():

@@ -54,11 +54,11 @@ def edit(path, old, new):
 
 
 def touch(tree):
-    os.utime(tree["chebsplat"] / "trainer.py", (1, 1))
+    os.utime(tree["chebsplat"] / "training/trainer.py", (1, 1))
 
 
 def comment(tree):
-    edit(tree["chebsplat"] / "trainer.py", "class Trainer", "# a remark\n\n\nclass Trainer")
+    edit(tree["chebsplat"] / "training/trainer.py", "class Trainer", "# a remark\n\n\nclass Trainer")
 
 
 def docstring(tree):
@@ -70,7 +70,7 @@ def plumbing(tree):
 
 
 def trainer_code(tree):
-    edit(tree["chebsplat"] / "schedule.py", '"means": 0.01', '"means": 0.02')
+    edit(tree["chebsplat"] / "training/schedule.py", '"means": 0.01', '"means": 0.02')
 
 
 def deep_code(tree):
@@ -82,7 +82,7 @@ def report_code(tree):
 
 
 def descriptor_code(tree):
-    edit(tree["chebsplat"] / "albo.py", "\nimport torch\n", "\nimport torch\n\nEXTRA = 1\n")
+    edit(tree["chebsplat"] / "shape/albo.py", "\nimport torch\n", "\nimport torch\n\nEXTRA = 1\n")
 
 
 def format_code(tree):

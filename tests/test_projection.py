@@ -10,7 +10,7 @@ from chebsplat.errors import InputError
 from chebsplat.formats import artifact
 from chebsplat.formats.artifact import Manifest
 from chebsplat.formats.projection import SCHEMA, Projection, read_projection, write_projection
-from chebsplat.projection import ROWS, Moments, projection
+from chebsplat.labels.channels import ROWS, Moments, projection
 
 
 def unit(values):

@@ -7,9 +7,9 @@ import numpy as np
 import pytest
 import torch
 
-from chebsplat import protocols
 from chebsplat.errors import ConfigError, DataFailure
-from chebsplat.protocols import (
+from chebsplat.evaluation import protocols
+from chebsplat.evaluation.protocols import (
     deep_blending,
     labels,
     replica_f3,
@@ -17,8 +17,8 @@ from chebsplat.protocols import (
     scannet_closed,
     scannet_open,
 )
-from chebsplat.protocols.split import every
-from chebsplat.protocols.task import Named, Seen, Task, bilinear, resized
+from chebsplat.evaluation.protocols.split import every
+from chebsplat.evaluation.protocols.task import Named, Seen, Task, bilinear, resized
 from chebsplat.stages.ingest import split
 from chebsplat.stages.settings import IngestSection
 

@@ -5,12 +5,12 @@ import pytest
 from shared import KEY, TOY, run_stage
 
 from chebsplat.errors import ConfigError
+from chebsplat.evaluation.protocols import labels, scannet_closed
+from chebsplat.evaluation.protocols.task import Seen, Task
 from chebsplat.formats.artifact import Manifest, publish
 from chebsplat.formats.capture import read_capture, write_capture
 from chebsplat.formats.features import read_features
-from chebsplat.protocols import labels, scannet_closed
-from chebsplat.protocols.task import Seen, Task
-from chebsplat.pseudo_labels import voted
+from chebsplat.labels.pseudo_labels import voted
 
 CODES = np.eye(3, dtype=np.float32)
 

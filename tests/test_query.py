@@ -16,8 +16,8 @@ from chebsplat.formats.capture import Capture, write_capture
 from chebsplat.formats.features import Features, write_features
 from chebsplat.formats.projection import Projection
 from chebsplat.formats.scene import Scene, write_scene
+from chebsplat.labels.relevancy import relevancy
 from chebsplat.pipelines.cli import main
-from chebsplat.relevancy import relevancy
 
 EMBEDDINGS = {
     "chair": [1, 0, 0, 0, 0, 0], "sofa": [0.8, 0.6, 0, 0, 0, 0], "wall": [0, 0, 1, 0, 0, 0],

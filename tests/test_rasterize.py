@@ -9,9 +9,9 @@ import pytest
 import torch
 from safetensors.torch import load_file
 
-from chebsplat import sh
 from chebsplat.rasterize import rasterize
-from chebsplat.rasterize.projection import rotation_matrices
+from chebsplat.splats import sh
+from chebsplat.splats.rotations import rotation_matrices
 
 DATA = Path(os.environ.get("CHEBSPLAT_TEST_DATA", Path(__file__).parents[2] / "shared/data"))
 

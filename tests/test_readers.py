@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 from shared import ROOT, gaussian_parameters
 
-import chebsplat.jit  # noqa: F401  # gsply runs on numba too: the threading layer is chosen first
+import chebsplat.kernels.jit  # noqa: F401  # gsply runs on numba too: the threading layer is chosen first
 from chebsplat.formats.cameras import Cameras
 from chebsplat.formats.scene import Scene, write_scene
 

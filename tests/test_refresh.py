@@ -3,8 +3,8 @@
 import pytest
 import torch
 
-from chebsplat.model import Shape
 from chebsplat.stages.config import Config
+from chebsplat.training.model import Shape
 
 
 def scene(n=600, seed=0):

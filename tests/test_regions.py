@@ -5,7 +5,7 @@ import itertools
 import numpy as np
 import pytest
 
-from chebsplat.regions import build_regions, farthest_points
+from chebsplat.shape.regions import build_regions, farthest_points
 
 
 def cloud(n=4000, seed=0):

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from chebsplat.relevancy import relevancy
+from chebsplat.labels.relevancy import relevancy
 
 
 def unit(rows):

@@ -4,9 +4,9 @@ import chebsplat  # noqa: F401  # isort: skip
 import pytest
 import torch
 
-from chebsplat.sh import eval_sh, n_coefficients
-from chebsplat.sh_kernels import colors_in_view
-from chebsplat.sh_prune import dense, masked_sh
+from chebsplat.splats.sh import eval_sh, n_coefficients
+from chebsplat.splats.sh_kernels import colors_in_view
+from chebsplat.training.sh_prune import dense, masked_sh
 
 
 def scene(held=(60, 60, 60, 60)):

@@ -7,8 +7,8 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from chebsplat import sh_prune
-from chebsplat.sh import basis, eval_sh
+from chebsplat.splats.sh import basis, eval_sh
+from chebsplat.training import sh_prune
 
 
 def normal(*shape, seed=0):

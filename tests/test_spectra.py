@@ -4,9 +4,9 @@ import pytest
 import torch
 from shared_regions import CASES, region, turned
 
-from chebsplat.albo import canonicalize, metric_factors, similarity
-from chebsplat.descriptor import describe_members, describe_reference, n_degrees
-from chebsplat.spectra import cut_spectrum
+from chebsplat.shape.albo import canonicalize, metric_factors, similarity
+from chebsplat.shape.descriptor import describe_members, describe_reference, n_degrees
+from chebsplat.shape.spectra import cut_spectrum
 
 
 def described(given, spectrum, **options):

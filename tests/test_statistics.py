@@ -5,7 +5,7 @@ import math
 import numpy as np
 import pytest
 
-from chebsplat.statistics import paired_difference, summarize
+from chebsplat.evaluation.statistics import paired_difference, summarize
 
 
 def test_spread_is_the_sample_deviation_and_unknown_of_one_value():

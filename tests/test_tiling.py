@@ -5,7 +5,7 @@ import itertools
 import numpy as np
 import pytest
 
-from chebsplat.tiling import OVERLAP, blended, sampling, window_starts
+from chebsplat.labels.tiling import OVERLAP, blended, sampling, window_starts
 
 
 @pytest.mark.parametrize(("length", "window"), [(480, 480), (481, 480), (300, 480), (520, 480), (1000, 480), (97, 12)])

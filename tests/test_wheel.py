@@ -19,8 +19,8 @@ def test_a_wheel_mounts_every_layer_under_chebsplat(tmp_path):
     tops = {name.split("/")[0] for name in names}
     assert {top for top in tops if not top.endswith(".dist-info")} == {"chebsplat"}
     for wanted in (
-        "chebsplat/descriptor.py",
-        "chebsplat/protocols/labels.py",
+        "chebsplat/shape/descriptor.py",
+        "chebsplat/evaluation/protocols/labels.py",
         "chebsplat/synthetic/layout.py",
         "chebsplat/formats/artifact.py",
         "chebsplat/stages/train.py",

@@ -8,7 +8,7 @@ import numpy as np
 import torch
 
 from benchmarks.shapes.samples import Regions
-from chebsplat.descriptor import describe_regions
+from chebsplat.shape.descriptor import describe_regions
 
 NEIGHBORS = 16
 

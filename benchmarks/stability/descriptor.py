@@ -13,8 +13,8 @@ import torch
 
 from benchmarks.stability import oracle
 from benchmarks.stability.case import Outcome, case, naive, relative
-from chebsplat.descriptor import describe_regions
-from chebsplat.rasterize.projection import rotation_matrices
+from chebsplat.shape.descriptor import describe_regions
+from chebsplat.splats.rotations import rotation_matrices
 
 TOLERANCE = 5e-6  # the worst that any case may reach in float32
 TOLERANCE_64 = 1e-12  # the same in float64, unless a case says why not

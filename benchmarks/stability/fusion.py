@@ -13,8 +13,8 @@ import torch
 from torch import Tensor
 
 from benchmarks.stability.case import Outcome, case, naive, relative
-from chebsplat.fusion import propagation_weights
-from chebsplat.rasterize.projection import rotation_matrices
+from chebsplat.shape.fusion import propagation_weights
+from chebsplat.splats.rotations import rotation_matrices
 
 TOLERANCE = 1e-5  # logits reach 16, and float32 rounds each to 1e-6
 N_POINTS, N_REGIONS = 60, 12

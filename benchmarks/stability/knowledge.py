@@ -14,7 +14,7 @@ import torch
 from torch import Tensor
 
 from benchmarks.stability.case import Outcome, case, naive, relative
-from chebsplat.cks import regularizer, update
+from chebsplat.shape.cks import regularizer, update
 
 ORTHONORMAL = 3e-8
 Q = 32

@@ -10,8 +10,8 @@ import torch
 from torch import Tensor
 
 from benchmarks.stability.case import Outcome, case, naive, relative
-from chebsplat.adapt import MAX_LOGIT, apply_mask, hard_mask, soft_mask
-from chebsplat.sh_prune import soft_histogram
+from chebsplat.training.prune import MAX_LOGIT, apply_mask, hard_mask, soft_mask
+from chebsplat.training.sh_prune import soft_histogram
 
 N_BINS = 8
 HISTOGRAM = 1e-5  # float32 rounds a value's place among 8 bins to 1e-6, and the slope is 20 / 4

@@ -15,7 +15,7 @@ from torch import Tensor
 
 from benchmarks.stability.case import Outcome, case, naive
 from chebsplat.rasterize import rasterize
-from chebsplat.rasterize.projection import rotation_matrices
+from chebsplat.splats.rotations import rotation_matrices
 
 IMAGE, GRADIENT = 2e-5, 1e-2
 WIDTH, HEIGHT = 40, 28

@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 
 from benchmarks.stability.case import Outcome, case, naive
-from chebsplat.regions import build_regions
+from chebsplat.shape.regions import build_regions
 
 N_REGIONS, SIZE = 24, 16
 TOLERANCE = 0.25

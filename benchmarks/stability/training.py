@@ -15,10 +15,10 @@ import torch
 
 from benchmarks.stability.case import Outcome, case
 from chebsplat.errors import DataFailure
-from chebsplat.gaussians import initial_gaussians, local_shape
-from chebsplat.model import SceneModel
+from chebsplat.splats.gaussians import initial_gaussians, local_shape
 from chebsplat.stages.config import Config
-from chebsplat.trainer import Trainer
+from chebsplat.training.model import SceneModel
+from chebsplat.training.trainer import Trainer
 from chebsplat.views import Views
 
 HEIGHT, WIDTH, CHANNELS = 40, 48, 8

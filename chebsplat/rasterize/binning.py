@@ -12,7 +12,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from chebsplat.jit import inline, kernel, prange, serial
+from chebsplat.kernels.jit import inline, kernel, prange, serial
 
 TILE = 16
 BANDS = 4  # at most; of tile rows

@@ -6,7 +6,7 @@ from llvmlite import ir
 from numba.core import cgutils, types
 from numba.core.typing import signature
 
-from chebsplat.simd import FLOAT, INT, WIDE, address, broadcast, intrinsic, multiply_add, shuffle
+from chebsplat.kernels.simd import FLOAT, INT, WIDE, address, broadcast, intrinsic, multiply_add, shuffle
 
 
 @intrinsic

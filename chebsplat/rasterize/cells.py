@@ -12,9 +12,9 @@ import math
 
 import numpy as np
 
-from chebsplat.jit import inline, lanes
+from chebsplat.kernels.jit import inline, lanes
+from chebsplat.kernels.simd import bits, fma, fnma, load, magnitude, scale_by_power, splat, store, total, where
 from chebsplat.rasterize.blocks import multiply
-from chebsplat.simd import bits, fma, fnma, load, magnitude, scale_by_power, splat, store, total, where
 
 LANES = 16
 SHAPE = 8  # floats of a row of shapes, and of a splat before its channels

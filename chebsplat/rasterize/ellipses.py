@@ -11,7 +11,7 @@ import math
 
 import numpy as np
 
-from chebsplat.jit import inline, kernel, prange
+from chebsplat.kernels.jit import inline, kernel, prange
 
 HALF_LOG2E = 0.5 * math.log2(math.e)
 LN2 = math.log(2.0)

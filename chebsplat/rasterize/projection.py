@@ -7,6 +7,8 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
+from chebsplat.splats.rotations import rotation_matrices
+
 EXTENT = 3.33  # in σ: there even a Gaussian of opacity 1 has fallen to 1/255, √(2 ln 255)
 LARGEST = 1e30  # of a projected variance, pixels²: more is culled, so that float32 can hold what is made of it
 
@@ -34,21 +36,6 @@ def is_antialiased(rasterize_mode: str) -> bool:
 def compensated(opacities: Tensor, compensations: Tensor) -> Tensor:
     """Opacities [N] times compensations [N]; one that is not finite becomes 0, and gives neither a gradient."""
     return torch.where(torch.isfinite(opacities), opacities, 0) * compensations
-
-
-def rotation_matrices(quats: Tensor) -> Tensor:
-    """Rotation matrices [N, 3, 3] of quaternions [N, 4], wxyz, not necessarily of unit length.
-
-    Choices: pre-scaled by the largest entry, so that neither 1e20 nor 1e-20 overflows or vanishes.
-    """
-    scaled = quats / quats.detach().abs().amax(-1, keepdim=True).clamp_min(1e-30)
-    w, x, y, z = torch.nn.functional.normalize(scaled, dim=-1).unbind(-1)
-    rows = [
-        torch.stack([1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)], -1),
-        torch.stack([2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)], -1),
-        torch.stack([2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)], -1),
-    ]
-    return torch.stack(rows, -2)
 
 
 def project(

@@ -15,7 +15,7 @@ import math
 
 import numpy as np
 
-from chebsplat.jit import inline, kernel, prange, serial
+from chebsplat.kernels.jit import inline, kernel, prange, serial
 from chebsplat.rasterize import cells
 from chebsplat.rasterize.binning import TILE, band_start
 from chebsplat.rasterize.blocks import from_lanes, prefetch, to_lanes

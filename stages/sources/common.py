@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 
 from chebsplat.errors import InputError
-from chebsplat.protocols.split import natural
+from chebsplat.evaluation.protocols.split import natural
 
 IMAGE_TYPES = (".jpg", ".jpeg", ".png")
 PINHOLES = {"SIMPLE_PINHOLE": 3, "PINHOLE": 4}  # model: number of parameters

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from chebsplat.errors import InputError
-from chebsplat.protocols import scannet_closed, scannet_open
+from chebsplat.evaluation.protocols import scannet_closed, scannet_open
 from chebsplat.stages.sources import assembly, common, scannet_labels
 from chebsplat.stages.sources.common import Camera, Frame, Listing
 

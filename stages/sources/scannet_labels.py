@@ -6,7 +6,7 @@ import csv
 from pathlib import Path
 
 from chebsplat.errors import InputError
-from chebsplat.protocols import scannet_closed, scannet_open
+from chebsplat.evaluation.protocols import scannet_closed, scannet_open
 
 MODIFIED, COMBINED = "scannetv2-labels.modified.tsv", "scannet-labels.combined.tsv"
 OTHER = "otherprop"  # SG's id 0: known and ignored

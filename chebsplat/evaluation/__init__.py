@@ -1,0 +1,4 @@
+"""How scenes are measured: image fidelity, segmentation, surfaces, statistics of studies, protocols of data sets.
+
+Images are u8 [H, W, 3], labels [H, W] with -1 ignored, figures fractions, not percent.
+"""

@@ -1,0 +1,80 @@
+"""`labels` (ours): exact labels of generated and rendered scenes.
+
+Split: the source's own, otherwise every 8th view from the first. Classes: the scene's own names; a label whose name is
+no class is wrong wherever it is predicted. One confusion matrix over all test views: mIoU over classes that occur in
+truth or prediction, mAcc over those in the truth, OA; mIoU within 5 pixels of a boundary; the same for the teacher.
+3D point mIoU, where depth and poses say where pixels lie: over points of the test views' surfaces (40,000 pixels a view
+on a regular grid, of which one a cell is kept: `surface.thinned`), the scene's label is that of its Gaussians there,
+without rendering; where it has none, it is wrong. The teacher's is the label of the pixel that the point comes from.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from typing import Any
+
+import numpy as np
+
+from chebsplat.evaluation.metrics import IGNORE, boundary_band, confusion, segmentation
+from chebsplat.evaluation.protocols.task import Seen, Task, predicted
+from chebsplat.evaluation.surface import thinned
+from chebsplat.labels.decode import decode_labels
+
+NAME = "labels"
+TEST_EVERY, TEST_OFFSET, ADJUSTABLE, OWN_SPLIT, ON_TRAINING, TRUTH = 8, 0, True, True, False, "labels"
+
+PER_VIEW = 40_000  # pixels of a view that become points, about, on a regular grid
+
+
+def measure(views: Iterable[Seen], task: Task) -> dict[str, Any]:
+    """mIoU (of pixels, boundary pixels and points), mAcc, OA, IoU by class: of the scene, and of its teacher."""
+    n = len(task.classes)
+    sums: dict[str, np.ndarray] = {}
+    points: list[tuple[np.ndarray, ...]] = []  # (place, truth, teacher's label) of a view's pixels with both
+    for view in views:
+        assert view.truth is not None
+        inside = np.where(boundary_band(view.truth, task.boundary), view.truth, IGNORE)
+        for side, labels in (("scene", view.labels), ("teacher", view.teacher_labels)):
+            if labels is not None:
+                found = predicted(labels, task.names, task.classes, n)
+                counts = np.stack([confusion(found, truth, n + 1) for truth in (view.truth, inside)])
+                sums[side] = sums.get(side, 0) + counts
+        if view.surface is not None:
+            step = max(round((view.truth.size / PER_VIEW) ** 0.5), 1)
+            maps = (view.surface.astype(np.float32), view.truth, view.teacher_labels)
+            place, truth, *told = (of[step // 2 :: step, step // 2 :: step] for of in maps if of is not None)
+            known = (truth != IGNORE) & np.isfinite(place).all(-1)
+            points.append(tuple(of[known] for of in (place, truth, *told)))
+    figures = {side: _figures(whole, edges, task.classes) for side, (whole, edges) in sums.items()}
+    of_points = _point_mious(points, task) if points and task.at is not None else {}
+    return {"classes": task.classes} | {
+        side: of_side | {"point_miou": of_points.get(side)} for side, of_side in figures.items()
+    }
+
+
+def _point_mious(points: list[tuple[np.ndarray, ...]], task: Task) -> dict[str, float | None]:
+    """mIoU of scene and teacher over points of surfaces."""
+    assert task.at is not None
+    places, truth, *told = (np.concatenate(parts) for parts in zip(*points, strict=True))
+    kept, n = thinned(places), len(task.classes)
+    features, weights = task.at(places[kept])
+    labels = predicted(decode_labels(features, task.embeddings), task.names, task.classes, n)
+    sides = {"scene": np.where(weights > 0, labels, n)}
+    if told:
+        sides["teacher"] = predicted(told[0][kept], task.names, task.classes, n)
+    return {side: _mean(segmentation(confusion(found, truth[kept], n + 1)).iou[:-1]) for side, found in sides.items()}
+
+
+def _mean(values: np.ndarray) -> float | None:
+    return None if np.isnan(values).all() else float(np.nanmean(values))
+
+
+def _figures(whole: np.ndarray, edges: np.ndarray, classes: list[str]) -> dict[str, Any]:
+    found = segmentation(whole)
+    return {
+        "miou": _mean(found.iou[:-1]),
+        "macc": _mean(np.array([found.macc])),
+        "oa": _mean(np.array([found.oa])),
+        "boundary_miou": _mean(segmentation(edges).iou[:-1]),
+        "iou": {name: None if np.isnan(v) else float(v) for name, v in zip(classes, found.iou, strict=False)},
+    }

@@ -1,0 +1,14 @@
+"""`replica-gt` (ours): Replica's own semantic ids as truth, on the views that `replica-f3` tests.
+
+Split: place % 8 == 2 by name, whatever the source says. Classes: Replica's names, none merged or dropped. One
+confusion matrix over all test views, as in `labels`: never to be put beside `replica-f3`, whose truth is a teacher.
+"""
+
+from __future__ import annotations
+
+from chebsplat.evaluation.protocols.labels import measure
+
+NAME = "replica-gt"
+TEST_EVERY, TEST_OFFSET, ADJUSTABLE, OWN_SPLIT, ON_TRAINING, TRUTH = 8, 2, False, False, False, "labels"
+
+__all__ = ["measure"]

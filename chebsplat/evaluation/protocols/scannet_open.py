@@ -1,0 +1,64 @@
+"""`scannet-open` (Semantic Gaussians): open vocabulary on 12 scenes of ScanNet, measured on the training cameras.
+
+Split: no view is held out, and every view is evaluated. Truth: `label-filt` through column `cocomapid`; 0 is ignored.
+Classes: the 20 below in this order; ids differ from `scannet-closed` in two places (10 is shelves, 11 counter), so
+labels are joined on names, never on ids. A leading prompt "other" is dropped before the largest cosine is taken: no
+pixel can be "other". Resizing: predictions and truth are compared at 648x484, nearest pixel; set ingest.max_side to
+648 to render at that size. Averaging: ONE confusion matrix summed over all scenes (`summed`); a class that is absent
+from the truth is skipped, even where it is predicted; mIoU and mAcc. A scene's own figures are those of its matrix.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from typing import Any
+
+import numpy as np
+
+from chebsplat.evaluation.metrics import confusion
+from chebsplat.evaluation.protocols.task import Seen, Task, required, resized, translated
+from chebsplat.labels.decode import decode_labels
+
+NAME = "scannet-open"
+TEST_EVERY, TEST_OFFSET, ADJUSTABLE, OWN_SPLIT, ON_TRAINING, TRUTH = 1, 0, False, False, True, "labels"
+CLASSES = ("wall", "floor", "cabinet", "bed", "chair", "sofa", "table", "door", "window", "shelves", "counter",
+           "curtain", "ceiling", "refrigerator", "television", "person", "toilet", "sink", "lamp", "bag")  # fmt: skip
+OTHER = "other"
+SIZE = (484, 648)  # (H, W)
+
+
+def measure(views: Iterable[Seen], task: Task) -> dict[str, Any]:
+    """Figures of one scene, and its `confusion` [20, 20] by truth, to be summed over scenes. Raises DataFailure."""
+    required(task.names, CLASSES, NAME, also=(OTHER,))
+    asked = [k for k, name in enumerate(task.names) if name != OTHER]
+    names, embeddings = [task.names[k] for k in asked], task.embeddings[asked]
+    classes = list(CLASSES)
+    sums: dict[str, np.ndarray] = {}
+    for view in views:
+        assert view.truth is not None
+        truth = resized(translated(view.truth, task.classes, classes, -1), SIZE, centred=True)
+        sides = {"scene": view.features} | ({} if view.teacher is None else {"teacher": view.teacher})
+        for side, features in sides.items():
+            found = resized(translated(decode_labels(features, embeddings), names, classes, -1), SIZE, centred=True)
+            sums[side] = sums.get(side, 0) + confusion(found, truth, len(classes))
+    return {"classes": classes} | {side: summed([matrix]) for side, matrix in sums.items()}
+
+
+def over_scenes(scenes: list[dict[str, Any]]) -> dict[str, Any]:
+    """Figures of several scenes together, from what `measure` says of each."""
+    return summed([np.array(scene["confusion"]) for scene in scenes])
+
+
+def summed(matrices: list[np.ndarray]) -> dict[str, Any]:
+    """Figures of confusion matrices [20, 20] of several scenes, rows by truth, summed first."""
+    matrix = np.sum(matrices, axis=0)
+    right, truth = np.diag(matrix).astype(float), matrix.sum(1)
+    present = truth > 0
+    iou = right[present] / (truth + matrix.sum(0) - right)[present]
+    mean = {"miou": float(iou.mean()), "macc": float((right[present] / truth[present]).mean())} if present.any() else {}
+    by_class = dict(zip(np.array(CLASSES)[present].tolist(), iou.tolist(), strict=True))
+    return {"miou": None, "macc": None, "oa": float(right.sum() / matrix.sum()) if present.any() else None} | mean | {
+        "boundary_miou": None,
+        "iou": {name: by_class.get(name) for name in CLASSES},
+        "confusion": matrix.tolist(),
+    }  # fmt: skip

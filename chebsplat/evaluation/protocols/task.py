@@ -1,0 +1,105 @@
+"""What a protocol measures: one view after another, and what their labels mean."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+
+from chebsplat.errors import DataFailure
+from chebsplat.evaluation.metrics import IGNORE
+
+
+@dataclass
+class Seen:
+    """One evaluated view of H x W pixels.
+
+    features: f32 [H, W, C] as rendered; labels: i16 [H, W] their label among the task's `names`.
+    teacher:  f32 [h, w, C] and teacher_labels i16 [H, W], None without a teacher.
+    truth:    i16 [H, W] index into the task's `classes`, IGNORE where unknown; None without labels.
+    surface:  f64 [H, W, 3] where in the world its pixels lie, nan where unknown; None without depth.
+    """
+
+    name: str
+    features: np.ndarray
+    labels: np.ndarray
+    teacher: np.ndarray | None = None
+    teacher_labels: np.ndarray | None = None
+    truth: np.ndarray | None = None
+    surface: np.ndarray | None = None
+
+
+@dataclass
+class Task:
+    """names, embeddings [L, C] of the labels that features are asked for; classes of the truth; boundary: pixels.
+
+    at: points [M, 3] of the world -> features [M, C] of the scene there and their weights [M], 0 where it has nothing.
+    """
+
+    names: list[str]
+    embeddings: np.ndarray
+    classes: list[str] = field(default_factory=list)
+    boundary: int = 5
+    at: Callable[[np.ndarray], tuple[np.ndarray, np.ndarray]] | None = None
+
+
+class Named(Mapping[str, np.ndarray]):
+    """Rows of a stack by view name, read when asked for: views are joined on names, never on position."""
+
+    def __init__(self, names: list[str], stack: Any, what: str):
+        self.rows, self.stack, self.what = {name: row for row, name in enumerate(names)}, stack, what
+
+    def __getitem__(self, name: str) -> np.ndarray:
+        if name not in self.rows:
+            raise DataFailure(f"view {name} has no {self.what}; make them of the same capture")
+        return np.asarray(self.stack[self.rows[name]])
+
+    def __iter__(self) -> Iterator[str]:
+        return iter(self.rows)
+
+    def __len__(self) -> int:
+        return len(self.rows)
+
+
+def translated(labels: np.ndarray, names: list[str], classes: list[str], unknown: int) -> np.ndarray:
+    """Labels among `names` as indices into `classes`, IGNORE kept; a name that is no class becomes `unknown`."""
+    table = np.array([*(classes.index(name) if name in classes else unknown for name in names), IGNORE])
+    return table[labels]
+
+
+def predicted(labels: np.ndarray, names: list[str], classes: list[str], unknown: int) -> np.ndarray:
+    """As `translated`, of a prediction: where there is none, it is `unknown` too, and not left out of the count."""
+    return np.where(labels == IGNORE, unknown, translated(labels, names, classes, unknown))
+
+
+def required(names: list[str], classes: tuple[str, ...], protocol: str, also: tuple[str, ...] = ()) -> None:
+    """Raise DataFailure unless `names` are all the `classes`, in any order, and nothing else but some of `also`."""
+    if lacking := [name for name in classes if name not in names]:
+        raise DataFailure(f"{protocol} asks for its {len(classes)} classes; the teacher has no {', '.join(lacking)}")
+    if foreign := [name for name in names if name not in (*classes, *also)]:
+        raise DataFailure(f"{protocol} knows no {', '.join(foreign)}; give the teacher the protocol's classes alone")
+
+
+def resized(labels: np.ndarray, size: tuple[int, int], centred: bool = False) -> np.ndarray:
+    """Labels [h, w] at size (H, W) by the nearest pixel.
+
+    Choices: the pixel that holds the corner of the new one, as torch does it; `centred`: its centre, as PIL does.
+    """
+    rows, columns = (
+        np.minimum((2 * np.arange(n) + centred) * m // (2 * n), m - 1) for n, m in zip(size, labels.shape, strict=True)
+    )
+    return labels[rows[:, None], columns]
+
+
+def bilinear(features: np.ndarray, size: tuple[int, int]) -> np.ndarray:
+    """Features [h, w, C] at size (H, W); the corner pixels' centres stay the corners ("align_corners")."""
+    for axis, n in enumerate(size):
+        m = features.shape[axis]
+        at = np.linspace(0, m - 1, n)
+        low = np.minimum(at.astype(int), max(m - 2, 0))
+        share = (at - low).astype(np.float32).reshape([-1 if k == axis else 1 for k in range(features.ndim)])
+        below, above = np.take(features, low, axis), np.take(features, np.minimum(low + 1, m - 1), axis)
+        features = below * (1 - share) + above * share
+    return features

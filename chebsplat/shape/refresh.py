@@ -1,0 +1,100 @@
+"""Descriptors that follow Gaussians in training: only regions whose members changed are described anew."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from chebsplat.shape.descriptor import describe_members, n_degrees
+
+
+class Names:
+    """A number for each Gaussian that it keeps while others are removed or added behind the last."""
+
+    def __init__(self) -> None:
+        self.ids, self.next = np.zeros(0, np.int64), 0
+
+    def of(self, n: int) -> np.ndarray:
+        """Ids i64 [n] of the Gaussians as they are now."""
+        added = n - len(self.ids)
+        if added < 0:
+            raise ValueError(f"{-added} Gaussians were removed and not announced")
+        self.ids = np.concatenate([self.ids, np.arange(self.next, self.next + added)])
+        self.next += added
+        return self.ids
+
+    def keep(self, rows: np.ndarray) -> None:
+        """Those where `rows` [N] is false are gone."""
+        self.ids = self.of(len(rows))[rows]
+
+
+class Descriptors:
+    """Descriptors of regions beside the Gaussians that they were computed from.
+
+    Args:
+      parameters: keyword arguments of `describe_members`.
+      tolerance:  what a region's members may change by before it is described anew: centres as a fraction of the
+        region's radius, log-scales and quaternions as they are. At 0 the values are those of `describe_members`,
+        bit for bit.
+    """
+
+    def __init__(self, parameters: dict[str, Any], tolerance: float = 0.0):
+        self.parameters, self.tolerance = parameters, tolerance
+        self.n_described = self.n_regions = 0  # over all calls
+        self.forget()
+
+    @property
+    def share_described(self) -> float:
+        """Of the regions seen in all calls, the part that was described anew."""
+        return self.n_described / max(self.n_regions, 1)
+
+    def forget(self, region_size: int = 0) -> None:
+        size = self.parameters["n_angles"] * n_degrees(self.parameters["spectrum"], self.parameters["max_degree"])
+        self.given = torch.zeros(0, region_size, 10)
+        self.mask = torch.zeros(0, region_size, dtype=torch.bool)
+        self.values = torch.zeros(0, region_size, size)
+
+    def keep(self, rows: Tensor) -> None:
+        """Of the regions, only `rows` [M] bool are left; the Gaussians' own indices do not matter here."""
+        if len(rows) == len(self.values):
+            self.given, self.mask, self.values = self.given[rows], self.mask[rows], self.values[rows]
+
+    def update(
+        self,
+        means: Tensor,
+        quats: Tensor,
+        log_scales: Tensor,
+        members: Tensor,
+        radius: float,
+        known: Tensor | None = None,
+    ) -> Tensor:
+        """Descriptors [M, n, J P] of Gaussians [N] gathered by members [M, n], -1 where padded.
+
+        Row r is compared with row r of the last call; rows may have been appended. `known` [M, n, J, P] spares the
+        computation of all.
+        """
+        index, mask = members.clamp_min(0), members >= 0
+        given = torch.cat([means[index], log_scales[index], quats[index]], -1)
+        given = torch.where(mask[..., None], given, 0.0)
+        if known is not None:
+            self.given, self.mask, self.values = given, mask, known.flatten(2)
+            return self.values
+        if self.values.shape[1] != members.shape[1]:
+            self.forget(members.shape[1])
+        held = min(len(self.values), len(members))
+        limit = self.tolerance * given.new_tensor([radius] * 3 + [1.0] * 7)
+        same = ((given[:held] - self.given[:held]).abs() <= limit).all(-1).all(-1)
+        same &= (mask[:held] == self.mask[:held]).all(-1)
+        changed = torch.cat([~same, torch.ones(len(members) - held, dtype=torch.bool)])
+        described = describe_members(means, quats, log_scales.exp(), members[changed], **self.parameters)
+        values = described.values.new_zeros(len(members), members.shape[1], self.values.shape[2])
+        before = values.new_zeros(len(members), *given.shape[1:])
+        values[:held], before[:held] = self.values[:held], self.given[:held]
+        values[changed], before[changed] = described.values.flatten(2), given[changed]
+        self.values, self.given, self.mask = values, before, mask
+        self.n_described += int(changed.sum())
+        self.n_regions += len(members)
+        return values

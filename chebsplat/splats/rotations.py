@@ -1,0 +1,21 @@
+"""Rotations of Gaussians: quaternions wxyz, of any length."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+
+def rotation_matrices(quats: Tensor) -> Tensor:
+    """Rotation matrices [N, 3, 3] of quaternions [N, 4], wxyz, not necessarily of unit length.
+
+    Choices: pre-scaled by the largest entry, so that neither 1e20 nor 1e-20 overflows or vanishes.
+    """
+    scaled = quats / quats.detach().abs().amax(-1, keepdim=True).clamp_min(1e-30)
+    w, x, y, z = torch.nn.functional.normalize(scaled, dim=-1).unbind(-1)
+    rows = [
+        torch.stack([1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)], -1),
+        torch.stack([2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)], -1),
+        torch.stack([2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)], -1),
+    ]
+    return torch.stack(rows, -2)

@@ -1,0 +1,156 @@
+"""Colour by spherical harmonics of the Gaussians in view, in numba: a Gaussian costs only the bands it keeps.
+
+Twin of `sh.eval_sh` with `sh_prune.masked_sh`, which are its oracles; reads and writes whole parameters, so that no
+copy of the coefficients in view is ever made. A band is a tensor [N_l, 2 l + 1, 3] that the first N_l Gaussians have.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from chebsplat.kernels.jit import inline, kernel, prange
+
+
+@inline
+def _basis(means, eye, i, degree, out):
+    """Fill basis values of the bands up to `degree`, seen from `eye`: as `sh.basis`."""
+    x, y, z = means[i, 0] - eye[0], means[i, 1] - eye[1], means[i, 2] - eye[2]
+    length = max(math.sqrt(x * x + y * y + z * z), 1e-12)
+    x, y, z = x / length, y / length, z / length
+    out[0] = 0.28209479177387814
+    if degree >= 1:
+        c = 0.4886025119029199
+        out[1], out[2], out[3] = -c * y, c * z, -c * x
+    if degree >= 2:
+        c = 1.0925484305920792
+        out[4], out[5], out[6] = c * x * y, -c * y * z, 0.31539156525252005 * (3 * z * z - 1)
+        out[7], out[8] = -c * x * z, 0.5 * c * (x * x - y * y)
+    if degree >= 3:
+        c, d = 0.5900435899266435, 0.4570457994644658
+        out[9], out[10] = -c * y * (3 * x * x - y * y), 2.890611442640554 * x * y * z
+        out[11], out[12] = -d * y * (5 * z * z - 1), 0.3731763325901154 * z * (5 * z * z - 3)
+        out[13], out[14] = -d * x * (5 * z * z - 1), 1.445305721320277 * z * (x * x - y * y)
+        out[15] = -c * x * (x * x - 3 * y * y)
+
+
+@inline
+def _kept(bands, held, i, v, degree):
+    """The highest band that counts for Gaussian i, row v of the masks: it has it, and so for all bands below."""
+    top = 0
+    while top < degree and i < held[top] and bands[v, top] != 0:
+        top += 1
+    return top
+
+
+@inline
+def _band(values, first, band, i, c):
+    """What one band adds to channel c of Gaussian i."""
+    total = 0.0
+    for k in range(band.shape[1]):
+        total += values[first + k] * band[i, k, c]
+    return total
+
+
+@kernel
+def _forward(sh0, sh1, sh2, sh3, bands, index, means, eye, degree):
+    out, held = np.empty((len(index), 3), np.float32), (len(sh1), len(sh2), len(sh3))
+    for v in prange(len(index)):
+        i, values = index[v], np.empty(16)
+        top = _kept(bands, held, i, v, degree)
+        _basis(means, eye, i, top, values)
+        for c in range(3):
+            total = 0.5 + values[0] * sh0[i, 0, c]
+            if top >= 1:
+                total += _band(values, 1, sh1, i, c)
+            if top >= 2:
+                total += _band(values, 4, sh2, i, c)
+            if top >= 3:
+                total += _band(values, 9, sh3, i, c)
+            out[v, c] = max(total, 0.0)
+    return out
+
+
+@inline
+def _to_band(values, first, g, out, i, c):
+    for k in range(out.shape[1]):
+        out[i, k, c] = values[first + k] * g
+
+
+@kernel
+def _backward(sh1, sh2, sh3, bands, index, means, eye, degree, out, grad, for_bands):
+    """Gradients to sh0, to each band and, if asked for, to the masks [V, 3] (straight through closed ones too)."""
+    n, held = len(means), (len(sh1), len(sh2), len(sh3))
+    to_sh0, to_sh1 = np.empty((n, 1, 3), np.float32), np.empty(sh1.shape, np.float32)
+    to_sh2, to_sh3 = np.empty(sh2.shape, np.float32), np.empty(sh3.shape, np.float32)
+    to_bands = np.zeros((len(index) if for_bands else 0, 3), np.float32)
+    for i in prange(n):
+        to_sh0[i] = np.float32(0)
+        if i < held[0]:
+            to_sh1[i] = np.float32(0)
+        if i < held[1]:
+            to_sh2[i] = np.float32(0)
+        if i < held[2]:
+            to_sh3[i] = np.float32(0)
+    for v in prange(len(index)):
+        i, values = index[v], np.empty(16)
+        top = _kept(bands, held, i, v, degree)
+        _basis(means, eye, i, degree if for_bands else top, values)
+        for c in range(3):
+            g = grad[v, c] if out[v, c] > 0 else np.float32(0)
+            to_sh0[i, 0, c] = values[0] * g
+            if top >= 1:
+                _to_band(values, 1, g, to_sh1, i, c)
+            if top >= 2:
+                _to_band(values, 4, g, to_sh2, i, c)
+            if top >= 3:
+                _to_band(values, 9, g, to_sh3, i, c)
+            if for_bands and degree >= 1 and i < held[0]:
+                to_bands[v, 0] += _band(values, 1, sh1, i, c) * g
+            if for_bands and degree >= 2 and i < held[1]:
+                to_bands[v, 1] += _band(values, 4, sh2, i, c) * g
+            if for_bands and degree >= 3 and i < held[2]:
+                to_bands[v, 2] += _band(values, 9, sh3, i, c) * g
+    return to_sh0, to_sh1, to_sh2, to_sh3, to_bands
+
+
+class _Colors(torch.autograd.Function):
+    @staticmethod
+    def forward(ctx: Any, sh0, sh1, sh2, sh3, masks, index, means, eye, degree):  # type: ignore[no-untyped-def, override]
+        arrays = [t.detach().contiguous().numpy() for t in (sh0, sh1, sh2, sh3, masks, index, means, eye)]
+        out = _forward(*arrays, degree)
+        ctx.arrays, ctx.degree, ctx.out = arrays, degree, out
+        return torch.from_numpy(out)
+
+    @staticmethod
+    def backward(ctx: Any, grad):  # type: ignore[no-untyped-def, override]
+        for_bands = ctx.needs_input_grad[4]
+        found = _backward(*ctx.arrays[1:], ctx.degree, ctx.out, grad.contiguous().numpy(), for_bands)
+        parts = [torch.from_numpy(a) for a in found]
+        return *parts[:4], parts[4] if for_bands else None, None, None, None, None
+
+
+def colors_in_view(
+    bands: Sequence[Tensor], masks: Tensor | None, index: Tensor, means: Tensor, eye: Tensor, degree: int
+) -> Tensor:
+    """Colours [V, 3], at least 0, of the Gaussians `index` i64 [V] (no row twice) as seen from `eye` [3].
+
+    Args: bands: coefficients [N_l, 2 l + 1, 3] of bands 0 to 3 or fewer, float32: the first N_l Gaussians have band l,
+      N = N_0 ≥ N_1 ≥ ...; masks [V, 3] nested, of bands 1 to 3, None for all open; means [N, 3]; degree: the highest
+      band to use.
+    Raises: ValueError if the degree is not within 0 and 3.
+    Choices: no gradient reaches the means through the view's direction; a closed band costs nothing, except while its
+      mask still learns; a band that is not used gets no gradient at all, so that the optimizer leaves it out.
+    """
+    if not 0 <= degree <= 3:
+        raise ValueError(f"degree {degree} is not within 0 and 3")
+    used = [band if at <= degree else band[:0].detach() for at, band in enumerate(bands)]
+    used += [bands[0].new_zeros(0, 2 * at + 1, 3) for at in range(len(used), 4)]
+    if masks is None:
+        masks = torch.ones(1, 3).expand(len(index), 3)
+    return _Colors.apply(*used, masks, index, means.detach(), eye, degree)

@@ -1,0 +1,192 @@
+"""Densification: new Gaussians in regions of steep gradient (Eqs 11-12), and 3DGS's own rule as the baseline."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from chebsplat.splats.rotations import rotation_matrices
+
+SHRINK = 1.6  # 3DGS's divisor of the scales of two Gaussians that replace one
+
+
+class Additions(NamedTuple):
+    """parents i64 [A]: whom each new Gaussian comes from. rows: raw parameters [A, ...] of the new ones.
+    changed: raw parameters [A, ...] that the parents take on, by name (a parent occurs once at most).
+    """
+
+    parents: Tensor
+    rows: dict[str, Tensor]
+    changed: dict[str, Tensor]
+
+
+def region_gradients(gradients: Tensor, members: Tensor) -> Tensor:
+    """Mean gradient [M] of each region's members (Eq 11); gradients [N], members i64 [M, n], -1 where padded."""
+    present = members >= 0
+    if not present.any():
+        return gradients.new_zeros(len(members))
+    values = torch.where(present, gradients[members.clamp_min(0)], 0.0)
+    return values.sum(1) / present.sum(1).clamp_min(1)
+
+
+def densify(
+    raw: dict[str, Tensor],
+    members: Tensor,
+    gradient: Tensor,
+    threshold: float,
+    budget: int,
+    generator: torch.Generator,
+    *,
+    density: float = 0.05,
+    max_candidates: int = 32,
+    nearest: float = 0.5,
+    farthest: float = 1.5,
+) -> Additions:
+    """New Gaussians in the regions whose mean gradient exceeds the threshold (Eq 12).
+
+    Args:
+      raw:      raw parameters [N, ...] by name; members i64 [M, n]; gradient [M] of `region_gradients`.
+      budget:   at most so many are added; the steepest regions come first.
+      density:  candidates per local spacing³; max_candidates: a region's most.
+      nearest, farthest: bounds of a candidate's distance to the nearest Gaussian, in local spacings.
+    Raises:  ValueError on a threshold or bounds that are not positive and in order.
+    Choices: local spacing is the median over the members of the mean distance to the three nearest Gaussians, members
+      or not. A region of radius ρ gets density · 4/3 π (ρ / spacing)³ · min(gradient / threshold − 1, 1) candidates,
+      rounded up, uniform in the ball about its members' mean; new ones also keep `nearest` spacings apart. Each
+      inherits from the nearest Gaussian, which is its parent once at most, and both change so that the two render
+      like the one (`shared_opacity`, `shared_scales`). Gaussians with non-finite means are left out.
+    """
+    if not (threshold > 0 and 0 < nearest < farthest):
+        raise ValueError(f"threshold {threshold} and 0 < nearest {nearest} < farthest {farthest} do not hold")
+    from scipy.spatial import cKDTree
+
+    alive = torch.isfinite(raw["means"]).all(1).numpy()
+    order = torch.argsort(gradient, descending=True, stable=True)
+    steep = order[gradient[order] > threshold]
+    places, index = np.zeros((0, 3)), np.zeros(0, np.int64)
+    if budget > 0 and len(steep) and alive.sum() > 3:
+        means, ids = raw["means"].detach().double().numpy()[alive], np.flatnonzero(alive)
+        tree = cKDTree(means)
+        excess = (gradient[steep].double() / threshold - 1).clamp_max(1).numpy()
+        inside = np.where(alive, np.cumsum(alive) - 1, -1)[members[steep].clamp_min(0).numpy()]
+        inside[members[steep].numpy() < 0] = -1
+        centers, radii, spacings = _balls(tree, means, inside)
+        volume = 4 / 3 * np.pi * (radii / np.where(spacings > 0, spacings, np.inf)) ** 3
+        counts = np.ceil(np.minimum(density * volume * excess, max_candidates)).astype(np.int64)
+        counts[np.cumsum(counts) - counts >= 16 * budget] = 0
+        region = np.repeat(np.arange(len(counts)), counts)
+        rng = np.random.default_rng(int(torch.randint(2**62, (1,), generator=generator)))
+        places = centers[region] + radii[region, None] * _in_unit_ball(rng, len(region))
+        distance, parents = tree.query(places)
+        spacing = spacings[region]
+        kept = np.flatnonzero((distance >= nearest * spacing) & (distance <= farthest * spacing))
+        kept = kept[np.sort(np.unique(parents[kept], return_index=True)[1])]
+        kept = kept[_apart(places[kept], nearest * spacing[kept])][:budget]
+        places, index = places[kept], ids[parents[kept]]
+    parent = torch.from_numpy(index)
+    rows = {name: value.detach()[parent] for name, value in raw.items()}
+    offsets = torch.from_numpy(places).to(rows["means"]) - rows["means"]
+    changed = {
+        "logit_opacities": shared_opacity(rows["logit_opacities"], rows["log_scales"], rows["quats"], offsets),
+        "log_scales": shared_scales(rows["log_scales"], rows["quats"], offsets),
+    }
+    return Additions(parent, rows | changed | {"means": rows["means"] + offsets}, changed)
+
+
+def _balls(tree, means: np.ndarray, inside: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:  # type: ignore[no-untyped-def]
+    """Centres [R, 3], radii [R] and local spacings [R] of regions of members [R, n], -1 where padded."""
+    present = inside >= 0
+    where = np.where(present[..., None], means[inside], np.nan)
+    empty = ~present.any(1)
+    where[empty] = 0.0
+    centers = np.nanmean(where, 1)
+    radii = np.sqrt(np.nanmax(((where - centers[:, None]) ** 2).sum(-1), 1))
+    used = np.unique(inside[present])
+    typical = np.zeros(len(means))
+    typical[used] = tree.query(means[used], 4)[0][:, 1:].mean(1)
+    spacings = np.where(present, typical[inside], np.nan)
+    spacings[empty] = 0.0
+    return centers, radii, np.nanmedian(spacings, 1)
+
+
+def _in_unit_ball(rng: np.random.Generator, count: int) -> np.ndarray:
+    directions = rng.normal(size=(count, 3))
+    return directions * (rng.random((count, 1)) ** (1 / 3) / np.linalg.norm(directions, axis=1, keepdims=True))
+
+
+def _apart(places: np.ndarray, least: np.ndarray) -> np.ndarray:
+    """Which places [A] to keep, bool: those with no earlier place nearer than `least` [A]."""
+    from scipy.spatial import cKDTree
+
+    keep = np.ones(len(places), bool)
+    if len(places) > 1:
+        pairs = cKDTree(places).query_pairs(least.max(), output_type="ndarray")
+        gap = np.linalg.norm(places[pairs[:, 0]] - places[pairs[:, 1]], axis=1)
+        keep[pairs[gap < least[pairs[:, 1]], 1]] = False
+    return keep
+
+
+def shared_opacity(logits: Tensor, log_scales: Tensor, quats: Tensor, offsets: Tensor) -> Tensor:
+    """Logits [A] of the opacity o' that a Gaussian and its copy, `offsets` [A, 3] away, both take on.
+
+    Choices: the opacity o at the old centre stays: o = 1 − (1 − o')(1 − κ o'), where κ = exp(−½ |S⁻¹Rᵀoffset|²) is the
+      copy's falloff there. So 1 − √(1 − o) for a copy in place, and o for one too far to be seen at the centre.
+    """
+    local = torch.einsum("nji,nj->ni", rotation_matrices(quats), offsets)
+    kappa = (-0.5 * (local * torch.exp(-log_scales)).square().sum(-1)).nan_to_num(0.0, neginf=-1e3).exp()
+    opacity = logits.sigmoid()
+    root = ((1 + kappa) ** 2 - 4 * kappa * opacity).clamp_min(0).sqrt()
+    return torch.logit((2 * opacity / (1 + kappa + root)).clamp(1e-6, 1 - 1e-6))
+
+
+def shared_scales(log_scales: Tensor, quats: Tensor, offsets: Tensor) -> Tensor:
+    """Log scales [A, 3] that a Gaussian and its copy, `offsets` [A, 3] away, both take on.
+
+    Choices: the two equal Gaussians keep the one's second moment along each of its axes: s'² = s² − (Rᵀoffset)² / 4,
+      at least s / 1.6 (classic split's factor). Axes across which the copy was not moved keep their size.
+    """
+    local = torch.einsum("nji,nj->ni", rotation_matrices(quats), offsets)
+    relative = (1 - 0.25 * (local * torch.exp(-log_scales)).square()).nan_to_num(0.0)
+    return log_scales + 0.5 * relative.clamp_min(SHRINK**-2).log()
+
+
+def classic_candidates(
+    raw: dict[str, Tensor], gradients: Tensor, threshold: float, scale_limit: float
+) -> tuple[Tensor, Tensor]:
+    """3DGS's choice by a Gaussian's own gradient [N]: whom to clone and whom to split, i64, the steepest first.
+
+    Args: scale_limit: scene units; a Gaussian with a larger scale is split, any other one cloned.
+    """
+    order = torch.argsort(gradients, descending=True, stable=True)
+    steep = order[(gradients > threshold)[order] & torch.isfinite(raw["means"]).all(1)[order]]
+    large = raw["log_scales"][steep].exp().amax(1) > scale_limit
+    return steep[~large], steep[large]
+
+
+def clone_or_split(
+    raw: dict[str, Tensor],
+    gradients: Tensor,
+    threshold: float,
+    scale_limit: float,
+    budget: int,
+    generator: torch.Generator,
+) -> Additions:
+    """3DGS's rule, the baseline: small Gaussians with a steep gradient [N] are cloned, large ones split in two.
+
+    Choices: the steepest come first where the budget does not suffice. A clone is the same Gaussian again; the two
+      halves of a split are drawn from it, with scales divided by 1.6 and the opacity unchanged, as 3DGS does.
+    """
+    clones, splits = classic_candidates(raw, gradients, threshold, scale_limit)
+    parents = torch.cat([clones, splits])
+    first = torch.argsort(gradients[parents], descending=True, stable=True)[: max(budget, 0)]
+    parents, large = parents[first], first >= len(clones)
+    rows = {name: value.detach()[parents] for name, value in raw.items()}
+    draws = torch.randn(2, *rows["log_scales"].shape, generator=generator) * rows["log_scales"].exp()
+    offsets = torch.einsum("nij,knj->kni", rotation_matrices(rows["quats"]), draws)
+    offsets = torch.where(large[:, None], offsets, 0.0)
+    smaller = torch.where(large[:, None], rows["log_scales"] - float(np.log(SHRINK)), rows["log_scales"])
+    changed = {"means": rows["means"] + offsets[0], "log_scales": smaller}
+    return Additions(parents, rows | {"means": rows["means"] + offsets[1], "log_scales": smaller}, changed)

@@ -1,0 +1,136 @@
+"""Training losses: photometric (L1 and SSIM) and feature distance."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor
+
+
+def _blur(images: Tensor) -> Tensor:
+    """Window blur of [H, W, C] with zero padding, by plain convolutions."""
+    from chebsplat.training.ssim import TAPS, WINDOW
+
+    taps = torch.as_tensor(TAPS, dtype=images.dtype)
+    planes = images.permute(2, 0, 1)[:, None]
+    planes = torch.nn.functional.conv2d(planes, taps[None, None, :, None], padding=(WINDOW // 2, 0))
+    return torch.nn.functional.conv2d(planes, taps[None, None, None, :], padding=(0, WINDOW // 2))[:, 0].permute(
+        1, 2, 0
+    )
+
+
+def ssim_map(a: Tensor, b: Tensor) -> Tensor:
+    """Structural similarity [H, W, C] of images [H, W, C] in [0, 1]; plain torch, the oracle of the fused loss.
+
+    Choices: Gaussian window 11, σ 1.5, zero padding, biased variances, as 3DGS.
+    """
+    from chebsplat.training.ssim import C1, C2
+
+    mean_a, mean_b = _blur(a), _blur(b)
+    var_a, var_b = _blur(a * a) - mean_a**2, _blur(b * b) - mean_b**2
+    covariance = _blur(a * b) - mean_a * mean_b
+    top = (2 * mean_a * mean_b + float(C1)) * (2 * covariance + float(C2))
+    return top / ((mean_a**2 + mean_b**2 + float(C1)) * (var_a + var_b + float(C2)))
+
+
+def ssim(a: np.ndarray, b: np.ndarray) -> float:
+    """Mean SSIM of two u8 images [H, W, 3]."""
+    if a.dtype != np.uint8 or b.dtype != np.uint8 or a.shape != b.shape:
+        raise ValueError(f"two u8 images of one shape are needed, not {a.dtype} {a.shape}, {b.dtype} {b.shape}")
+    return float(ssim_map(torch.from_numpy(a).double() / 255, torch.from_numpy(b).double() / 255).mean())
+
+
+class _Photometric(torch.autograd.Function):
+    """The fused loss: its gradient is computed with its value."""
+
+    @staticmethod
+    def forward(ctx: Any, render: Tensor, target: Tensor, weight: Tensor, weight_ssim: float) -> Tensor:  # type: ignore[override]
+        from chebsplat.training.ssim import photometric
+
+        a, b, w = (t.detach().numpy() for t in (render, target, weight))
+        loss, gradient = photometric(a, b, w, weight_ssim)
+        ctx.save_for_backward(torch.from_numpy(gradient))
+        return render.new_tensor(loss)
+
+    @staticmethod
+    def backward(ctx: Any, grad: Tensor):  # type: ignore[no-untyped-def, override]
+        (gradient,) = ctx.saved_tensors
+        return grad * gradient, None, None, None
+
+
+def photometric(render: Tensor, target: Tensor, mask: Tensor | None, weight_ssim: float) -> Tensor:
+    """(1 − w) L1 + w (1 − SSIM) over the pixels that count.
+
+    Args: render, target [H, W, 3] float32 in [0, 1]; mask [H, W] bool, true where a pixel counts, or float ≥ 0, how
+      much it does; None: all alike.
+    Choices: pixels that do not count take the target's colour first, so they have no gradient, not even through
+      SSIM's window. 0 where nothing counts.
+    """
+    if mask is None:
+        weight = torch.full_like(target, 1 / target.numel())
+    else:
+        render = torch.where(mask[..., None] > 0, render, target)
+        weight = mask[..., None].to(target.dtype).expand_as(target)
+        weight = weight / weight.sum().clamp_min(1e-6)
+    return _Photometric.apply(render, target, weight, weight_ssim)
+
+
+def photometric_reference(render: Tensor, target: Tensor, mask: Tensor | None, weight_ssim: float) -> Tensor:
+    """As `photometric`, in plain torch and any float type: the oracle of the fused loss."""
+    counted = torch.ones_like(target[..., 0]) if mask is None else mask.to(target.dtype)
+    render = torch.where(counted[..., None] > 0, render, target)
+    weight = counted[..., None].expand_as(target) / (counted.sum() * target.shape[-1]).clamp_min(1e-6)
+    distance = (weight * (render - target).abs()).sum()
+    return (1 - weight_ssim) * distance + weight_ssim * (weight * (1 - ssim_map(render, target))).sum()
+
+
+class _FeatureDistance(torch.autograd.Function):
+    """The fused loss: its gradient is computed with its value."""
+
+    @staticmethod
+    def forward(ctx: Any, render: Tensor, target: Tensor, share: Tensor, by_channel: bool) -> Tensor:  # type: ignore[override]
+        from chebsplat.training.pooling import feature_distance
+
+        arrays = (t.detach().contiguous().numpy() for t in (render, target, share))
+        values, gradient = feature_distance(*arrays, by_channel)
+        ctx.save_for_backward(torch.from_numpy(gradient))
+        return render.new_tensor(values.sum())
+
+    @staticmethod
+    def backward(ctx: Any, grad: Tensor):  # type: ignore[no-untyped-def, override]
+        (gradient,) = ctx.saved_tensors
+        return grad * gradient, None, None, None
+
+
+def _cell_shares(mask: Tensor | None, size: tuple[int, int], kind: torch.dtype) -> Tensor:
+    """What each cell of the target counts, [h, w], summing to 1 (or 0): the mean of its pixels' mask."""
+    if mask is None:
+        return torch.full(size, 1 / (size[0] * size[1]), dtype=kind)
+    share = torch.nn.functional.adaptive_avg_pool2d(mask[None].to(kind), size)[0]
+    return share / share.sum().clamp_min(1e-6)
+
+
+def feature_distance(render: Tensor, target: Tensor, mask: Tensor | None = None, kind: str = "length") -> Tensor:
+    """Mean distance to the teacher's features at the teacher's resolution.
+
+    Args: render [H, W, C]; target [h, w, C], h ≤ H; mask [H, W] bool, true where a pixel counts, or float ≥ 0, how
+      much it does; float32. kind: `length` of the difference over √C, or `l1`, its mean magnitude by channel.
+    Choices: the render is averaged over each cell of the target; a cell counts by the mean of its pixels' mask.
+      Where views disagree about a Gaussian the shortest total length is at their geometric median, which lies near the
+      most common vector; the median channel by channel, where L1 is least, may be near none of them.
+    """
+    share = _cell_shares(mask, (target.shape[0], target.shape[1]), render.dtype)
+    return _FeatureDistance.apply(render, target.to(render.dtype), share, kind == "l1")
+
+
+def feature_distance_reference(
+    render: Tensor, target: Tensor, mask: Tensor | None = None, kind: str = "length"
+) -> Tensor:
+    """As `feature_distance`, in plain torch and any float type: the oracle of the fused loss."""
+    size = (target.shape[0], target.shape[1])
+    pooled = torch.nn.functional.adaptive_avg_pool2d(render.permute(2, 0, 1), size).permute(1, 2, 0)
+    difference = pooled - target
+    distance = difference.abs().mean(-1) if kind == "l1" else difference.square().mean(-1).clamp_min(1e-30).sqrt()
+    return (distance * _cell_shares(mask, size, render.dtype)).sum()

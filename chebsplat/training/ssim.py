@@ -1,0 +1,128 @@
+"""The photometric loss and its gradient in one sweep over the image: L1 and SSIM, in numba, float32.
+
+Images are [H, W, 3] seen as rows of W · 3 values, so a tap of the horizontal window is a shift by 3. Rows are
+independent in each of four passes; no pass writes what another thread writes, so the thread count changes no bit.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from chebsplat.kernels.jit import inline, kernel, prange
+
+WINDOW, SIGMA = 11, 1.5
+C1, C2 = np.float32(0.01**2), np.float32(0.03**2)
+HALF = WINDOW // 2
+_x = np.arange(WINDOW) - HALF
+TAPS = (np.exp(-0.5 * (_x / SIGMA) ** 2) / np.exp(-0.5 * (_x / SIGMA) ** 2).sum()).astype(np.float32)
+
+
+@kernel
+def _blur_products(a, b):
+    """Horizontal blur of a, b, a², b², ab: [H, L] twice -> [H, 5, L], zero beyond the border."""
+    height, length = a.shape
+    out = np.zeros((height, 5, length), np.float32)
+    for y in prange(height):
+        row = np.zeros((5, length + 6 * HALF), np.float32)
+        for x in range(length):
+            u, v = a[y, x], b[y, x]
+            row[0, x + 3 * HALF], row[1, x + 3 * HALF] = u, v
+            row[2, x + 3 * HALF], row[3, x + 3 * HALF], row[4, x + 3 * HALF] = u * u, v * v, u * v
+        for k in range(5):
+            for t in range(WINDOW):
+                tap = TAPS[t]
+                for x in range(length):
+                    out[y, k, x] += tap * row[k, x + 3 * t]
+    return out
+
+
+@inline
+def _sum(terms):
+    """In order, apart from the loop that makes them: that one vectorises then."""
+    total = 0.0
+    for x in range(len(terms)):
+        total += terms[x]
+    return total
+
+
+@kernel
+def _compare(blurred, weight):
+    """SSIM summed under a weight [H, L], by row, and its derivatives: to mean, variance and covariance, [H, 3, L]."""
+    height, _, length = blurred.shape
+    values = np.zeros(height, np.float64)
+    slopes = np.zeros((height, 3, length), np.float32)
+    for y in prange(height):
+        m, terms = np.zeros((5, length), np.float32), np.empty(length, np.float32)
+        for t in range(max(0, HALF - y), min(WINDOW, height + HALF - y)):
+            tap = TAPS[t]
+            for k in range(5):
+                for x in range(length):
+                    m[k, x] += tap * blurred[y + t - HALF, k, x]
+        for x in range(length):
+            mean_a, mean_b = m[0, x], m[1, x]
+            squares = mean_a * mean_a + mean_b * mean_b
+            top_1 = np.float32(2) * mean_a * mean_b + C1
+            top_2 = np.float32(2) * (m[4, x] - mean_a * mean_b) + C2
+            low_1, low_2 = squares + C1, m[2, x] + m[3, x] - squares + C2
+            over = np.float32(1) / (low_1 * low_2)
+            value, w = top_1 * top_2 * over, weight[y, x]
+            terms[x] = w * value
+            by_cov = np.float32(2) * top_1 * over * w
+            by_var = -value / low_2 * w
+            by_mean = (np.float32(2) * mean_b * top_2 * over - np.float32(2) * mean_a * value / low_1) * w
+            slopes[y, 0, x] = by_mean - np.float32(2) * mean_a * by_var - mean_b * by_cov
+            slopes[y, 1, x], slopes[y, 2, x] = by_var, by_cov
+        values[y] = _sum(terms)
+    return values, slopes
+
+
+@kernel
+def _blur_rows(slopes):
+    """Horizontal blur of [H, 3, L], in place of a copy."""
+    height, n, length = slopes.shape
+    out = np.zeros((height, n, length), np.float32)
+    for y in prange(height):
+        row = np.zeros(length + 6 * HALF, np.float32)
+        for k in range(n):
+            row[3 * HALF : 3 * HALF + length] = slopes[y, k]
+            for t in range(WINDOW):
+                tap = TAPS[t]
+                for x in range(length):
+                    out[y, k, x] += tap * row[x + 3 * t]
+    return out
+
+
+@kernel
+def _gather(slopes, a, b, weight, weight_ssim):
+    """Gradient [H, L] of (1 − w) L1 + w (1 − SSIM) to a, and the weighted L1 by row."""
+    height, _, length = slopes.shape
+    gradient = np.zeros((height, length), np.float32)
+    distance = np.zeros(height, np.float64)
+    for y in prange(height):
+        m, terms = np.zeros((3, length), np.float32), np.empty(length, np.float32)
+        for t in range(max(0, HALF - y), min(WINDOW, height + HALF - y)):
+            tap = TAPS[t]
+            for k in range(3):
+                for x in range(length):
+                    m[k, x] += tap * slopes[y + t - HALF, k, x]
+        for x in range(length):
+            difference, w = a[y, x] - b[y, x], weight[y, x]
+            terms[x] = w * abs(difference)
+            sign = np.float32(difference > 0) - np.float32(difference < 0)
+            by_ssim = m[0, x] + np.float32(2) * a[y, x] * m[1, x] + b[y, x] * m[2, x]
+            gradient[y, x] = (np.float32(1) - weight_ssim) * sign * w - weight_ssim * by_ssim
+        distance[y] = _sum(terms)
+    return gradient, distance
+
+
+def photometric(a: np.ndarray, b: np.ndarray, weight: np.ndarray, weight_ssim: float) -> tuple[float, np.ndarray]:
+    """Loss (1 − w) L1 + w (Σ weight − SSIM) and its gradient [H, W, 3] to `a`.
+
+    Args: a, b [H, W, 3] float32 in [0, 1]; weight [H, W, 3] what each value counts, summing to 1 (or 0).
+    """
+    shape = a.shape
+    a, b, weight = (np.ascontiguousarray(v.reshape(shape[0], -1)) for v in (a, b, weight))
+    values, slopes = _compare(_blur_products(a, b), weight)
+    gradient, distance = _gather(_blur_rows(slopes), a, b, weight, np.float32(weight_ssim))
+    loss = (1 - weight_ssim) * distance.sum() + weight_ssim * (weight.sum(dtype=np.float64) - values.sum())
+    return float(loss), gradient.reshape(shape)

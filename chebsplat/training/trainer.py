@@ -1,0 +1,247 @@
+"""One training: schedules, losses, growth and pruning of a scene model. Arrays in, arrays out; no files."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Iterator
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from chebsplat.errors import DataFailure
+from chebsplat.evaluation.metrics import psnr
+from chebsplat.shape import cks
+from chebsplat.shape.regions import Regions, build_regions
+from chebsplat.training import sh_prune
+from chebsplat.training.laps import Laps
+from chebsplat.training.losses import feature_distance, photometric
+from chebsplat.training.model import SceneModel
+from chebsplat.training.population import HELD as POPULATION
+from chebsplat.training.population import Population, broken
+from chebsplat.training.schedule import Schedule, adam
+from chebsplat.views import Views
+
+HELD = ("step", "seconds", "order", "members", "guidance")
+
+
+class Trainer:
+    """Call `refresh()` once, iterate over `steps()`, then call `finish()`.
+
+    Args:
+      settings, describe: the config's sections; extent: scene units, scales the means' learning rate.
+      basis:    matrices [q, r] by name of an earlier scene's knowledge, empty for none.
+    `state()` between two steps holds all that the steps to come depend on: a trainer that is given it by `restore`
+    takes them as this one does, to the bit, with as many threads.
+    """
+
+    def __init__(
+        self,
+        model: SceneModel,
+        views: Views,
+        settings: dict[str, Any],
+        describe: dict[str, Any],
+        extent: float,
+        basis: dict[str, Tensor],
+    ):
+        self.model, self.views, self.settings, self.describe, self.extent = model, views, settings, describe, extent
+        self.basis = basis if model.shape is not None else {}
+        self.schedule = Schedule(settings)
+        self.guidance: Tensor | None = None
+        self.optimizer = adam(self.model, self.settings, self.extent)
+        self.order_generator = np.random.default_rng(settings["seed"])
+        self.generator = torch.Generator().manual_seed(settings["seed"])
+        self.order: list[int] = []  # views still to be seen before any is seen again
+        self.step = 0
+        self.seconds = 0.0  # of the steps but the first
+        self.population = Population(model, settings, extent)
+        self.laps = Laps()  # of the same steps; after a resume, from there on
+
+    @property
+    def share(self) -> float:
+        """Part of the budget that is spent."""
+        return self.schedule.share(self.step, self.seconds)
+
+    def steps(self) -> Iterator[dict[str, float]]:
+        """Train until the budget is spent; yields each step's figures."""
+        while self.share < 1:
+            began = time.perf_counter()
+            self.laps.start()
+            self.step += 1
+            share = self.share  # of a budget in steps, with this one; of one in seconds, what was spent before
+            for group in self.optimizer.param_groups:
+                group["lr"] = group["rate"] * self.schedule.rate(group["name"], share)
+            self.order = self.order or self.order_generator.permutation(len(self.views.names)).tolist()
+            figures = self._step(self.order.pop(), share)
+            self._adapt(share)
+            self.laps.mark("growth and pruning")
+            if self.step == 1:  # kernels were compiled or loaded
+                self.laps = Laps()
+            else:
+                self.seconds += time.perf_counter() - began
+            yield figures | {"n": len(self.model)}
+
+    def _adapt(self, share: float) -> None:
+        """Growth, pruning, the freeze and refreshes that are due after a step."""
+        due = self.step % self.settings["refresh_every"] == 0
+        growing = self.schedule.grown(share) > self.population.n_grown
+        removing = growing or (self.schedule.has("densify_until", share) and self.step % 200 == 0)
+        if growing or due:
+            self._drop_broken()
+        mask = self._soft_mask(share) if removing else None
+        if growing:
+            self.population.grow(self.optimizer, self.members, self.generator)
+        if removing:
+            self.population.remove(self.optimizer, mask)
+        if removing or due:
+            self.refresh()
+        if self.schedule.has("sh_freeze", share) and self.population.freeze_bands(self.optimizer):
+            self.refresh()
+
+    def _drop_broken(self) -> None:
+        if self.population.drop_broken(self.optimizer):
+            self.refresh()
+        elif names := broken(self.model):
+            raise DataFailure(f"step {self.step}: the training has broken down; {names}")
+
+    @torch.no_grad()
+    def _soft_mask(self, share: float) -> Tensor | None:
+        """Of all Gaussians, once pruning has begun; encodings are as the last refresh or step left them."""
+        if not self.schedule.has("prune_from", share):
+            return None
+        everyone, features, shape = torch.arange(len(self.model)), self.model.raw.get("features"), self.model.shape
+        if shape is not None and features is not None and self._encodes(share) and self.model.semantic_gate is not None:
+            features = shape.fuse(features, everyone)
+        return self.model.soft_mask(everyone, features)
+
+    def state(self) -> dict[str, Any]:
+        """All that the steps to come depend on: tensors (shared, not copied) and plain values."""
+        return {
+            "raw": {name: value.detach() for name, value in self.model.raw.items()},
+            "modules": {name: module.state_dict() for name, module in self.model.modules.items()},
+            "shape": None if self.model.shape is None else self.model.shape.state(),
+            "optimizer": self.optimizer.state_dict(),
+            "order_generator": self.order_generator.bit_generator.state,
+            "generator": self.generator.get_state(),
+            "population": {name: getattr(self.population, name) for name in POPULATION},
+        } | {name: getattr(self, name) for name in HELD}
+
+    def restore(self, state: dict[str, Any]) -> None:
+        """Go on as the trainer whose `state()` this is; it is not to be used otherwise afterwards."""
+        model = self.model
+        model.raw = {name: value.requires_grad_(True) for name, value in state["raw"].items()}
+        for name, module in model.modules.items():
+            module.load_state_dict(state["modules"][name])
+        if model.shape is not None:
+            model.shape.restore(state["shape"])
+        self.optimizer = adam(self.model, self.settings, self.extent)
+        self.optimizer.load_state_dict(state["optimizer"])
+        self.order_generator.bit_generator.state = state["order_generator"]
+        self.generator.set_state(state["generator"])
+        for name, value in ({k: state[k] for k in HELD}).items():
+            setattr(self, name, value)
+        for name, value in state["population"].items():
+            setattr(self.population, name, value)
+
+    def _encodes(self, share: float) -> bool:
+        return self.model.shape is not None and self.schedule.has("encode_from", share)
+
+    def refresh(self, regions: Regions | None = None, descriptors: Tensor | None = None) -> None:
+        """Regions and descriptors of the Gaussians as they are now."""
+        self.laps.mark("growth and pruning")
+        shape = self.model.shape
+        if shape is not None:
+            shape.refresh(self.model.raw, regions, descriptors)
+            regions = shape.regions
+        elif regions is None:
+            means = self.model.raw["means"].detach().double().numpy()
+            regions = build_regions(means, *(self.describe[k] for k in ("n_regions", "region_size", "seed")))
+        assert regions is not None
+        self.members, self.guidance = torch.as_tensor(regions.members), None
+        self.laps.mark("refresh")
+
+    def _guided(self, index: Tensor) -> Tensor | None:
+        """Weights [V, 3] of the bands' penalty, found when they are first wanted after a refresh; None: all alike."""
+        if not self.settings["sh_guided"]:
+            return None
+        if self.guidance is None:
+            self.laps.mark("losses")
+            shN = sh_prune.dense([band.detach() for band in self.model.bands()[1:]], len(self.model))
+            self.guidance = sh_prune.region_guidance(shN, self.members, len(self.model))
+            self.laps.mark("refresh")
+        return self.guidance[index]
+
+    def _step(self, index: int, share: float) -> dict[str, float]:
+        settings, factor = self.settings, self.schedule.factor(share)
+        target, mask = self.views.target(index, factor)
+        pruning = self.schedule.has("prune_from", share)
+        wanted = None if self.views.features is None else self.views.features(index)
+        rendered, aside = self.model.render(
+            self.views.camera(index, factor),
+            self.schedule.degree(share),
+            masked=pruning,
+            fused=self._encodes(share),
+            generator=self.generator if self.step % settings["encode_every"] == 0 else None,
+            grid=None if wanted is None else (wanted.shape[0], wanted.shape[1]),
+        )
+        self.laps.mark("render")
+        losses = {"color": photometric(rendered.rgb, target, mask, settings["weight_ssim"])}
+        if rendered.features is not None and wanted is not None:
+            distance = feature_distance(rendered.features, wanted, mask, settings["feature_loss"])
+            losses["features"] = settings["weight_features"] * distance
+        if "mask" in aside and pruning:
+            losses["mask"] = settings["weight_mask"] * aside["mask"].mean()
+        if "shape" in aside and settings["weight_shape"] > 0:
+            losses["shape"] = settings["weight_shape"] * aside["shape"]
+        if "bands" in aside:
+            losses["sh"] = settings["weight_sh"] * sh_prune.sh_loss(aside["bands"], self._guided(rendered.index))
+        if self.basis and self.model.shape is not None:
+            projections = self.model.shape.encoder.projections()
+            losses["basis"] = settings["weight_basis"] * cks.basis_loss(projections, self.basis)
+        loss = torch.stack(list(losses.values())).sum()
+        if not torch.isfinite(loss):
+            bad = [name for name, value in losses.items() if not torch.isfinite(value)]
+            where = f"step {self.step}, view {self.views.names[index]}: loss {', '.join(bad)} is not finite"
+            raise DataFailure(f"{where}; {broken(self.model) or 'all parameters are finite: look at the view itself'}")
+        self.laps.mark("losses")
+        self.optimizer.zero_grad(set_to_none=True)
+        if settings["densify_semantic"]:
+            loss.backward()
+            self.population.note_gradients(rendered)
+        else:
+            losses["color"].backward(retain_graph=True)
+            self.population.note_gradients(rendered)
+            (loss - losses["color"]).backward()
+        self.laps.mark("backward")
+        self.optimizer.step()
+        self.laps.mark("optimizer")
+        return {"loss": float(loss.detach())} | {f"loss_{k}": float(v.detach()) for k, v in losses.items()}
+
+    @torch.no_grad()
+    def held_in_psnr(self, indices: list[int]) -> float:
+        """Mean PSNR over training views at full resolution, dB."""
+        scores = []
+        for index in indices:
+            camera, degree = self.views.camera(index, 1), self.schedule.degree(self.share)
+            rendered, _ = self.model.render(camera, degree, semantic=False)
+            image = (rendered.rgb.clamp(0, 1) * 255).round().byte().numpy()
+            mask = None if self.views.masks is None else self.views.masks[index].numpy()
+            truth = self.views.images[index].numpy()
+            scores.append(psnr(image, truth) if mask is None else psnr(image[mask], truth[mask]))
+        return float(np.mean(scores))
+
+    @torch.no_grad()
+    def finish(self) -> dict[str, np.ndarray]:
+        """Final raw parameters: degrees fixed, bands above them zero, fused features of every Gaussian."""
+        self._drop_broken()
+        self.population.freeze_bands(self.optimizer)
+        bands = [band.detach() for band in self.model.bands()][: self.schedule.degree(1.0) + 1]
+        others = self.model.raw.keys() - {"sh1", "sh2", "sh3", "prune_logits"}
+        parameters = {name: self.model.raw[name].detach().numpy() for name in sorted(others)}
+        parameters["shN"] = sh_prune.dense(bands[1:], len(self.model)).numpy()
+        parameters["degrees"] = np.zeros(len(self.model), np.uint8)
+        for band in bands[1:]:
+            parameters["degrees"][: len(band)] += 1
+        fused = self.model.fused_features()
+        return parameters if fused is None else parameters | {"fused": fused}
