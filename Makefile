@@ -10,7 +10,7 @@ CHOICE := $(if $(scene),--scene '$(scene)') $(if $(sequence),--sequence '$(seque
 
 # `make scene=office0` needs no target: naming a scene, a sequence or a study means running it.
 .DEFAULT_GOAL := $(if $(study),study,$(if $(scene)$(sequence),run,help))
-.PHONY: help run study plan verify clean-stale setup test test-all malformed stability bench-raster bench-train bench-descriptor bench-encoder bench-layouts bench-refresh bench-cost bench-knowledge bench-shapes bench-store nouns teacher teacher-quality lint lock
+.PHONY: help run study plan verify clean-stale setup test test-all malformed soak stability bench-raster bench-train bench-descriptor bench-encoder bench-layouts bench-refresh bench-cost bench-knowledge bench-shapes bench-store nouns teacher teacher-quality lint lock
 
 run: $(READY)  ## make scene=NAME|FOLDER [stage=] [set=a.b=c,...] [ablation=] [basis=NAME@REVISION] [cores=] [device=]; or sequence=NAME
 	@$(CHEBSPLAT) run $(CHOICE) $(if $(stage),--stage '$(stage)') $(if $(cores),--cores '$(cores)') $(if $(device),--device '$(device)')
@@ -44,6 +44,9 @@ test-all: $(READY)  ## all tests, the slow ones too
 
 malformed: $(READY)  ## every malformed input of the corpus: exit code, seconds, memory; build/malformed.csv (args="WORD ...")
 	@PYTHONPATH=tests $(PY) -m malformed $(args)
+
+soak: $(READY)  ## runs killed, stopped, on full disks, by the hundred; build/soak-*.csv (args="kills=200 stops=50 disk=20 runs=60")
+	@PYTHONPATH=tests $(PY) -m soak $(args)
 
 bench-raster: $(READY)  ## the rasterizer against its bars, in build/bench/: table, CSV, figure (a minute, on a quiet machine)
 	@$(PY) benchmarks/rasterize.py $(args)

@@ -25,6 +25,12 @@ class DataFailure(ChebsplatError):
     exit_code = 4
 
 
+class DiskFailure(ChebsplatError):
+    """A disk that is full or may not be written; the message names file, bytes and remedy."""
+
+    exit_code = 4
+
+
 class Stopped(BaseException):
     """The process was asked to end; like KeyboardInterrupt, no `except Exception` takes it for a failure."""
 

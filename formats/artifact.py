@@ -11,14 +11,15 @@ import json
 import os
 import shutil
 import stat
+import time
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import asdict
-from errno import EDQUOT, ENOSPC, EROFS
 from pathlib import Path
 from typing import Any
 
 from chebsplat.errors import ConfigError, InputError
+from chebsplat.formats import disk
 from chebsplat.formats.manifest import MANIFEST, Manifest, parse_manifest, remedy
 
 
@@ -59,28 +60,37 @@ def publish(out: Path, manifest: Manifest, force: bool = False) -> Iterator[Path
     `manifest` may be completed inside the block (facts, seconds); its file table is filled in here.
     A whole artifact that stands there, such as a twin's that was faster, is kept and ours is discarded, unless `force`
     asks for ours. Until the block has ended, what stands at `out` stays.
-    Raises: InputError as `check_place`; ConfigError if `out` cannot be written.
+    Raises: InputError as `check_place`; ConfigError if there can be no `out`; DiskFailure if the disk takes no more.
     """
     out = Path(out)
     tmp = out.parent / f".tmp-{out.name}-{os.getpid()}"
+    try:
+        with disk.explained(tmp):
+            _make(tmp, out)
+            yield tmp
+            if force or not is_whole(out, manifest.schema):
+                manifest.files = _file_table(tmp)
+                _write_synced(tmp / MANIFEST, json.dumps(asdict(manifest), indent=1, sort_keys=True) + "\n")
+                _settle_tree(tmp)
+                _put(tmp, out, manifest, force)
+                sync_directory(out.parent)
+    finally:
+        for _ in range(20):  # zarr's threads may still be writing what belongs to a chunk that failed
+            shutil.rmtree(tmp, ignore_errors=True)
+            if not tmp.exists():
+                break
+            time.sleep(0.05)
+
+
+def _make(tmp: Path, out: Path) -> None:
     try:
         if tmp.exists():
             shutil.rmtree(tmp)
         tmp.mkdir(parents=True)
     except OSError as error:
-        if error.errno in (ENOSPC, EDQUOT, EROFS):
+        if error.errno in disk.REFUSALS:
             raise
         raise ConfigError(f"{out} cannot be written ({error.strerror}); choose another --out") from None
-    try:
-        yield tmp
-        if force or not is_whole(out, manifest.schema):
-            manifest.files = _file_table(tmp)
-            _write_synced(tmp / MANIFEST, json.dumps(asdict(manifest), indent=1, sort_keys=True) + "\n")
-            _settle_tree(tmp)
-            _put(tmp, out, manifest, force)
-            sync_directory(out.parent)
-    finally:
-        shutil.rmtree(tmp, ignore_errors=True)
 
 
 def _put(tmp: Path, out: Path, manifest: Manifest, force: bool) -> None:

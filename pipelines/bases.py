@@ -13,9 +13,9 @@ from pathlib import Path
 from chebsplat.errors import ConfigError
 from chebsplat.formats import artifact, heads
 from chebsplat.formats.basis import SCHEMA, read_lineage
-from chebsplat.pipelines import store
+from chebsplat.pipelines import job, store
 from chebsplat.pipelines.plan import Plan, Planner
-from chebsplat.pipelines.run import HERE, entry, git_state, job, write_plan
+from chebsplat.pipelines.run import HERE, entry, git_state, write_plan
 from chebsplat.pipelines.scenes import names
 from chebsplat.pipelines.sequences import chain, scenes_of
 from chebsplat.stages.registry import STAGES
@@ -156,7 +156,7 @@ def extend(name: str, gaussians: Path, scene: str) -> list[Path]:
         plan = write_plan([entry(step, git_state(HERE)) | {"threads": 1}])
         folders.append(plan.parent)  # until the revision is linked, its plan keeps `clean-stale` from it
         with redirect_stdout(io.StringIO()):
-            code = job(plan, step.key)
+            code = job.run(plan, step.key)
         if code:
             sys.exit(code)
         return step.path

@@ -10,15 +10,15 @@ import shutil
 import subprocess
 import sys
 import time
-from collections.abc import Iterable, Iterator
-from contextlib import contextmanager
+from collections.abc import Iterable
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from chebsplat.pipelines import children, store, summary
+from chebsplat.formats import disk
+from chebsplat.pipelines import children, job, store, summary
 from chebsplat.pipelines.plan import Plan, Step
-from chebsplat.pipelines.raw import unchanged
+from chebsplat.pipelines.store import say
 from chebsplat.pipelines.tables import aligned
 
 HERE = Path(__file__).parent
@@ -30,10 +30,6 @@ class Outcome:
 
     code: int = 0
     failed: dict[str, tuple[int, str, Path]] = field(default_factory=dict)
-
-
-def say(text: str) -> None:
-    print(text, file=sys.stderr, flush=True)
 
 
 def device_of(wanted: str) -> str:
@@ -126,7 +122,9 @@ def write_plan(entries: list[dict[str, Any]]) -> Path:
     shutil.rmtree(folder, ignore_errors=True)
     folder.mkdir(parents=True)
     for item in entries:
-        (folder / f"{item['stage']}-{item['key']}.json").write_text(json.dumps(item["config"], indent=1))
+        file = folder / f"{item['stage']}-{item['key']}"
+        file.with_suffix(".json").write_text(json.dumps(item["config"], indent=1))
+        file.with_suffix(".exit").write_text(job.CODE.format(0))
     for name, hashes in raw.items():
         (folder / name).write_text(json.dumps(hashes))
     plan = folder / "plan.json"
@@ -137,16 +135,17 @@ def write_plan(entries: list[dict[str, Any]]) -> Path:
 
 def failures(steps: list[Step], folder: Path, words: Path) -> Outcome:
     """Say which steps failed, and where their log is."""
-    failed = {}
+    failed, killed = {}, False
     for step in steps:
         log, exit_file = (folder / f"{step.stage}-{step.key}.{kind}" for kind in ("log", "exit"))
-        if exit_file.is_file():
-            code = int(exit_file.read_text())
+        if code := int(exit_file.read_text()):
             failed[step.key] = (code, last_word(log), log)
             say(f"{step.stage} {'was stopped' if code > 128 else 'failed'} with exit code {code}; log: {log}")
         elif log.is_file() and not step.fresh:
-            failed[step.key] = (1, "killed before it could report", log)
+            failed[step.key], killed = (1, "killed before it could report", log), True
             say(f"{step.stage} was killed before it could report; log: {log}")
+    if killed or not failed:
+        disk.check(store.work(), words.read_text(errors="replace") if words.is_file() else "")
     if not failed:
         say(f"the run stopped before a stage began; log: {words}")
     return Outcome(max((code for code, *_ in failed.values()), default=1), failed)
@@ -185,54 +184,6 @@ def entry(step: Step, state: dict[str, Any], device: str = "cpu") -> dict[str, A
 def job_command(plan: Path, step: dict[str, Any]) -> str:
     """The shell line that the Snakefile runs for a step."""
     return shlex.join([sys.executable, "-P", "-m", "chebsplat.pipelines.cli", "job", str(plan), step["key"]])
-
-
-def job(plan: Path, key: str) -> int:
-    """One Snakemake job: the stage's own command, in this process; a twin in another run is waited for."""
-    import logging
-    from importlib import import_module
-
-    # Snakemake sets OMP_NUM_THREADS to the one thread that a rule declares; a stage may use all cores of the run.
-    if threads := os.environ.get("CHEBSPLAT_THREADS"):
-        os.environ |= {"OMP_NUM_THREADS": threads, "NUMBA_NUM_THREADS": threads}
-    step = next(s for s in json.loads(plan.read_text())["steps"] if s["key"] == key)
-    files = plan.parent / f"{step['stage']}-{key}"
-    handler = logging.FileHandler(f"{files}.log")
-    logging.getLogger("chebsplat").addHandler(handler)
-    arguments = ["--config", f"{files}.json", "--out", step["path"], "--key", key]
-    arguments += ["--code", json.dumps(step["code"]), "--device", step["device"]]
-    for role, path in step["inputs"].items():
-        arguments += [f"--in-{role}", path]
-    code = 0
-    try:
-        with alone(Path(step["path"])):
-            store.remove_half(Path(step["path"]))
-            watch = unchanged(step["stage"], step["config"], json.loads(Path(f"{files}.raw.json").read_text()))
-            import_module(f"chebsplat.stages.{step['stage']}").main(arguments, prog_name=step["stage"], obj=watch)
-    except SystemExit as stop:
-        code = stop.code if isinstance(stop.code, int) else 1
-    finally:
-        logging.getLogger("chebsplat").removeHandler(handler)
-        handler.close()
-    if code:
-        Path(f"{files}.exit").write_text(str(code))
-    return code
-
-
-@contextmanager
-def alone(path: Path) -> Iterator[None]:
-    """Hold the lock of one artifact; the system releases it when the process ends, however it ends."""
-    import fcntl
-
-    file = path.parents[2] / ".locks" / f"{path.parent.name}-{path.name}"
-    file.parent.mkdir(exist_ok=True)
-    with file.open("w") as handle:
-        try:
-            fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except BlockingIOError:
-            say(f"{path.parent.name}: another run is making it; waiting")
-            fcntl.flock(handle, fcntl.LOCK_EX)
-        yield
 
 
 def seconds(steps: list[Step], ran: set[str]) -> None:

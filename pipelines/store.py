@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import os
 import shutil
+import sys
 import time
 from collections.abc import Container
 from contextlib import suppress
@@ -23,6 +24,10 @@ def work() -> Path:
 
 def artifact_path(stage: str, key: str) -> Path:
     return work() / "store" / stage / key
+
+
+def say(text: str) -> None:
+    print(text, file=sys.stderr, flush=True)
 
 
 def is_fresh(path: Path) -> bool:
@@ -51,10 +56,15 @@ class Memo:
         """Nothing where there is no work folder: a run makes one, planning does not."""
         text = json.dumps(self.values, sort_keys=True)
         if text != self._before and work().is_dir():
-            self.path.parent.mkdir(parents=True, exist_ok=True)
             tmp = self.path.with_suffix(f".{os.getpid()}")
-            tmp.write_text(text)
-            os.replace(tmp, self.path)
+            try:
+                self.path.parent.mkdir(parents=True, exist_ok=True)
+                tmp.write_text(text)
+                os.replace(tmp, self.path)
+            except OSError as error:
+                with suppress(OSError):
+                    tmp.unlink(missing_ok=True)
+                say(f"{self.path} cannot be written ({error.strerror}): what it would spare is done again next time")
 
 
 def link(scene: str, targets: dict[str, Path]) -> Path:

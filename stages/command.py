@@ -16,7 +16,7 @@ from typing import Any
 import click
 
 from chebsplat.errors import ChebsplatError, ConfigError, Stopped
-from chebsplat.formats import artifact
+from chebsplat.formats import artifact, disk
 from chebsplat.formats.manifest import Manifest, is_key
 from chebsplat.stages import config as configs
 from chebsplat.stages.device import DEVICES, resolve
@@ -93,7 +93,7 @@ def execute(name: str, run: Callable[[Job], None], options: dict[str, Any]) -> i
         if not options["force"] and artifact.is_whole(out, STAGES[name].schema):
             log.info("already there")
         else:
-            with heeded():
+            with heeded(), disk.explained(out.parent):
                 _run(name, run, options, out)
     except ChebsplatError as error:
         log.error("%s", error)

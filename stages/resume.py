@@ -7,6 +7,7 @@ import os
 import time
 from typing import Any
 
+from chebsplat.formats import disk
 from chebsplat.formats.artifact import digest, read_manifest
 from chebsplat.stages.command import Job, n_threads
 
@@ -53,11 +54,17 @@ class Saves:
             return
         import torch
 
-        self.file.parent.mkdir(parents=True, exist_ok=True)
-        part = self.file.with_suffix(".part")
-        with part.open("wb") as handle:
-            torch.save({"identity": self.identity, "state": state()}, handle)
-            handle.flush()
-            os.fsync(handle.fileno())
-        os.replace(part, self.file)
         self.saved = time.monotonic()
+        part = self.file.with_suffix(".part")
+        try:
+            self.file.parent.mkdir(parents=True, exist_ok=True)
+            with part.open("wb") as handle:
+                torch.save({"identity": self.identity, "state": state()}, handle)
+                handle.flush()
+                os.fsync(handle.fileno())
+            os.replace(part, self.file)
+        except (OSError, RuntimeError):  # torch has its own word for a full disk
+            if (fault := disk.refusal(part.parent)) is None:
+                raise
+            part.unlink(missing_ok=True)
+            log.warning("%s cannot be saved (%s): the training goes on without", self.file, fault.strerror)

@@ -23,7 +23,7 @@ from chebsplat.errors import Stopped
 
 SIGNALS = tuple(getattr(signal, name) for name in ("SIGINT", "SIGTERM", "SIGHUP") if hasattr(signal, name))
 LIFELINE = "CHEBSPLAT_LIFELINE"  # the number of the pipe; of another pipe or file nothing is to be concluded
-SECONDS = 3.0  # from being asked to the end of a job
+SECONDS = 2.5  # from being asked to the end of a job
 PATIENCE = SECONDS + 0.7  # of a run with its jobs, before it kills them
 
 

@@ -9,9 +9,18 @@ from typing import NoReturn
 import click
 
 from chebsplat.errors import ChebsplatError, Stopped
+from chebsplat.formats.disk import explained
+from chebsplat.pipelines import store
 from chebsplat.stages.stopping import heeded
 
 KEPT = "what was finished is kept, and the same command goes on from there"
+
+CLICK = (click.ClickException, click.Abort, click.exceptions.Exit)
+
+
+def say(text: str) -> None:
+    with suppress(OSError):  # the terminal may be gone, and the disk of a log full
+        print(f"chebsplat: {text}", file=sys.stderr)
 
 
 class Guarded(click.Group):
@@ -20,13 +29,13 @@ class Guarded(click.Group):
     def invoke(self, context: click.Context) -> NoReturn:
         with heeded():
             try:
-                code = super().invoke(context)
+                with explained(store.work(), CLICK):
+                    code = super().invoke(context)
             except ChebsplatError as error:
-                print(f"chebsplat: {error}", file=sys.stderr)
+                say(f"{error}")
                 code = error.exit_code
             except Stopped as stop:
-                with suppress(OSError):  # the terminal may be gone
-                    print(f"chebsplat: {stop}; {KEPT}", file=sys.stderr)
+                say(f"{stop}; {KEPT}")
                 code = stop.exit_code
         context.exit(code or 0)
 

@@ -139,7 +139,7 @@ def study(name: str, cores: int, threads: int, out: Path | None, only_plan: bool
 @click.argument("key")
 def job(plan: Path, key: str) -> int:
     """One step of a plan, as Snakemake runs it."""
-    from chebsplat.pipelines.run import job as run_job
+    from chebsplat.pipelines.job import run as run_job
     from chebsplat.stages.stopping import watch_lifeline
 
     watch_lifeline()

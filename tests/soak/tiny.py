@@ -12,13 +12,14 @@ from contextlib import suppress
 from dataclasses import dataclass, field
 from pathlib import Path
 
+from chebsplat.errors import InputError
 from chebsplat.formats import artifact
 
 ROOT = Path(__file__).parents[2]
 SET = ("train.steps=12,train.n_densify=1,sfm.max_points=200,evaluate.timing_repeats=0,train.encoder=off,"
        "train.seed={seed}")  # fmt: skip
 MARKER = "CHEBSPLAT_SOAK"  # in the environment of a run and of all that it starts
-LOGS = ("log.jsonl", "trace.safetensors")  # hold seconds
+LOGS = ("log.jsonl", "trace.csv")  # hold seconds
 
 
 @dataclass
@@ -27,12 +28,15 @@ class Run:
 
     work: Path
     seed: int = 0
-    stage: str = "evaluate"
+    stage: str = "export"
     environment: dict[str, str] = field(default_factory=dict)
+    words: Path = Path()  # its stderr; beside `work` if it is not named
 
     def __post_init__(self) -> None:
         self.mark = uuid.uuid4().hex
-        self.words = self.work.with_name(f"{self.work.name}.stderr")
+        self.before = set(hidden(self.work))  # left by earlier runs
+        if self.words == Path():
+            self.words = self.work.with_name(f"{self.work.name}.stderr")
         command = [sys.executable, "-P", "-m", "chebsplat.pipelines.cli", "run", "--scene", "toy"]
         command += ["--set", SET.format(seed=self.seed), "--stage", self.stage, "--cores", "2"]
         environment = os.environ | {"CHEBSPLAT_WORK": str(self.work), MARKER: self.mark} | self.environment
@@ -91,6 +95,17 @@ def kill(number: int, how: signal.Signals, group: bool = False) -> None:
 
 def artifacts(work: Path) -> list[Path]:
     return sorted(path for path in work.glob("store/*/*") if not path.name.startswith("."))
+
+
+def different(work: Path, whole: dict[str, str], finished: bool = False) -> str:
+    """What is half or not as in the undisturbed run; empty if all is well."""
+    try:
+        found = contents(work)
+    except InputError as error:
+        return f"half: {error}"
+    other = sorted(name for name, digest in found.items() if whole.get(name) != digest)
+    other += sorted(whole.keys() - found.keys()) if finished else []
+    return f"not the same bytes: {other[0]} and {len(other) - 1} more" if other else ""
 
 
 def hidden(work: Path) -> list[Path]:

@@ -1,0 +1,75 @@
+"""A disk that is full, read-only or not ours ends a command with exit code 4, the file, the bytes and no traceback."""
+
+import errno
+import os
+import subprocess
+import sys
+
+import pytest
+from shared import ROOT
+from soak.disk import namespace
+
+from chebsplat.errors import DiskFailure, InputError
+from chebsplat.formats import artifact, disk
+from chebsplat.formats.artifact import Manifest
+
+MOUNT = 'mount -t tmpfs -o "$0" tmpfs "$1" && shift && exec "$@"'
+
+
+def on_a_disk(folder, options, *arguments):
+    """A `chebsplat` command whose work folder is a disk of its own."""
+    if (unshare := namespace()) is None:
+        pytest.skip("nothing can be mounted here (root, or user namespaces, are needed)")
+    command = [*unshare, "sh", "-c", MOUNT, options, folder, sys.executable, "-P", "-m", "chebsplat.pipelines.cli"]
+    return subprocess.run([*command, *arguments], cwd=ROOT, env=os.environ | {"CHEBSPLAT_WORK": str(folder)},
+                          capture_output=True, text=True)  # fmt: skip
+
+
+def test_a_stage_on_a_full_disk_exits_4_with_file_and_bytes(tmp_path):
+    done = on_a_disk(tmp_path, "size=200k", "run", "--scene", "toy", "--stage", "ingest")
+    assert done.returncode == 4
+    assert "Traceback" not in done.stderr
+    assert f"{tmp_path}/store/ingest" in done.stderr
+    assert "No space left on device" in done.stderr
+    assert "bytes are needed" in done.stderr
+
+
+@pytest.mark.parametrize("options", ["ro", "size=4k"])
+def test_a_work_folder_that_takes_nothing_is_said_before_anything_runs(tmp_path, options):
+    done = on_a_disk(tmp_path, options, "run", "--scene", "toy")
+    assert done.returncode == 4
+    assert "Traceback" not in done.stderr
+    assert done.stderr.splitlines()[-1].startswith(f"chebsplat: {tmp_path}")
+    assert "cannot be written" in done.stderr.splitlines()[-1]
+
+
+def test_a_full_disk_is_recognised_behind_a_library_s_own_error(tmp_path):
+    manifest, said = Manifest("chebsplat.capture/1", "k", "ingest"), r"a\.bin cannot be .*more than 3 bytes are needed"
+    with pytest.raises(DiskFailure, match=said), artifact.publish(tmp_path / "x", manifest) as tmp:
+        (tmp / "a.bin").write_bytes(b"abc")
+        try:
+            raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC), str(tmp / "a.bin"))
+        except OSError as error:
+            raise RuntimeError("the codec failed") from error
+    assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.parametrize("said", ["12 requested and 0 written", "Io error: No space left on device (os error 28)"])
+def test_an_error_without_a_number_is_held_against_the_disk(tmp_path, monkeypatch, said):
+    full = OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+    monkeypatch.setattr(disk, "refusal", lambda folder: full)
+    with pytest.raises(DiskFailure, match="No space left"), disk.explained(tmp_path):
+        raise OSError(said)
+
+
+def test_a_crash_that_is_not_the_disk_s_stays_one(tmp_path):
+    with pytest.raises(ZeroDivisionError), disk.explained(tmp_path):
+        1 / 0  # noqa: B018
+    assert not list(tmp_path.iterdir())
+
+
+def test_a_file_that_may_not_be_read_is_an_input_s_fault(tmp_path, monkeypatch):
+    monkeypatch.setattr(os, "access", lambda path, mode: False)
+    (tmp_path / "photo.jpg").touch()
+    with pytest.raises(InputError, match=r"photo\.jpg cannot be read"), disk.explained(tmp_path):
+        raise PermissionError(errno.EACCES, os.strerror(errno.EACCES), str(tmp_path / "photo.jpg"))
