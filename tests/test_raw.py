@@ -12,10 +12,10 @@ from tiny_teachers import color_reference, color_teacher
 
 from chebsplat.errors import InputError
 from chebsplat.formats import artifact
-from chebsplat.pipelines import raw, store
+from chebsplat.pipelines import job, raw, store
 from chebsplat.pipelines.plan import Planner
 from chebsplat.pipelines.raw import hashes, raw_files, unchanged
-from chebsplat.pipelines.run import entry, job, write_plan
+from chebsplat.pipelines.run import entry, write_plan
 
 
 @pytest.fixture(autouse=True)
@@ -78,13 +78,13 @@ CHANGES = [edited, added, removed, replaced]
 def test_photos_changed_between_plan_and_read_are_not_published(photos, change, capfd):
     step, plan = planned("ingest", photos)
     named = change(photos)
-    assert job(plan, step.key) == 3
+    assert job.run(plan, step.key) == 3
     told = capfd.readouterr().err
     assert named in told and "run again" in told
     assert not step.path.exists()
     again, plan = planned("ingest", photos)
     assert again.key != step.key
-    assert job(plan, again.key) == 0
+    assert job.run(plan, again.key) == 0
     assert artifact.verify(again.path).key == again.key
 
 
@@ -111,7 +111,7 @@ def test_photos_changed_in_the_middle_of_reading_are_not_published(photos, chang
         return found
 
     monkeypatch.setattr("chebsplat.stages.sources.assembly.open_photo", opened)
-    assert job(plan, step.key) == 3
+    assert job.run(plan, step.key) == 3
     assert named and named[0] in capfd.readouterr().err
     assert not step.path.exists()
     assert not [path for path in step.path.parent.iterdir() if path.name.startswith(".tmp")]
@@ -128,7 +128,7 @@ def test_a_teacher_that_is_exported_anew_meanwhile_is_noticed(tmp_path, stage, w
     step, plan = planned(stage, "toy", settings)
     for of in ("ingest", "projection") if stage == "teacher" else ():
         earlier, its_plan = planned(of, "toy", settings)
-        assert job(its_plan, earlier.key) == 0
+        assert job.run(its_plan, earlier.key) == 0
     swap = SimpleNamespace(done=False)
 
     def exported_anew():
@@ -148,7 +148,7 @@ def test_a_teacher_that_is_exported_anew_meanwhile_is_noticed(tmp_path, stage, w
             return encode(self, *arguments)
 
         monkeypatch.setattr(ImageEncoder, "encode", encoded)
-    assert job(plan, step.key) == 3
+    assert job.run(plan, step.key) == 3
     assert swap.done
     assert f"{model} has changed" in capfd.readouterr().err
     assert not step.path.exists()
@@ -205,9 +205,9 @@ def test_names_that_are_not_utf8_are_hashed(tmp_path):
 
 def test_a_finished_step_is_made_again_where_a_member_is_gone(photos):
     step, plan = planned("ingest", photos)
-    assert job(plan, step.key) == 0 and step.fresh
+    assert job.run(plan, step.key) == 0 and step.fresh
     member = next(path for path in step.path.rglob("*") if path.name == "cameras.safetensors")
     member.unlink()
     assert not store.is_fresh(step.path)
-    assert job(plan, step.key) == 0
+    assert job.run(plan, step.key) == 0
     assert artifact.verify(step.path).key == step.key
