@@ -2,6 +2,13 @@
 SHELL := /bin/bash
 PY := .venv/bin/python
 READY := .venv/.ready
+# Programs in .venv know the folder that it was made in: in a renamed or copied clone it is made anew (setup.sh).
+MADE := $(shell sed -n 's|^command = .* -m venv [^/]*/|/|p' .venv/pyvenv.cfg 2>/dev/null)
+ifneq ($(MADE),)
+ifneq ($(MADE),$(shell realpath .venv))
+.PHONY: $(READY)
+endif
+endif
 unexport PYTHONDONTWRITEBYTECODE
 
 CHEBSPLAT := .venv/bin/chebsplat
@@ -21,8 +28,8 @@ study: $(READY)  ## make study=NAME [cores=] [threads=] [args=--no-run]: its run
 plan: $(READY)  ## make plan scene=NAME (or study=NAME): what would run, what is fresh, what is left out, and why
 	@$(CHEBSPLAT) $(if $(study),study '$(study)' --plan,plan $(CHOICE))
 
-verify: $(READY)  ## make verify dir=FOLDER: recompute every digest of an artifact
-	@$(CHEBSPLAT) verify $(dir)
+verify: $(READY)  ## make verify scene=NAME|FOLDER: recompute every digest of its artifacts, or (dir=) of one artifact
+	@$(CHEBSPLAT) verify $(if $(scene),'$(scene)') $(dir)
 
 clean-stale: $(READY)  ## list artifacts that nothing names; yes=1 removes them
 	@$(CHEBSPLAT) clean-stale $(if $(yes),--yes)

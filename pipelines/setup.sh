@@ -9,6 +9,12 @@ for candidate in python3.11 python3; do
 done
 [ -n "$python" ] || { echo "setup: Python 3.11 is needed (python3.11 or python3 on PATH); the lock is resolved for it" >&2; exit 2; }
 
+# Programs in .venv begin with its path: one that was made elsewhere (a renamed or copied clone) runs nothing here.
+made=$(sed -n 's|^command = .* -m venv [^/]*/|/|p' .venv/pyvenv.cfg 2>/dev/null || true)
+if [ -n "$made" ] && [ "$made" != "$(realpath .venv)" ]; then
+  echo "setup: .venv was made for $made; making it anew" >&2
+  rm -rf .venv
+fi
 [ -x .venv/bin/python ] || "$python" -m venv .venv
 py=.venv/bin/python
 $py -m pip install --quiet "uv==0.13.8"
