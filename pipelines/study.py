@@ -14,6 +14,7 @@ from pydantic import AfterValidator, Field, model_validator
 from chebsplat.errors import ConfigError
 from chebsplat.formats.files import parse_toml
 from chebsplat.pipelines import store
+from chebsplat.pipelines.counters import counted
 from chebsplat.pipelines.plan import Plan, Planner, Step, merged, suffix
 from chebsplat.pipelines.run import Outcome, say, snakemake, wanted_steps
 from chebsplat.pipelines.scenes import read_toml, scene_values
@@ -210,7 +211,8 @@ def execute(name: str, runs: list[Run], cores: int, threads: int, device: str = 
         waiting = outstanding(part)
         if waiting:
             say(f"  {scene}, seed {seed}: {describe(waiting)}; {cores // threads} at once, {threads} threads each")
-            found = snakemake(waiting, cores, threads, device)
+            with counted(runs, cores // threads, say):
+                found = snakemake(waiting, cores, threads, device)
             outcome = Outcome(max(outcome.code, found.code), outcome.failed | found.failed)
         store.link(f"study-{name}", {run.name: run.plan.targets[LAST] for run in runs})
     return outcome

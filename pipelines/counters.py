@@ -1,0 +1,99 @@
+"""How far a study is: which runs are measured, and about how long the others take, by the seconds of finished steps."""
+
+from __future__ import annotations
+
+import json
+import threading
+from collections import defaultdict
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from typing import TYPE_CHECKING
+
+from chebsplat.pipelines.plan import Step
+
+if TYPE_CHECKING:
+    from chebsplat.pipelines.study import Run
+
+EVERY = 1.0  # seconds between looks at what is finished
+
+
+class Counter:
+    """Tells of every run when it is measured. at_once: jobs that run side by side."""
+
+    def __init__(self, runs: Sequence[Run], at_once: int, say: Callable[[str], None]):
+        self.n_runs, self.at_once, self.say = len(runs), max(at_once, 1), say
+        self.seconds: dict[str, float] = {}  # of finished steps, by key
+        steps = {run.name: run.steps for run in runs}
+        self.steps = list({step.key: step for some in steps.values() for step in some}.values())
+        self.waiting = {name: some[-1] for name, some in steps.items() if not self._finished(some[-1])}
+
+    def look(self) -> None:
+        """Say which runs have been finished since the last look."""
+        for name in [name for name, last in self.waiting.items() if self._finished(last)]:
+            del self.waiting[name]
+            done = f"  run {self.n_runs - len(self.waiting)} of {self.n_runs} is done: {name}"
+            left = self.left() if self.waiting else None
+            self.say(done if left is None else f"{done}; about {spoken(left)} left")
+
+    def left(self) -> float | None:
+        """Seconds until all is done; None as long as there is a stage that has never been finished.
+
+        Choices: a training takes as long as others by its steps, or its budget of seconds; any other step as long as
+          the mean of its stage.
+        """
+        spent: defaultdict[tuple, float] = defaultdict(float)
+        amount: defaultdict[tuple, float] = defaultdict(float)
+        waiting = [step for step in self.steps if not self._finished(step)]
+        for step in self.steps:
+            if step.key in self.seconds:
+                kind, units = measure(step)
+                spent[kind] += self.seconds[step.key]
+                amount[kind] += units
+        total = 0.0
+        for kind, units in map(measure, waiting):
+            if not amount[kind]:
+                return None
+            total += units * spent[kind] / amount[kind]
+        return total / self.at_once
+
+    def _finished(self, step: Step) -> bool:
+        if step.key not in self.seconds:
+            try:
+                manifest = json.loads((step.path / "artifact.json").read_text())
+                self.seconds[step.key] = float(manifest.get("seconds", 0.0))
+            except (OSError, ValueError, AttributeError, TypeError):  # not there, or damaged: its reader says so
+                return False
+        return True
+
+
+def measure(step: Step) -> tuple[tuple[str, bool], float]:
+    """(what a step's time compares with, in how many units)."""
+    settings = step.sections["train"] if step.stage == "train" else {}
+    by_clock = settings.get("seconds") is not None
+    return (step.stage, by_clock), float(settings["seconds" if by_clock else "steps"] if settings else 1)
+
+
+def spoken(seconds: float) -> str:
+    """A length of time as an estimate is said."""
+    if seconds < 100:
+        return f"{max(round(seconds), 1)} s"
+    return f"{seconds / 60:.0f} min" if seconds < 6000 else f"{seconds / 3600:.1f} h"
+
+
+@contextmanager
+def counted(runs: Sequence[Run], at_once: int, say: Callable[[str], None]) -> Iterator[None]:
+    """Tell of the runs that are finished inside the block."""
+    counter, over = Counter(runs, at_once, say), threading.Event()
+
+    def watch() -> None:
+        while not over.wait(EVERY):
+            counter.look()
+
+    thread = threading.Thread(target=watch, daemon=True)
+    thread.start()
+    try:
+        yield
+    finally:
+        over.set()
+        thread.join()
+        counter.look()
