@@ -4,25 +4,33 @@ from __future__ import annotations
 
 import base64
 import csv
-import math
 from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from chebsplat.errors import DataFailure
 from chebsplat.evaluation import protocols
-from chebsplat.evaluation.statistics import Difference, Summary, summarize
 from chebsplat.formats import artifact
 from chebsplat.pipelines import study_figures
-from chebsplat.pipelines.results import COLUMNS, FIGURES, Figure, Line, Row, compare, counted, groups, traces
+from chebsplat.pipelines.results import COLUMNS, Row, compare, traces
 from chebsplat.pipelines.study import Run, Study
+from chebsplat.pipelines.study_tables import (
+    labels,
+    left_out,
+    missing,
+    scene_table,
+    shown_figures,
+    stability,
+    table_row,
+    tables,
+)
 
 if TYPE_CHECKING:
     from chebsplat.pipelines.transfer import Section
 
 PICTURE = "error-against-time.png"
 STABILITY = Path("build/bench/stability.csv")  # of `make stability`
-BY_SCENE = ("miou", "miou_gain", "psnr", "n_gaussians", "train_seconds")
+NARROW = 1100  # pixels of a screen; the comparison's tables take more
 
 
 def write(
@@ -46,6 +54,7 @@ def write(
         "labels": labels(lines),
         "header": [*labels(lines), "runs", *(figure.heading for figure in shown_figures(lines))],
         "table": [(line.variant == study.baseline, table_row(line, lines)) for line in lines],
+        "tables": tables(lines, study.baseline),
         "scenes": scene_table(rows),
         "missing": missing(rows),
         "note": note(study, rows),
@@ -63,7 +72,9 @@ def write(
         name: "data:image/png;base64," + base64.b64encode((out / name).read_bytes()).decode()
         for name in (PICTURE, *(section.picture for section in more if section.picture))
     }
-    page = rendered(PAGE, picture=drawings[PICTURE], drawings=drawings, **parts, **gallery(study, runs, rows))
+    page = rendered(
+        PAGE, narrow=NARROW, picture=drawings[PICTURE], drawings=drawings, **parts, **gallery(study, runs, rows)
+    )
     if len(page) > LARGEST:
         raise DataFailure(f"the page would have {len(page) / 1e6:.0f} MB; name fewer scenes or variants in the study")
     (out / "study.html").write_text(page)
@@ -74,104 +85,6 @@ def settings_of(study: Study) -> dict[str, float]:
     """The value of `study.against` under every condition."""
     section, key = study.against.split(".")
     return {name: float(values[section][key]) for name, values in study.conditions.items()}
-
-
-def number(value: float, figure: Figure) -> str:
-    return f"{value * figure.scale:,.{figure.digits}f}"
-
-
-def mean_text(summary: Summary, figure: Figure) -> str:
-    """`mean ± spread`; no spread for a single run."""
-    spread = "" if math.isnan(summary.spread) else f" ± {number(summary.spread, figure)}"
-    return number(summary.mean, figure) + spread
-
-
-def difference_text(found: Difference, figure: Figure) -> str:
-    """`+2.1 [1.0, 3.2]`, or `×0.48 [0.40, 0.55]`; no interval where there is one unit."""
-
-    def shown(value: float) -> str:
-        return f"{value:.2f}" if figure.ratio else number(value, figure)
-
-    interval = "" if math.isnan(found.low) else f" [{shown(found.low)}, {shown(found.high)}]"
-    sign = "×" if figure.ratio else "+" if found.mean >= 0 else ""
-    return sign + shown(found.mean) + interval
-
-
-def shown_figures(lines: list[Line]) -> list[Figure]:
-    """Figures that at least one run has."""
-    return [figure for figure in FIGURES if any(figure.key in line.summaries for line in lines)]
-
-
-def labels(lines: list[Line]) -> list[str]:
-    """What tells lines apart; a study of one condition or of the scenes' own budget does not name it."""
-    return [name for name in ("condition", "budget", "variant") if any(getattr(line, name) for line in lines)]
-
-
-def table_row(line: Line, lines: list[Line]) -> list[tuple[str, str, bool]]:
-    """Cells of one of `lines` as (mean ± spread, paired difference, whether its interval excludes no effect)."""
-    texts = [*(getattr(line, name) for name in labels(lines)), f"{line.n_done} of {line.n_runs}"]
-    cells = [(text, "", False) for text in texts]
-    for figure in shown_figures(lines):
-        summary, difference = line.summaries.get(figure.key), line.differences.get(figure.key)
-        mean = "-" if summary is None else mean_text(summary, figure)
-        change = "" if difference is None else difference_text(difference, figure)
-        cells.append((mean, change, difference is not None and difference.excluded))
-    return cells
-
-
-def scene_table(rows: list[Row]) -> list[list[str]]:
-    """Header and rows: each scene apart, mean ± spread over seeds (and, in sequences, over orders)."""
-    done = [row for row in counted(rows) if row["state"] == "done"]
-    figures = [
-        figure for figure in FIGURES if figure.key in BY_SCENE and any(row[figure.key] is not None for row in done)
-    ]
-    names = [name for name in ("scene", "condition", "budget", "variant") if any(row[name] for row in done)]
-    table = [[*names, *(figure.heading for figure in figures)]]
-    for where, members in sorted(groups(done, *names).items(), key=lambda item: item[0][0]):
-        cells = list(where)
-        for figure in figures:
-            values = [row[figure.key] for row in members if row[figure.key] is not None]
-            cells.append(mean_text(summarize(values), figure) if values else "-")
-        table.append(cells)
-    return table
-
-
-def missing(rows: list[Row]) -> list[tuple[str, str]]:
-    """(run, why) of every run without figures."""
-    keys = ("scene", "condition", "variant", "budget", "sequence")
-    return [
-        (", ".join(str(row[k]) for k in keys if row[k]) + f", seed {row['seed']}", row["state"])
-        for row in rows
-        if row["state"] != "done"
-    ]
-
-
-def left_out(rows: list[Row]) -> list[tuple[str, str, str]]:
-    """(what, why, by which variants) of all that finished runs left out."""
-    done = [row for row in rows if row["state"] == "done"]
-    every = list(dict.fromkeys(row["variant"] for row in done))
-    found: dict[tuple[str, str], dict[str, None]] = {}
-    for row in done:
-        for entry in row["left_out"].items():
-            found.setdefault(entry, {})[row["variant"]] = None
-    return sorted((*entry, "all" if len(by) == len(every) else ", ".join(by)) for entry, by in found.items())
-
-
-def stability(path: Path) -> list[tuple[str, int, int, float]]:
-    """(part, cases, cases failed, largest error ÷ its tolerance) of the last `make stability`; none if it never ran."""
-    if not path.is_file():
-        return []
-    with path.open(newline="") as handle:
-        modules = groups(list(csv.DictReader(handle)), "module")
-
-    def share(case: Row) -> float:
-        error, tolerance = float(case["error"]), float(case["tolerance"])
-        return error / tolerance if tolerance else 0.0 if error == 0 else math.inf
-
-    return [
-        (module, len(cases), sum(case["passed"] != "True" for case in cases), max(map(share, cases)))
-        for (module,), cases in modules.items()
-    ]
 
 
 def note(study: Study, rows: list[Row]) -> str:

@@ -12,7 +12,7 @@ import numpy as np
 from chebsplat.evaluation.statistics import paired_difference
 from chebsplat.pipelines.results import FIGURES, Figure, Row, compare, counted, groups
 from chebsplat.pipelines.study import Study
-from chebsplat.pipelines.study_page import difference_text
+from chebsplat.pipelines.study_tables import difference_text
 
 PICTURE = "transfer.png"
 PLACE = ("sequence", "place", "scene", "seed")  # what a run shares with the run of another variant or budget

@@ -21,7 +21,7 @@ PAGE = """<!doctype html>
 <p class="soft">Seconds count training alone. The curves are measured on watched training views; test views are only touched at the end (the star).</p></div>
 <h2>All figures on the test views</h2>
 <div class="card wide"><table><thead><tr><th>figure</th><th class="n">scene</th><th class="n">2D teacher</th></tr></thead><tbody>
-{% for label, scene, of_teacher in rows %}<tr><td>{{ label }}</td><td class="n">{{ scene }}</td><td class="n">{{ of_teacher }}</td></tr>
+{% for label, scene, of_teacher in rows %}<tr><td>{{ label }}</td><td class="n" data-label="scene">{{ scene }}</td><td class="n" data-label="2D teacher">{{ of_teacher }}</td></tr>
 {% endfor %}</tbody></table></div>
 <h2>Left out, and why</h2>
 <div class="card wide"><table><tbody>{% for what, why in left_out %}<tr><td>{{ what }}</td><td>{{ why }}</td></tr>
@@ -29,8 +29,9 @@ PAGE = """<!doctype html>
 <h2>Where it comes from</h2>
 <div class="card wide"><div class="times">{% for stage, seconds, key, device, threads in stages %}<span title="{{ stage }}: {{ "%.1f"|format(seconds) }} s" style="flex: {{ seconds }}; background: hsl({{ loop.index0 * 40 }} 55% 60%)"></span>{% endfor %}</div>
 <table><thead><tr><th>stage</th><th class="n">seconds</th><th>device</th><th class="n">threads</th><th>artifact</th></tr></thead><tbody>
-{% for stage, seconds, key, device, threads in stages %}<tr><td class="stay"><i style="display: inline-block; width: .8em; height: .8em; background: hsl({{ loop.index0 * 40 }} 55% 60%)"></i> {{ stage }}</td><td class="n">{{ "%.1f"|format(seconds) }}</td><td>{{ device }}</td><td class="n">{{ threads }}</td><td><code>{{ key }}</code></td></tr>
-{% endfor %}<tr><td><b>total</b></td><td class="n"><b>{{ "%.1f"|format(total) }}</b></td></tr></tbody></table>
+{% for stage, seconds, key, device, threads in stages %}<tr><td class="stay"><i style="display: inline-block; width: .8em; height: .8em; background: hsl({{ loop.index0 * 40 }} 55% 60%)"></i> {{ stage }}</td><td class="n" data-label="seconds">{{ "%.1f"|format(seconds) }}</td><td data-label="device">{{ device }}</td><td class="n" data-label="threads">{{ threads }}</td><td data-label="artifact"><code>{{ key }}</code></td></tr>
+{% endfor %}<tr><td><b>total</b></td><td class="n" data-label="seconds"><b>{{ "%.1f"|format(total) }}</b></td></tr></tbody></table>
+<p class="soft">The total is of all stages before this page{% if "projection" in stages|map("first") %}; the projection is computed once for all scenes of one teacher{% endif %}.</p>
 <p class="soft">{% if code %}Commit {{ code.commit[:10] }}{{ " with changes" if code.dirty }}. {% endif %}{% for package, version in versions %}{{ package }} {{ version }}{{ ", " if not loop.last else "." }}{% endfor %}</p>
 <details><summary>Every setting</summary><pre>{{ settings }}</pre></details></div>
 </main>{% include "script" %}</body></html>

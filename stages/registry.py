@@ -47,8 +47,8 @@ STAGES: dict[str, Stage] = {
         Stage("evaluate", "chebsplat.evaluation/1", ("evaluate",), (("capture", "ingest"), ("scene", "export")),
               (("features", "teacher"),), help="Measure the exported scene on the test views."),
         Stage("report", "chebsplat.report/1", ("report",), (("evaluation", "evaluate"), ("gaussians", "train")),
-              (("capture", "ingest"), ("points", "sfm"), ("features", "teacher"), ("descriptors", "describe"),
-               ("scene", "export"), ("encoder", "onnx"), ("basis", "cks")),
+              (("capture", "ingest"), ("points", "sfm"), ("projection", "projection"), ("features", "teacher"),
+               ("descriptors", "describe"), ("scene", "export"), ("encoder", "onnx"), ("basis", "cks")),
               help="One self-contained HTML page with pictures, tables and error against run time."),
     )
 }  # fmt: skip

@@ -17,6 +17,7 @@ LARGEST = 20_000_000  # bytes of the page
 STAGE_OF = {
     "capture": "ingest",
     "points": "sfm",
+    "projection": "projection",
     "features": "teacher",
     "descriptors": "describe",
     "gaussians": "train",
@@ -26,12 +27,13 @@ STAGE_OF = {
     "evaluation": "evaluate",
 }
 BYTES = {
-    "unpruned_ply": "PLY with every SH band (unpruned)",
-    "ply": "scene.ply",
+    "unpruned_ply": "plain 3DGS: every SH band, nothing else",
+    "ply": "scene.ply: every SH band, label and SH degree",
     "split": "PLY split by SH degree",
     "ragged": "ragged arrays",
-    "semantic": "semantic arrays",
+    "semantic": "semantic arrays, beside either",
 }
+SMALLER = ("split", "ragged")  # layouts of what plain 3DGS holds, without the bands that were pruned
 FRAMES = {"color": "colour", "color_and_features": "colour and features"}
 
 
@@ -153,7 +155,7 @@ def summary_rows(figures: dict[str, Any], by_degree: list[int] | None, trained: 
         rows.append(["Gaussians of SH degree 0, 1, 2, 3", " / ".join(f"{n:,}" for n in by_degree), ""])
     whole = figures["bytes"]["unpruned_ply"]
     for name, size in figures["bytes"].items():
-        share = "" if name == "unpruned_ply" else f" ({size / whole:.0%} of unpruned)"
+        share = f" ({size / whole:.0%} of plain 3DGS)" if name in SMALLER else ""
         rows.append([f"bytes, {BYTES[name]}", f"{size:,}{share}", ""])
     rows += [[f"frames/s, {FRAMES[name]}", f"{v:.1f}", ""] for name, v in figures["frames_per_second"].items()]
     if split := figures["milliseconds"]:

@@ -1,7 +1,8 @@
 """What the pages share, parts of jinja2 templates: style, a slider between two pictures, bars by class.
 
 A page includes them by name: viewer and script want `modes`, `legend` and, on the page, sheet with its `pictures`;
-bars wants `classes`.
+bars wants `classes`. On a screen narrower than `narrow` pixels the rows of a table become cards, whose cells say by
+`data-label` what they are: nothing is cut off, and nothing scrolls sideways.
 """
 
 from typing import Any
@@ -19,8 +20,8 @@ p { max-width: 76ch } .soft { color: var(--soft); font-size: .9rem }
 .wide { overflow-x: auto } table { border-collapse: collapse; font-size: .92rem }
 td, th { padding: .25em 1em .25em 0; text-align: left; vertical-align: top } td:first-child { min-width: 8.5em } th { color: var(--soft); font-weight: 600 }
 td.n, th.n { text-align: right; font-variant-numeric: tabular-nums; white-space: nowrap }
-.stay { white-space: nowrap } tbody tr + tr td { border-top: 1px solid var(--line) }
-code { font-size: .85em; overflow-wrap: anywhere } pre { font-size: .8rem; overflow-x: auto }
+.stay { white-space: nowrap } .long { overflow-wrap: anywhere } tbody tr + tr td { border-top: 1px solid var(--line) }
+code { font-size: .85em; overflow-wrap: anywhere } pre { font-size: .8rem; white-space: pre-wrap; overflow-wrap: anywhere }
 img, svg { max-width: 100%; height: auto; display: block } [hidden] { display: none !important } summary { cursor: pointer }
 .curves { display: grid; grid-template-columns: repeat(auto-fit, minmax(290px, 1fr)); gap: 12px }
 .modes { display: flex; flex-wrap: wrap; gap: 6px; margin-bottom: 10px }
@@ -42,6 +43,13 @@ img, svg { max-width: 100%; height: auto; display: block } [hidden] { display: n
 .classes { display: grid; grid-template-columns: max-content 1fr max-content; gap: .3em .8em; align-items: center; font-size: .9rem }
 .bars { position: relative; height: 1.05em; background: var(--back); border-radius: 3px } .bars b, .bars u { position: absolute; left: 0; height: 100%; border-radius: 3px }
 .bars b { background: var(--main) } .bars u { border-right: 3px solid #e36209; background: none } .n { font-variant-numeric: tabular-nums; text-align: right }
+@media (max-width: NARROWpx) {
+  .wide thead { display: none } .wide table, .wide tbody, .wide tr, .wide td { display: block }
+  .wide tr { padding: .5em 0 } .wide tbody tr + tr { border-top: 1px solid var(--line) } .wide tbody tr + tr td { border: 0 }
+  .wide table td { padding: 0; text-align: left; white-space: normal; overflow-wrap: anywhere } .wide td:empty { display: none }
+  .wide table td:first-child { position: static; font-weight: 600 }
+  .wide td[data-label]::before { content: attr(data-label) ": "; color: var(--soft); font-weight: 400 }
+}
 """  # noqa: E501
 
 VIEWER = """<div class="card viewer" hidden>
@@ -95,10 +103,10 @@ viewer.hidden = false; show();
 </script>"""  # noqa: E501
 
 
-def rendered(page: str, **values: Any) -> str:
+def rendered(page: str, narrow: int = 700, **values: Any) -> str:
     """A page of its template. Raises jinja2's UndefinedError for a value that it wants and is not given."""
     import jinja2
 
     parts = jinja2.DictLoader({"page": page, "viewer": VIEWER, "sheet": SHEET, "bars": BARS, "script": SCRIPT})
     environment = jinja2.Environment(loader=parts, autoescape=True, undefined=jinja2.StrictUndefined)
-    return environment.get_template("page").render(style=STYLE, **values)
+    return environment.get_template("page").render(style=STYLE.replace("NARROW", str(narrow)), **values)

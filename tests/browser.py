@@ -1,4 +1,5 @@
-"""What a real browser makes of a page: errors, requests, width, and what its slider shows in every mode."""
+"""What a real browser makes of a page: errors, requests, width, what is cut off or scrolls sideways, and what its
+slider shows in every mode."""
 
 import json
 import shutil
@@ -13,7 +14,14 @@ addEventListener("load", () => {
   const modes = [...document.querySelectorAll(".modes button:not(.next)")].reverse();
   const layers = Object.fromEntries(modes.map(button => (button.click(), [button.textContent, stage().length])));
   document.querySelectorAll(".modes button").forEach(button => button.click());
-  parent.postMessage({ wide: document.documentElement.scrollWidth, problems, layers,
+  document.querySelectorAll("details").forEach(part => part.open = true);
+  const called = part => `${part.tagName}.${part.className}: ${part.textContent.trim().slice(0, 60)}`;
+  const cut = [...document.querySelectorAll("main, main *:not(svg *)")].filter(part => {
+    const box = part.getBoundingClientRect();
+    const scrolls = getComputedStyle(part).overflowX != "visible" && part.scrollWidth > part.clientWidth + 1;
+    return box.width && (scrolls || box.right > innerWidth + 1 || box.left < -1);
+  }).map(called);
+  parent.postMessage({ wide: document.documentElement.scrollWidth, problems, layers, cut,
     shown: stage().map(image => image.naturalWidth) }, "*");
 });</script>"""
 FRAME = """<body><pre></pre><script>

@@ -3,16 +3,17 @@
 import base64
 import io
 import json
+import re
 from collections import Counter
 from html.parser import HTMLParser
 
 import numpy as np
 import pytest
 from browser import BROWSER, browsed
-from shared import KEY, run_stage
+from shared import INPUTS, KEY, run_stage
 
 from chebsplat.errors import InputError
-from chebsplat.formats.artifact import Manifest, publish
+from chebsplat.formats.artifact import Manifest, publish, read_manifest
 from chebsplat.formats.evaluation import read_evaluation
 from chebsplat.stages import figures as draw
 from chebsplat.stages.report_parts import class_rows, label_names, legend, picture_rows
@@ -111,6 +112,17 @@ def test_error_pictures_show_where_it_is_wrong_and_nowhere_else():
     assert wrong[..., 3].tolist() == [[0, 255], [0, 0]]
 
 
+def test_the_total_counts_every_stage_with_the_projection_and_no_size_exceeds_plain_3dgs(toy, tmp_path):
+    inputs = {role: toy[of] for role, of in INPUTS["report"].items()} | {"projection": toy["projection"]}
+    assert run_stage("report", tmp_path / "report", inputs) == 0
+    text = (tmp_path / "report/report.html").read_text()
+    seconds = [read_manifest(path).seconds for path in inputs.values()]
+    assert f"<b>{sum(seconds):.1f}</b>" in text
+    assert "once for all scenes of one teacher" in text
+    assert all(int(share) <= 100 for share in re.findall(r"\((\d+)% of plain 3DGS\)", text))
+    assert "unpruned" not in text
+
+
 def test_a_page_that_would_be_too_large_is_refused(toy, tmp_path, monkeypatch):
     from chebsplat.stages import report
 
@@ -130,6 +142,7 @@ def test_in_a_browser_the_page_fits_its_width_without_an_error_or_a_request(toy,
     seen, console, requests = browsed(tmp_path, (toy["report"] / "report.html").read_text(), wide)
     assert seen["problems"] == console == requests == []
     assert seen["wide"] <= wide
+    assert seen["cut"] == []
     assert len(seen["shown"]) > 1
     assert all(seen["shown"])
     # one picture a side, and what lies over it; nothing is left over from the mode before
@@ -139,9 +152,11 @@ def test_in_a_browser_the_page_fits_its_width_without_an_error_or_a_request(toy,
 @pytest.mark.slow
 @in_a_browser
 def test_a_browser_would_notice_an_error_a_request_and_a_page_too_wide(tmp_path):
-    page = '<html><head></head><img src="http://a.invalid/x.png" style="width: 500px"><script>nothing()</script></html>'
+    page = '<html><head></head><main><div style="overflow: auto"><p style="width: 500px">text</p></div>'
+    page += '<img src="http://a.invalid/x.png" style="width: 500px"><script>nothing()</script></main></html>'
     seen, console, requests = browsed(tmp_path, page, 390)
     assert seen["problems"]
     assert console
     assert requests
     assert seen["wide"] > 390
+    assert [part.split(".")[0] for part in seen["cut"]] == ["DIV", "P", "IMG"]

@@ -19,8 +19,10 @@ from chebsplat.pipelines.results import compare, row_of
 from chebsplat.pipelines.scenes import names
 from chebsplat.pipelines.sequences import scenes_of
 from chebsplat.pipelines.study import Study, checked_study, execute, expand, outstanding, read_study
-from chebsplat.pipelines.study_page import stability, write
+from chebsplat.pipelines.study_page import write
 from chebsplat.pipelines.study_pictures import gallery
+from chebsplat.pipelines.study_tables import stability
+from chebsplat.pipelines.transfer import Section
 from chebsplat.stages.registry import STAGES
 
 
@@ -51,6 +53,9 @@ def publish_stage(run, stage, fill):
         else:
             for name, text in fill.items():
                 (tmp / name).write_text(text)
+
+
+ONE_LABEL = np.zeros((1, 4, 6), np.int16)
 
 
 def finish(run, miou=0.5, psnr=30.0, n=100, seconds=10.0, steps=10, segmentation=None, labels=None):
@@ -230,6 +235,24 @@ def test_the_page_shows_a_view_of_each_scene_in_one_set_of_colours(tmp_path):
         assert seen["problems"] == console == []
         assert len(seen["shown"]) == 2 and all(seen["shown"])
     assert '<td class="w">LPIPS</td><td class="w">not measured</td><td class="w">all</td>' in page
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(BROWSER is None, reason="neither chromium nor google-chrome is installed")
+@pytest.mark.parametrize("wide", [1440, 390])
+def test_in_a_browser_nothing_of_a_crowded_study_is_cut_off(tmp_path, wide):
+    values = {"conditions": {f"noise {p}": {"teacher": {"confusion": p}} for p in (0.1, 0.3)}, "baseline": "plain-3dgs"}
+    values |= {"variants": {"plain-3dgs": {}, "feature-3dgs equivalent": {"train": {"sh_prune": False}}, "less": {}}}
+    asked = study(**values, scenes=["toy", "office0"], budgets={"steps": [1000, 3000]})
+    runs = expand(asked)
+    for k, run in enumerate(runs):
+        finish(run, 0.71 + 0.004 * k, 31.2 + 0.1 * k, 25_000 + 791 * k, 300 + k, labels=(["wall", "sofa"], ONE_LABEL))
+    rows = [row_of(run, {}) | {"point_miou": 0.5 + 0.01 * k} for k, run in enumerate(runs)]
+    section = Section("Transfer", "By place.", [["a", "b", *["mIoU − its 2D teacher's, points"] * 6], ["x"] * 8])
+    page = write(tmp_path, asked, runs, rows, "make study=crowded", [section]).read_text()
+    seen, console, requests = browsed(tmp_path, page, wide)
+    assert seen["problems"] == console == requests == seen["cut"] == []
+    assert seen["wide"] <= wide
 
 
 def test_a_run_that_failed_is_named_and_counts_in_no_mean(tmp_path):

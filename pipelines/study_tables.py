@@ -1,0 +1,126 @@
+"""Tables of a study's page: means and differences by variant, each scene, what is missing, what was left out."""
+
+from __future__ import annotations
+
+import csv
+import math
+from pathlib import Path
+
+from chebsplat.evaluation.statistics import Difference, Summary, summarize
+from chebsplat.pipelines.results import FIGURES, Figure, Line, Row, counted, groups
+
+COSTS = ("n_gaussians", "sh_kept", "bytes_ply", "bytes_ragged", "frames_per_second", "train_seconds")
+BY_SCENE = ("miou", "miou_gain", "psnr", "n_gaussians", "train_seconds")
+
+
+def number(value: float, figure: Figure) -> str:
+    return f"{value * figure.scale:,.{figure.digits}f}"
+
+
+def mean_text(summary: Summary, figure: Figure) -> str:
+    """`mean ± spread`; no spread for a single run."""
+    spread = "" if math.isnan(summary.spread) else f" ± {number(summary.spread, figure)}"
+    return number(summary.mean, figure) + spread
+
+
+def difference_text(found: Difference, figure: Figure) -> str:
+    """`+2.1 [1.0, 3.2]`, or `×0.48 [0.40, 0.55]`; no interval where there is one unit."""
+
+    def shown(value: float) -> str:
+        return f"{value:.2f}" if figure.ratio else number(value, figure)
+
+    interval = "" if math.isnan(found.low) else f" [{shown(found.low)}, {shown(found.high)}]"
+    sign = "×" if figure.ratio else "+" if found.mean >= 0 else ""
+    return sign + shown(found.mean) + interval
+
+
+def shown_figures(lines: list[Line]) -> list[Figure]:
+    """Figures that at least one run has."""
+    return [figure for figure in FIGURES if any(figure.key in line.summaries for line in lines)]
+
+
+def labels(lines: list[Line]) -> list[str]:
+    """What tells lines apart; a study of one condition or of the scenes' own budget does not name it."""
+    return [name for name in ("condition", "budget", "variant") if any(getattr(line, name) for line in lines)]
+
+
+def table_row(line: Line, lines: list[Line]) -> list[tuple[str, str, bool]]:
+    """Cells of one of `lines` as (mean ± spread, paired difference, whether its interval excludes no effect)."""
+    texts = [*(getattr(line, name) for name in labels(lines)), f"{line.n_done} of {line.n_runs}"]
+    cells = [(text, "", False) for text in texts]
+    for figure in shown_figures(lines):
+        summary, difference = line.summaries.get(figure.key), line.differences.get(figure.key)
+        mean = "-" if summary is None else mean_text(summary, figure)
+        change = "" if difference is None else difference_text(difference, figure)
+        cells.append((mean, change, difference is not None and difference.excluded))
+    return cells
+
+
+def tables(lines: list[Line], baseline: str) -> list[tuple[list[str], list[tuple[bool, list]]]]:
+    """(header, rows) of the comparison, in two tables that fit a screen: how good it is, and what it costs.
+
+    A row: whether it is the baseline's, and its cells as of `table_row`.
+    """
+    fixed, figures = [*labels(lines), "runs"], shown_figures(lines)
+    parts = [[k for k, figure in enumerate(figures) if (figure.key in COSTS) == costs] for costs in (False, True)]
+    found = []
+    for part in filter(None, parts):
+        columns = [*range(len(fixed)), *(len(fixed) + k for k in part)]
+        rows = [(line.variant == baseline, [table_row(line, lines)[k] for k in columns]) for line in lines]
+        found.append(([*fixed, *(figures[k].heading for k in part)], rows))
+    return found
+
+
+def scene_table(rows: list[Row]) -> list[list[str]]:
+    """Header and rows: each scene apart, mean ± spread over seeds (and, in sequences, over orders)."""
+    done = [row for row in counted(rows) if row["state"] == "done"]
+    figures = [
+        figure for figure in FIGURES if figure.key in BY_SCENE and any(row[figure.key] is not None for row in done)
+    ]
+    names = [name for name in ("scene", "condition", "budget", "variant") if any(row[name] for row in done)]
+    table = [[*names, *(figure.heading for figure in figures)]]
+    for where, members in sorted(groups(done, *names).items(), key=lambda item: item[0][0]):
+        cells = list(where)
+        for figure in figures:
+            values = [row[figure.key] for row in members if row[figure.key] is not None]
+            cells.append(mean_text(summarize(values), figure) if values else "-")
+        table.append(cells)
+    return table
+
+
+def missing(rows: list[Row]) -> list[tuple[str, str]]:
+    """(run, why) of every run without figures."""
+    keys = ("scene", "condition", "variant", "budget", "sequence")
+    return [
+        (", ".join(str(row[k]) for k in keys if row[k]) + f", seed {row['seed']}", row["state"])
+        for row in rows
+        if row["state"] != "done"
+    ]
+
+
+def left_out(rows: list[Row]) -> list[tuple[str, str, str]]:
+    """(what, why, by which variants) of all that finished runs left out."""
+    done = [row for row in rows if row["state"] == "done"]
+    every = list(dict.fromkeys(row["variant"] for row in done))
+    found: dict[tuple[str, str], dict[str, None]] = {}
+    for row in done:
+        for entry in row["left_out"].items():
+            found.setdefault(entry, {})[row["variant"]] = None
+    return sorted((*entry, "all" if len(by) == len(every) else ", ".join(by)) for entry, by in found.items())
+
+
+def stability(path: Path) -> list[tuple[str, int, int, float]]:
+    """(part, cases, cases failed, largest error ÷ its tolerance) of the last `make stability`; none if it never ran."""
+    if not path.is_file():
+        return []
+    with path.open(newline="") as handle:
+        modules = groups(list(csv.DictReader(handle)), "module")
+
+    def share(case: Row) -> float:
+        error, tolerance = float(case["error"]), float(case["tolerance"])
+        return error / tolerance if tolerance else 0.0 if error == 0 else math.inf
+
+    return [
+        (module, len(cases), sum(case["passed"] != "True" for case in cases), max(map(share, cases)))
+        for (module,), cases in modules.items()
+    ]
