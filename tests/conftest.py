@@ -67,7 +67,7 @@ def quick_plans(tmp_path, monkeypatch):
     """A work folder that is not there yet, beside where the test stands; planning does not read the code."""
     from chebsplat.pipelines.code import Code
 
-    monkeypatch.setattr(Code, "stage", lambda self, name: {"hash": name})
+    monkeypatch.setattr(Code, "stage", lambda self, name, *used: {"hash": name})
     monkeypatch.setenv("CHEBSPLAT_WORK", str(tmp_path / "work"))
     monkeypatch.chdir(tmp_path)
     return tmp_path / "work"
