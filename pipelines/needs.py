@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from chebsplat.errors import ConfigError
+from chebsplat.stages.sources.common import unread
 
 if TYPE_CHECKING:
     from chebsplat.formats.teacher_model import TeacherModel
@@ -89,7 +90,8 @@ def text_packages(model: TeacherModel | None, labels: str | None) -> tuple[str, 
 def source_sentence(name: str, asked: Any, source: Any) -> str:
     """Which of the possible sources it is, for the console."""
     if source.kind != "generated":
-        return f"{source.kind} source at {source.path}"
+        said = unread(Path(source.path))
+        return f"{source.kind} source at {source.path}{said and f' ({said})'}"
     note = ""
     if asked.kind == "named":
         note = " (REPLICA_ROOT has no such scene)" if os.environ.get("REPLICA_ROOT") else " (REPLICA_ROOT is not set)"

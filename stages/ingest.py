@@ -2,13 +2,16 @@
 
 from __future__ import annotations
 
+import logging
 import os
 from pathlib import Path
 from typing import Any
 
-from chebsplat.errors import ConfigError, InputError
+from chebsplat.errors import ConfigError, DataFailure, InputError
 from chebsplat.stages.command import Job, command
 from chebsplat.stages.settings import IngestSection, SourceSection
+
+log = logging.getLogger("chebsplat")
 
 
 def resolve(name: str, source: SourceSection) -> SourceSection:
@@ -33,7 +36,7 @@ def read(name: str, source: SourceSection, settings: IngestSection) -> dict[str,
         from chebsplat.stages.sources import generated
 
         return generated.capture(name, source.seed, source.preset)
-    from chebsplat.stages.sources import colmap, photos, replica, scannet, seven_scenes, transforms
+    from chebsplat.stages.sources import colmap, common, photos, replica, scannet, seven_scenes, transforms
 
     folder = Path(str(source.path)).expanduser()
     if not folder.is_dir():
@@ -46,14 +49,18 @@ def read(name: str, source: SourceSection, settings: IngestSection) -> dict[str,
         "scannet": scannet,
         "seven_scenes": seven_scenes,
     }
-    return modules[source.kind].read(folder, settings)
+    fields: dict[str, Any] = modules[source.kind].read(folder, settings)
+    if said := common.unread(folder):
+        fields["source"]["notes"].append(f"{said[0].upper()}{said[1:]}.")
+    return fields
 
 
 def split(names: list[str], own: Any, settings: IngestSection) -> tuple[Any, dict[str, Any]]:
     """Test views by the protocol's rule, bool [V], and the protocol with its parameters, for the record.
 
     Args: own: bool [V], the source's own split, or None.
-    Raises: ConfigError if the config changes a rule that is part of a protocol's name.
+    Raises: ConfigError if the config changes a rule that is part of a protocol's name; DataFailure if it leaves no
+            test or no training view.
     """
     import numpy as np
 
@@ -73,7 +80,13 @@ def split(names: list[str], own: Any, settings: IngestSection) -> tuple[Any, dic
         return own, record | {"split": "the source's own"}
     step, offset = used["test_every"], used["test_offset"] % used["test_every"]
     said = {"split": f"view index % {step} == {offset} is test", "test_every": step, "test_offset": offset}
-    return every(names, step, offset), record | said
+    is_test = every(names, step, offset)
+    if is_test.all() or not is_test.any():
+        raise DataFailure(
+            f"of {len(names)} views every one whose index % {step} is {offset} is a test view (ingest.test_every, "
+            f"ingest.test_offset): that is {'all' if is_test.any() else 'none'} of them; add views or change the rule"
+        )
+    return is_test, record | said
 
 
 def run(job: Job) -> None:
@@ -85,6 +98,8 @@ def run(job: Job) -> None:
     source = resolve(name, job.config.source)
     fields = read(name, source, settings)
     fields["source"] = {"name": name} | fields["source"]
+    for note in fields["source"].get("notes", []):
+        log.info("%s", note)
     n_views = len(fields["names"])
     fields["is_test"], protocol = split(fields["names"], fields.pop("is_test", None), settings)
     optional: dict[str, Any] = {"depth": None, "labels": None, "loss_mask": None, "class_names": None}

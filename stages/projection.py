@@ -13,6 +13,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from chebsplat.errors import ConfigError, DataFailure, InputError
+from chebsplat.formats.images import SUFFIXES, read_rgb
 from chebsplat.stages.command import Job, command, n_threads
 
 if TYPE_CHECKING:
@@ -21,7 +22,6 @@ if TYPE_CHECKING:
     from chebsplat.formats.teacher_model import TeacherModel
     from chebsplat.stages.settings import ProjectionSection
 
-IMAGES = (".jpeg", ".jpg", ".png")
 ENTRY = 4  # pixels of an image that an entry of its map is wide, at least
 VIEWS = 4  # of a generated room
 CHECKED = 20_000  # pixels whose labels before and after are compared
@@ -99,7 +99,7 @@ def digest(teacher: TeacherModel) -> str:
 
 def reference_files(folder: Path) -> list[Path]:
     """The images of a reference folder. Raises InputError if there are none."""
-    files = sorted(path for path in folder.rglob("*") if path.suffix.lower() in IMAGES)
+    files = sorted(path for path in folder.rglob("*") if path.suffix.lower() in SUFFIXES)
     if not files:
         raise InputError(f"{folder} holds no .png or .jpg image; correct projection.reference")
     return files
@@ -116,16 +116,8 @@ def reference(settings: ProjectionSection) -> tuple[Iterator[tuple[str, np.ndarr
 
 
 def photos(files: list[Path]) -> Iterator[tuple[str, np.ndarray]]:
-    import numpy as np
-    from PIL import Image
-
     for file in files:
-        try:
-            with Image.open(file) as image:
-                pixels = np.asarray(image.convert("RGB"))
-        except OSError as error:
-            raise InputError(f"{file} is not an image ({error}); remove it from projection.reference") from None
-        yield str(file), pixels
+        yield str(file), read_rgb(file, "correct projection.reference")
 
 
 def generated(seeds: range) -> Iterator[tuple[str, np.ndarray]]:

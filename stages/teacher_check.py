@@ -6,8 +6,6 @@ import time
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from chebsplat.errors import InputError
-
 if TYPE_CHECKING:
     import numpy as np
 
@@ -69,16 +67,10 @@ def n_windows(size: tuple[int, int], window: tuple[int, int]) -> int:
 
 def shown(photo: Path | None) -> tuple[str, np.ndarray]:
     """(name, image u8 [H, W, 3])."""
-    import numpy as np
-    from PIL import Image
-
+    from chebsplat.formats.images import read_rgb
     from chebsplat.stages.projection import generated
     from chebsplat.synthetic.seeds import REFERENCE
 
     if photo is None:
         return next(generated(REFERENCE[:1]))
-    try:
-        with Image.open(photo) as image:
-            return photo.name, np.asarray(image.convert("RGB"))
-    except OSError as error:
-        raise InputError(f"{photo} is not an image ({error}); give another --photo") from None
+    return photo.name, read_rgb(photo, "give another --photo")

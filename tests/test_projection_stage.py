@@ -8,9 +8,10 @@ from shared import ROOT, run_stage
 from tiny_teachers import color_reference, color_teacher, write_settings, write_table
 
 from chebsplat.formats.artifact import read_manifest
+from chebsplat.formats.images import SUFFIXES
 from chebsplat.formats.projection import SCHEMA, read_projection
 from chebsplat.pipelines.plan import Planner
-from chebsplat.stages.projection import IMAGES, generated
+from chebsplat.stages.projection import generated
 from chebsplat.synthetic import seeds
 
 
@@ -108,7 +109,7 @@ def test_scenes_share_one_projection_which_only_its_teacher_changes(tmp_path, ti
     assert {key(planner, "toy", f"{settings},{change}") for change in changes} == {shared}
     assert key(planner, "toy", f"{settings},projection.n_channels=2") != shared
     of_photos = key(planner, "toy", f"{settings},projection.reference={reference}")
-    (reference / f"again{IMAGES[-1]}").write_bytes((reference / "0.png").read_bytes())
+    (reference / f"again{SUFFIXES[-1]}").write_bytes((reference / "0.png").read_bytes())
     assert len({shared, of_photos, key(planner, "toy", f"{settings},projection.reference={reference}")}) == 3
     before = key(planner, "toy", settings, "teacher")
     write_table(tmp_path / "tiny.npz", embeddings=np.eye(3, 6))

@@ -11,7 +11,8 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from chebsplat.errors import DataFailure, InputError
-from chebsplat.stages.sources.common import DISTORTED, Camera, Frame, Listing, natural
+from chebsplat.stages.sources.cameras import DISTORTED, Camera, undistorted
+from chebsplat.stages.sources.common import Frame, Listing, natural
 from chebsplat.stages.sources.label_images import indexed, label_ids
 from chebsplat.stages.sources.pictures import DEEP, GREY, companion, confidences, nearest, open_photo
 
@@ -64,6 +65,8 @@ def assemble(listing: Listing, settings: IngestSection, class_names: tuple[str, 
         fields["pseudo_labels"], fields["class_names"], said = found
         fields["confidence"] = stacks["confidence"]
         notes += said
+    if not stacks["loss_mask"].any():
+        raise DataFailure(f"{frames[0].mask or frames[0].image}: no pixel of any view counts; correct the masks")
     if not stacks["loss_mask"].all():
         fields["loss_mask"] = stacks["loss_mask"]
         notes.append(f"{1 - stacks['loss_mask'].mean():.1%} of the pixels are masked.")
@@ -115,14 +118,8 @@ class Geometry:
 
 def geometry(camera: Camera, max_side: int) -> Geometry:
     """The view's camera: undistorted first, then reduced until no side exceeds `max_side`; never enlarged."""
-    (fx, fy, cx, cy), width, height = camera.pinhole, camera.width, camera.height
-    if camera.model in DISTORTED:
-        import pycolmap
-
-        options = pycolmap.UndistortCameraOptions()
-        options.blank_pixels = 0.0
-        plain = pycolmap.undistort_camera(options, _pycolmap_camera(camera))
-        (fx, fy, cx, cy), width, height = plain.params, plain.width, plain.height
+    plain = undistorted(camera)
+    (fx, fy, cx, cy), width, height = plain.pinhole, plain.width, plain.height
     factor = min(1.0, max_side / max(width, height))
     w, h = max(round(width * factor), 1), max(round(height * factor), 1)
     K = np.array([[fx * w / width, 0, cx * w / width], [0, fy * h / height, cy * h / height], [0, 0, 1.0]])
@@ -140,17 +137,11 @@ def positions(camera: Camera, view: Geometry) -> np.ndarray:
         return np.stack(np.meshgrid(x, y))
     grid = np.meshgrid(np.arange(view.width) + 0.5, np.arange(view.height) + 0.5)
     pixels = np.stack([*grid, np.ones((view.height, view.width))], -1).reshape(-1, 3)
-    found = _pycolmap_camera(camera).img_from_cam(pixels @ np.linalg.inv(view.K).T)
+    found = camera.colmap.img_from_cam(pixels @ np.linalg.inv(view.K).T)
     at = np.asarray(found, float).T.reshape(2, view.height, view.width)
     (x_down, x_right), (y_down, y_right) = (np.gradient(side) for side in at)
     plain = (x_right > 0) & (y_down > 0) & (x_right * y_down > x_down * y_right)  # not where at is nan
     return np.where(plain, at, -1.0)
-
-
-def _pycolmap_camera(camera: Camera) -> Any:
-    import pycolmap
-
-    return pycolmap.Camera(model=camera.model, width=camera.width, height=camera.height, params=list(camera.params))
 
 
 def read_view(
@@ -159,25 +150,23 @@ def read_view(
     """images u8 [H, W, 3], loss_mask bool [H, W]; where `wanted`, depth, labels, pseudo_labels, confidence [H, W]."""
     camera, size = frame.camera, (frame.camera.width, frame.camera.height)
     inside = within(at, size)
-    image, opaque = open_photo(frame.image, size, listing.upright)
-    counts = inside.copy() if opaque is None else inside & nearest(opaque, at, size)
+    with open_photo(frame.image, size, listing.upright) as (image, opaque):
+        counts = inside.copy() if opaque is None else inside & nearest(opaque, at, size)
+        fields = {"images": resampled(image, camera, view, at), "loss_mask": counts}
     if frame.mask is not None:
-        counts &= nearest(companion(frame.mask, size), at, size) > 0
-    fields = {"images": resampled(image, camera, view, at), "loss_mask": counts}
+        counts &= companion(frame.mask, size, at) > 0
     if "depth" in wanted and frame.depth is not None:
         place, field = at, size
         if listing.depth_camera is not None:
             place, field = moved(at, camera, listing.depth_camera)
-        stored = companion(frame.depth, field, DEEP, "16-bit depth")
-        stored = nearest(stored, place, field).astype(np.float32)
+        stored = companion(frame.depth, field, place, DEEP, "16-bit depth").astype(np.float32)
         known = within(place, field) & inside & ~np.isin(stored, listing.no_depth)
         fields["depth"] = np.where(known, stored / np.float32(listing.depth_scale), np.float32(np.nan))
     if "labels" in wanted and frame.labels is not None:
-        ids = label_ids(frame, listing, size)
-        fields["labels"] = np.where(inside, nearest(ids, at, size), np.int32(-1))
+        fields["labels"] = np.where(inside, label_ids(frame, listing, size, at), np.int32(-1))
     if "pseudo_labels" in wanted and frame.pseudo_labels is not None and frame.confidence is not None:
-        ids = companion(frame.pseudo_labels, size, GREY, "8- or 16-bit ids", listing.any_label_size)
-        fields["pseudo_labels"] = np.where(inside, nearest(ids.astype(np.int32), at, size), np.int32(0))
+        ids = companion(frame.pseudo_labels, size, at, GREY, "8- or 16-bit ids", listing.any_label_size)
+        fields["pseudo_labels"] = np.where(inside, ids.astype(np.int32), np.int32(0))
         sure = nearest(confidences(frame.confidence), at, size)
         fields["confidence"] = np.where(inside & (fields["pseudo_labels"] > 0), sure, 0).astype(np.float16)
     return fields

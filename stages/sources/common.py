@@ -1,40 +1,31 @@
-"""What every source on disk shares: frames, cameras and poses as a listing, and the files behind them."""
+"""What every source on disk shares: frames as a listing, the files behind them, and which kind a folder is."""
 
 from __future__ import annotations
 
-import json
-import math
 import os
-from collections.abc import Iterator
+import re
+from collections import Counter
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
 from chebsplat.errors import InputError
+from chebsplat.formats.images import SUFFIXES, is_image
 from chebsplat.evaluation.protocols.split import natural
+from chebsplat.stages.sources.cameras import Camera
 
-IMAGE_TYPES = (".jpg", ".jpeg", ".png")
-PINHOLES = {"SIMPLE_PINHOLE": 3, "PINHOLE": 4}  # model: number of parameters
-DISTORTED = {"SIMPLE_RADIAL": 4, "RADIAL": 5, "OPENCV": 8}
-ROTATION_TOLERANCE = 1e-2  # of RᵀR − I: rows written with three decimals pass, a scale of 1 % does not
-
-
-@dataclass(frozen=True)
-class Camera:
-    """A COLMAP camera: model, its parameters in pixels with pixel centres at half integers, and the image's size."""
-
-    model: str
-    params: tuple[float, ...]
-    width: int
-    height: int
-
-    @property
-    def pinhole(self) -> tuple[float, float, float, float]:
-        """fx, fy, cx, cy."""
-        p = self.params
-        return (p[0], p[1], p[2], p[3]) if self.model in ("PINHOLE", "OPENCV") else (p[0], p[0], p[1], p[2])
+# What phones and cameras leave beside JPEGs, or instead of them, and what makes JPEGs of it.
+UNREAD = (
+    dict.fromkeys((".heic", ".heif"), "heif-convert a{0} a.jpg")
+    | dict.fromkeys((".mp4", ".mov", ".avi", ".mkv", ".m4v", ".webm", ".mts", ".3gp"),
+                    "ffmpeg -i a{0} -vf fps=2 -q:v 2 a_%04d.jpg")
+    | dict.fromkeys((".dng", ".cr2", ".cr3", ".nef", ".arw", ".raf", ".orf", ".rw2"), "darktable-cli a{0} a.jpg")
+    | dict.fromkeys((".avif", ".webp", ".tif", ".tiff", ".bmp", ".gif", ".jp2", ".jxl", ".exr", ".psd"),
+                    "magick a{0} a.jpg")
+)  # fmt: skip
+UNPRINTABLE = re.compile("[\x00-\x1f\x7f-\x9f\u2028\u2029\ud800-\udfff]")
 
 
 @dataclass
@@ -83,95 +74,28 @@ class Listing:
         return bool(self.frames) and all(getattr(frame, what) is not None for frame in self.frames)
 
 
-def camera_of(origin: Path, model: str, params: Any, width: Any, height: Any) -> Camera:
-    """A camera that can be used. Raises InputError naming the file that describes it."""
-    if model not in PINHOLES and model not in DISTORTED:
-        raise InputError(
-            f"{origin}: camera model {model} is not supported ({', '.join([*PINHOLES, *DISTORTED])} are); "
-            "undistort the images first, for example with `colmap image_undistorter`"
-        )
-    try:
-        camera = Camera(model, tuple(float(v) for v in params), int(width), int(height))
-    except (TypeError, ValueError, OverflowError) as error:
-        raise InputError(f"{origin}: camera size or parameters are no numbers ({error}); restore the file") from None
-    usable = len(camera.params) == (PINHOLES | DISTORTED)[model] and all(map(math.isfinite, camera.params))
-    if not usable or min(camera.width, camera.height) < 1 or min(camera.pinhole[:2]) <= 0:
-        raise InputError(
-            f"{origin}: camera {model} {camera.width}x{camera.height} {camera.params} is not usable; restore the file"
-        )
-    return camera
-
-
-def cam_from_world(origin: Path, world_from_cam: np.ndarray, names: list[str]) -> np.ndarray:
-    """Inverse [V, 4, 4] of rigid camera-to-world matrices [V, 4, 4]; nan where one holds inf or nan.
-
-    Raises:  InputError naming the first frame whose matrix is scaled, mirrored, sheared or projective.
-    Choices: the rounding of a text file is removed by taking the nearest rotation (SVD).
-    """
-    usable = np.isfinite(world_from_cam).all((1, 2))
-    rotations = np.where(usable[:, None, None], world_from_cam[:, :3, :3], np.eye(3))
-    error = np.abs(rotations.transpose(0, 2, 1) @ rotations - np.eye(3)).max((1, 2))
-    last = np.abs(world_from_cam[:, 3] - [0, 0, 0, 1]).max(1, where=usable[:, None], initial=0)
-    rigid = (error < ROTATION_TOLERANCE) & (np.linalg.det(rotations) > 0) & (last < ROTATION_TOLERANCE)
-    if not rigid.all():
-        raise InputError(
-            f"{origin}: the pose of {names[int(np.argmin(rigid))]} is not a rotation and a translation; "
-            "write poses without scale, shear or mirroring"
-        )
-    left, _, right = np.linalg.svd(rotations)
-    inverse = (left @ right).transpose(0, 2, 1)
-    poses = np.tile(np.eye(4), (len(rotations), 1, 1))
-    poses[:, :3, :3] = inverse
-    poses[usable, :3, 3] = -np.einsum("vij,vj->vi", inverse, np.nan_to_num(world_from_cam[:, :3, 3]))[usable]
-    poses[~usable] = np.nan
-    return poses
-
-
 def stem(name: str) -> str:
     """A relative POSIX path without the suffix of an image; other dots are part of the name."""
     base, end = os.path.splitext(name)
-    return base if end.lower() in IMAGE_TYPES else name
+    return base if end.lower() in SUFFIXES else name
 
 
-def read_json(path: Path) -> dict[str, Any]:
-    """The object in a JSON file. Raises InputError."""
-    try:
-        document = json.loads(path.read_text())
-    except OSError as error:
-        raise InputError(f"{path}: {error.strerror}; the source is incomplete") from None
-    except ValueError as error:
-        raise InputError(f"{path} does not parse ({error}); restore the file") from None
-    if not isinstance(document, dict):
-        raise InputError(f"{path} holds a {type(document).__name__}, not an object; restore the file")
-    return document
-
-
-def read_matrix(path: Path) -> np.ndarray:
-    """A 4x4 matrix in a text file of 3 or 4 rows, as float64; a 3x3 matrix or 3x4 rows are completed. InputError."""
-    try:
-        rows = [[float(v) for v in line.split()] for line in path.read_text().splitlines() if line.strip()]
-    except OSError as error:
-        raise InputError(f"{path}: {error.strerror}; the source is incomplete") from None
-    except ValueError as error:
-        raise InputError(f"{path} does not hold numbers ({error}); restore the file") from None
-    if len(rows) not in (3, 4) or {len(row) for row in rows} not in ({3}, {4}):
-        raise InputError(f"{path} does not hold a 3x3 or 4x4 matrix; restore the file")
-    matrix = np.eye(4)
-    matrix[: len(rows), : len(rows[0])] = rows
-    return matrix
+def present(path: Path) -> bool:
+    """Whether there is anything of that name: a pipe or a dangling link is refused when it is read, not passed over."""
+    return os.path.lexists(path)
 
 
 def nearest_file(folder: Path, name: str) -> Path | None:
     """A file that many scenes share: in the scene's folder or in one of the two above it."""
     places = (folder, *folder.absolute().parents[:2])
-    return next((place / name for place in places if (place / name).is_file()), None)
+    return next((place / name for place in places if present(place / name)), None)
 
 
 def detect(folder: Path) -> str:
     """The kind of source a folder is. Raises InputError naming what was looked for."""
-    if (folder / "transforms.json").is_file():
+    if present(folder / "transforms.json"):
         return "transforms"
-    if any((folder / part).exists() for part in ("traj.txt", "Sequence_1", "results")):
+    if any(present(folder / part) for part in ("traj.txt", "Sequence_1", "results")):
         return "replica"
     if all((folder / part).is_dir() for part in ("color", "pose", "intrinsic")):
         return "scannet"
@@ -179,8 +103,10 @@ def detect(folder: Path) -> str:
         return "colmap"
     if any(path.is_file() for place in ("", "seq-*/") for path in folder.glob(f"{place}frame-*.color.*")):
         return "seven_scenes"
-    if folder.is_dir() and any(is_image(path.name) for path in folder.iterdir()):
+    if folder.is_dir() and any(is_image(name) for name in os.listdir(folder)):
         return "photos"
+    if said := unread(folder):
+        raise InputError(f"{folder} holds no .jpg or .png photo: {said}")
     hint = f"; {folder / 'images'} may be meant" if (folder / "images").is_dir() else ""
     raise InputError(
         f"{folder} is no source: it holds neither transforms.json, traj.txt, results/, Sequence_1/, "
@@ -189,17 +115,31 @@ def detect(folder: Path) -> str:
     )
 
 
-def is_image(name: str) -> bool:
-    return os.path.splitext(name)[1].lower() in IMAGE_TYPES and not name.startswith(".")
+def unread(folder: Path) -> str:
+    """What else a folder and its images/ hold that people take for photos, counted by suffix; nothing of none."""
+    places = [place for place in (folder, folder / "images") if place.is_dir()]
+    ends = [os.path.splitext(name)[1].lower() for place in places for name in os.listdir(place) if name[0] != "."]
+    counts = {end: n for end, n in sorted(Counter(ends).items()) if end in UNREAD}
+    if not counts:
+        return ""
+    how = dict.fromkeys(UNREAD[end].format(end) for end in counts)
+    said = ", ".join(f"{n} {end}" for end, n in counts.items())
+    return f"{said} not read; convert to JPEG, for example with {' and '.join(f'`{line}`' for line in how)}"
 
 
 def names_below(folder: Path) -> Iterator[str]:
-    """Relative POSIX paths of the images below a folder, in no order; none if it does not exist."""
+    """Relative POSIX paths of the images below a folder, in no order; none if it does not exist. InputError."""
     for place, _, names in os.walk(folder):
         inner = os.path.relpath(place, folder).replace(os.sep, "/")
-        for name in names:
-            if is_image(name):
-                yield name if inner == "." else f"{inner}/{name}"
+        yield from printable(place, (name if inner == "." else f"{inner}/{name}" for name in names if is_image(name)))
+
+
+def printable(place: str | Path, names: Iterable[str]) -> Iterator[str]:
+    """Names of files, which become names of views. Raises InputError on bytes that are no UTF-8, and on newlines."""
+    for name in names:
+        if UNPRINTABLE.search(name):
+            raise InputError(f"{place}: the file name {name!a} holds bytes that cannot be printed; rename the file")
+        yield name
 
 
 def images_in(folder: Path) -> list[str]:
@@ -210,39 +150,3 @@ def images_in(folder: Path) -> list[str]:
     if not found:
         raise InputError(f"{folder} holds no .jpg or .png image; correct source.path")
     return found
-
-
-def open_image(path: Path, remedy: str = "the source is incomplete") -> Any:
-    """A decoded PIL image. Raises InputError if it is missing (with that remedy) or damaged."""
-    return _opened(path, lambda image: image.load(), remedy)
-
-
-def header(path: Path) -> tuple[tuple[int, int], float | None]:
-    """(width, height) as the photo is meant to be seen, and its 35 mm focal length if it says so; decodes no pixel."""
-
-    def look(image: Any) -> None:
-        found["size"], found["exif"] = image.size, image.getexif()
-
-    found: dict[str, Any] = {}
-    _opened(path, look, "the source is incomplete")
-    exif = found["exif"]
-    size = found["size"][::-1] if exif.get(0x0112, 1) in (5, 6, 7, 8) else found["size"]
-    focal = exif.get_ifd(0x8769).get(0xA405)
-    usable = isinstance(focal, (int, float)) and math.isfinite(focal) and focal > 0
-    return size, float(focal) if usable else None
-
-
-def _opened(path: Path, look: Any, remedy: str) -> Any:
-    from PIL import Image
-
-    try:
-        with path.open("rb") as handle:
-            image = Image.open(handle)
-            look(image)
-    except FileNotFoundError:
-        raise InputError(f"{path} is missing; {remedy}") from None
-    except Image.DecompressionBombError as error:
-        raise InputError(f"{path} is too large ({error}); reduce it") from None
-    except (OSError, SyntaxError, ValueError) as error:
-        raise InputError(f"{path} is not a readable image ({error}); copy it again") from None
-    return image

@@ -2,27 +2,44 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
+from pathlib import Path
+from typing import Any
+
 import numpy as np
 
 from chebsplat.errors import DataFailure, InputError
 from chebsplat.stages.sources.common import Frame, Listing
 from chebsplat.stages.sources.pictures import GREY, companion
+from chebsplat.stages.sources.texts import LONGEST, shortened, whole
 
 IGNORED = {"void", "ignore", "ignored", "unlabeled", "unlabelled", "undefined", "unknown"}
-MAX_ID = 65_535
+MAX_ID = 65_535  # what 16 bits hold
 
 
-def label_ids(frame: Frame, listing: Listing, size: tuple[int, int]) -> np.ndarray:
-    """Raw ids i32 [h, w] of a frame's label image, its corrected objects replaced. InputError beyond MAX_ID."""
+def label_ids(frame: Frame, listing: Listing, size: tuple[int, int], at: np.ndarray) -> np.ndarray:
+    """Raw ids i32 [H, W] at positions `at` [2, H, W] of a frame's label image, its corrected objects replaced."""
     assert frame.labels is not None
-    ids = companion(frame.labels, size, GREY, "8- or 16-bit ids", listing.any_label_size).astype(np.int32)
-    if ids.max() > MAX_ID:
-        raise InputError(f"{frame.labels} holds id {ids.max()}; ids up to {MAX_ID} are supported")
+    ids = companion(frame.labels, size, at, GREY, "8- or 16-bit ids", listing.any_label_size).astype(np.int32)
     if frame.objects is not None and listing.corrections:
-        objects = companion(frame.objects, ids.shape[::-1], GREY, "8- or 16-bit ids")
+        objects = companion(frame.objects, size, at, GREY, "8- or 16-bit ids", listing.any_label_size)
         for which, value in listing.corrections.items():
             ids[objects == which] = value
     return ids
+
+
+def names_by_id(path: Path, entries: Iterable[tuple[Any, Any]]) -> dict[int, str]:
+    """Class names by id, from pairs in a document; ids may be written as text. Raises InputError."""
+    names: dict[int, str] = {}
+    for key, name in entries:
+        try:
+            which = whole(int(key) if isinstance(key, str) else key, 0, MAX_ID)
+        except ValueError as error:
+            raise InputError(f"{path}: a label's id is not usable ({str(error)[:LONGEST]}); correct it") from None
+        if not isinstance(name, str) or not name.strip():
+            raise InputError(f"{path}: label {which} has {shortened(name)} for a name; give a text that is not empty")
+        names[which] = name
+    return names
 
 
 def indexed(

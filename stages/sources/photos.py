@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import os
 from pathlib import Path
 from typing import Any
 
 from chebsplat.errors import InputError
-from chebsplat.stages.sources import assembly, common
+from chebsplat.formats.images import header, is_image
+from chebsplat.stages.sources import assembly, cameras, common
 from chebsplat.stages.sources.common import Frame, Listing
 
 GUESS = 1.2  # focal length in longer sides, where EXIF says nothing
@@ -25,21 +27,21 @@ def probe(folder: Path) -> dict[str, bool]:
 def files(folder: Path) -> list[Path]:
     """The photos; subfolders are not searched. Raises InputError if there are none."""
     try:
-        found = sorted(path for path in folder.iterdir() if common.is_image(path.name))
+        names = [name for name in os.listdir(folder) if is_image(name)]
     except OSError as error:
         raise InputError(f"{folder}: {error.strerror}; correct source.path") from None
-    if not found:
+    if not names:
         raise InputError(f"{folder} holds no .jpg or .png image; correct source.path")
-    return found
+    return sorted(folder / name for name in common.printable(folder, names))
 
 
 def _listing(folder: Path) -> Listing:
     frames, guessed = [], 0
     for path in files(folder):
-        (width, height), focal = common.header(path)
+        (width, height), focal = header(path)
         guessed += focal is None
         pixels = max(width, height) * (GUESS if focal is None else focal / FILM)
-        camera = common.camera_of(path, "SIMPLE_PINHOLE", (pixels, width / 2, height / 2), width, height)
+        camera = cameras.camera_of(path, "SIMPLE_PINHOLE", (pixels, width / 2, height / 2), width, height)
         frames.append(Frame(path.stem, path, camera))
     notes = []
     if guessed:

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+from contextlib import contextmanager
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from chebsplat.errors import InputError
-from chebsplat.stages.sources.common import open_image
+from chebsplat.formats.images import opened, seen_size, turned
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -16,57 +18,69 @@ EIGHT_BIT = {"1", "L", "LA", "P", "PA", "RGB", "RGBA", "CMYK", "YCbCr"}  # PIL's
 DEEP = {"I", "I;16", "I;16B"}  # 16-bit
 GREY = DEEP | {"L", "P"}
 SAME_SHAPE = 0.02  # difference in aspect ratio that still counts as another resolution of the same picture
+LARGEST = 64 << 20  # bytes of a view's confidences: 16 million in single precision
 
 
-def open_photo(path: Path, size: tuple[int, int], upright: bool) -> tuple[Any, np.ndarray | None]:
-    """An RGB image of (width, height) `size`, and where it is opaque (None: everywhere).
+@contextmanager
+def open_photo(path: Path, size: tuple[int, int], upright: bool) -> Iterator[tuple[Any, np.ndarray | None]]:
+    """An RGB image of (width, height) `size`, and where it is opaque (None: everywhere), as `opened` gives one.
 
     Choices: a model's own photos are turned by EXIF only if they fit its camera no other way, since COLMAP counts
       pixels as they are stored; alpha under one half is transparent.
     """
-    from PIL import ImageOps
 
-    image = open_image(path)
-    if image.mode not in EIGHT_BIT:
-        raise InputError(f"{path} is no 8-bit photo (mode {image.mode}); convert it to 8 bits")
-    if upright or image.size != size:
-        image = ImageOps.exif_transpose(image)
-    if image.size != size:
-        raise InputError(f"{path} is {_by(image.size)}, its camera {_by(size)}; restore the image or its camera")
-    if "A" not in image.mode and "transparency" not in image.info:
-        return image.convert("RGB"), None
-    opaque = np.asarray(image.convert("RGBA"))[..., 3] >= 128
-    return image.convert("RGBA").convert("RGB"), None if opaque.all() else opaque
+    def check(image: Any) -> None:
+        if image.mode not in EIGHT_BIT:
+            raise InputError(f"{path} is no 8-bit photo (mode {image.mode}); convert it to 8 bits")
+        found = seen_size(image) if upright or image.size != size else image.size
+        if found != size:
+            raise InputError(f"{path} is {_by(found)}, its camera {_by(size)}; restore the image or its camera")
+
+    with opened(path, check=check) as image:
+        if upright or image.size != size:
+            image = turned(image)
+        if "A" not in image.mode and "transparency" not in image.info:
+            yield (image if image.mode == "RGB" else image.convert("RGB")), None
+            return
+        image = image if image.mode == "RGBA" else image.convert("RGBA")
+        opaque = np.asarray(image.getchannel("A")) >= 128
+        yield image.convert("RGB"), None if opaque.all() else opaque
 
 
 def companion(
-    path: Path, size: tuple[int, int], modes: set[str] | None = None, wanted: str = "", any_size: bool = False
+    path: Path,
+    size: tuple[int, int],
+    at: np.ndarray,
+    modes: set[str] | None = None,
+    wanted: str = "",
+    any_size: bool = False,
 ) -> np.ndarray:
-    """A one-channel image [h, w] that belongs to a photo of (width, height) `size`; without `modes`, as grey values.
+    """The pixels at `at` [2, H, W] of a one-channel image that belongs to a photo of (width, height) `size`.
 
-    Args: any_size: it may have another resolution, but must have the photo's shape.
+    Args: modes: PIL's, that are taken as they are; None: all, as grey values. any_size: it may have another
+          resolution, but must have the photo's shape.
     Raises: InputError naming the file.
     """
-    image = open_image(path, "add it, or take its folder away to do without")
-    if modes is not None and image.mode not in modes:
-        raise InputError(f"{path} has mode {image.mode}, not {wanted} in one channel; convert it")
-    alike = abs(image.width * size[1] / (image.height * size[0]) - 1) < SAME_SHAPE
-    if image.size != size and not (any_size and alike):
-        raise InputError(f"{path} is {_by(image.size)}, its photo {_by(size)}; restore it")
-    return np.asarray(image if modes is not None or image.mode in DEEP else image.convert("L"))
+
+    def check(image: Any) -> None:
+        if modes is not None and image.mode not in modes:
+            raise InputError(f"{path} has mode {image.mode}, not {wanted} in one channel; convert it")
+        alike = abs(image.width * size[1] / (image.height * size[0]) - 1) < SAME_SHAPE
+        if image.size != size and not (any_size and alike):
+            raise InputError(f"{path} is {_by(image.size)}, its photo {_by(size)}; restore it")
+
+    with opened(path, "add it, or take its folder away to do without", check) as image:
+        grey = image if modes is not None or image.mode in DEEP else image.convert("L")
+        return nearest(np.asarray(grey), at, size)
 
 
 def confidences(path: Path) -> np.ndarray:
     """The array `confidence` [h, w] of an .npz file, f32 in [0, 1]; nothing in it is unpickled. Raises InputError."""
-    import zipfile
-    import zlib
+    from chebsplat.formats.npz import finite32, read_npz
 
-    try:
-        with np.load(path, allow_pickle=False) as parts:
-            found = np.asarray(parts["confidence"], np.float32)
-    except (OSError, KeyError, ValueError, TypeError, zipfile.BadZipFile, zlib.error) as error:
-        raise InputError(f"{path} holds no readable array `confidence` ({error}); copy it again") from None
-    if found.ndim != 2 or not ((found >= 0) & (found <= 1 + 1e-4)).all():
+    held = read_npz(path, ["confidence"], "copy it again", LARGEST).get("confidence")
+    found = None if held is None else finite32(held)
+    if found is None or found.ndim != 2 or not found.size or not ((found >= 0) & (found <= 1 + 1e-4)).all():
         raise InputError(f"{path}: `confidence` must be an image of values in 0...1; copy it again")
     return found.clip(0, 1)
 

@@ -9,11 +9,14 @@ from typing import Any
 import numpy as np
 
 from chebsplat.errors import InputError
-from chebsplat.stages.sources import assembly, common
+from chebsplat.formats.images import header
+from chebsplat.stages.sources import assembly, cameras, common, texts
 from chebsplat.stages.sources.common import Frame, Listing
+from chebsplat.stages.sources.label_images import names_by_id
 
 VOID = 0  # Semantic-NeRF's id of pixels without a class
 SEQUENCE = "Sequence_1"
+SCALES = (0.1, 1e6)  # stored units in one scene unit: depth stays below cameras.FARTHEST, and is never rounded to 0
 
 
 def read(folder: Path, settings: Any, class_names: tuple[str, ...] | None = None) -> dict[str, Any]:
@@ -35,7 +38,7 @@ def files(folder: Path) -> list[Path]:
     tables = [folder / "traj.txt", folder / SEQUENCE / "traj_w_c.txt", *_parameter_files(folder), *_class_files(folder)]
     places = [folder / "results", *(folder / SEQUENCE / part for part in ("rgb", "depth", "semantic_class"))]
     data = [place / name for place in places for name in common.names_below(place)]
-    return sorted([*(path for path in tables if path.is_file()), *data])
+    return sorted([*(path for path in tables if common.present(path)), *data])
 
 
 def _parameter_files(folder: Path) -> list[Path]:
@@ -63,12 +66,7 @@ def _trajectory(path: Path, names: list[str]) -> np.ndarray:
     Raises:  InputError unless the images are numbered 0 to V − 1 and there are V rows. A row is found by the number
       in the image's name, so a missing frame cannot shift the others.
     """
-    try:
-        rows = [line.split() for line in path.read_text().splitlines() if line.strip()]
-    except OSError as error:
-        raise InputError(f"{path}: {error.strerror}; the source is incomplete") from None
-    except ValueError as error:
-        raise InputError(f"{path} is no text ({error}); restore the file") from None
+    rows = texts.read_rows(path)
     if len(rows) != len(names):
         raise InputError(f"{path} has {len(rows)} poses for {len(names)} images; restore the file or the images")
     found = [re.search(r"(\d+)$", name) for name in names]
@@ -81,8 +79,9 @@ def _trajectory(path: Path, names: list[str]) -> np.ndarray:
         try:
             matrices[k] = [float(v) for v in row]
         except ValueError as error:
-            raise InputError(f"{path}: row {k + 1} does not hold 16 numbers ({error}); restore the file") from None
-    return common.cam_from_world(path, matrices[numbers].reshape(-1, 4, 4), names)
+            said = str(error)[: texts.LONGEST]
+            raise InputError(f"{path}: row {k + 1} does not hold 16 numbers ({said}); restore the file") from None
+    return cameras.cam_from_world(path, matrices[numbers].reshape(-1, 4, 4), names)
 
 
 def _nice_slam(folder: Path) -> Listing:
@@ -90,19 +89,21 @@ def _nice_slam(folder: Path) -> Listing:
     images = [name for name in common.images_in(place) if name.startswith("frame")]
     if not images:
         raise InputError(f"{place} holds no frame*.jpg; the source is incomplete")
-    parameters = next((path for path in _parameter_files(folder) if path.is_file()), None)
+    parameters = next((path for path in _parameter_files(folder) if common.present(path)), None)
     if parameters is None:
         raise InputError(f"{folder / 'cam_params.json'} is missing, here and one level up; the source is incomplete")
     try:
-        v = common.read_json(parameters)["camera"]
+        v = texts.read_json(parameters)["camera"]
         # Their principal point counts from the centre of the first pixel.
-        params = (v["fx"], v["fy"], float(v["cx"]) + 0.5, float(v["cy"]) + 0.5)
-        camera = common.camera_of(parameters, "PINHOLE", params, v["w"], v["h"])
-        scale = float(v["scale"])
+        params = (v["fx"], v["fy"], texts.number(v["cx"]) + 0.5, texts.number(v["cy"]) + 0.5)
+        camera = cameras.camera_of(parameters, "PINHOLE", params, v["w"], v["h"])
+        scale = texts.number(v["scale"])
     except (KeyError, TypeError, ValueError) as error:
         raise InputError(f"{parameters} lacks a camera's fx, fy, cx, cy, w, h or scale ({error}); restore it") from None
-    if not 0 < scale < float("inf"):
-        raise InputError(f"{parameters}: a depth scale of {scale} is not usable; restore it")
+    if not SCALES[0] <= scale <= SCALES[1]:
+        raise InputError(
+            f"{parameters}: a depth scale of {scale:g} is outside {SCALES[0]:g}...{SCALES[1]:g}; restore it"
+        )
     names = [common.stem(name) for name in images]
     has_depth = probe(folder)["depth"]
     frames = []
@@ -117,8 +118,8 @@ def _semantic_nerf(folder: Path) -> Listing:
     images = [name for name in common.images_in(sequence / "rgb") if name.startswith("rgb_")]
     if not images:
         raise InputError(f"{sequence / 'rgb'} holds no rgb_N.png; the source is incomplete")
-    (width, height), _ = common.header(sequence / "rgb" / images[0])
-    camera = common.camera_of(sequence, "PINHOLE", (width / 2, width / 2, width / 2, height / 2), width, height)
+    (width, height), _ = header(sequence / "rgb" / images[0])
+    camera = cameras.camera_of(sequence, "PINHOLE", (width / 2, width / 2, width / 2, height / 2), width, height)
     has = probe(folder)
     names = [common.stem(name) for name in images]
     frames = []
@@ -139,11 +140,12 @@ def _semantic_nerf(folder: Path) -> Listing:
 
 def _class_names(folder: Path) -> dict[int, str] | None:
     """Class names by id, of the nearest info_semantic.json; void is none of them."""
-    path = next((path for path in _class_files(folder) if path.is_file()), None)
+    path = next((path for path in _class_files(folder) if common.present(path)), None)
     if path is None:
         return None
     try:
-        names = {int(entry["id"]): str(entry["name"]) for entry in common.read_json(path)["classes"]}
-    except (KeyError, TypeError, ValueError) as error:
+        pairs = [(entry["id"], entry["name"]) for entry in texts.read_json(path)["classes"]]
+    except (KeyError, TypeError) as error:
         raise InputError(f"{path} lacks classes with id and name ({error}); restore the file") from None
+    names = names_by_id(path, pairs)
     return {k: name for k, name in names.items() if k != VOID}

@@ -8,9 +8,11 @@ from typing import Any
 import numpy as np
 
 from chebsplat.errors import InputError
+from chebsplat.formats.images import header
 from chebsplat.evaluation.protocols import scannet_closed, scannet_open
-from chebsplat.stages.sources import assembly, common, scannet_labels
-from chebsplat.stages.sources.common import Camera, Frame, Listing
+from chebsplat.stages.sources import assembly, cameras, common, scannet_labels, texts
+from chebsplat.stages.sources.cameras import Camera
+from chebsplat.stages.sources.common import Frame, Listing
 
 SENSOR = 1296  # width of the colour sensor, which intrinsics refer to even where images are reduced
 OFF_CENTRE = 0.1  # of the width, by which a principal point may lie off the middle
@@ -58,8 +60,8 @@ def files(folder: Path) -> list[Path]:
     if _has_pseudo_labels(folder):
         data += [folder / PSEUDO / name for name in common.names_below(folder / PSEUDO)]
         texts += list((folder / CONFIDENCE).glob("*.npz"))
-    single = [folder / name for name in (POINTS, "splits.json") if (folder / name).is_file()]
-    return sorted([*data, *texts, *single, *([table] if table is not None and table.is_file() else [])])
+    single = [folder / name for name in (POINTS, "splits.json") if common.present(folder / name)]
+    return sorted([*data, *texts, *single, *([table] if table is not None and common.present(table) else [])])
 
 
 def _has_pseudo_labels(folder: Path) -> bool:
@@ -92,24 +94,24 @@ def _camera(folder: Path, kind: str, size: tuple[int, int], sensor: int) -> Came
       nearer to the middle; they count from the centre of the first pixel, as depth's 319.5 of 640 shows.
     """
     path = folder / f"intrinsic/intrinsic_{kind}.txt"
-    K = common.read_matrix(path)
+    K = texts.read_matrix(path)
     whole = min((size[0], sensor), key=lambda width: abs(2 * K[0, 2] - width))
     if abs(2 * K[0, 2] - whole) > OFF_CENTRE * whole:
         raise InputError(f"{path}: a principal point at {K[0, 2]:g} fits no width of {size[0]}; restore the file")
     factor = size[0] / whole
     params = (K[0, 0] * factor, K[1, 1] * factor, (K[0, 2] + 0.5) * factor, (K[1, 2] + 0.5) * factor)
-    return common.camera_of(path, "PINHOLE", params, *size)
+    return cameras.camera_of(path, "PINHOLE", params, *size)
 
 
 def _split(path: Path) -> tuple[set[str], set[str]] | None:
     """(training, test) names of splits.json, None without one."""
-    if not path.is_file():
+    if not common.present(path):
         return None
-    document = common.read_json(path)
-    try:
-        sides = [{str(name) for name in document[side]} for side in ("train", "test")]
-    except (KeyError, TypeError) as error:
-        raise InputError(f"{path} lacks lists of train and test names ({error}); restore the file") from None
+    document = texts.read_json(path)
+    lists: list[Any] = [document.get(side) for side in ("train", "test")]
+    if not all(isinstance(names, list) and all(isinstance(name, str) for name in names) for names in lists):
+        raise InputError(f"{path} lacks lists of train and test names; restore the file")
+    sides = [set(names) for names in lists]
     if both := sides[0] & sides[1]:
         raise InputError(f"{path}: {min(both)} is both a training and a test view; restore the file")
     return sides[0], sides[1]
@@ -118,9 +120,9 @@ def _split(path: Path) -> tuple[set[str], set[str]] | None:
 def _listing(folder: Path) -> Listing:
     images = common.images_in(folder / "color")
     names = [common.stem(name) for name in images]
-    matrices = np.array([common.read_matrix(folder / f"pose/{name}.txt") for name in names])
-    poses = common.cam_from_world(folder / "pose", matrices, names)
-    size, _ = common.header(folder / "color" / images[0])
+    matrices = np.array([texts.read_matrix(folder / f"pose/{name}.txt") for name in names])
+    poses = cameras.cam_from_world(folder / "pose", matrices, names)
+    size, _ = header(folder / "color" / images[0])
     camera = _camera(folder, "color", size, SENSOR)
     has, place = probe(folder), _labels_folder(folder)
     pseudo = has["pseudo_labels"]
@@ -146,8 +148,8 @@ def _listing(folder: Path) -> Listing:
     listing.notes.append(f"ScanNet as {'Panoptic Lifting' if reduced else 'Semantic Gaussians'} lays it out.")
     if extra := sum(path.stem not in set(names) for path in (folder / "pose").glob("*.txt")):
         listing.notes.append(f"{extra} poses have no image in color/ and are left out.")
-    if has["depth"] and (folder / "intrinsic/intrinsic_depth.txt").is_file():
-        depth_size, _ = common.header(folder / f"depth/{names[0]}.png")
+    if has["depth"] and common.present(folder / "intrinsic/intrinsic_depth.txt"):
+        depth_size, _ = header(folder / f"depth/{names[0]}.png")
         listing.depth_camera = _camera(folder, "depth", depth_size, depth_size[0])
     if place == "rs_semantics":
         listing.label_names = reduced_names

@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
-import csv
 from pathlib import Path
 
 from chebsplat.errors import InputError
 from chebsplat.evaluation.protocols import scannet_closed, scannet_open
+from chebsplat.stages.sources.common import present
+from chebsplat.stages.sources.texts import LONGEST, read_table
 
 MODIFIED, COMBINED = "scannetv2-labels.modified.tsv", "scannet-labels.combined.tsv"
 OTHER = "otherprop"  # SG's id 0: known and ignored
@@ -46,14 +47,16 @@ def reduced(path: Path | None, scene: str) -> tuple[dict[int, str], dict[int, in
 
 def _column(path: Path | None, name: str, column: str, n_values: int, empty: int | None = None) -> dict[int, int]:
     """A column of whole numbers below `n_values`, by the column `id`; of an id listed twice the last row counts."""
-    if path is None or not path.is_file():
+    if path is None or not present(path):
         raise InputError(f"{path} is missing; put {name} into the scene's folder or one above it")
+    rows = read_table(path, f"take {name}")
     try:
-        with path.open(newline="") as handle:
-            rows = list(csv.DictReader(handle, delimiter="\t"))
         found = {int(row["id"]): int(row[column]) if row[column] or empty is None else empty for row in rows}
     except (KeyError, TypeError, ValueError) as error:
-        raise InputError(f"{path} has no usable columns id and {column} ({error}); take {name}") from None
-    if not found or not all(0 <= value < n_values for value in found.values()):
-        raise InputError(f"{path}: values of {column} must lie in 0...{n_values - 1}; take {name}")
+        said = str(error)[:LONGEST]
+        raise InputError(f"{path} has no usable columns id and {column} ({said}); take {name}") from None
+    if not found or min(found) < 0 or not all(0 <= value < n_values for value in found.values()):
+        raise InputError(
+            f"{path}: ids must not be negative, and values of {column} must lie in 0...{n_values - 1}; take {name}"
+        )
     return found

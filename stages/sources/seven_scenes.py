@@ -13,7 +13,8 @@ from typing import Any
 import numpy as np
 
 from chebsplat.errors import InputError
-from chebsplat.stages.sources import assembly, common
+from chebsplat.formats.images import header, is_image
+from chebsplat.stages.sources import assembly, cameras, common, texts
 from chebsplat.stages.sources.common import Frame, Listing
 
 # Focal lengths in pixels of a 640 wide image. The data set states the depth camera's alone; 525 is a Kinect's colour
@@ -44,7 +45,7 @@ def files(folder: Path) -> list[Path]:
 
 def _intrinsics(folder: Path) -> Path | None:
     places = (folder, folder.absolute().parent)
-    return next((p / "camera-intrinsics.txt" for p in places if (p / "camera-intrinsics.txt").is_file()), None)
+    return next((p / "camera-intrinsics.txt" for p in places if common.present(p / "camera-intrinsics.txt")), None)
 
 
 def _places(folder: Path) -> list[str]:
@@ -60,9 +61,9 @@ def _frames(folder: Path) -> list[tuple[str, str, set[str]]]:
     frames = []
     for place in _places(folder):
         found = {place + name for name in os.listdir(folder / place)}
-        for image in found:
+        for image in common.printable(folder, filter(is_image, found)):
             name = common.stem(image)
-            if common.is_image(image) and name.endswith(".color") and name[len(place) :].startswith("frame-"):
+            if name.endswith(".color") and name[len(place) :].startswith("frame-"):
                 frames.append((name.removesuffix(".color"), image, found))
     return sorted(frames, key=lambda frame: common.natural(frame[0]))
 
@@ -71,19 +72,19 @@ def _listing(folder: Path) -> Listing:
     frames = _frames(folder)
     if not frames:
         raise InputError(f"{folder} holds no frame-*.color.jpg or .png, nor does a seq-*/ in it; correct source.path")
-    (width, height), _ = common.header(folder / frames[0][1])
+    (width, height), _ = header(folder / frames[0][1])
     path, image = _intrinsics(folder), folder / frames[0][1]
     focal = COLOR * width / 640
-    camera = common.camera_of(image, "PINHOLE", (focal, focal, width / 2, height / 2), width, height)
+    camera = cameras.camera_of(image, "PINHOLE", (focal, focal, width / 2, height / 2), width, height)
     K = np.diag([DEPTH * width / 640, DEPTH * width / 640, 1.0, 1.0])
     K[:2, 2] = width / 2, height / 2
     if path is not None:
-        K = common.read_matrix(path)
-    depth_camera = common.camera_of(path or image, "PINHOLE", (K[0, 0], K[1, 1], K[0, 2], K[1, 2]), width, height)
+        K = texts.read_matrix(path)
+    depth_camera = cameras.camera_of(path or image, "PINHOLE", (K[0, 0], K[1, 1], K[0, 2], K[1, 2]), width, height)
     notes = [f"The colour camera's focal length is taken to be {focal:g} pixels, at the depth camera's place."]
     names = [name for name, _, _ in frames]
-    matrices = np.array([common.read_matrix(folder / f"{name}.pose.txt") for name in names])
-    poses = common.cam_from_world(folder, matrices, [f"{name}.pose.txt" for name in names])
+    matrices = np.array([texts.read_matrix(folder / f"{name}.pose.txt") for name in names])
+    poses = cameras.cam_from_world(folder, matrices, [f"{name}.pose.txt" for name in names])
     has_depth = probe(folder)["depth"]
     listed = [
         Frame(name, folder / image, camera, pose, folder / f"{name}.depth.png" if has_depth else None)

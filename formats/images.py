@@ -1,0 +1,133 @@
+"""Images from outside: the one door to Pillow's readers. PNG and JPEG, told by content, of bounded size.
+
+Pillow would read forty more formats, whatever a file is called; one of its readers starts Ghostscript.
+"""
+
+from __future__ import annotations
+
+import math
+import os
+import struct
+import threading
+import warnings
+from collections.abc import Callable, Iterator
+from contextlib import ExitStack, contextmanager
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from chebsplat.errors import InputError
+from chebsplat.formats.files import regular
+
+if TYPE_CHECKING:
+    import numpy as np
+
+FORMATS = ("PNG", "JPEG")
+SUFFIXES = (".jpg", ".jpeg", ".png")
+MAX_PIXELS = 64_000_000  # of one image, and of all that are being decoded: that takes up to 12 bytes a pixel
+MAX_SIDE = 65_535  # what JPEG can hold
+INCOMPLETE = "the source is incomplete"
+# What Pillow raises on damaged pixels, and struct and its own parsers on damaged EXIF.
+DAMAGE = (OSError, SyntaxError, ValueError, struct.error, EOFError, LookupError, TypeError, AttributeError,
+          ArithmeticError)  # fmt: skip
+SUBSECTION, ORIENTATION, FOCAL_35 = 0x8769, 0x0112, 0xA405  # EXIF tags
+TURNS = {2: 0, 3: 3, 4: 1, 5: 5, 6: 4, 7: 6, 8: 2}  # orientation: Pillow's Transpose that undoes it
+ON_ITS_SIDE = (5, 6, 7, 8)  # orientations that swap width and height
+
+
+def is_image(name: str) -> bool:
+    return os.path.splitext(name)[1].lower() in SUFFIXES and not name.startswith(".")
+
+
+@contextmanager
+def opened(path: Path, remedy: str = INCOMPLETE, check: Callable[[Any], None] | None = None) -> Iterator[Any]:
+    """A decoded PIL image, for as long as a `with` block needs all of its pixels; `check` sees it before it is decoded.
+
+    Choices: threads decode at once what fits into MAX_PIXELS together, and a larger photo waits for the others, so
+      that blocks must not be nested.
+    Raises:  InputError if it is missing (with that remedy), damaged, too large or of another format.
+    """
+    with ExitStack() as held:
+
+        def look(image: Any) -> None:
+            if check is not None:
+                check(image)
+            held.enter_context(_BUDGET.hold(image.width * image.height))
+            image.load()
+
+        yield _opened(path, look, remedy)
+
+
+def read_rgb(path: Path, remedy: str = INCOMPLETE) -> np.ndarray:
+    """u8 [H, W, 3] as it is stored, whatever its mode. Raises InputError."""
+    import numpy as np
+
+    with opened(path, remedy) as image:
+        return np.asarray(image if image.mode == "RGB" else image.convert("RGB"))
+
+
+def header(path: Path, remedy: str = INCOMPLETE) -> tuple[tuple[int, int], float | None]:
+    """(width, height) as the photo is meant to be seen, and its 35 mm focal length if it says so; decodes no pixel."""
+
+    def look(image: Any) -> None:
+        focal = image.getexif().get_ifd(SUBSECTION).get(FOCAL_35)
+        usable = isinstance(focal, (int, float)) and math.isfinite(focal) and focal > 0
+        found.update(size=seen_size(image), focal=float(focal) if usable else None)
+
+    found: dict[str, Any] = {}
+    _opened(path, look, remedy)
+    return found["size"], found["focal"]
+
+
+def seen_size(image: Any) -> tuple[int, int]:
+    """(width, height) of a PIL image once it is turned by its EXIF orientation."""
+    width, height = image.size
+    return (height, width) if image.getexif().get(ORIENTATION) in ON_ITS_SIDE else (width, height)
+
+
+def turned(image: Any) -> Any:
+    """A PIL image as its EXIF orientation says it is meant to be seen."""
+    method = TURNS.get(image.getexif().get(ORIENTATION))
+    return image if method is None else image.transpose(method)
+
+
+def _opened(path: Path, look: Callable[[Any], None], remedy: str) -> Any:
+    from PIL import Image
+
+    regular(path, remedy)
+    warnings.simplefilter("error", Image.DecompressionBombWarning)  # Pillow's own limit lies above ours
+    try:
+        with Path(path).open("rb") as handle:
+            image = Image.open(handle, formats=FORMATS)
+            if image.width * image.height > MAX_PIXELS or max(image.size) > MAX_SIDE:
+                raise Image.DecompressionBombError(f"{image.width}x{image.height}")
+            look(image)
+    except (Image.DecompressionBombError, Image.DecompressionBombWarning) as error:
+        raise InputError(
+            f"{path} is too large ({error}; {MAX_PIXELS // 10**6} megapixels and {MAX_SIDE} pixels a side are read); "
+            "reduce it"
+        ) from None
+    except Image.UnidentifiedImageError:
+        raise InputError(f"{path} is no PNG or JPEG image, whatever its name; convert it") from None
+    except DAMAGE as error:
+        raise InputError(f"{path} is not a readable image ({error}); copy it again") from None
+    return image
+
+
+class _PixelBudget:
+    def __init__(self) -> None:
+        self._free, self._changed = MAX_PIXELS, threading.Condition()
+
+    @contextmanager
+    def hold(self, n_pixels: int) -> Iterator[None]:
+        with self._changed:
+            self._changed.wait_for(lambda: self._free >= n_pixels)
+            self._free -= n_pixels
+        try:
+            yield
+        finally:
+            with self._changed:
+                self._free += n_pixels
+                self._changed.notify_all()
+
+
+_BUDGET = _PixelBudget()

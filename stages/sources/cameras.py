@@ -1,0 +1,136 @@
+"""Cameras and poses of a source: what is usable, and what no photo was ever taken with."""
+
+from __future__ import annotations
+
+import functools
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from chebsplat.errors import InputError
+from chebsplat.formats.images import MAX_PIXELS, MAX_SIDE
+from chebsplat.stages.sources.texts import number
+
+PINHOLES = {"SIMPLE_PINHOLE": 3, "PINHOLE": 4}  # model: number of parameters
+DISTORTED = {"SIMPLE_RADIAL": 4, "RADIAL": 5, "OPENCV": 8}
+ROTATION_TOLERANCE = 1e-2  # of RᵀR − I: rows written with three decimals pass, a scale of 1 % does not
+FOCAL = (0.01, 100.0)  # of the longer side: fields of view of 178 and of 0.6 degrees
+OFF_CENTRE = 1.5  # sides by which a principal point may lie off the middle: crops have it outside
+LEAST_KEPT = 0.25  # of each side: a distortion that leaves less of a photo is none that a lens has
+FARTHEST = 1e6  # scene units from the origin: in float32, points that far out are 0.06 apart
+
+
+@dataclass(frozen=True)
+class Camera:
+    """A COLMAP camera: model, its parameters in pixels with pixel centres at half integers, and the image's size."""
+
+    model: str
+    params: tuple[float, ...]
+    width: int
+    height: int
+
+    @property
+    def pinhole(self) -> tuple[float, float, float, float]:
+        """fx, fy, cx, cy."""
+        p = self.params
+        return (p[0], p[1], p[2], p[3]) if self.model in ("PINHOLE", "OPENCV") else (p[0], p[0], p[1], p[2])
+
+    @property
+    def colmap(self) -> Any:
+        import pycolmap
+
+        return pycolmap.Camera(model=self.model, width=self.width, height=self.height, params=list(self.params))
+
+
+def camera_of(origin: Path, model: str, params: Any, width: Any, height: Any) -> Camera:
+    """A camera that can be used. Raises InputError naming the file that describes it."""
+    if model not in PINHOLES and model not in DISTORTED:
+        raise InputError(
+            f"{origin}: camera model {model} is not supported ({', '.join([*PINHOLES, *DISTORTED])} are); "
+            "undistort the images first, for example with `colmap image_undistorter`"
+        )
+    try:
+        camera = Camera(model, tuple(number(v) for v in params), int(number(width)), int(number(height)))
+    except (TypeError, ValueError) as error:
+        raise InputError(f"{origin}: camera size or parameters are no numbers ({error}); restore the file") from None
+    if fault := _fault(camera):
+        raise InputError(
+            f"{origin}: camera {model} {camera.width}x{camera.height} {camera.params} is not usable: {fault}; "
+            "restore the file"
+        )
+    return camera
+
+
+def _fault(camera: Camera) -> str:
+    """What is wrong with a camera; nothing of a usable one."""
+    width, height = camera.width, camera.height
+    if len(camera.params) != (PINHOLES | DISTORTED)[camera.model]:
+        return f"{len(camera.params)} parameters"
+    if min(width, height) < 1 or max(width, height) > MAX_SIDE or width * height > MAX_PIXELS:
+        return f"a photo has 1 to {MAX_SIDE} pixels a side and at most {MAX_PIXELS // 10**6} million"
+    fx, fy, cx, cy = camera.pinhole
+    least, most = (share * max(width, height) for share in FOCAL)
+    if not (least <= min(fx, fy) and max(fx, fy) <= most):
+        return f"its focal length lies outside {least:g} to {most:g} pixels"
+    if abs(cx / width - 0.5) > OFF_CENTRE or abs(cy / height - 0.5) > OFF_CENTRE:
+        return "its principal point lies far outside the image"
+    if camera.model in DISTORTED:
+        try:
+            plain = undistorted(camera)
+        except (ValueError, RuntimeError) as error:
+            return f"its distortion cannot be undone ({error})"
+        if plain.width < LEAST_KEPT * width or plain.height < LEAST_KEPT * height:
+            return f"its distortion leaves {plain.width}x{plain.height} pixels"
+    return ""
+
+
+@functools.lru_cache(64)
+def undistorted(camera: Camera) -> Camera:
+    """The pinhole camera of the largest view without blank pixels; pinhole cameras as they are."""
+    if camera.model not in DISTORTED:
+        return Camera("PINHOLE", camera.pinhole, camera.width, camera.height)
+    import pycolmap
+
+    options = pycolmap.UndistortCameraOptions()
+    options.blank_pixels = 0.0
+    plain = pycolmap.undistort_camera(options, camera.colmap)
+    return Camera("PINHOLE", tuple(float(v) for v in plain.params), plain.width, plain.height)
+
+
+def cam_from_world(origin: Path, world_from_cam: np.ndarray, names: list[str]) -> np.ndarray:
+    """Inverse [V, 4, 4] of rigid camera-to-world matrices [V, 4, 4]; nan where one holds inf or nan.
+
+    Raises:  InputError naming the first frame whose matrix is scaled, mirrored, sheared or projective, or far away.
+    Choices: the rounding of a text file is removed by taking the nearest rotation (SVD).
+    """
+    usable = np.isfinite(world_from_cam).all((1, 2))
+    rotations = np.where(usable[:, None, None], world_from_cam[:, :3, :3], np.eye(3))
+    with np.errstate(over="ignore", invalid="ignore"):  # of entries like 1e300, which no rotation has
+        error = np.abs(rotations.transpose(0, 2, 1) @ rotations - np.eye(3)).max((1, 2))
+        last = np.abs(world_from_cam[:, 3] - [0, 0, 0, 1]).max(1, where=usable[:, None], initial=0)
+        rigid = (error < ROTATION_TOLERANCE) & (np.linalg.det(rotations) > 0) & (last < ROTATION_TOLERANCE)
+    if not rigid.all():
+        raise InputError(
+            f"{origin}: the pose of {names[int(np.argmin(rigid))]} is not a rotation and a translation; "
+            "write poses without scale, shear or mirroring"
+        )
+    near(origin, world_from_cam[:, :3, 3], names)
+    left, _, right = np.linalg.svd(rotations)
+    inverse = (left @ right).transpose(0, 2, 1)
+    poses = np.tile(np.eye(4), (len(rotations), 1, 1))
+    poses[:, :3, :3] = inverse
+    poses[usable, :3, 3] = -np.einsum("vij,vj->vi", inverse, np.nan_to_num(world_from_cam[:, :3, 3]))[usable]
+    poses[~usable] = np.nan
+    return poses
+
+
+def near(origin: Path, places: np.ndarray, names: list[str]) -> None:
+    """Raise InputError if one of some cameras' places [V, 3] is beyond FARTHEST; nan is left to `chosen`."""
+    reach = np.abs(places).max(1, initial=0)
+    for k in np.flatnonzero(np.isfinite(reach) & (reach > FARTHEST)):
+        raise InputError(
+            f"{origin}: {names[k]} lies {reach[k]:.3g} units from the origin, farther than the {FARTHEST:.0e} that "
+            "single precision allows; move the scene's origin into the scene"
+        )

@@ -1,0 +1,183 @@
+"""COLMAP's models, binary and text: cameras and posed images, read by their documented layout.
+
+They are read here and not by pycolmap, which loops for ever over a file that is cut in the middle of a record, and
+takes all memory for a name without an end. Points are walked over, since a cut file means a copy that went wrong.
+"""
+
+from __future__ import annotations
+
+import math
+import struct
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from chebsplat.errors import InputError
+from chebsplat.formats.files import read_text, regular
+from chebsplat.stages.sources import cameras, common
+from chebsplat.stages.sources.texts import LONGEST
+
+LARGEST = 512 << 20  # bytes of a file: a million images, or five million points
+AGAIN = "copy it again"
+# id in binary files: (name, number of parameters)
+MODELS = {0: ("SIMPLE_PINHOLE", 3), 1: ("PINHOLE", 4), 2: ("SIMPLE_RADIAL", 4), 3: ("RADIAL", 5), 4: ("OPENCV", 8),
+          5: ("OPENCV_FISHEYE", 8), 6: ("FULL_OPENCV", 12), 7: ("FOV", 5), 8: ("SIMPLE_RADIAL_FISHEYE", 4),
+          9: ("RADIAL_FISHEYE", 5), 10: ("THIN_PRISM_FISHEYE", 12), 11: ("RAD_TAN_THIN_PRISM_FISHEYE", 16)}  # fmt: skip
+
+
+@dataclass(frozen=True)
+class Image:
+    """name: as COLMAP holds it; camera: its id; pose: cam_from_world [4, 4]."""
+
+    name: str
+    camera: int
+    pose: np.ndarray
+
+
+@dataclass(frozen=True)
+class Model:
+    """origin: the cameras' file; cameras: (model, parameters, width, height) by id; images in the file's order."""
+
+    origin: Path
+    cameras: dict[int, tuple[str, tuple[float, ...], int, int]]
+    images: list[Image]
+
+
+def read_model(place: Path) -> Model:
+    """The model in a folder. Raises InputError naming the file that is cut, inconsistent or no model's."""
+    end = "bin" if common.present(place / "cameras.bin") else "txt"
+    paths = [place / f"{name}.{end}" for name in ("cameras", "images", "points3D")]
+    for path in paths:
+        regular(path, "a model has cameras, images and points3D")
+    read: Any = (_binary_cameras, _binary_images) if end == "bin" else (_text_cameras, _text_images)
+    found: list[list[Any]] = []
+    for path, entries in zip(paths, read, strict=False):
+        try:
+            found.append(list(entries(path)))
+        except (ValueError, IndexError, struct.error) as error:
+            raise InputError(f"{path} is cut or no COLMAP model ({str(error)[:LONGEST]}); {AGAIN}") from None
+    if end == "bin":
+        _walk_points(paths[2])
+    known = dict(found[0])
+    images = []
+    for name, camera, quaternion, translation in found[1]:
+        if camera not in known:
+            raise InputError(f"{paths[1]}: {name[:LONGEST]!r} is of camera {camera}, which is not listed; {AGAIN}")
+        images.append(Image(name, camera, _pose(paths[1], name, quaternion, translation)))
+    cameras.near(paths[1], np.array([image.pose[:3, 3] for image in images]).reshape(-1, 3), [i.name for i in images])
+    return Model(paths[0], known, images)
+
+
+def _pose(path: Path, name: str, quaternion: Any, translation: Any) -> np.ndarray:
+    """cam_from_world [4, 4] of a quaternion (w, x, y, z) and a translation.
+
+    Choices: a quaternion of unit length is taken as it is, as COLMAP does; one of few decimals is normalised.
+    """
+    q, t = np.array(quaternion, float), np.array(translation, float)
+    off = abs(math.hypot(*q) - 1)
+    if not (off < 0.01 and np.isfinite(t).all()):
+        raise InputError(f"{path}: the pose of {name[:LONGEST]!r} is no rotation and translation; {AGAIN}")
+    w, x, y, z = q if off < 1e-9 else q / math.hypot(*q)
+    pose = np.eye(4)
+    pose[:3, :3] = [
+        [1 - (2 * y * y + 2 * z * z), 2 * x * y - 2 * z * w, 2 * x * z + 2 * y * w],
+        [2 * x * y + 2 * z * w, 1 - (2 * x * x + 2 * z * z), 2 * y * z - 2 * x * w],
+        [2 * x * z - 2 * y * w, 2 * y * z + 2 * x * w, 1 - (2 * x * x + 2 * y * y)],
+    ]
+    pose[:3, 3] = t
+    return pose
+
+
+class _Bytes:
+    """A binary file from its first byte on; ends in ValueError where a record would pass the last one."""
+
+    def __init__(self, path: Path):
+        if regular(path).st_size > LARGEST:
+            raise ValueError(f"more than {LARGEST >> 20} MiB")
+        self.data, self.at = path.read_bytes(), 0
+
+    def take(self, layout: struct.Struct) -> tuple[Any, ...]:
+        found = layout.unpack_from(self.data, self.at)
+        self.at += layout.size
+        return found
+
+    def skip(self, n_bytes: int) -> None:
+        self.at += n_bytes
+        if self.at > len(self.data):
+            raise ValueError(f"it ends after {len(self.data)} bytes, in the middle of a record")
+
+    def word(self) -> str:
+        end = self.data.index(b"\0", self.at)  # raises ValueError
+        found = self.data[self.at : end].decode(errors="surrogateescape")
+        self.at = end + 1
+        return found
+
+    def count(self, least: int) -> range:
+        """As many as the file says there are, of at least so many bytes each."""
+        (n,) = self.take(_COUNT)
+        if n * least > len(self.data) - self.at:
+            raise ValueError(f"it counts {n} records in {len(self.data)} bytes")
+        return range(n)
+
+    def end(self) -> None:
+        if self.at != len(self.data):
+            raise ValueError(f"{len(self.data) - self.at} bytes follow its last record")
+
+
+_COUNT, _CAMERA, _IMAGE, _POINT = (struct.Struct(f"<{layout}") for layout in ("Q", "IiQQ", "I4d3dI", "Q3d3BdQ"))
+
+
+def _binary_cameras(path: Path) -> Iterator[tuple[int, tuple[str, tuple[float, ...], int, int]]]:
+    data = _Bytes(path)
+    for _ in data.count(_CAMERA.size):
+        key, kind, width, height = data.take(_CAMERA)
+        if kind not in MODELS:
+            raise ValueError(f"camera {key} is of no known model ({kind})")
+        name, n = MODELS[kind]
+        yield key, (name, data.take(struct.Struct(f"<{n}d")), width, height)
+    data.end()
+
+
+def _binary_images(path: Path) -> Iterator[tuple[str, int, tuple[float, ...], tuple[float, ...]]]:
+    data = _Bytes(path)
+    for _ in data.count(_IMAGE.size):
+        values = data.take(_IMAGE)
+        name = data.word()
+        data.skip(24 * len(data.count(24)))  # its keypoints
+        yield name, values[8], values[1:5], values[5:8]
+    data.end()
+
+
+def _walk_points(path: Path) -> None:
+    try:
+        data = _Bytes(path)
+        for _ in data.count(_POINT.size):
+            data.skip(8 * data.take(_POINT)[-1])
+        data.end()
+    except (ValueError, struct.error) as error:
+        raise InputError(f"{path} is cut or no COLMAP model ({str(error)[:LONGEST]}); {AGAIN}") from None
+
+
+def _lines(path: Path) -> list[str]:
+    lines = read_text(path, AGAIN, largest=LARGEST // 8).splitlines()
+    return [line for line in lines if not line.startswith("#")]
+
+
+def _text_cameras(path: Path) -> Iterator[tuple[int, tuple[str, tuple[float, ...], int, int]]]:
+    for line in _lines(path):
+        if words := line.split():
+            yield int(words[0]), (words[1], tuple(map(float, words[4:])), int(words[2]), int(words[3]))
+
+
+def _text_images(path: Path) -> Iterator[tuple[str, int, list[float], list[float]]]:
+    """Every second line lists keypoints, and may be empty."""
+    lines = iter(_lines(path))
+    for line in lines:
+        if line.strip():
+            words = line.split(maxsplit=9)
+            values = [float(v) for v in words[1:8]]
+            yield words[9].strip(), int(words[8]), values[:4], values[4:]
+            next(lines, "")
