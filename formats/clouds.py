@@ -54,7 +54,7 @@ def _check_header(path: Path, size: int) -> None:
         start = handle.read(LONGEST_HEADER)
     header, found, _ = start.partition(b"end_header")
     if not start.startswith(b"ply") or not found:
-        raise InputError(f"{path} is no PLY: it lacks a header of at most {LONGEST_HEADER} bytes; copy it again")
+        raise InputError(f"{path} is not a readable PLY (no header of at most {LONGEST_HEADER} bytes); copy it again")
     counts = [int(count[:20]) for count in re.findall(rb"^element\s+\S+\s+(\d+)", header, re.MULTILINE)]
     if any(count > size - len(header) for count in counts):
         raise InputError(f"{path} counts {max(counts)} rows in {size} bytes; copy it again")

@@ -80,11 +80,12 @@ def _split(folder: Path, names: list[str]) -> set[str] | None:
 
 def _label_names(folder: Path) -> dict[int, str] | None:
     """Class names by id, of scene.json's "labels" or of labels.json: {"id": name}."""
-    path, table = folder / "scene.json", _document(folder).get("labels")
-    if table is None and common.present(folder / "labels.json"):
-        path = folder / "labels.json"
+    path, document = folder / "scene.json", _document(folder)
+    if "labels" in document:
+        table = document["labels"]
+    elif common.present(path := folder / "labels.json"):
         table = texts.read_json(path)
-    if table is None:
+    else:
         return None
     if not isinstance(table, dict):
         raise InputError(f"{path}: labels must map ids to names; correct it")

@@ -128,10 +128,14 @@ def unread(folder: Path) -> str:
 
 
 def names_below(folder: Path) -> Iterator[str]:
-    """Relative POSIX paths of the images below a folder, in no order; none if it does not exist. InputError."""
-    for place, _, names in os.walk(folder):
+    """Relative POSIX paths of the images below a folder, in no order; none if it does not exist. InputError.
+
+    Choices: a folder that is called like an image counts as one, so that reading it says so.
+    """
+    for place, folders, names in os.walk(folder):
         inner = os.path.relpath(place, folder).replace(os.sep, "/")
-        yield from printable(place, (name if inner == "." else f"{inner}/{name}" for name in names if is_image(name)))
+        images = filter(is_image, [*folders, *names])
+        yield from printable(place, (name if inner == "." else f"{inner}/{name}" for name in images))
 
 
 def printable(place: str | Path, names: Iterable[str]) -> Iterator[str]:

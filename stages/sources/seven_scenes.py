@@ -50,10 +50,8 @@ def _intrinsics(folder: Path) -> Path | None:
 
 def _places(folder: Path) -> list[str]:
     """The folder itself and its sequences, as they precede the names of what they hold."""
-    return [
-        "",
-        *sorted(f"{entry.name}/" for entry in os.scandir(folder) if entry.is_dir() and entry.name[:4] == "seq-"),
-    ]
+    sequences = [name for name in os.listdir(folder) if name[:4] == "seq-" and (folder / name).is_dir()]
+    return ["", *(f"{name}/" for name in sorted(sequences))]
 
 
 def _frames(folder: Path) -> list[tuple[str, str, set[str]]]:

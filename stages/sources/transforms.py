@@ -14,7 +14,7 @@ from chebsplat.formats.images import header, is_image
 from chebsplat.stages.sources import assembly, cameras, common
 from chebsplat.stages.sources.cameras import Camera
 from chebsplat.stages.sources.common import Frame, Listing
-from chebsplat.stages.sources.texts import number, read_json
+from chebsplat.stages.sources.texts import number, read_json, shortened
 
 PARTS = ("file_path", "depth_file_path", "mask_path")
 DISTORTION = ("k1", "k2", "p1", "p2")
@@ -117,7 +117,8 @@ def _listing(folder: Path) -> Listing:
 
 def _camera(values: dict[str, Any], image: Path, path: Path) -> Camera:
     """The camera of one frame. Raises InputError on a fisheye, a higher distortion or no focal length."""
-    model = "OPENCV_FISHEYE" if values.get("is_fisheye") else str(values.get("camera_model") or "OPENCV")
+    named = values.get("camera_model")
+    model = "OPENCV_FISHEYE" if values.get("is_fisheye") else "OPENCV" if named is None else shortened(named).strip("'")
     if model not in PERSPECTIVE or any(values.get(k) for k in HIGHER):
         model = model if model not in PERSPECTIVE else "FULL_OPENCV"
         return cameras.camera_of(path, model, (), 0, 0)  # raises: says what is supported
