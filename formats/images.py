@@ -69,7 +69,7 @@ def header(path: Path, remedy: str = INCOMPLETE) -> tuple[tuple[int, int], float
     """(width, height) as the photo is meant to be seen, and its 35 mm focal length if it says so; decodes no pixel."""
 
     def look(image: Any) -> None:
-        focal = image.getexif().get_ifd(SUBSECTION).get(FOCAL_35)
+        focal = _exif(image).get_ifd(SUBSECTION).get(FOCAL_35)
         usable = isinstance(focal, (int, float)) and math.isfinite(focal) and focal > 0
         found.update(size=seen_size(image), focal=float(focal) if usable else None)
 
@@ -81,13 +81,20 @@ def header(path: Path, remedy: str = INCOMPLETE) -> tuple[tuple[int, int], float
 def seen_size(image: Any) -> tuple[int, int]:
     """(width, height) of a PIL image once it is turned by its EXIF orientation."""
     width, height = image.size
-    return (height, width) if image.getexif().get(ORIENTATION) in ON_ITS_SIDE else (width, height)
+    return (height, width) if _exif(image).get(ORIENTATION) in ON_ITS_SIDE else (width, height)
 
 
 def turned(image: Any) -> Any:
     """A PIL image as its EXIF orientation says it is meant to be seen."""
-    method = TURNS.get(image.getexif().get(ORIENTATION))
+    method = TURNS.get(_exif(image).get(ORIENTATION))
     return image if method is None else image.transpose(method)
+
+
+def _exif(image: Any) -> Any:
+    """What precedes the pixels: for the rest of a PNG Pillow's own `getexif` would decode them all."""
+    from PIL import Image
+
+    return Image.Image.getexif(image)
 
 
 def _opened(path: Path, look: Callable[[Any], None], remedy: str) -> Any:

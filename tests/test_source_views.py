@@ -10,7 +10,7 @@ from source_folders import SETTINGS, image, save, write_colmap
 
 from chebsplat.errors import DataFailure, InputError
 from chebsplat.stages.settings import IngestSection
-from chebsplat.stages.sources import colmap, common, photos
+from chebsplat.stages.sources import colmap, colmap_model, common, photos
 
 SIZE, FOCAL = (240, 180), 200.0
 MODELS = {
@@ -47,6 +47,10 @@ def test_models_that_colmap_writes_today_read(tmp_path, suffix):
     for view in model.images.values():
         camera = model.cameras[view.camera_id]
         image(tmp_path / "images" / view.name, (camera.width, camera.height))
+    found = colmap_model.read_model(place)
+    assert {view.name: view.pose[:3].tolist() for view in found.images} == {
+        view.name: view.cam_from_world().matrix().tolist() for view in model.images.values()
+    }
     fields = colmap.read(tmp_path, IngestSection(max_side=64))
     expected = {common.stem(v.name): v.cam_from_world().matrix() for v in model.images.values()}
     assert set(fields["names"]) == set(expected) and len(expected) == 6
@@ -247,4 +251,4 @@ def test_images_are_reduced_but_never_enlarged(tmp_path):
     fields = photos.read(tmp_path, SETTINGS)
     assert fields["images"].shape == (3, 80, 160, 3)
     assert fields["Ks"][0][0, 0] == pytest.approx(1.2 * 160)
-    assert photos.read(tmp_path, IngestSection(max_side=9999))["images"].shape == (3, 160, 320, 3)
+    assert photos.read(tmp_path, IngestSection(max_side=8192))["images"].shape == (3, 160, 320, 3)
