@@ -12,8 +12,8 @@ from pathlib import Path
 import numpy as np
 
 from chebsplat.errors import InputError
-from chebsplat.formats.images import SUFFIXES, is_image
 from chebsplat.evaluation.protocols.split import natural
+from chebsplat.formats.images import SUFFIXES, is_image
 from chebsplat.stages.sources.cameras import Camera
 
 # What phones and cameras leave beside JPEGs, or instead of them, and what makes JPEGs of it.

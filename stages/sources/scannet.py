@@ -8,8 +8,8 @@ from typing import Any
 import numpy as np
 
 from chebsplat.errors import InputError
-from chebsplat.formats.images import header
 from chebsplat.evaluation.protocols import scannet_closed, scannet_open
+from chebsplat.formats.images import header
 from chebsplat.stages.sources import assembly, cameras, common, scannet_labels, texts
 from chebsplat.stages.sources.cameras import Camera
 from chebsplat.stages.sources.common import Frame, Listing
