@@ -106,7 +106,8 @@ def snakemake(steps: list[Step], cores: int, threads: int | None = None, device:
     arguments += ["--snakefile", str(HERE / "Snakefile"), "--directory", str(store.work()), "--config", f"plan={plan}"]
     keep = False
     try:
-        keep = children.snakemake(words, arguments, {"CHEBSPLAT_THREADS": str(threads or cores)}) != 0
+        environment = {"CHEBSPLAT_THREADS": str(threads or cores), "CHEBSPLAT_WORK": str(store.work())}
+        keep = children.snakemake(words, arguments, environment) != 0
         return failures(steps, folder, words) if keep else Outcome()
     finally:
         if not keep:

@@ -1,40 +1,130 @@
-"""The door to numba: its on-disk cache is keyed by our kernels' source, so an edited helper is never served stale."""
+"""The door to numba: how kernels are compiled, and where they are kept.
+
+The folder is named for our kernels' source, so that an edited helper is never served stale. It lies in the user's
+cache; CHEBSPLAT_CACHE moves it.
+"""
 
 from __future__ import annotations
 
+import fcntl
 import hashlib
 import logging
 import os
+import pickle
+import tempfile
+import time
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 import numba
+from numba.core import event
+from numba.core.caching import FunctionCache
 
 log = logging.getLogger("chebsplat")
+EVERY = 10.0  # seconds between two lines on what is being compiled
 
 
-def _cache_folder() -> Path:
+def _places() -> list[Path]:
+    """Folders for compiled kernels, the best first."""
     root = Path(__file__).parents[1]
     sources = [path.read_bytes() for path in sorted(root.rglob("*.py"))]
     text = b"".join(source for source in sources if b"numba" in source or b"chebsplat.kernels.jit" in source)
-    base = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache")
-    return base / "chebsplat" / f"numba-{hashlib.sha256(text).hexdigest()[:16]}"
+    name = f"numba-{hashlib.sha256(text).hexdigest()[:16]}"
+    chosen, cache, work = (os.environ.get(key) for key in ("CHEBSPLAT_CACHE", "XDG_CACHE_HOME", "CHEBSPLAT_WORK"))
+    user = Path(cache or Path(os.path.expanduser("~")) / ".cache")
+    found = [Path(chosen or user / "chebsplat") / name] + ([Path(work) / ".cache" / name] if work else [])
+    own = os.environ.get("NUMBA_CACHE_DIR")  # numba's word for it; what a user says there is left alone
+    return [folder for folder in ([Path(own)] if own else []) + found if own or folder.is_absolute()]
 
 
-# A folder that the user has chosen is left alone.
-FOLDER = Path(os.environ.get("NUMBA_CACHE_DIR") or _cache_folder())
-if not FOLDER.exists():
-    log.info("compiling kernels, about 60 s, once")
+def _writable(folder: Path) -> bool:
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        tempfile.TemporaryFile(dir=folder).close()
+    except OSError as error:
+        log.warning("no kernels can be kept in %s (%s); CHEBSPLAT_CACHE names another folder", folder, error.strerror)
+        return False
+    return True
+
+
+FOLDER = next(filter(_writable, _places()), None)
 settings: Any = numba.config
-settings.CACHE_DIR = str(FOLDER)
 # open3d brings a TBB that numba refuses with a warning: OpenMP comes first.
 settings.THREADING_LAYER_PRIORITY = ["omp", "workqueue", "tbb"]
+if FOLDER is None:
+    log.warning("kernels are compiled, and not kept")
+else:
+    settings.CACHE_DIR = str(FOLDER)
+
+
+class _Kept(FunctionCache):
+    """A kernel's place on disk. A disk that is full costs the keeping, a damaged file another compilation."""
+
+    def load_overload(self, signature: Any, context: Any) -> Any:
+        try:
+            return super().load_overload(signature, context)
+        except (OSError, EOFError, pickle.UnpicklingError) as error:
+            log.warning("a compiled kernel in %s is damaged (%s) and compiled anew", self.cache_path, error)
+            return None
+
+    def save_overload(self, signature: Any, compiled: Any) -> None:
+        try:
+            # numba numbers files by an index that it reads first: two processes at once would mix their kernels up.
+            with open(Path(self.cache_path) / ".lock", "w") as lock:
+                fcntl.flock(lock, fcntl.LOCK_EX)
+                super().save_overload(signature, compiled)
+        except OSError as error:
+            log.warning("a kernel cannot be kept in %s (%s): it is compiled again next time; CHEBSPLAT_CACHE names "
+                        "another folder", self.cache_path, error.strerror)  # fmt: skip
+
+
+class _Told(event.Listener):
+    """Says what is being compiled, now and then: it takes a minute or two, once for each version of the kernels."""
+
+    def __init__(self) -> None:
+        self.kernels, self.depth = 0, 0
+        self.seconds, self.began, self.last = 0.0, 0.0, -EVERY
+
+    def on_start(self, started: event.Event) -> None:
+        now = time.monotonic()
+        if self.depth == 0:
+            self.began = now
+        self.depth += 1
+        function = started.data["dispatcher"].py_func
+        if function.__module__.startswith("chebsplat") and now - self.last >= EVERY:
+            done = f"{self.kernels} done in {self.spent(now):.0f} s" if self.kernels else f"kept in {FOLDER}"
+            log.info("compiling kernels: %s of %s (%s)", function.__name__, function.__module__, done)
+            self.last = now
+
+    def on_end(self, ended: event.Event) -> None:
+        self.depth -= 1
+        self.kernels += 1
+        if self.depth == 0:
+            self.seconds += time.monotonic() - self.began
+
+    def spent(self, now: float) -> float:
+        return self.seconds + (now - self.began if self.depth else 0)
+
+
+told = _Told()
+event.register("numba:compile", told)
+
+
+def _compiled(**options: Any) -> Callable[[Callable[..., Any]], Any]:
+    def decorate(function: Callable[..., Any]) -> Any:
+        dispatcher = numba.njit(error_model="numpy", **options)(function)
+        if FOLDER is not None:
+            dispatcher._cache = _Kept(function)  # as `cache=True` does with numba's own
+        return dispatcher
+
+    return decorate
+
 
 # No fast-math but contraction: NaN and infinity keep their meaning. Not reassociation either, for kernels just compiled
 # then differ in the last bit from the same ones read from the cache.
-kernel: Any = numba.njit(cache=True, parallel=True, error_model="numpy", fastmath={"contract", "nsz"})
-inline: Any = numba.njit(cache=True, error_model="numpy", fastmath={"contract", "nsz"}, inline="always")
-# Of explicit vectors and their scalars.
-lanes: Any = numba.njit(cache=True, error_model="numpy", fastmath={"contract"})
-serial: Any = numba.njit(cache=True, error_model="numpy")
+kernel: Any = _compiled(parallel=True, fastmath={"contract", "nsz"})
+inline: Any = _compiled(fastmath={"contract", "nsz"}, inline="always")
+lanes: Any = _compiled(fastmath={"contract"})  # of explicit vectors and their scalars
+serial: Any = _compiled()
 prange = numba.prange
