@@ -186,7 +186,7 @@ class Planner:
         """The name of a scene's links."""
         folder = folder_of(scene)
         if self.running:
-            store.work().mkdir(parents=True, exist_ok=True)
+            store.make_work()
         if folder is None:
             return scene
         return folders.claim(folder) if self.running else folders.name_of(folder)

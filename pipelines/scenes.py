@@ -40,6 +40,8 @@ def expanded(text: str) -> str:
 
 def folder_of(scene: str) -> Path | None:
     """The folder that `scene` is, absolute; None of a scene of ours. Raises InputError if there is no such folder."""
+    if not scene:
+        raise ConfigError("scene= is empty; name a scene or a folder")
     folder = Path(os.path.expanduser(scene))
     if "/" not in scene and scene not in (".", "..") and (scene in names("scenes") or not os.path.isdir(folder)):
         return None

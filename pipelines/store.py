@@ -12,7 +12,7 @@ from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
-from chebsplat.errors import ConfigError
+from chebsplat.errors import ConfigError, InputError
 from chebsplat.formats import artifact
 from chebsplat.formats.manifest import parse_manifest
 
@@ -20,6 +20,14 @@ from chebsplat.formats.manifest import parse_manifest
 def work() -> Path:
     """Where everything lies: the folder CHEBSPLAT_WORK, otherwise `work` where the user stands."""
     return Path(os.environ.get("CHEBSPLAT_WORK") or "work").absolute()
+
+
+def make_work() -> None:
+    """Raises ConfigError where there cannot be such a folder."""
+    try:
+        work().mkdir(parents=True, exist_ok=True)
+    except (FileExistsError, NotADirectoryError, FileNotFoundError):
+        raise ConfigError(f"{work()} is no folder and cannot become one; set CHEBSPLAT_WORK to a folder") from None
 
 
 def artifact_path(stage: str, key: str) -> Path:
@@ -126,13 +134,18 @@ def _real(path: Path) -> Path:
 
 
 def _running(base: Path) -> set[Path]:
-    """Artifacts that a run under way makes or reads."""
+    """Artifacts that a run under way makes or reads. Raises InputError if its plan is damaged."""
     found: set[Path] = set()
     for plan in base.glob(".plans/*/plan.json"):
-        with suppress(FileNotFoundError):  # it has just ended
+        try:
             if _owner_lives(plan.parent):
                 for step in json.loads(plan.read_text())["steps"]:
                     found |= {Path(step["path"]), *map(Path, step["inputs"].values())}
+        except FileNotFoundError:  # it has just ended
+            continue
+        except (OSError, ValueError, TypeError, KeyError, AttributeError, RecursionError):
+            advice = f"remove {plan.parent} if no run is under way"
+            raise InputError(f"{plan} is damaged: what that run needs is not known; {advice}") from None
     return found
 
 

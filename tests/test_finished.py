@@ -79,10 +79,15 @@ def test_rubbish_in_work_is_no_scene(work):
     (work / "loop").symlink_to("loop")
     (work / "dangling").mkdir()
     (work / "dangling/train").symlink_to("nowhere")
+    (work / "dangling/loop").symlink_to("loop")
+    (work / "store/train/loop").symlink_to("loop")
+    (work / "store/file").write_text("x")
     for command in (["ls"], ["clean-stale"], ["scenes"]):
         done = CliRunner().invoke(main, command)
         assert done.exit_code == 0, done.output
         assert "dangling" not in done.stdout
+    assert CliRunner().invoke(main, ["clean-stale", "--yes"]).exit_code == 0
+    assert not (work / "store/train/loop").is_symlink()
 
 
 def test_ls_tells_of_each_scene_even_of_a_damaged_one(tmp_path, work):

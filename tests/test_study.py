@@ -234,7 +234,7 @@ def test_the_page_shows_a_view_of_each_scene_in_one_set_of_colours(tmp_path):
         seen, console, _ = browsed(tmp_path, page, 1440)
         assert seen["problems"] == console == []
         assert len(seen["shown"]) == 2 and all(seen["shown"])
-    assert '<td class="w">LPIPS</td><td class="w">not measured</td><td class="w">all</td>' in page
+    assert '<td class="w">LPIPS</td><td class="w">not measured</td><td class="w" data-label="by">all</td>' in page
 
 
 @pytest.mark.slow
