@@ -6,6 +6,7 @@ silently as data. Presence and size come from the manifest, the bits from each c
 
 from __future__ import annotations
 
+import asyncio
 import itertools
 import math
 from collections.abc import Sequence
@@ -66,6 +67,18 @@ def write_array(
     absent = [name for name in chunk_names(array) if not (path / name).is_file()]
     if absent:
         raise OSError(f"{path / absent[0]} was not written ({len(absent)} chunks absent)")
+
+
+def settle(seconds: float = 2.0) -> None:
+    """Wait until no chunk is on its way to the disk: where one fails, zarr goes on with the others behind our back."""
+    from zarr.core.sync import sync
+
+    async def others() -> None:
+        tasks = asyncio.all_tasks() - {asyncio.current_task()}
+        if tasks:
+            await asyncio.wait(tasks, timeout=seconds)
+
+    sync(others())
 
 
 def chunk_names(array: Any) -> list[str]:

@@ -11,7 +11,7 @@ import json
 import os
 import shutil
 import stat
-import time
+import sys
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import asdict
@@ -74,12 +74,14 @@ def publish(out: Path, manifest: Manifest, force: bool = False) -> Iterator[Path
                 _settle_tree(tmp)
                 _put(tmp, out, manifest, force)
                 sync_directory(out.parent)
+    except BaseException:
+        if "zarr" in sys.modules:
+            from chebsplat.formats.arrays import settle
+
+            settle()
+        raise
     finally:
-        for _ in range(20):  # zarr's threads may still be writing what belongs to a chunk that failed
-            shutil.rmtree(tmp, ignore_errors=True)
-            if not tmp.exists():
-                break
-            time.sleep(0.05)
+        shutil.rmtree(tmp, ignore_errors=True)
 
 
 def _make(tmp: Path, out: Path) -> None:

@@ -22,12 +22,13 @@ SIZE = 64 << 20  # bytes
 
 @dataclass
 class Full:
-    """A run that found so many bytes free of the many that it wants. fault: empty if all is well."""
+    """A run to a stage that found so many bytes free of the many that it wants. fault: empty if all is well."""
 
+    stage: str
     free: int
     wanted: int
     code: int
-    last_stage: str
+    finished: int  # artifacts before the disk was full
     again: int
     fault: str
 
@@ -58,10 +59,10 @@ def leave(disk: Path, free: int) -> Path:
     return filler
 
 
-def one(disk: Path, number: int, free: int, wanted: int, whole: dict[str, str]) -> Full:
+def one(disk: Path, number: int, stage: str, free: int, wanted: int, whole: dict[str, str]) -> Full:
     work, words = disk / f"work-{number}", disk.parent / f"{number}.stderr"
     filler = leave(disk, free)
-    run = Run(work, words=words)
+    run = Run(work, stage=stage, words=words)
     code, fault = run.finish(), ""
     done = [path.parent.name for path in work.glob("store/*/[!.]*")]
     if code != 4:
@@ -72,27 +73,30 @@ def one(disk: Path, number: int, free: int, wanted: int, whole: dict[str, str]) 
         fault = f"left {half[0].name}"
     fault = fault or different(work, whole)
     filler.unlink()
-    again = Run(work, words=words.with_suffix(".again")).finish()
+    again = Run(work, stage=stage, words=words.with_suffix(".again")).finish()
     fault = fault or (f"exit code {again} with room" if again else different(work, whole, True))
     shutil.rmtree(work)
-    return Full(free, wanted, code, done[-1] if done else "none", again, fault)
+    return Full(stage, free, wanted, code, len(done), again, fault)
 
 
 def disks(folder: Path, count: int, seed: int = 0) -> list[Full]:
-    """Full disks of a random free size, in the namespace."""
-    disk = folder / "disk"
+    """Full disks of a random free size, in the namespace; by turns for what a disk meets first, and for all stages."""
+    disk, needs = folder / "disk", {}
     mount(disk, f"size={SIZE}")
-    before, run = shutil.disk_usage(disk).free, Run(disk / "whole", words=folder / "whole.stderr")
-    if run.finish():
-        raise RuntimeError(run.stderr)
-    whole, wanted = contents(disk / "whole"), before - shutil.disk_usage(disk).free
-    shutil.rmtree(disk / "whole")
+    for stage in ("teacher", "export"):
+        before, run = shutil.disk_usage(disk).free, Run(disk / stage, stage=stage, words=folder / f"{stage}.stderr")
+        if run.finish():
+            raise RuntimeError(run.stderr)
+        needs[stage] = (before - shutil.disk_usage(disk).free, contents(disk / stage))
+        shutil.rmtree(disk / stage)
     rng, rows = random.Random(seed), []
     for number in range(count):
-        rows.append(one(disk, number, int(rng.uniform(0.002, 0.9) * wanted), wanted, whole))
+        stage = list(needs)[number % len(needs)]
+        wanted, whole = needs[stage]
+        rows.append(one(disk, number, stage, int(rng.uniform(0.002, 0.9) * wanted), wanted, whole))
         row = rows[-1]
-        print(f"disk: {row.free:,} of {row.wanted:,} bytes free: exit code {row.code} after {row.last_stage}, then "
-              f"{row.again}{'; ' + row.fault if row.fault else ''}", file=sys.stderr, flush=True)  # fmt: skip
+        print(f"disk: {row.free:,} of {row.wanted:,} bytes free: exit code {row.code} after {row.finished} artifacts, "
+              f"then {row.again}{'; ' + row.fault if row.fault else ''}", file=sys.stderr, flush=True)  # fmt: skip
     return rows
 
 
