@@ -121,9 +121,9 @@ def check_place(out: Path, schema: str, key: str, force: bool = False) -> None:
       artifact of the same schema goes, by `force`, and with nothing beside what its manifest lists.
     Raises: InputError saying what stands there; nothing is removed.
     """
-    if out.is_symlink():
+    if os.path.islink(out):
         raise InputError(f"{out} is a link to {os.readlink(out)}: nothing was replaced; name that, or another --out")
-    if not os.path.lexists(out) or (out.is_dir() and (out.name == key or not any(out.iterdir()))):
+    if not os.path.lexists(out) or (os.path.isdir(out) and (out.name == key or not os.listdir(out))):
         return
     if not is_published(out):
         raise InputError(f"{out} exists and is not an artifact: nothing was replaced; choose another --out")

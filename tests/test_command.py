@@ -49,6 +49,43 @@ def test_finished_artifact_is_not_made_again_unless_forced(tmp_path):
     assert len(runs) == 2
 
 
+def test_force_keeps_what_stands_there_until_the_new_one_is_there(tmp_path):
+    assert invoke(good, "--out", tmp_path / "x").exit_code == 0
+    assert invoke(fail_data, "--out", tmp_path / "x", "--force").exit_code == 4
+    artifact.verify(tmp_path / "x")
+
+
+@pytest.mark.parametrize("force", [[], ["--force"]])
+def test_a_place_that_is_not_the_stage_s_is_refused_before_it_runs(tmp_path, force):
+    (tmp_path / "photos").mkdir()
+    (tmp_path / "photos/artifact.json").write_text("{}")
+    assert invoke(good, "--out", tmp_path / "points", stage="sfm").exit_code == 2  # --in-capture is needed
+    with artifact.publish(tmp_path / "points", Manifest(STAGES["sfm"].schema, KEY, "sfm")):
+        pass
+    (tmp_path / "link").symlink_to("points")
+    for place in ("photos", "points", "link"):
+        result = invoke(crash, "--out", tmp_path / place, *force)
+        assert result.exit_code == 3
+        assert str(tmp_path / place) in result.stderr
+    artifact.verify(tmp_path / "points")
+    assert (tmp_path / "photos/artifact.json").read_text() == "{}"
+
+
+@pytest.mark.parametrize("key", ["", "k", "../../x", "/tmp/x", "0" * 17, "G" * 16])
+def test_a_key_is_sixteen_hexadecimal_digits(tmp_path, key):
+    result = invoke(crash, "--out", tmp_path / "x", "--key", key)
+    assert result.exit_code == 2
+    assert "--key" in result.stderr
+
+
+@pytest.mark.parametrize("place", ["file/x", "file/x/y", "n" * 250, "n" * 3000])
+def test_a_place_that_cannot_be_written_is_named_before_the_stage_runs(tmp_path, place):
+    (tmp_path / "file").write_text("years")
+    result = invoke(crash, "--out", tmp_path / place)
+    assert result.exit_code == 2
+    assert str(tmp_path / place) in result.stderr and "choose another --out" in result.stderr
+
+
 def fail_data(job):
     raise DataFailure("3 of 9 views registered")
 

@@ -2,10 +2,22 @@
 
 from __future__ import annotations
 
-from malformed import colmap, commands, images, photos, replica, scannet, settings, seven_scenes, transforms
+from malformed import (
+    arguments,
+    colmap,
+    commands,
+    images,
+    manifests,
+    photos,
+    replica,
+    scannet,
+    settings,
+    seven_scenes,
+    transforms,
+)
 from malformed.case import Case
 
-MODULES = (settings, commands, photos, images, colmap, transforms, replica, scannet, seven_scenes)
+MODULES = (settings, commands, manifests, arguments, photos, images, colmap, transforms, replica, scannet, seven_scenes)
 CASES: list[Case] = [case for module in MODULES for case in module.cases()]
 
 
