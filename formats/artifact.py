@@ -160,6 +160,19 @@ def read_manifest(path: Path, schema: str | None = None) -> Manifest:
     return manifest
 
 
+def stated(path: Path, manifest: Manifest, *names: str, kind: type | tuple[type, ...]) -> Any:
+    """What a manifest says under nested names, such as "config", "cks", "max_rank".
+
+    Raises: InputError if it does not, or says something of another kind.
+    """
+    value: Any = vars(manifest)
+    for name in names:
+        value = value.get(name) if isinstance(value, dict) else None
+    if not isinstance(value, kind):
+        raise InputError(f"{path / MANIFEST} is damaged: {'.'.join(names)} is {value!r:.60}; {remedy(path)}")
+    return value
+
+
 def verify(path: Path, schema: str | None = None) -> Manifest:
     """`read_manifest`, and every digest recomputed and every unlisted file reported."""
     path = Path(path)

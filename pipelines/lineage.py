@@ -118,7 +118,7 @@ def verify(path: Path | None, earlier: Path | None) -> str:
         return "not in this store: nothing to check"
     artifact.verify(path, SCHEMA)
     basis, manifest = read_basis(path), artifact.read_manifest(path)
-    share = manifest.config["cks"]["max_rank"]
+    share = artifact.stated(path, manifest, "config", "cks", "max_rank", kind=(int, float))
     for name, columns in basis.bases.items():
         before = basis.lineage[-1]["projections"][name]["rank_before"]
         if columns.shape[1] > max(int(share * len(columns)), before):

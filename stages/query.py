@@ -59,13 +59,15 @@ def run(folder: Path, text: str, phrases: list[str], out: Path, n_rows: int) -> 
 
 def understood(path: Path, text: str, phrases: list[str]) -> Query:
     """The words as vectors of the scene's channels, by the teacher that the scene was trained from."""
-    from chebsplat.formats.artifact import read_manifest
+    from types import NoneType
+
+    from chebsplat.formats.artifact import read_manifest, stated
     from chebsplat.formats.features import read_features
 
     features = read_features(path)
     if features.convention["kind"] in ("labels", "given") or features.convention.get("output") == "logits":
         return among_labels(features, text, phrases)
-    model = read_manifest(path).config["teacher"]["model"]
+    model = stated(path, read_manifest(path), "config", "teacher", "model", kind=(str, NoneType))
     try:
         vectors = embedded([text, *(phrases or CANONICAL)], features, model)
     except InputError as error:

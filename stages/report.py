@@ -40,7 +40,7 @@ FRAMES = {"color": "colour", "color_and_features": "colour and features"}
 def run(job: Job) -> None:
     import json
 
-    from chebsplat.formats.artifact import read_manifest
+    from chebsplat.formats.artifact import read_manifest, stated
     from chebsplat.formats.evaluation import read_evaluation
     from chebsplat.formats.gaussians import read_gaussians
     from chebsplat.stages import figures as draw
@@ -55,15 +55,18 @@ def run(job: Job) -> None:
     manifests = {role: read_manifest(job.inputs[role]) for role in STAGE_OF if role in job.inputs}
     figures = evaluation.figures
     left_out = absent_stages(job, gaussians) | figures["left_out"]
-    for manifest in manifests.values():
-        left_out |= manifest.facts.get("left_out", {})
+    for role, manifest in manifests.items():
+        if "left_out" in manifest.facts:
+            left_out |= stated(job.inputs[role], manifest, "facts", "left_out", kind=dict)
     stages = [(STAGE_OF[role], m.seconds, m.key, m.device, m.threads) for role, m in manifests.items()]
     versions: dict[str, str] = {}
     settings: dict[str, Any] = {}
     for manifest in manifests.values():
         versions |= manifest.versions
         settings |= manifest.config
-    by_degree = manifests["scene"].facts["by_degree"] if "scene" in manifests else None
+    by_degree = None
+    if "scene" in manifests:
+        by_degree = stated(job.inputs["scene"], manifests["scene"], "facts", "by_degree", kind=list)
     rows = summary_rows(figures, by_degree, manifests["gaussians"].facts)
     write_table(job.out / "figures.csv", rows)
     write_table(job.out / "trace.csv", [list(gaussians.trace[0]), *(list(row.values()) for row in gaussians.trace)])

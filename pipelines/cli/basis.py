@@ -36,7 +36,7 @@ def found(name: str) -> tuple[Path, Basis]:
 @click.option("--out", type=click.Path(path_type=Path), help="folder for lineage.csv and lineage.png")
 def log(name: str, out: Path | None) -> None:
     """Revisions: the scene, ranks, ρ before and after, energy; means over projections."""
-    from chebsplat.formats.artifact import read_manifest
+    from chebsplat.formats import artifact
     from chebsplat.pipelines import lineage
 
     path, one = found(name)
@@ -48,7 +48,8 @@ def log(name: str, out: Path | None) -> None:
             writer = csv.DictWriter(handle, list(rows[0]))
             writer.writeheader()
             writer.writerows(rows)
-        lineage.draw(out / "lineage.png", one, read_manifest(path).config["cks"]["max_rank"])
+        share = artifact.stated(path, artifact.read_manifest(path), "config", "cks", "max_rank", kind=(int, float))
+        lineage.draw(out / "lineage.png", one, share)
         print(f"{out}: lineage.csv, lineage.png", file=sys.stderr)
 
 

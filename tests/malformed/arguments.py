@@ -164,7 +164,19 @@ def _exported(damage: str) -> Callable[[Path], Asked]:
     return build
 
 
+def _without_a_rank(folder: Path) -> Asked:
+    """Right in every file but the settings that its manifest says."""
+    from chebsplat.formats import artifact
+    from chebsplat.formats.basis import SCHEMA, Basis, write_basis
+    from chebsplat.formats.manifest import Manifest
+
+    with artifact.publish(folder / "knowledge", Manifest(SCHEMA, KEY, "cks")) as tmp:
+        write_basis(tmp, Basis({}, {}, [{"scene": "toy", "gaussians": KEY, "projections": {}}]))
+    return Asked(["basis", "verify", f"{folder / 'knowledge'}/"], "config.cks.max_rank")
+
+
 def cases() -> Iterator[Case]:
+    yield Case("argument", "basis verify FOLDER/, settings gone", _without_a_rank, (3,))
     for key in KEYS:
         yield Case("argument", f"--key {key!r}", _key(key), (2,))
     for option, values in NAMES.items():
