@@ -158,7 +158,13 @@ def last_word(log: Path) -> str:
 
 
 def git_state(root: Path) -> dict[str, Any]:
-    """{"commit", "dirty"} of the checkout; empty outside one."""
+    """{"commit", "dirty"} of the checkout that the layer `root` belongs to; empty where it is installed.
+
+    Choices: a repository around an environment that chebsplat is installed in is none of ours: neither is its commit
+      recorded, nor git started in it, which runs what its settings name.
+    """
+    if not (root.parent / ".git").exists():
+        return {}
     try:
         run = {"cwd": root, "capture_output": True, "text": True, "check": True}
         commit = subprocess.run(["git", "rev-parse", "HEAD"], **run).stdout.strip()  # type: ignore[call-overload]

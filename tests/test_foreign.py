@@ -48,3 +48,18 @@ def test_what_the_user_says_of_telemetry_stands(said):
     env = os.environ | {"ORT_DISABLE_TELEMETRY": said}
     done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, env=env)
     assert done.stdout == f"{said}\n"
+
+
+def test_git_is_not_asked_about_a_repository_that_chebsplat_is_merely_installed_in(tmp_path):
+    from chebsplat.pipelines.run import HERE, git_state
+
+    layer = tmp_path / "project/.venv/site-packages/chebsplat/pipelines"
+    layer.mkdir(parents=True)
+    subprocess.run(["git", "init", "-q", tmp_path / "project"], check=True)
+    hook = tmp_path / "hook"
+    hook.write_text(f"#!/bin/sh\ntouch {tmp_path / 'ran'}\n")
+    hook.chmod(0o755)
+    subprocess.run(["git", "config", "core.fsmonitor", hook], cwd=tmp_path / "project", check=True)
+    assert git_state(layer) == {}
+    assert not (tmp_path / "ran").exists()
+    assert set(git_state(HERE)) <= {"commit", "dirty"}
