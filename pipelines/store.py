@@ -128,6 +128,13 @@ def unnamed(without: Container[Path] = ()) -> list[tuple[Path, int]]:
     return [(p, sum(f.stat().st_size for f in p.rglob("*") if f.is_file())) for p in found]
 
 
+def sweep() -> None:
+    """Remove what Snakemake remembers of earlier runs, and their locks; nothing while a run is under way."""
+    if not any(map(_owner_lives, work().glob(".plans/*"))):
+        for name in (".snakemake", ".done", ".locks"):
+            shutil.rmtree(work() / name, ignore_errors=True)
+
+
 def _real(path: Path) -> Path:
     """Where a path leads; unlike `Path.resolve`, it takes links that lead in a circle for what they are."""
     return Path(os.path.realpath(path))

@@ -12,6 +12,7 @@ from click.testing import CliRunner
 from soak.tiny import Run, artifacts, contents, hidden, kill
 
 from chebsplat.errors import Stopped
+from chebsplat.pipelines import store
 from chebsplat.pipelines.cli.group import Guarded
 from chebsplat.stages import stopping
 
@@ -93,3 +94,14 @@ def test_an_ignored_signal_stays_ignored():
             os.kill(os.getpid(), signal.SIGHUP)
     finally:
         signal.signal(signal.SIGHUP, before)
+
+
+def test_what_runs_leave_beside_the_store_is_swept_when_none_is_under_way(tmp_path, monkeypatch):
+    monkeypatch.setenv("CHEBSPLAT_WORK", str(tmp_path))
+    for name in (".snakemake/log", ".done", ".locks", f".plans/abc-{os.getpid()}"):
+        (tmp_path / name).mkdir(parents=True)
+    store.sweep()
+    assert (tmp_path / ".snakemake/log").is_dir()
+    (tmp_path / f".plans/abc-{os.getpid()}").rmdir()
+    store.sweep()
+    assert sorted(path.name for path in tmp_path.iterdir()) == [".plans"]

@@ -82,6 +82,7 @@ def clean_stale(yes: bool) -> None:
     if yes:
         for path, _ in found:
             store.remove(path)
+        store.sweep()
 
 
 COMMANDS = (list_scenes, rm, verify, clean_stale)

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import csv
 import json
+import os
 import shutil
 import signal
 import subprocess
@@ -21,6 +22,7 @@ from typing import Any
 
 from soak.disk import Full, namespace
 from soak.kills import kills
+from soak.runs import WARM, Count, growth, sizes
 
 COUNTS = {"kills": 200, "stops": 50, "disk": 20, "runs": 60}
 
@@ -71,11 +73,32 @@ def do_disk(folder: Path, asked: dict[str, int]) -> int:
     return faults
 
 
+def do_runs(folder: Path, asked: dict[str, int]) -> int:
+    """In a process of their own, whose memory and files are counted."""
+    work, temporary = folder / "work", folder / "tmp"
+    temporary.mkdir()
+    environment = os.environ | {"CHEBSPLAT_WORK": str(work), "TMPDIR": str(temporary)}
+    command = [sys.executable, "-m", "soak.runs", str(asked["runs"])]
+    done = subprocess.run(command, stdout=subprocess.PIPE, text=True, env=environment)
+    if done.returncode:
+        return 1
+    rows = [Count(**row) for row in json.loads(done.stdout)]
+    clean = [sys.executable, "-m", "chebsplat.pipelines.cli", "clean-stale", "--yes"]
+    subprocess.run(clean, env=environment, check=True)
+    there, named = sizes(work)
+    faults = growth(rows) + ([f"{there} bytes in the store, {named} in its manifests"] if there != named else [])
+    for row in (rows[0], rows[min(WARM, len(rows) - 1)], rows[len(rows) // 2], rows[-1]):
+        print(row)
+    print(f"{len(rows)} runs; after clean-stale {there:,} bytes in the store, {named:,} in its manifests; "
+          f"{'; '.join(faults) or 'flat'}; {table('runs', rows)}")  # fmt: skip
+    return len(faults)
+
+
 def main(arguments: list[str]) -> int:
     signal.signal(signal.SIGINT, signal.default_int_handler)  # a shell's `&` has runs ignore it
     asked, faults = counts(arguments), 0
     folder = Path(tempfile.mkdtemp(prefix="soak-"))
-    for part, names in {do_kills: ("kills", "stops"), do_disk: ("disk",)}.items():
+    for part, names in {do_kills: ("kills", "stops"), do_disk: ("disk",), do_runs: ("runs",)}.items():
         if any(asked.get(name) for name in names):
             began = time.monotonic()
             place = folder / names[0]

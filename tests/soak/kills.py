@@ -21,7 +21,7 @@ ORPHAN = 5.0  # seconds after which a process that is left counts as one
 
 @dataclass
 class Blow:
-    """What one kill or stop did. left: processes; half: artifacts; fault: empty if all is well."""
+    """What one kill or stop did: seconds until no process was left; fault: empty if all is well."""
 
     how: str
     delay: float
