@@ -14,7 +14,8 @@ from pathlib import Path
 from chebsplat.stages.stopping import LIFELINE, PATIENCE
 
 # Snakemake's own words go to a file; its jobs inherit the real stderr, which may be a terminal. Its standard input, and
-# theirs, is the lifeline (stages/stopping.py): without a run it ends at once, and its jobs stop by themselves.
+# theirs, is the lifeline (stages/stopping.py): without a run it ends at once, and its jobs stop by themselves. Its
+# cache lies beside its other files, not in the home folder, which may be full or read-only.
 SNAKEMAKE = """
 import os, sys, threading
 def watch():
@@ -23,22 +24,25 @@ def watch():
     os._exit(143)
 threading.Thread(target=watch, daemon=True).start()
 sys.stderr = open(sys.argv.pop(1), "w", 1)
+import platformdirs, snakemake.common
+own = type("Own", (platformdirs.PlatformDirs,), {"user_cache_dir": sys.argv.pop(1)})
+snakemake.common.APPDIRS = own("snakemake", "snakemake")
 from snakemake.cli import main
 main()
 """
 
 
-def snakemake(words: Path, arguments: list[str], environment: Mapping[str, str]) -> int:
+def snakemake(words: Path, cache: Path, arguments: list[str], environment: Mapping[str, str]) -> int:
     """Run Snakemake; returns its exit code when it and all that it has started are gone.
 
-    Args: words: a file for what it says; environment: variables beside our own.
+    Args: words: a file for what it says; cache: a folder for its own; environment: variables beside our own.
     """
     reader, writer = os.pipe()
     with open(reader, "rb") as lifeline, open(writer, "wb") as held:
         environment = {LIFELINE: str(os.fstat(reader).st_ino), "PYTHONSAFEPATH": "1", **environment}
         # -P and PYTHONSAFEPATH: a module where the user stands, or in the work folder, is never run. A session of its
         # own: a terminal's Ctrl-C reaches the run alone, which ends its jobs in good order.
-        process = subprocess.Popen([sys.executable, "-P", "-c", SNAKEMAKE, str(words), *arguments],
+        process = subprocess.Popen([sys.executable, "-P", "-c", SNAKEMAKE, str(words), str(cache), *arguments],
                                    stdin=lifeline, stdout=subprocess.DEVNULL, start_new_session=True,
                                    env=os.environ | environment)  # fmt: skip
         try:

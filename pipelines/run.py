@@ -107,7 +107,7 @@ def snakemake(steps: list[Step], cores: int, threads: int | None = None, device:
     keep = False
     try:
         environment = {"CHEBSPLAT_THREADS": str(threads or cores), "CHEBSPLAT_WORK": str(store.work())}
-        keep = children.snakemake(words, arguments, environment) != 0
+        keep = children.snakemake(words, store.work() / ".snakemake/cache", arguments, environment) != 0
         return failures(steps, folder, words) if keep else Outcome()
     finally:
         if not keep:

@@ -20,13 +20,18 @@ from chebsplat.formats.artifact import Manifest
 MOUNT = 'mount -t tmpfs -o "$0" tmpfs "$1" && shift && exec "$@"'
 
 
+@pytest.fixture(autouse=True)
+def _no_work_folder_of_the_caller(monkeypatch):
+    monkeypatch.delenv("CHEBSPLAT_WORK", raising=False)
+
+
 def on_a_disk(folder, options, *arguments):
-    """A `chebsplat` command whose work folder is a disk of its own."""
+    """A `chebsplat` command whose work folder, or another, is a disk of its own."""
     if (unshare := namespace()) is None:
         pytest.skip("nothing can be mounted here (root, or user namespaces, are needed)")
     command = [*unshare, "sh", "-c", MOUNT, options, folder, sys.executable, "-P", "-m", "chebsplat.pipelines.cli"]
-    return subprocess.run([*command, *arguments], cwd=ROOT, env=os.environ | {"CHEBSPLAT_WORK": str(folder)},
-                          capture_output=True, text=True)  # fmt: skip
+    env = {"CHEBSPLAT_WORK": str(folder)} | os.environ
+    return subprocess.run([*command, *arguments], cwd=ROOT, env=env, capture_output=True, text=True)
 
 
 def test_a_stage_on_a_full_disk_exits_4_with_file_and_bytes(tmp_path):
@@ -45,6 +50,15 @@ def test_a_work_folder_that_takes_nothing_is_said_before_anything_runs(tmp_path,
     assert "Traceback" not in done.stderr
     assert done.stderr.splitlines()[-1].startswith(f"chebsplat: {tmp_path}")
     assert "cannot be written" in done.stderr.splitlines()[-1]
+
+
+def test_a_home_folder_that_takes_nothing_stops_no_run(tmp_path, monkeypatch):
+    (tmp_path / "home").mkdir()
+    monkeypatch.setenv("HOME", str(tmp_path / "home"))
+    monkeypatch.delenv("XDG_CACHE_HOME", raising=False)
+    monkeypatch.setenv("CHEBSPLAT_WORK", str(tmp_path / "work"))
+    done = on_a_disk(tmp_path / "home", "ro", "run", "--scene", "toy", "--stage", "ingest")
+    assert done.returncode == 0, done.stderr
 
 
 def test_a_full_disk_is_recognised_behind_a_library_s_own_error(tmp_path):
