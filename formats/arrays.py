@@ -11,13 +11,18 @@ import itertools
 import math
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any, Literal
 
 import numpy as np
+from annotated_types import Ge, Len
 
 from chebsplat.errors import InputError
 from chebsplat.formats import artifact
 from chebsplat.formats.artifact import Manifest
+from chebsplat.formats.documents import Count, NotRequired, Positive, TypedDict, conform
+from chebsplat.formats.files import parse_json
+
+TIGHTEST = 32_768  # bytes that zstd packs into one
 
 
 def create_array(
@@ -93,23 +98,22 @@ def _file_shape(array: Any) -> tuple[int, ...]:
 
 
 class StoredArray:
-    """A published array, read chunk by chunk: `array[i]`, `array[a:b]`, `array[:]` give numpy arrays."""
+    """A published array, read chunk by chunk: `array[i]`, `array[a:b]`, `array[:]` give numpy arrays.
 
-    def __init__(self, root: Path, manifest: Manifest, name: str):
-        """Raises: InputError if metadata is damaged or a chunk is not listed in the manifest."""
+    Values are held against `within` (lowest, highest) as they are read; nan lies in no range.
+    """
+
+    def __init__(self, root: Path, manifest: Manifest, name: str, within: tuple[float, float] | None = None):
+        """Raises: InputError if metadata is damaged, or its chunks are not those that the manifest lists."""
         import zarr
 
-        self.root, self.path = root, root / name
-        artifact.checked(root, manifest, f"{name}/zarr.json")
+        self.root, self.path, self.within = root, root / name, within
+        metadata = artifact.checked(root, manifest, f"{name}/zarr.json")
+        _check_metadata(metadata, manifest, name, artifact.remedy(root))
         try:
             self._array: Any = zarr.open_array(str(self.path), mode="r")
-        except (ValueError, KeyError, OSError) as error:
-            raise InputError(
-                f"{self.path / 'zarr.json'} is not zarr metadata ({error}); {artifact.remedy(root)}"
-            ) from None
-        for chunk in chunk_names(self._array):
-            if f"{name}/{chunk}" not in manifest.files:
-                raise InputError(f"{self.path / chunk} is missing; {artifact.remedy(root)}")
+        except (ValueError, KeyError, TypeError, AttributeError, OSError) as error:
+            raise InputError(f"{metadata} is not zarr metadata ({error}); {artifact.remedy(root)}") from None
         self.shape: tuple[int, ...] = self._array.shape
         self.dtype: np.dtype = self._array.dtype
         attributes: Any = self._array.attrs
@@ -120,11 +124,19 @@ class StoredArray:
 
     def __getitem__(self, index: Any) -> np.ndarray:
         try:
-            return np.asarray(self._array[index])
+            values = np.asarray(self._array[index])
         except IndexError:
             raise
         except (ValueError, RuntimeError, OSError) as error:
             raise InputError(f"{self.path}: {self._culprit()}: {error}; {artifact.remedy(self.root)}") from None
+        if self.within is not None and values.size:
+            low, high = self.within
+            if not (values.min() >= low and values.max() <= high):
+                raise InputError(
+                    f"{self.path} holds {values.min():g} to {values.max():g}, {low:g} to {high:g} are possible; "
+                    + artifact.remedy(self.root)
+                )
+        return values
 
     def __array__(self, dtype: Any = None, copy: bool | None = None) -> np.ndarray:
         return np.asarray(self[:], dtype)
@@ -141,15 +153,83 @@ class StoredArray:
         return "a chunk is damaged"
 
 
-def open_array(root: Path, manifest: Manifest, name: str, shape: Sequence[int | None], dtype: str) -> StoredArray:
+def open_array(
+    root: Path,
+    manifest: Manifest,
+    name: str,
+    shape: Sequence[int | None],
+    dtype: str,
+    within: tuple[float, float] | None = None,
+) -> StoredArray:
     """A listed array whose shape (None: any size) and dtype are as expected. Raises InputError otherwise."""
-    array = StoredArray(root, manifest, name)
+    array = StoredArray(root, manifest, name, within)
     fits = len(array.shape) == len(shape) and all(w in (None, n) for n, w in zip(array.shape, shape, strict=True))
     if not fits or array.dtype != np.dtype(dtype):
         raise InputError(
             f"{array.path} is {array.dtype} {array.shape}, expected {dtype} {tuple(shape)}; {artifact.remedy(root)}"
         )
     return array
+
+
+class _Codec(TypedDict):
+    name: Literal["bytes", "zstd", "crc32c", "sharding_indexed"]
+    configuration: NotRequired[dict[str, Any]]
+
+
+class _Chunks(TypedDict):
+    chunk_shape: list[Annotated[int, Ge(1)]]
+
+
+class _Grid(TypedDict):
+    name: Literal["regular"]
+    configuration: _Chunks
+
+
+class _Attributes(TypedDict):
+    scale_factor: NotRequired[Positive]
+
+
+class _Metadata(TypedDict):
+    """What `create_array` writes of zarr's own."""
+
+    zarr_format: Literal[3]
+    node_type: Literal["array"]
+    shape: Annotated[list[Count], Len(1, 8)]
+    data_type: Literal["bool", "uint8", "int16", "int32", "float16", "float32"]
+    chunk_grid: _Grid
+    codecs: list[_Codec]
+    attributes: _Attributes
+
+
+def _check_metadata(file: Path, manifest: Manifest, name: str, remedy: str) -> None:
+    """Hold what zarr's metadata declare against the files of the manifest, before zarr believes them.
+
+    Choices: zstd stores 128 KB of one value in 4 bytes, its best; what claims to be packed more tightly lies.
+    """
+    found = conform(parse_json(file, remedy), _Metadata, file, remedy)
+    shape, part = found["shape"], found["chunk_grid"]["configuration"]["chunk_shape"]
+    for codec in found["codecs"]:
+        inner = codec.get("configuration", {})
+        conform([*inner.get("codecs", []), *inner.get("index_codecs", [])], list[_Codec], file, remedy)
+    held = {path: entry["bytes"] for path, entry in manifest.files.items() if path.startswith(f"{name}/c/")}
+    if len(part) != len(shape):
+        raise InputError(f"{file} declares chunks {part} of an array {shape}; {remedy}")
+    grid = [-(-n // c) for n, c in zip(shape, part, strict=True)]
+    for k in range(min(math.prod(grid), len(held) + 1)):
+        if (chunk := "/".join([name, "c", *map(str, _unravelled(k, grid))])) not in held:
+            raise InputError(f"{file.parents[name.count('/') + 1] / chunk} is missing; {remedy}")
+    size, least = math.prod(part) * np.dtype(found["data_type"]).itemsize, min(held.values(), default=0)
+    if held and size > TIGHTEST * max(least, 64):
+        raise InputError(f"{file} declares {size:,} bytes of a file of {least}; {remedy}")
+
+
+def _unravelled(k: int, grid: list[int]) -> list[int]:
+    """Indices of the k-th file in a grid of any size."""
+    index = []
+    for n in reversed(grid):
+        k, last = divmod(k, n)
+        index.append(last)
+    return index[::-1]
 
 
 def has_array(manifest: Manifest, name: str) -> bool:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -11,11 +10,28 @@ import numpy as np
 
 from chebsplat.errors import InputError
 from chebsplat.formats import artifact
-from chebsplat.formats.documents import read_document, write_document
+from chebsplat.formats.documents import Count, TypedDict, read_document, write_document
 from chebsplat.formats.tensors import read_tensors, write_tensors
 
 SCHEMA = "chebsplat.basis/2"
 ORTHONORMAL = 1e-6
+
+
+class Report(TypedDict):
+    """Of `cks.update`."""
+
+    rank_before: Count
+    rank_after: Count
+    added: Count
+    rho: float
+    rho_after: float
+    energy: float
+
+
+class Entry(TypedDict):
+    scene: str
+    gaussians: str
+    projections: dict[str, Report]
 
 
 @dataclass
@@ -50,6 +66,8 @@ def read_basis(path: Path) -> Basis:
     lineage = read_lineage(path)
     file = path / "bases.safetensors"
     for name, columns in bases.items():
+        if columns.ndim != 2 or columns.dtype != np.float32:
+            raise InputError(f"{file}: {name} is no float32 matrix; {artifact.remedy(path)}")
         if (error := off_orthonormal(columns)) > ORTHONORMAL:
             raise InputError(f"{file}: {name} is not orthonormal ({error:.1e}); {artifact.remedy(path)}")
         rank = lineage[-1]["projections"].get(name, {}).get("rank_after") if lineage else 0
@@ -68,8 +86,5 @@ def off_orthonormal(columns: np.ndarray) -> float:
 def read_lineage(path: Path) -> list[dict[str, Any]]:
     """The lineage alone. Raises InputError naming file and remedy."""
     manifest = artifact.read_manifest(path, SCHEMA)
-    entries: list[dict[str, Any]] = read_document(path, manifest, "lineage.json")
-    for entry in entries:
-        if not {"scene", "gaussians", "projections"} <= entry.keys():
-            raise InputError(f"{path / 'lineage.json'} lacks fields: {json.dumps(entry)[:80]}; {artifact.remedy(path)}")
+    entries: list[dict[str, Any]] = read_document(path, manifest, "lineage.json", list[Entry])
     return entries

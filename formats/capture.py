@@ -11,7 +11,9 @@ import numpy as np
 from chebsplat.errors import InputError
 from chebsplat.formats import artifact
 from chebsplat.formats.arrays import StoredArray, has_array, open_array, write_array
-from chebsplat.formats.documents import read_document, write_document
+from chebsplat.formats.cameras import POSES, check_cameras
+from chebsplat.formats.documents import TypedDict, read_document, write_document
+from chebsplat.formats.names import check_names
 from chebsplat.formats.tensors import read_tensors, write_tensors
 
 SCHEMA = "chebsplat.capture/1"
@@ -61,9 +63,16 @@ class Capture:
         return self.images.shape[2], self.images.shape[1]
 
 
+class Document(TypedDict):
+    names: list[str]
+    class_names: list[str] | None
+    source: dict[str, Any]
+    protocol: dict[str, Any]
+
+
 def write_capture(out: Path, capture: Capture) -> None:
     """Fill the directory that `artifact.publish` yields. Raises InputError if the views do not fit together."""
-    _check(capture, "capture")
+    _check(capture, "capture", "correct the source")
     write_array(out / "images", np.asarray(capture.images), ("view", "row", "column", "channel"), "sRGB")
     for name, (dtype, dimensions, units) in OPTIONAL.items():
         data = getattr(capture, name)
@@ -91,16 +100,19 @@ def read_capture(path: Path) -> Capture:
     """Images, depth, labels and masks stay on disk until indexed. Raises InputError naming file and remedy."""
     path = Path(path)
     manifest = artifact.read_manifest(path, SCHEMA)
-    document = read_document(path, manifest, "capture.json", ("names", "class_names", "source", "protocol"))
-    cameras = read_tensors(path, manifest, "cameras.safetensors", {"Ks": ("v", 3, 3), "is_test": ("v",)})
+    document = read_document(path, manifest, "capture.json", Document)
+    cameras = read_tensors(path, manifest, "cameras.safetensors", {"Ks": POSES["Ks"], "is_test": ("uint8", "v")})
     images = open_array(path, manifest, "images", (len(document["names"]), None, None, 3), "uint8")
+    last = len(document["class_names"] or []) - 1
+    within = {"labels": (-1, last), "pseudo_labels": (-1, last), "confidence": (0, 1)}
     optional = {
-        name: open_array(path, manifest, name, images.shape[:3], dtype) if has_array(manifest, name) else None
+        name: open_array(path, manifest, name, images.shape[:3], dtype, within.get(name))
         for name, (dtype, _, _) in OPTIONAL.items()
+        if has_array(manifest, name)
     }
     cloud = {}
     if "points.safetensors" in manifest.files:
-        cloud = read_tensors(path, manifest, "points.safetensors", {"points": ("n", 3)})
+        cloud = read_tensors(path, manifest, "points.safetensors", {"points": ("float32", "n", 3)})
     capture = Capture(
         document["names"],
         images,
@@ -114,28 +126,28 @@ def read_capture(path: Path) -> Capture:
         source=document["source"],
         protocol=document["protocol"],
     )
-    _check(capture, str(path))
+    _check(capture, str(path), artifact.remedy(path))
     return capture
 
 
-def _check(capture: Capture, where: str) -> None:
-    n = len(capture.names)
-    if len(set(capture.names)) != n:
-        twice = next(name for name in capture.names if capture.names.count(name) > 1)
-        raise InputError(f"{where}: view name {twice} occurs twice; rename the image")
+def _check(capture: Capture, where: str, remedy: str) -> None:
+    n, poses = len(capture.names), capture.cam_from_world
+    check_names(capture.names, "view names", where, remedy)
+    if capture.class_names is not None:
+        check_names(capture.class_names, "class names", where, remedy)
     for name in ("images", "Ks", "is_test", "cam_from_world", *OPTIONAL):
         data = getattr(capture, name)
         if data is not None and len(data) != n:
-            raise InputError(f"{where}: {len(data)} {name} for {n} views")
+            raise InputError(f"{where}: {len(data)} {name} for {n} views; {remedy}")
     for name in OPTIONAL:
         data = getattr(capture, name)
         if data is not None and tuple(data.shape) != tuple(capture.images.shape[:3]):
-            raise InputError(f"{where}: {name} is {data.shape}, images are {capture.images.shape}")
+            raise InputError(f"{where}: {name} is {data.shape}, images are {capture.images.shape}; {remedy}")
     if (capture.labels is not None or capture.pseudo_labels is not None) and not capture.class_names:
         raise InputError(f"{where}: labels without class names; name them in scene.json or labels.json")
-    if capture.cam_from_world is not None:
-        rotations = capture.cam_from_world[:, :3, :3]
-        error = np.abs(rotations @ rotations.transpose(0, 2, 1) - np.eye(3)).max(axis=(1, 2))
-        if not np.all(error < 1e-3):
-            worst = int(np.argmax(np.nan_to_num(error, nan=np.inf)))
-            raise InputError(f"{where}: the pose of {capture.names[worst]} is not a rotation; correct the source")
+    if (poses is not None and poses.shape[1:] != (4, 4)) or capture.Ks.shape[1:] != (3, 3):
+        raise InputError(f"{where}: cameras are no matrices 3x3 and 4x4; {remedy}")
+    check_cameras(capture.names, capture.Ks, poses, where, remedy)
+    points, colors = capture.points, capture.point_colors
+    if points is not None and colors is not None and (colors.shape, colors.dtype) != (points.shape, np.uint8):
+        raise InputError(f"{where}: points {points.shape} with colours {colors.dtype} {colors.shape}; {remedy}")

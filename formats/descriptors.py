@@ -8,11 +8,22 @@ from typing import Any
 
 import numpy as np
 
+from chebsplat.errors import InputError
 from chebsplat.formats import artifact
-from chebsplat.formats.documents import read_document, write_document
-from chebsplat.formats.tensors import read_tensors, write_tensors
+from chebsplat.formats.documents import Positive, TypedDict, read_document, write_document
+from chebsplat.formats.tensors import Spec, read_tensors, write_tensors
 
 SCHEMA = "chebsplat.descriptors/1"
+SPECS: dict[str, Spec] = {
+    "centers": ("int64", "m"),
+    "members": ("int64", "m", "n"),
+    "values": ("float32", "m", "n", "j", "d"),
+}
+
+
+class Settings(TypedDict):
+    radius: Positive
+    share: Positive
 
 
 @dataclass
@@ -30,7 +41,7 @@ class Descriptors:
 
 def write_descriptors(out: Path, descriptors: Descriptors) -> None:
     """Fill the directory that `artifact.publish` yields. Raises ValueError on a non-finite value."""
-    arrays = {name: getattr(descriptors, name) for name in ("centers", "members", "values")}
+    arrays = {name: getattr(descriptors, name) for name in SPECS}
     write_tensors(out / "descriptors.safetensors", arrays)
     write_document(out / "settings.json", descriptors.settings)
 
@@ -39,7 +50,9 @@ def read_descriptors(path: Path) -> Descriptors:
     """Raises: InputError naming the damaged file and the remedy."""
     path = Path(path)
     manifest = artifact.read_manifest(path, SCHEMA)
-    shapes = {"centers": ("m",), "members": ("m", "n"), "values": ("m", "n", "j", "d")}
-    arrays = read_tensors(path, manifest, "descriptors.safetensors", shapes)
-    settings = read_document(path, manifest, "settings.json", ("radius", "share"))
-    return Descriptors(**{k: arrays[k] for k in shapes}, settings=settings)
+    arrays = read_tensors(path, manifest, "descriptors.safetensors", SPECS)
+    centers, members = arrays["centers"], arrays["members"]
+    if min(centers.min(initial=0), members.min(initial=0) + 1) < 0:
+        raise InputError(f"{path / 'descriptors.safetensors'}: an index is negative; {artifact.remedy(path)}")
+    settings = read_document(path, manifest, "settings.json", Settings)
+    return Descriptors(**{name: arrays[name] for name in SPECS}, settings=settings)

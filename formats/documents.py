@@ -1,29 +1,45 @@
-"""Small JSON documents inside artifacts, checked against their digest on reading."""
+"""Small JSON documents inside artifacts, held against their digest and their declared type on reading."""
 
 from __future__ import annotations
 
 import json
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any, NotRequired
+
+from annotated_types import Ge, Gt, Le
+from typing_extensions import TypedDict
 
 from chebsplat.errors import InputError
 from chebsplat.formats import artifact
 from chebsplat.formats.artifact import Manifest
+from chebsplat.formats.files import parse_json
+
+__all__ = ["Count", "NotRequired", "Positive", "Side", "TypedDict", "conform", "read_document", "write_document"]
+
+Count = Annotated[int, Ge(0)]
+Positive = Annotated[float, Gt(0)]
+Side = Annotated[int, Ge(1), Le(65_536)]  # of an image, pixels
 
 
 def write_document(path: Path, value: Any) -> None:
-    """Write `value` as JSON. Raises ValueError on a value JSON does not have, nan among them."""
-    path.write_text(json.dumps(value, indent=1, allow_nan=False) + "\n")
+    """Write `value` as JSON. Raises ValueError on a value JSON or UTF-8 does not have, nan among them."""
+    path.write_text(json.dumps(value, indent=1, allow_nan=False, ensure_ascii=False) + "\n", encoding="utf-8")
 
 
-def read_document(root: Path, manifest: Manifest, name: str, fields: tuple[str, ...] = ()) -> Any:
-    """Read a listed document that has at least `fields`. Raises InputError naming file and remedy."""
+def read_document(root: Path, manifest: Manifest, name: str, kind: Any = dict[str, Any]) -> Any:
+    """Read a listed document of a type, such as a TypedDict. Raises InputError naming file, field and remedy."""
     path = artifact.checked(root, manifest, name)
+    return conform(parse_json(path, artifact.remedy(root), finite=True), kind, path, artifact.remedy(root))
+
+
+def conform(value: Any, kind: Any, where: object, remedy: str) -> Any:
+    """`value` itself, if it is of a type. Raises InputError naming the first field that is not."""
+    from pydantic import TypeAdapter, ValidationError
+
     try:
-        value = json.loads(path.read_text())
-    except ValueError as error:
-        raise InputError(f"{path} does not parse ({error}); {artifact.remedy(root)}") from None
-    absent = [field for field in fields if field not in value]
-    if absent:
-        raise InputError(f"{path} has no {absent[0]}; {artifact.remedy(root)}")
+        TypeAdapter(kind).validate_python(value, strict=True)
+    except ValidationError as error:
+        first = error.errors()[0]
+        field = ".".join(str(part)[:60] for part in first["loc"]) or "the document"
+        raise InputError(f"{where}: {field}: {first['msg']}; {remedy}") from None
     return value

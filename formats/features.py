@@ -15,14 +15,24 @@ import numpy as np
 from chebsplat.errors import InputError
 from chebsplat.formats import artifact
 from chebsplat.formats.arrays import StoredArray, create_array, has_array, open_array
-from chebsplat.formats.documents import read_document, write_document
-from chebsplat.formats.projection import SHAPES, Projection, from_parts, tensors
+from chebsplat.formats.documents import NotRequired, TypedDict, read_document, write_document
+from chebsplat.formats.names import check_names
+from chebsplat.formats.projection import SPECS, Projection, from_parts, tensors
+from chebsplat.formats.projection import Document as ProjectionDocument
 from chebsplat.formats.tensors import read_tensors, write_tensors
 
 SCHEMA = "chebsplat.features/1"
 AXES = ("view", "row", "column", "channel")
 DTYPES = {"features": np.float16, "pseudo_labels": np.int16, "confidence": np.float16}
+LARGEST = 65_504.0  # of float16
 PATCH = 64  # longest side, in feature pixels, of a patch that is read on its own
+
+
+class Document(TypedDict):
+    names: list[str]
+    label_names: list[str]
+    convention: dict[str, Any]
+    projection: NotRequired[ProjectionDocument]
 
 
 @dataclass
@@ -137,6 +147,7 @@ class FeatureWriter:
                 file = self._file(name, view)
                 _link(file, out / file.relative_to(self.folder))
             _link(self.folder / name / "zarr.json", out / name / "zarr.json")
+        check_names(label_names, "label names", "features", "correct the labels")
         write_tensors(out / "labels.safetensors", {"embeddings": label_embeddings.astype(np.float32)})
         document: dict[str, Any] = {"names": self.names, "label_names": label_names, "convention": convention}
         if projection is not None:
@@ -207,14 +218,18 @@ def read_features(path: Path) -> Features:
     """Features stay on disk until indexed. Raises InputError naming the damaged file and the remedy."""
     path = Path(path)
     manifest = artifact.read_manifest(path, SCHEMA)
-    document = read_document(path, manifest, "features.json", ("names", "label_names", "convention"))
+    document, file = read_document(path, manifest, "features.json", Document), path / "features.json"
     names, label_names = document["names"], document["label_names"]
-    features = open_array(path, manifest, "features", (len(names), None, None, None), "float16")
-    shape = {"embeddings": (len(label_names), features.shape[3])}
-    embeddings = read_tensors(path, manifest, "labels.safetensors", shape)["embeddings"]
+    check_names(names, "names", file, artifact.remedy(path))
+    check_names(label_names, "label names", file, artifact.remedy(path))
+    features = open_array(path, manifest, "features", (len(names), None, None, None), "float16", (-LARGEST, LARGEST))
+    spec = {"embeddings": ("float32", len(label_names), features.shape[3])}
+    embeddings = read_tensors(path, manifest, "labels.safetensors", spec)["embeddings"]
+    kinds = {"pseudo_labels": ("int16", (-1, len(label_names) - 1)), "confidence": ("float16", (0, 1))}
     optional = {
-        name: open_array(path, manifest, name, features.shape[:3], dtype) if has_array(manifest, name) else None
-        for name, dtype in (("pseudo_labels", "int16"), ("confidence", "float16"))
+        name: open_array(path, manifest, name, features.shape[:3], dtype, within)
+        for name, (dtype, within) in kinds.items()
+        if has_array(manifest, name)
     }
     longest = np.linalg.norm(embeddings, axis=1).max(initial=0)
     if longest > 1 + 1e-3:
@@ -224,8 +239,8 @@ def read_features(path: Path) -> Features:
         )
     projection = None
     if "projection" in document:
-        shapes = SHAPES | {"matrix": ("C", features.shape[3])}
-        arrays = read_tensors(path, manifest, "projection.safetensors", shapes)
+        specs = SPECS | {"matrix": ("float32", "C", features.shape[3])}
+        arrays = read_tensors(path, manifest, "projection.safetensors", specs)
         projection = from_parts(arrays, document["projection"])
     return Features(names, features, label_names, embeddings, **optional, convention=document["convention"],
                     projection=projection)  # fmt: skip

@@ -7,6 +7,7 @@ no text and a document nested a thousand levels deep are each refused at once, i
 from __future__ import annotations
 
 import json
+import math
 import os
 import re
 import stat
@@ -53,11 +54,14 @@ def read_text(
         raise error(f"{path} is no UTF-8 text (byte {fault.start}); {remedy}") from None
 
 
-def parse_json(path: Path, remedy: str = RESTORE, error: type[ChebsplatError] = InputError) -> Any:
-    """The value in a JSON file. Raises `error`."""
+def parse_json(
+    path: Path, remedy: str = RESTORE, error: type[ChebsplatError] = InputError, finite: bool = False
+) -> Any:
+    """The value in a JSON file; `finite`: without nan or infinities, as JSON really is. Raises `error`."""
     text = read_text(path, remedy, error)
     try:
-        value = json.loads(text, object_pairs_hook=_once)
+        strict: dict[str, Any] = {"parse_constant": _finite, "parse_float": _finite} if finite else {}
+        value = json.loads(text, object_pairs_hook=_once, **strict)
         if SURROGATE.search(text):  # half a character: it could be printed, hashed or written nowhere
             json.dumps(value, ensure_ascii=False).encode()
     except RecursionError:
@@ -73,6 +77,12 @@ def _once(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
     if len(value) < len(pairs):
         twice = Counter(key for key, _ in pairs).most_common(1)[0][0]
         raise ValueError(f"{twice[:80]!r} is given twice")
+    return value
+
+
+def _finite(text: str) -> float:
+    if not math.isfinite(value := float(text)):
+        raise ValueError(f"{text[:40]} is no finite number")
     return value
 
 

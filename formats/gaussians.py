@@ -3,29 +3,56 @@
 from __future__ import annotations
 
 import csv
+import math
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
 import numpy as np
+from annotated_types import Ge, Le
 
 from chebsplat.errors import InputError
 from chebsplat.formats import artifact
 from chebsplat.formats.artifact import Manifest
 from chebsplat.formats.cameras import Cameras, read_cameras, write_cameras
-from chebsplat.formats.documents import read_document, write_document
-from chebsplat.formats.tensors import Shape, read_tensors, write_tensors
+from chebsplat.formats.documents import Count, NotRequired, TypedDict, conform, read_document, write_document
+from chebsplat.formats.files import read_text
+from chebsplat.formats.ply import REST
+from chebsplat.formats.tensors import Spec, read_tensors, write_tensors
 
 SCHEMA = "chebsplat.gaussians/1"
-SHAPES: dict[str, Shape] = {
-    "means": ("n", 3),
-    "log_scales": ("n", 3),
-    "quats": ("n", 4),
-    "logit_opacities": ("n",),
-    "sh0": ("n", 1, 3),
-    "shN": ("n", "k", 3),
-    "degrees": ("n",),
+SPECS: dict[str, Spec] = {
+    "means": ("float32", "n", 3),
+    "log_scales": ("float32", "n", 3),
+    "quats": ("float32", "n", 4),
+    "logit_opacities": ("float32", "n"),
+    "sh0": ("float32", "n", 1, 3),
+    "shN": ("float32", "n", "k", 3),
+    "degrees": ("uint8", "n"),
 }
+SEMANTIC: dict[str, Spec] = {"features": ("float32", "n", "c"), "fused": ("float32", "n", "c")}
+
+
+class EncoderSettings(TypedDict):
+    n_inputs: Annotated[int, Ge(0), Le(10_000)]
+    n_channels: Annotated[int, Ge(1), Le(1024)]
+    width: Annotated[int, Ge(1), Le(1024)]
+    n_layers: Annotated[int, Ge(0), Le(64)]
+    n_heads: Annotated[int, Ge(1), Le(64)]
+
+
+class Notes(TypedDict):
+    left_out: NotRequired[dict[str, str]]
+    n_initial: NotRequired[Count]
+    encoder: NotRequired[EncoderSettings]
+
+
+class Row(TypedDict):
+    """What a trace says in every row; the losses that there are besides."""
+
+    step: float
+    seconds: float
+    psnr: float
 
 
 @dataclass
@@ -81,15 +108,14 @@ def write_gaussians(out: Path, gaussians: Gaussians) -> None:
 def read_gaussians(path: Path) -> Gaussians:
     """Raises: InputError naming the damaged file and the remedy."""
     manifest = artifact.read_manifest(path, SCHEMA)
-    parameters = read_tensors(path, manifest, "parameters.safetensors", SHAPES)
+    file, remedy = path / "parameters.safetensors", artifact.remedy(path)
+    parameters = read_tensors(path, manifest, file.name, SPECS)
+    if held := {name: spec for name, spec in SEMANTIC.items() if name in parameters}:
+        parameters = read_tensors(path, manifest, file.name, SPECS | held)
     n, shN = len(parameters["means"]), parameters["shN"]
+    if parameters["degrees"].max(initial=0) > 3 or shN.shape[1] not in REST.values():
+        raise InputError(f"{file}: SH {shN.shape} or a degree beyond 3 make no scene; {remedy}")
     parameters["shN"] = np.concatenate([shN, np.zeros((n, 15 - shN.shape[1], 3), np.float32)], 1)
-    for name in {"features", "fused"} & set(parameters):
-        if parameters[name].ndim != 2 or len(parameters[name]) != n:
-            raise InputError(
-                f"{path / 'parameters.safetensors'}: {name} has shape {parameters[name].shape}, expected ({n}, C); "
-                + artifact.remedy(path)
-            )
     optional = {
         name: read_tensors(path, manifest, f"{name}.safetensors") if f"{name}.safetensors" in manifest.files else {}
         for name in ("modules", "optimizer")
@@ -100,11 +126,18 @@ def read_gaussians(path: Path) -> Gaussians:
         optional["modules"],
         optional["optimizer"],
         read_trace(path, manifest),
-        read_document(path, manifest, "notes.json"),
+        read_document(path, manifest, "notes.json", Notes),
     )
 
 
 def read_trace(path: Path, manifest: Manifest) -> list[dict[str, float]]:
     """The trace alone, without the parameters. Raises InputError naming file and remedy."""
-    with artifact.checked(path, manifest, "trace.csv").open(newline="") as handle:
-        return [{name: float(value) for name, value in row.items()} for row in csv.DictReader(handle)]
+    file, remedy = artifact.checked(path, manifest, "trace.csv"), artifact.remedy(path)
+    try:
+        rows = list(csv.DictReader(read_text(file, remedy).splitlines()))
+        trace = [{name: float(value) for name, value in row.items()} for row in rows]
+    except (csv.Error, ValueError, TypeError) as error:
+        raise InputError(f"{file} is no table of numbers ({error}); {remedy}") from None
+    if not all(map(math.isfinite, (value for row in trace for value in row.values()))):
+        raise InputError(f"{file} holds values that are not finite; {remedy}")
+    return conform(trace, list[Row], file, remedy)

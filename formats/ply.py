@@ -7,6 +7,7 @@ from pathlib import Path
 import numpy as np
 
 from chebsplat.errors import InputError
+from chebsplat.formats.vertices import read_vertices
 
 REST = {0: 0, 1: 3, 2: 8, 3: 15}  # coefficients beyond band 0, by degree
 _FIXED = ["x", "y", "z", "nx", "ny", "nz", "f_dc_0", "f_dc_1", "f_dc_2"]
@@ -26,7 +27,8 @@ def write_ply(
       parameters: where `degrees` [N] are given, `sh_degree` follows `rot_3`.
       degree:     highest band to write; `f_rest` is channel-major and shorter below 3.
       labels:     [N] class ids, -1 none; `label` is then the last property.
-      label_names: by id, written as comments `label ID NAME` of those that occur.
+      label_names: by id, written as comments `label ID NAME` of those that occur, in ASCII: what else a name holds is
+                   escaped as Python does (`caf\\xe9`); `labels.json` beside a scene's PLY has the names themselves.
     Choices: normals are written as zeros, since some loaders hard-code their presence. Tags are floats like all else:
       Open3D skips a `ushort`, and gsply 0.4 and spz-js 1.2 take any other type, or a second element, for the data.
     """
@@ -53,7 +55,8 @@ def write_ply(
     vertex = PlyElement.describe(rows.view([(name, "<f4") for name in names])[:, 0], "vertex")
     comments = []
     if labels is not None and label_names is not None:
-        comments = [f"label {index} {label_names[index]}" for index in np.unique(labels[labels >= 0])]
+        plain = [name.encode("unicode_escape").decode("ascii") for name in label_names]
+        comments = [f"label {index} {plain[index]}" for index in np.unique(labels[labels >= 0])]
     PlyData([vertex], byte_order="<", comments=comments).write(str(path))
 
 
@@ -64,15 +67,8 @@ def read_ply(path: Path) -> tuple[dict[str, np.ndarray], int, np.ndarray | None]
     Choices: an infinite logit, which converters write for 8-bit opacities of exactly 0 or 1, becomes ±20: the same
       opacity in float32.
     """
-    from plyfile import PlyData, PlyParseError
-
     path = Path(path)
-    if not path.is_file():
-        raise InputError(f"{path} is missing; export the scene again")
-    try:
-        vertex = PlyData.read(str(path))["vertex"]
-    except (PlyParseError, KeyError, ValueError, UnicodeDecodeError, MemoryError) as error:
-        raise InputError(f"{path} is not a readable PLY ({error}); export the scene again") from None
+    vertex = read_vertices(path, "export the scene again")
     names = [p.name for p in vertex.properties]
     absent = [name for name in (*_FIXED[:3], *_FIXED[6:], *_TAIL) if name not in names]
     if absent:
@@ -83,7 +79,14 @@ def read_ply(path: Path) -> tuple[dict[str, np.ndarray], int, np.ndarray | None]
         raise InputError(f"{path} has {n_rest} f_rest properties; 0, 9, 24 or 45 are possible")
 
     def block(wanted: list[str]) -> np.ndarray:
-        return np.stack([np.asarray(vertex[name], np.float32) for name in wanted], 1)
+        with np.errstate(over="ignore"):  # of doubles; what is infinite then is refused below
+            return np.stack([np.asarray(vertex[name], np.float32) for name in wanted], 1)
+
+    def whole(name: str, low: int, high: int) -> np.ndarray:
+        values = np.asarray(vertex[name])
+        if not ((values >= low) & (values <= high) & (values == np.round(values))).all():
+            raise InputError(f"{path}: {name} holds more than whole numbers {low} to {high}; export the scene again")
+        return values
 
     n = len(vertex.data)
     rest = block([f"f_rest_{i}" for i in range(n_rest)]) if n_rest else np.zeros((n, 0), np.float32)
@@ -103,8 +106,6 @@ def read_ply(path: Path) -> tuple[dict[str, np.ndarray], int, np.ndarray | None]
         if not np.isfinite(values).all():
             raise InputError(f"{path}: {name} holds non-finite values; export the scene again")
     if "sh_degree" in names:
-        parameters["degrees"] = np.asarray(vertex["sh_degree"]).astype(np.uint8)
-        if n and parameters["degrees"].max() > degree:
-            raise InputError(f"{path}: a sh_degree exceeds the file's degree {degree}; export the scene again")
-    labels = np.asarray(vertex["label"]).astype(np.int32) if "label" in names else None
+        parameters["degrees"] = whole("sh_degree", 0, degree).astype(np.uint8)
+    labels = whole("label", -1, 2**24).astype(np.int32) if "label" in names else None
     return parameters, degree, labels

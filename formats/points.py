@@ -2,24 +2,25 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from chebsplat.formats import artifact
-from chebsplat.formats.documents import read_document, write_document
-from chebsplat.formats.tensors import Shape, read_tensors, write_tensors
+from chebsplat.formats.cameras import POSES, check_cameras
+from chebsplat.formats.documents import TypedDict, read_document, write_document
+from chebsplat.formats.names import check_names
+from chebsplat.formats.tensors import FLOAT, Spec, read_tensors, write_tensors
 
 SCHEMA = "chebsplat.points/1"
-SHAPES: dict[str, Shape] = {
-    "Ks": ("v", 3, 3),
-    "cam_from_world": ("v", 4, 4),
-    "means": ("n", 3),
-    "colors": ("n", 3),
-    "normals": ("n", 3),
-    "covariances": ("n", 3, 3),
+SPECS: dict[str, Spec] = POSES | {
+    "means": (FLOAT, "n", 3),
+    "colors": ("uint8", "n", 3),
+    "normals": (FLOAT, "n", 3),
+    "covariances": (FLOAT, "n", 3, 3),
+    "tracks": ("int32 or int64", "t", 2),
 }
 
 
@@ -46,9 +47,23 @@ class Points:
     notes: dict[str, Any] = field(default_factory=dict)
 
 
+class Document(TypedDict):
+    names: list[str]
+    notes: dict[str, Any]
+
+
+def thinned(points: Points, most: int, seed: int) -> Points:
+    """At most so many of the points, drawn alike from all and in their order; without the tracks of any."""
+    if len(points.means) <= most:
+        return points
+    kept = np.sort(np.random.default_rng(seed).choice(len(points.means), most, replace=False))
+    fewer = {name: getattr(points, name)[kept] for name in ("means", "colors", "normals", "covariances")}
+    return replace(points, **fewer, tracks=points.tracks[:0])
+
+
 def write_points(out: Path, points: Points) -> None:
     """Fill the directory that `artifact.publish` yields. Raises ValueError on a non-finite value."""
-    arrays = {name: getattr(points, name) for name in (*SHAPES, "tracks")}
+    arrays = {name: getattr(points, name) for name in SPECS}
     write_tensors(out / "points.safetensors", arrays)
     write_document(out / "points.json", {"names": points.names, "notes": points.notes})
 
@@ -57,7 +72,9 @@ def read_points(path: Path) -> Points:
     """Raises: InputError naming the damaged file and the remedy."""
     path = Path(path)
     manifest = artifact.read_manifest(path, SCHEMA)
-    document = read_document(path, manifest, "points.json", ("names", "notes"))
-    shapes = SHAPES | {"Ks": (len(document["names"]), 3, 3), "tracks": ("t", 2)}
-    arrays = read_tensors(path, manifest, "points.safetensors", shapes)
-    return Points(document["names"], **{name: arrays[name] for name in shapes}, notes=document["notes"])
+    document, file = read_document(path, manifest, "points.json", Document), path / "points.safetensors"
+    names = document["names"]
+    check_names(names, "names", path / "points.json", artifact.remedy(path))
+    arrays = read_tensors(path, manifest, file.name, SPECS)
+    check_cameras(names, arrays["Ks"], arrays["cam_from_world"], file, artifact.remedy(path))
+    return Points(names, **{name: arrays[name] for name in SPECS}, notes=document["notes"])

@@ -10,11 +10,16 @@ from typing import Any
 import numpy as np
 
 from chebsplat.formats import artifact
-from chebsplat.formats.documents import read_document, write_document
-from chebsplat.formats.tensors import Shape, read_tensors, write_tensors
+from chebsplat.formats.documents import TypedDict, read_document, write_document
+from chebsplat.formats.tensors import Spec, read_tensors, write_tensors
 
 SCHEMA = "chebsplat.projection/1"
-SHAPES: dict[str, Shape] = {"matrix": ("C", "d"), "inverse": ("d", "C"), "energy": ("C",)}
+SPECS: dict[str, Spec] = {"matrix": ("float32", "C", "d"), "inverse": ("float32", "d", "C"), "energy": ("float32", "C")}
+
+
+class Document(TypedDict):
+    teacher: str
+    notes: dict[str, Any]
 
 
 @dataclass
@@ -52,11 +57,11 @@ class Projection:
 
 
 def tensors(projection: Projection) -> dict[str, np.ndarray]:
-    return {name: getattr(projection, name).astype(np.float32) for name in SHAPES}
+    return {name: getattr(projection, name).astype(np.float32) for name in SPECS}
 
 
 def from_parts(arrays: Mapping[str, np.ndarray], document: Mapping[str, Any]) -> Projection:
-    return Projection(**{name: arrays[name] for name in SHAPES}, teacher=document["teacher"], notes=document["notes"])
+    return Projection(**{name: arrays[name] for name in SPECS}, teacher=document["teacher"], notes=document["notes"])
 
 
 def write_projection(out: Path, projection: Projection) -> None:
@@ -69,5 +74,5 @@ def read_projection(path: Path) -> Projection:
     """Raises InputError naming the damaged file and the remedy."""
     path = Path(path)
     manifest = artifact.read_manifest(path, SCHEMA)
-    arrays = read_tensors(path, manifest, "projection.safetensors", SHAPES)
-    return from_parts(arrays, read_document(path, manifest, "projection.json", ("teacher", "notes")))
+    arrays = read_tensors(path, manifest, "projection.safetensors", SPECS)
+    return from_parts(arrays, read_document(path, manifest, "projection.json", Document))

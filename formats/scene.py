@@ -10,15 +10,25 @@ import numpy as np
 
 from chebsplat.errors import InputError
 from chebsplat.formats import artifact
-from chebsplat.formats.arrays import StoredArray, has_array, open_array, write_array
+from chebsplat.formats.arrays import has_array, open_array, write_array
+from chebsplat.formats.artifact import Manifest
 from chebsplat.formats.cameras import Cameras, read_cameras, write_cameras
-from chebsplat.formats.documents import read_document, write_document
+from chebsplat.formats.documents import Count, NotRequired, TypedDict, read_document, write_document
+from chebsplat.formats.names import check_names
 from chebsplat.formats.ply import REST, write_ply
 from chebsplat.formats.tensors import read_tensors, write_tensors
 
 SCHEMA = "chebsplat.scene/2"
+FINITE = (-3.4e38, 3.4e38)
 FEATURES = {"features", "raw_features"}
 _FLAT = {"means": 3, "log_scales": 3, "quats": 4, "sh0": 3}
+
+
+class Summary(TypedDict):
+    bytes: dict[str, Count]
+    max_degree: Count
+    n: Count
+    left_out: NotRequired[dict[str, str]]
 
 
 @dataclass
@@ -95,16 +105,14 @@ def read_scene(path: Path) -> Scene:
     """Raises: InputError naming the damaged file and the remedy."""
     path = Path(path)
     manifest = artifact.read_manifest(path, SCHEMA)
-    unsorted = read_tensors(path, manifest, "degrees.safetensors", {"degrees": ("n",)})["degrees"]
+    unsorted = read_tensors(path, manifest, "degrees.safetensors", {"degrees": ("uint8", "n")})["degrees"]
+    if len(unsorted) == 0 or unsorted.max() > 3:
+        raise InputError(f"{path / 'degrees.safetensors'} holds a degree beyond 3, or none; {artifact.remedy(path)}")
     order = np.argsort(unsorted, kind="stable")
     n, degrees = len(order), unsorted[order]
 
     def flat(name: str, rows: int, width: int) -> np.ndarray:
-        array: StoredArray = open_array(path, manifest, f"ragged/{name}", (rows, width), "float32")
-        values = array[:]
-        if not np.isfinite(values).all():
-            raise InputError(f"{array.path} holds non-finite values; {artifact.remedy(path)}")
-        return values
+        return open_array(path, manifest, f"ragged/{name}", (rows, width), "float32", FINITE)[:]
 
     parameters = {name: flat(name, n, width) for name, width in _FLAT.items()}
     parameters["sh0"] = parameters["sh0"][:, None]
@@ -117,17 +125,33 @@ def read_scene(path: Path) -> Scene:
         parameters["shN"][kept, REST[band - 1] : REST[band]] = rows
     parameters["degrees"] = degrees
     cameras = read_cameras(path, manifest)
-    summary = read_document(path, manifest, "summary.json", ("bytes", "max_degree", "n"))
+    summary = read_document(path, manifest, "summary.json", Summary)
     for name in FEATURES:
         if has_array(manifest, f"semantic/{name}"):
             array = open_array(path, manifest, f"semantic/{name}", (n, None), "int16")
             parameters[name] = array[:] * np.float32(array.scale_factor)
     if "features" not in parameters:
         return Scene(parameters, cameras, order, summary=summary)
-    names = list(read_document(path, manifest, "labels.json").values())
-    shapes = {"labels": (n,), "embeddings": (len(names), parameters["features"].shape[1])}
-    found = read_tensors(path, manifest, "labels.safetensors", shapes)
+    names = read_label_names(path, manifest)
+    specs = {"labels": ("int32", n), "embeddings": ("float32", len(names), parameters["features"].shape[1])}
+    found = read_tensors(path, manifest, "labels.safetensors", specs)
+    labels = found["labels"]
+    if not -1 <= labels.min() <= labels.max() < len(names):
+        raise InputError(
+            f"{path / 'labels.safetensors'}: labels {labels.min()} to {labels.max()} of {len(names)}; "
+            + artifact.remedy(path)
+        )
     return Scene(parameters, cameras, order, found["labels"], names, found["embeddings"], summary)
+
+
+def read_label_names(path: Path, manifest: Manifest) -> list[str]:
+    """The label dictionary alone, in order of ids. Raises InputError naming file and remedy."""
+    held = read_document(path, manifest, "labels.json", dict[str, str])
+    names, file = list(held.values()), path / "labels.json"
+    if list(held) != [str(k) for k in range(len(names))]:
+        raise InputError(f"{file}: the ids are not 0, 1, ... in order; {artifact.remedy(path)}")
+    check_names(names, "labels", file, artifact.remedy(path))
+    return names
 
 
 def _write_flat(path: Path, rows: np.ndarray, scale_factor: float | None = None) -> None:

@@ -3,16 +3,19 @@
 from __future__ import annotations
 
 import difflib
-import tomllib
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from chebsplat.errors import InputError
+from chebsplat.formats.files import parse_toml, read_text
+from chebsplat.formats.names import check_names, unprintable
 
 if TYPE_CHECKING:
     import numpy as np
 
+MAX_LABELS = 2**15 - 1  # what maps of int16 can number
+MAX_SIDE = 4096  # pixels of what a model is fed
 FILES = ("labels", "text", "tokenizer")
 TEXT_PACKAGE = "minilm"  # `text` may name the optional extra instead of a file
 
@@ -66,10 +69,7 @@ def read_teacher(path: Path) -> TeacherModel:
         raise InputError(
             f"{settings} is missing; write it beside the model, with at least mean, std and labels (docs/teachers.md)"
         )
-    try:
-        values = tomllib.loads(settings.read_text())
-    except ValueError as error:
-        raise InputError(f"{settings} does not parse ({error}); correct it (docs/teachers.md)") from None
+    values = parse_toml(settings, "correct it (docs/teachers.md)")
     for key, value in values.items():
         _check(settings, key, value)
     values = {key: tuple(value) if isinstance(value, list) else value for key, value in values.items()}
@@ -90,22 +90,31 @@ def read_teacher(path: Path) -> TeacherModel:
     return found
 
 
-def _is_list(value: Any, kinds: tuple[type, ...], length: int) -> bool:
-    return isinstance(value, list) and len(value) == length and all(type(v) in kinds for v in value)
+def _is_list(value: Any, kinds: tuple[type, ...], length: int, low: float, high: float) -> bool:
+    whole = isinstance(value, list) and len(value) == length and all(type(v) in kinds for v in value)
+    return whole and all(low <= v <= high for v in value)
+
+
+def _is_side(value: Any) -> bool:
+    return type(value) is int and 0 < value <= MAX_SIDE
+
+
+def _is_text(value: Any) -> bool:
+    return isinstance(value, str) and 0 < len(value) <= 1000 and not unprintable(value)
 
 
 RULES = {
-    "name": ("a word", lambda v: isinstance(v, str) and v),
+    "name": ("a word", _is_text),
     "output": ('"features" or "logits"', lambda v: v in ("features", "logits")),
-    "mean": ("three numbers", lambda v: _is_list(v, (int, float), 3)),
-    "std": ("three numbers above 0", lambda v: _is_list(v, (int, float), 3) and min(v) > 0),
-    "size": ("[height, width] in pixels", lambda v: _is_list(v, (int,), 2) and min(v) > 0),
-    "multiple": ("a whole number above 0", lambda v: type(v) is int and v > 0),
-    "base": ("a whole number of pixels", lambda v: type(v) is int and v > 0),
-    "labels": ("a file's name", lambda v: isinstance(v, str) and v),
-    "text": ("a file's name", lambda v: isinstance(v, str) and v),
-    "tokenizer": ("a file's name", lambda v: isinstance(v, str) and v),
-    "prompt": ('text with a {} in it, such as "a photo of a {}"', lambda v: isinstance(v, str) and v.count("{}") == 1),
+    "mean": ("three numbers", lambda v: _is_list(v, (int, float), 3, -1e3, 1e3)),
+    "std": ("three numbers above 0", lambda v: _is_list(v, (int, float), 3, 1e-6, 1e3)),
+    "size": (f"[height, width], 1 to {MAX_SIDE} pixels", lambda v: _is_list(v, (int,), 2, 1, MAX_SIDE)),
+    "multiple": (f"a whole number, 1 to {MAX_SIDE}", _is_side),
+    "base": (f"a whole number of pixels, 1 to {MAX_SIDE}", _is_side),
+    "labels": ("a file's name", _is_text),
+    "text": ("a file's name", _is_text),
+    "tokenizer": ("a file's name", _is_text),
+    "prompt": ('text with one {} in it, such as "a photo of a {}"', lambda v: _is_text(v) and v.count("{}") == 1),
 }
 
 
@@ -116,7 +125,7 @@ def _check(settings: Path, key: str, value: Any) -> None:
         raise InputError(f"{settings}: no such key {key}; {advice}")
     wanted, fits = RULES[key]
     if not fits(value):
-        raise InputError(f"{settings}: {key} = {value!r} is not {wanted}; correct it")
+        raise InputError(f"{settings}: {key} = {value!r:.60} is not {wanted}; correct it")
 
 
 def read_label_table(path: Path) -> tuple[list[str], np.ndarray | None]:
@@ -134,6 +143,7 @@ def read_label_table(path: Path) -> tuple[list[str], np.ndarray | None]:
     if listed is None or listed.ndim != 1 or listed.dtype.kind != "U" or not 0 < len(set(listed)) == len(listed):
         raise InputError(f"{path}: names are missing, occur twice or are no list of words; write it again")
     names = [str(name) for name in listed]
+    check_names(names, "names", path, "write it again")
     if embeddings is None:
         return names, None
     rows = finite32(embeddings)
@@ -151,12 +161,7 @@ def read_label_set(path: Path) -> dict[str, list[str]]:
     The file is plain text: `name` or `name: synonym, synonym` a line; `#` begins a comment.
     Raises: InputError naming the file, the line and the remedy.
     """
-    try:
-        lines = path.read_text(encoding="utf-8").splitlines()
-    except FileNotFoundError:
-        raise InputError(f"{path} is missing; correct the file of labels") from None
-    except (OSError, UnicodeDecodeError):
-        raise InputError(f"{path} is not a text file; labels are plain text, one name a line") from None
+    lines = read_text(path, "labels are plain text, one name a line").splitlines()
     found: dict[str, list[str]] = {}
     for number, line in enumerate(lines, start=1):
         name, _, others = (part.strip() for part in line.partition("#")[0].partition(":"))
@@ -166,6 +171,7 @@ def read_label_set(path: Path) -> dict[str, list[str]]:
             raise InputError(f"{path}, line {number}: a name is {'given twice' if name else 'missing'}; correct it")
         words = [name, *(word.strip() for word in others.split(",") if word.strip())]
         found[name] = list(dict.fromkeys(words))
-    if not found:
-        raise InputError(f"{path} holds no label; write one name a line")
+        check_names(found[name], f"line {number}", path, "correct it")
+    if not 0 < len(found) <= MAX_LABELS:
+        raise InputError(f"{path} holds {len(found)} labels; 1 to {MAX_LABELS} are possible, one name a line")
     return found

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from safetensors import SafetensorError
@@ -13,7 +14,8 @@ from chebsplat.errors import InputError
 from chebsplat.formats import artifact
 from chebsplat.formats.artifact import Manifest
 
-Shape = tuple[int | str, ...]
+Spec = tuple[Any, ...]  # of an array: its dtype, then its sizes
+FLOAT = "float32 or float64"
 
 
 def write_tensors(path: Path, arrays: Mapping[str, np.ndarray]) -> None:
@@ -25,30 +27,32 @@ def write_tensors(path: Path, arrays: Mapping[str, np.ndarray]) -> None:
 
 
 def read_tensors(
-    root: Path, manifest: Manifest, name: str, shapes: Mapping[str, Shape] | None = None
+    root: Path, manifest: Manifest, name: str, specs: Mapping[str, Spec] | None = None
 ) -> dict[str, np.ndarray]:
     """Read a listed file after comparing its digest.
 
     Args:
-      shapes: what must be there; a string is a size that has to agree wherever it occurs, e.g. ("n", 3).
+      specs: what must be there, e.g. ("float32", "n", 3); a string is a size that has to agree wherever it occurs.
     Raises: InputError naming the file, the array and the remedy.
     """
     path = artifact.checked(root, manifest, name)
     try:
         arrays = load_file(path)
-    except (SafetensorError, ValueError) as error:
+    except (SafetensorError, ValueError, KeyError, TypeError, AttributeError, OSError) as error:  # of odd dtypes, too
         raise InputError(f"{path} is not a safetensors file ({error}); {artifact.remedy(root)}") from None
     sizes: dict[str, int] = {}
-    for key, shape in (shapes or {}).items():
+    for key, (dtype, *shape) in (specs or {}).items():
         if key not in arrays:
             raise InputError(f"{path} has no array {key}; {artifact.remedy(root)}")
         found = arrays[key].shape
+        if arrays[key].dtype.name not in dtype.split(" or "):
+            raise InputError(f"{path}: {key} is {arrays[key].dtype}, expected {dtype}; {artifact.remedy(root)}")
         fits = len(found) == len(shape) and all(
             n == (sizes.setdefault(want, n) if isinstance(want, str) else want)
             for n, want in zip(found, shape, strict=True)
         )
         if not fits:
-            raise InputError(f"{path}: {key} has shape {found}, expected {shape}; {artifact.remedy(root)}")
+            raise InputError(f"{path}: {key} has shape {found}, expected {tuple(shape)}; {artifact.remedy(root)}")
     for key, array in arrays.items():
         if np.issubdtype(array.dtype, np.floating) and not np.isfinite(array).all():
             raise InputError(f"{path}: {key} holds non-finite values; {artifact.remedy(root)}")

@@ -109,7 +109,7 @@ def parsed(key: str, value: str) -> Any:
         return value
     try:
         return tomllib.loads(f"v = {value}")["v"]
-    except (tomllib.TOMLDecodeError, RecursionError):
+    except (ValueError, RecursionError):  # no TOML, a number of thousands of digits, nested a thousand times
         return {"on": True, "off": False}.get(value, value)
 
 

@@ -15,10 +15,10 @@ def run(job: Job) -> None:
     from chebsplat.formats.basis import Basis, read_basis, write_basis
     from chebsplat.formats.gaussians import read_gaussians
     from chebsplat.shape.cks import update
-    from chebsplat.shape.encoder import RegionEncoder
+    from chebsplat.stages.restored import restored_encoder
 
     settings = job.config.cks
-    encoder = RegionEncoder.restored(*read_gaussians(job.inputs["gaussians"]).encoder())
+    encoder = restored_encoder(job.inputs["gaussians"], read_gaussians(job.inputs["gaussians"]))
     old = read_basis(job.inputs["basis"]) if "basis" in job.inputs else Basis({}, {})
     projections = encoder.projections()
     if not projections:

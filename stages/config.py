@@ -9,7 +9,7 @@ from typing import Any, TypeVar
 
 from pydantic import BaseModel, ValidationError
 
-from chebsplat.errors import ConfigError
+from chebsplat.errors import ChebsplatError, ConfigError
 from chebsplat.formats.files import parse_json, parse_toml
 from chebsplat.stages import settings as parts
 from chebsplat.stages.settings import Section
@@ -60,16 +60,14 @@ def build(values: dict[str, Any], origin: str) -> Config:
     return checked(Config, values, origin)
 
 
-def checked(model: type[Model], values: Any, origin: str) -> Model:
-    """A model of pydantic's from values that somebody wrote. Raises ConfigError: one line about the first bad key."""
+def checked(model: type[Model], values: Any, origin: str, error: type[ChebsplatError] = ConfigError) -> Model:
+    """A model of pydantic's from values that somebody wrote. Raises `error`: one line about the first bad key."""
     try:
         return model.model_validate(values)
-    except ValidationError as error:
-        fault = error.errors()[0]
+    except ValidationError as faults:
+        fault = faults.errors()[0]
         where = ".".join(_shown(part) for part in fault["loc"])
-        raise ConfigError(
-            f"{origin}: {where}{': ' if where else ''}{_advice(fault, list(model.model_fields))}"
-        ) from None
+        raise error(f"{origin}: {where}{': ' if where else ''}{_advice(fault, list(model.model_fields))}") from None
 
 
 def known_keys() -> list[str]:

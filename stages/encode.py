@@ -8,6 +8,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from chebsplat.errors import ConfigError, InputError
+from chebsplat.formats import artifact
+from chebsplat.stages.inference import Model
 
 if TYPE_CHECKING:
     import numpy as np
@@ -33,6 +35,8 @@ def encode(scene: Path, encoder: Path, features: Path | None, out: Path) -> dict
 
     from chebsplat.formats.encoder import DYNAMIC, FLOAT, FUSED, read_encoder
     from chebsplat.shape.encoding import prepare
+    from chebsplat.stages.config import checked
+    from chebsplat.stages.settings import DescribeSection
 
     if out.suffix != ".npz":
         raise ConfigError(f"{out}: the result is a .npz; name it so")
@@ -41,8 +45,11 @@ def encode(scene: Path, encoder: Path, features: Path | None, out: Path) -> dict
     name = FLOAT if encoder.is_dir() else encoder.name
     if name not in (FLOAT, DYNAMIC):
         raise ConfigError(f"{encoder} is neither an onnx artifact nor its {FLOAT} or {DYNAMIC}; pass one of these")
-    held = read_encoder(encoder if encoder.is_dir() else encoder.parent)
+    folder = encoder if encoder.is_dir() else encoder.parent
+    held = read_encoder(folder)
     settings = held.contract["settings"]
+    file = f"{folder / 'contract.json'}: settings.describe"
+    settings |= {"describe": checked(DescribeSection, settings["describe"], file, InputError).model_dump()}
     p, order = gaussians(scene, features, settings["n_channels"])
     began = time.perf_counter()
     try:
@@ -54,7 +61,6 @@ def encode(scene: Path, encoder: Path, features: Path | None, out: Path) -> dict
     done = time.perf_counter()
     centers = given.regions.centers
     fused, gate = opened(held.models[FUSED]).run(
-        None,
         {
             "features": p["raw_features"],
             "encodings": encodings,
@@ -66,6 +72,8 @@ def encode(scene: Path, encoder: Path, features: Path | None, out: Path) -> dict
             "radius": np.array(given.regions.radius, np.float32),
         },
     )
+    if any(values.shape != p["raw_features"].shape for values in (fused, gate)):
+        raise InputError(f"{held.models[FUSED]} is of another scene's encoder; {artifact.remedy(folder)}")
     finished = time.perf_counter()
     place = np.argsort(order)  # of each Gaussian in the scene's files
     members = given.regions.members
@@ -116,15 +124,15 @@ def read_features(path: Path, n: int) -> np.ndarray:
     return values
 
 
-def opened(path: Path) -> Any:
-    """A model in onnxruntime on the CPU, on as many threads as the other kernels."""
+def opened(path: Path) -> Model:
+    """A model on the CPU, on as many threads as the other kernels."""
     import onnxruntime
 
     from chebsplat.stages.command import n_threads
 
     options = onnxruntime.SessionOptions()
     options.intra_op_num_threads = n_threads()
-    return onnxruntime.InferenceSession(str(path), options, providers=["CPUExecutionProvider"])
+    return Model(path, artifact.remedy(path.parent), options)
 
 
 def encoded(model: Path, given: Given) -> np.ndarray:
@@ -134,7 +142,10 @@ def encoded(model: Path, given: Given) -> np.ndarray:
     runner = opened(model)
     feed = {"inputs": given.inputs, "positions": given.positions, "mask": given.mask}
     starts = range(0, len(given.mask), CHUNK)
-    return np.concatenate([runner.run(None, {k: v[s : s + CHUNK] for k, v in feed.items()})[0] for s in starts])
+    found = np.concatenate([runner.run({k: v[s : s + CHUNK] for k, v in feed.items()})[0] for s in starts])
+    if found.ndim != 2 or len(found) != len(given.mask) or not np.isfinite(found).all():
+        raise InputError(f"{model} gives {found.shape} or values that are not finite; {artifact.remedy(model.parent)}")
+    return found
 
 
 def write(out: Path, arrays: dict[str, Any]) -> None:

@@ -32,9 +32,12 @@ def run(job: Job) -> None:
 
     settings = job.config.evaluate
     capture, scene = read_capture(job.inputs["capture"]), read_scene(job.inputs["scene"])
-    protocol = protocols.ALL.get(capture.protocol["name"])
+    named = str(capture.protocol.get("name"))
+    protocol = protocols.ALL.get(named)
     if protocol is None:
-        raise ConfigError(f"the capture's protocol {capture.protocol['name']} is unknown; ingest it again")
+        raise ConfigError(f"{job.inputs['capture']}: its protocol {named:.60} is unknown; ingest it again")
+    if capture.size != (scene.cameras.width, scene.cameras.height):
+        raise InputError(f"{job.inputs['scene']} has cameras of another size than the capture; pass those of one scene")
     lpips = perceptual(Path(settings.lpips_weights).expanduser()) if settings.lpips_weights else None
     row = {name: view for view, name in enumerate(capture.names)}
     chosen = capture.is_test if not protocol.ON_TRAINING else ~capture.is_test
@@ -78,7 +81,7 @@ def run(job: Job) -> None:
         figures["lpips_net"] = {"net": NET, "normalize": NORMALIZE}
     if segmentation is not None:
         figures["segmentation"] = segmentation
-    figures["left_out"] = scene.summary["left_out"] | job.facts.get("left_out", {})
+    figures["left_out"] = scene.summary.get("left_out", {}) | job.facts.get("left_out", {})
     job.facts |= {"psnr": figures["image"]["psnr"], "n_test": len(names)}
     if segmentation:
         job.facts["miou"] = segmentation["scene"]["miou"]
@@ -148,7 +151,8 @@ def seen(
     teachers = told = None
     if "features" in job.inputs and scene.labels is not None:
         teacher = read_features(job.inputs["features"])
-        if teacher.label_names != scene.label_names:
+        own = scene.label_embeddings
+        if teacher.label_names != scene.label_names or own is None or teacher.label_embeddings.shape != own.shape:
             raise InputError(f"{job.inputs['features']} has other labels than the scene; export the scene again")
         teachers = Named(teacher.names, teacher.features, "features of a teacher")
         if teacher.pseudo_labels is not None:  # its own, before any projection

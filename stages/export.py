@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Any
 
-from chebsplat.errors import DataFailure
+from chebsplat.errors import DataFailure, InputError
 from chebsplat.stages.command import Job, command
 
 
@@ -33,6 +33,8 @@ def run(job: Job) -> None:
     else:
         teacher = read_features(job.inputs["features"])
         parameters["features"] = semantic[order]
+        if semantic.shape[1] != teacher.label_embeddings.shape[1]:
+            raise InputError(f"{job.inputs['features']} has other channels than the checkpoint; pass its own")
         labels = decode_labels(parameters["features"], teacher.label_embeddings)
         labelled = {
             "labels": labels.astype(np.int32),

@@ -73,7 +73,8 @@ def has_label(scene: Scene, path: Path, names: tuple[str, ...]) -> np.ndarray:
     import numpy as np
 
     if scene.labels is None or scene.label_names is None:
-        raise ConfigError(f"{path} has no labels: {scene.summary['left_out'].get('labels', 'it has no semantics')}")
+        why = scene.summary.get("left_out", {}).get("labels", "it has no semantics")
+        raise ConfigError(f"{path} has no labels: {why}")
     for name in names:
         if name not in scene.label_names:
             near = difflib.get_close_matches(name, scene.label_names, 1)

@@ -6,12 +6,16 @@ import math
 from typing import TYPE_CHECKING, Any
 
 from chebsplat.errors import DataFailure, InputError
+from chebsplat.formats.teacher_model import MAX_SIDE
+from chebsplat.labels.tiling import window_starts
+from chebsplat.stages.inference import Model
 
 if TYPE_CHECKING:
     import numpy as np
 
     from chebsplat.formats.teacher_model import TeacherModel
 
+MAX_WINDOWS = 4096  # of a view
 MAX_SHARE = 0.5  # of the image's side that an entry of the map may be wide
 
 
@@ -30,18 +34,13 @@ class ImageEncoder:
         options.intra_op_num_threads, options.inter_op_num_threads = threads, 1
         options.use_deterministic_compute = True
         options.add_session_config_entry("session.intra_op.allow_spinning", "0")  # leave the cores to others
-        options.log_severity_level = 4  # what fails is raised, and told once
-        try:
-            self.session: Any = onnxruntime.InferenceSession(
-                str(teacher.path), options, providers=["CPUExecutionProvider"]
-            )
-        except Exception as error:  # onnxruntime's own exception types are not public
-            raise InputError(f"{teacher.path} is not a usable ONNX model ({_line(error)}); export it again") from None
+        remedy = f"correct `size` or `multiple` in {teacher.settings}, or export it again"
+        self.model = Model(teacher.path, remedy, options)
         self.size = self._window_size()
 
     def _window_size(self) -> tuple[int, int] | None:
         """(H, W) of the graph or of the TOML; None where the model takes any size."""
-        path, entries = self.teacher.path, self.session.get_inputs()
+        path, entries = self.teacher.path, self.model.inputs
         shape, kind = list(entries[0].shape), entries[0].type
         if len(entries) != 1:
             raise InputError(f"{path} has {len(entries)} inputs; one image [1, 3, H, W] is needed: export it again")
@@ -50,6 +49,8 @@ class ImageEncoder:
         if kind != "tensor(float)":
             raise InputError(f"{path} takes {kind}; export it with a float32 input (weights may be float16)")
         fixed = tuple(side for side in shape[2:] if isinstance(side, int))
+        if max(fixed, default=0) > MAX_SIDE:
+            raise InputError(f"{path} takes {list(fixed)}; sides up to {MAX_SIDE} pixels are possible")
         if len(fixed) < 2:
             return self.teacher.size
         if self.teacher.size not in (None, fixed):
@@ -63,7 +64,13 @@ class ImageEncoder:
         """(H, W) of an image at a scale; the aspect ratio stays, to half a pixel."""
         height, width = image.shape[:2]
         factor = scale * (self.teacher.base / max(height, width) if self.teacher.base else 1)
-        return max(round(height * factor), 1), max(round(width * factor), 1)
+        size = max(round(height * factor), 1), max(round(width * factor), 1)
+        if max(size) > MAX_SIDE:
+            raise InputError(
+                f"{self.teacher.settings}: an image of {size[1]} x {size[0]} is beyond {MAX_SIDE} pixels a side; lower "
+                "`base` or teacher.scales"
+            )
+        return size
 
     def window(self, size: tuple[int, int]) -> tuple[int, int]:
         """What the model is fed of an image of a size: the model's size, or the image's own up to a multiple."""
@@ -80,6 +87,12 @@ class ImageEncoder:
         """
         scaled = self.scaled_size(image, 1.0)
         side = self.window(scaled)
+        count = math.prod(len(window_starts(n, m)) for n, m in zip(scaled, side, strict=True))
+        if count > MAX_WINDOWS or max(side) > MAX_SIDE:
+            raise InputError(
+                f"{self.teacher.settings}: a view takes {count:,} windows of {side[1]} x {side[0]}; {MAX_WINDOWS:,} of "
+                f"sides up to {MAX_SIDE} are possible: correct `base`, `size` or `multiple`"
+            )
         cells = self.run(_padded(_resized(image, scaled), side)[: side[0], : side[1]], "the first view")
         sides = []
         for n, m, window, count in zip(image.shape[:2], scaled, side, cells.shape[1:], strict=True):
@@ -133,13 +146,7 @@ class ImageEncoder:
         teacher = self.teacher
         mean, std = (np.array(v, np.float32)[:, None, None] for v in (teacher.mean, teacher.std))
         image = (window.transpose(2, 0, 1).astype(np.float32) / 255 - mean) / std
-        try:
-            found = np.asarray(self.session.run(None, {self.session.get_inputs()[0].name: image[None]})[0])
-        except Exception as error:
-            raise InputError(
-                f"{teacher.path} fails on an image [1, 3, {image.shape[1]}, {image.shape[2]}] ({_line(error)}); "
-                f"correct `size` or `multiple` in {teacher.settings}, or export it again"
-            ) from None
+        found = self.model.run({self.model.inputs[0].name: image[None]})[0]
         if found.ndim != 4 or found.shape[0] != 1 or not found.size:
             raise InputError(f"{teacher.path} gives {list(found.shape)}; [1, C, h, w] is needed: export it again")
         if not np.isfinite(found).all():
@@ -180,7 +187,3 @@ def _padded(image: np.ndarray, side: tuple[int, int]) -> np.ndarray:
 
     below, right = (max(side[k] - image.shape[k], 0) for k in (0, 1))
     return np.pad(image, ((0, below), (0, right), (0, 0)), "edge")
-
-
-def _line(error: Exception) -> str:
-    return " ".join(str(error).split())[:200]

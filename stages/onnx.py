@@ -26,13 +26,14 @@ def run(job: Job) -> None:
 
     from chebsplat.formats.encoder import DYNAMIC, FLOAT, FUSED, write_encoder
     from chebsplat.formats.gaussians import read_gaussians
-    from chebsplat.shape.encoder import RegionEncoder
     from chebsplat.stages.onnx_graphs import encoder_model, fusion_model
+    from chebsplat.stages.restored import fitting, restored_encoder
 
-    gaussians = read_gaussians(job.inputs["gaussians"])
-    encoder = RegionEncoder.restored(*gaussians.encoder())
-    fusion = restored_fusion(gaussians, encoder.n_channels)
-    agreed = contract(encoder, trained_with(job.inputs["gaussians"]))
+    path = job.inputs["gaussians"]
+    gaussians = read_gaussians(path)
+    encoder = restored_encoder(path, gaussians)
+    fusion = fitting(path, lambda: restored_fusion(gaussians, encoder.n_channels))
+    agreed = contract(encoder, trained_with(path))
     opset = job.config.onnx.opset
     onnx.save(encoder_model(encoder, opset), job.out / FLOAT)
     onnx.save(fusion_model(fusion.gate, opset), job.out / FUSED)
@@ -57,11 +58,16 @@ def run(job: Job) -> None:
 def trained_with(path: Path) -> dict[str, Any]:
     """The sections `describe` and `train` that the checkpoint was made with. Raises InputError if it names none."""
     from chebsplat.formats.artifact import read_manifest
+    from chebsplat.stages.config import checked
+    from chebsplat.stages.settings import DescribeSection, TrainSection
 
-    config = read_manifest(path).config
+    config, file = read_manifest(path).config, path / "artifact.json"
     if not {"describe", "train"} <= set(config):
-        raise InputError(f"{path / 'artifact.json'} does not say how the scene was trained; train it again")
-    return config
+        raise InputError(f"{file} does not say how the scene was trained; train it again")
+    return {
+        "describe": checked(DescribeSection, config["describe"], f"{file}: describe", InputError).model_dump(),
+        "train": checked(TrainSection, config["train"], f"{file}: train", InputError).model_dump(),
+    }
 
 
 def restored_fusion(gaussians: Any, n_channels: int) -> Any:

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import itertools
 import logging
+import re
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -158,12 +160,26 @@ def draw(scene: Scene, views: list[int], query: Query, out: Path) -> None:
     renderer, rows = SceneRenderer(scene.parameters), []
     shown = {views[round(k)] for k in np.linspace(0, len(views) - 1, min(N_SHEET, len(views)))}
     (out / "heat").mkdir(exist_ok=True)
+    files = dict(zip(views, file_names([scene.cameras.names[k] for k in views]), strict=True))
     for k in views:
         image, features = renderer.render(camera(scene, k), with_features=True)
         assert features is not None
         warm = heat(image, relevancy(features, query.embedding, query.against))
-        png(warm, out / "heat" / f"{Path(scene.cameras.names[k]).stem}.png")
+        png(warm, out / "heat" / f"{files[k]}.png")
         if k in shown:
             rows.append(np.concatenate([image, warm], 1))
     title = heat_scale(f"{query.text}  (against {', '.join(query.phrases)})", rows[0].shape[1])
     png(np.concatenate([title, *rows]), out / "sheet.png")
+
+
+def file_names(views: list[str]) -> list[str]:
+    """A file's name for each view: its path with every separator replaced, and a number where two would be alike."""
+    found: list[str] = []
+    for view in views:
+        name = re.sub(r"[^\w.-]+", "-", view.removesuffix(Path(view).suffix)).strip(".-") or "view"
+        name = name.encode()[:200].decode(errors="ignore")
+        taken = {held.lower() for held in found}  # some file systems fold case
+        found.append(
+            next(new for k in itertools.count(1) if (new := name if k == 1 else f"{name}-{k}").lower() not in taken)
+        )
+    return found

@@ -40,12 +40,14 @@ FRAMES = {"color": "colour", "color_and_features": "colour and features"}
 def run(job: Job) -> None:
     import json
 
-    from chebsplat.formats.artifact import read_manifest, stated
+    from chebsplat.formats.artifact import read_manifest, remedy
+    from chebsplat.formats.documents import conform
     from chebsplat.formats.evaluation import read_evaluation
     from chebsplat.formats.gaussians import read_gaussians
     from chebsplat.stages import figures as draw
     from chebsplat.stages import report_parts as parts
     from chebsplat.stages.page import PAGE
+    from chebsplat.stages.report_facts import Reported, facts_of
     from chebsplat.stages.viewer import rendered
 
     evaluation = read_evaluation(job.inputs["evaluation"])
@@ -53,21 +55,20 @@ def run(job: Job) -> None:
     if not gaussians.trace:
         raise DataFailure("the training left no trace of error against run time; train the scene again")
     manifests = {role: read_manifest(job.inputs[role]) for role in STAGE_OF if role in job.inputs}
-    figures = evaluation.figures
+    facts = {role: facts_of(role, job.inputs[role], manifest) for role, manifest in manifests.items()}
+    evaluated = job.inputs["evaluation"]
+    figures = conform(evaluation.figures, Reported, evaluated / "figures.json", remedy(evaluated))
     left_out = absent_stages(job, gaussians) | figures["left_out"]
-    for role, manifest in manifests.items():
-        if "left_out" in manifest.facts:
-            left_out |= stated(job.inputs[role], manifest, "facts", "left_out", kind=dict)
+    for said in facts.values():
+        left_out |= said.get("left_out", {})
     stages = [(STAGE_OF[role], m.seconds, m.key, m.device, m.threads) for role, m in manifests.items()]
     versions: dict[str, str] = {}
     settings: dict[str, Any] = {}
     for manifest in manifests.values():
         versions |= manifest.versions
         settings |= manifest.config
-    by_degree = None
-    if "scene" in manifests:
-        by_degree = stated(job.inputs["scene"], manifests["scene"], "facts", "by_degree", kind=list)
-    rows = summary_rows(figures, by_degree, manifests["gaussians"].facts)
+    by_degree = facts["scene"]["by_degree"] if "scene" in facts else None
+    rows = summary_rows(figures, by_degree, facts["gaussians"])
     write_table(job.out / "figures.csv", rows)
     write_table(job.out / "trace.csv", [list(gaussians.trace[0]), *(list(row.values()) for row in gaussians.trace)])
     names = parts.label_names(job.inputs, figures)
@@ -78,7 +79,7 @@ def run(job: Job) -> None:
         name=figures["source"].get("name") or figures["source"].get("kind", "scene"),
         source=figures["source"],
         protocol=figures["protocol"],
-        teacher=teacher_words(manifests["features"].facts) if "features" in manifests else None,
+        teacher=teacher_words(facts["features"]) if "features" in facts else None,
         rows=rows[1:],
         tiles=parts.tiles(figures, gaussians),
         legend=parts.legend(pixels, names, colors),
@@ -97,8 +98,8 @@ def run(job: Job) -> None:
         raise DataFailure(f"the page would have {len(text) / 1e6:.0f} MB; lower report.n_pictures or ingest.max_side")
     (job.out / "report.html").write_text(text)
     job.facts |= {"page": "report.html", "psnr": figures["image"]["psnr"]}
-    if "descriptors" in manifests:
-        known = manifests["descriptors"].facts
+    if "descriptors" in facts:
+        known = facts["descriptors"]
         kept = ("spectrum", "n_cuts", "n_cuts_in_clusters", "n_in_float64")
         job.facts["descriptors"] = {name: known[name] for name in kept if name in known}
 

@@ -55,13 +55,13 @@ def label_names(inputs: dict[str, Path], figures: dict[str, Any]) -> list[str]:
     """Names of the labels in the pictures: the capture's classes, or the scene's own labels where it has none."""
     from chebsplat.formats.artifact import read_manifest
     from chebsplat.formats.capture import read_capture
-    from chebsplat.formats.documents import read_document
+    from chebsplat.formats.scene import read_label_names
 
     classes = read_capture(inputs["capture"]).class_names if "capture" in inputs else None
     classes = classes or (figures.get("segmentation") or {}).get("classes")
     if classes is None and "scene" in inputs:
         path = inputs["scene"]
-        classes = list(read_document(path, read_manifest(path), "labels.json").values())
+        classes = read_label_names(path, read_manifest(path))
     return classes or []
 
 
@@ -112,6 +112,8 @@ def picture_rows(
     from chebsplat.stages import figures as draw
 
     views, pictures = evaluation.figures["names"], evaluation.pictures
+    if not views or not {"truth", "renders"} <= pictures.keys():
+        raise InputError("the evaluation holds no pictures of views; evaluate again")
     per_view = evaluation.figures["image"]["per_view"]["psnr"]
     rows, sheet = [], []
     pixels: Counter[int] = Counter()

@@ -6,9 +6,10 @@ import difflib
 import logging
 from collections.abc import Iterator
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 from chebsplat.errors import InputError
+from chebsplat.stages.inference import Model
 
 if TYPE_CHECKING:
     import numpy as np
@@ -75,7 +76,7 @@ def _encoded(names: list[str], teacher: TeacherModel, known: dict[str, int]) -> 
     lacking = f"{teacher.labels or teacher.settings} does not know {words}{hint}"
     if teacher.text is None:
         raise InputError(f"{lacking}, and the teacher has no text encoder; use known names, or add them to the table")
-    texts = [teacher.prompt.format(name) for name in names]
+    texts = [teacher.prompt.replace("{}", name) for name in names]
     if isinstance(teacher.text, Path):
         return _by_model(texts, teacher, lacking)
     try:
@@ -102,7 +103,6 @@ def _by_model(texts: list[str], teacher: TeacherModel, lacking: str) -> np.ndarr
       One text at a time, so that padding never counts.
     """
     import numpy as np
-    import onnxruntime
 
     try:
         from tokenizers import Tokenizer
@@ -112,23 +112,20 @@ def _by_model(texts: list[str], teacher: TeacherModel, lacking: str) -> np.ndarr
         tokenizer = Tokenizer.from_file(str(teacher.tokenizer))
     except Exception as error:  # tokenizers raises nothing narrower
         raise InputError(f"{teacher.tokenizer} is not a tokenizer.json ({error}); write it again") from None
-    options = onnxruntime.SessionOptions()
-    options.log_severity_level = 4  # what fails is raised, and told once
-    try:
-        session: Any = onnxruntime.InferenceSession(str(teacher.text), options, providers=["CPUExecutionProvider"])
-        entries = [entry.name for entry in session.get_inputs()]
-        parts = {e: "ids" if len(entries) == 1 else ENTRIES[e] for e in entries}
-        tokens = [tokenizer.encode(text) for text in texts]
-        rows = [
-            session.run(None, {e: np.array([getattr(t, part)], np.int64) for e, part in parts.items()})[0]
-            for t in tokens
-        ]
-    except Exception as error:  # onnxruntime's own exception types are not public
-        line = str(error).splitlines()[0] if str(error) else type(error).__name__
-        raise InputError(
-            f"{teacher.text} cannot be run ({line}); inputs are {', '.join(ENTRIES)} [1, n] int64: export it again"
-        ) from None
-    found = np.concatenate(rows)
-    if found.ndim != 2 or len(found) != len(texts) or not np.isfinite(found).all():
-        raise InputError(f"{teacher.text} gives {rows[0].shape} for one text; [1, C] is needed: export it again")
-    return found
+    model = Model(Path(str(teacher.text)), f"inputs are {', '.join(ENTRIES)} [1, n] int64: export it again")
+    entries = [entry.name for entry in model.inputs]
+    unknown = [e for e in entries if len(entries) > 1 and e not in ENTRIES]
+    if unknown:
+        raise InputError(f"{model.path} has an input {unknown[0]}; {model.remedy}")
+    parts = {e: "ids" if len(entries) == 1 else ENTRIES[e] for e in entries}
+    rows: list[np.ndarray] = []
+    for text in texts:
+        try:
+            tokens = tokenizer.encode(text)
+        except Exception as error:  # tokenizers raises nothing narrower
+            raise InputError(f"{teacher.tokenizer} fails on {text!r} ({error}); write it again") from None
+        row = model.run({e: np.array([getattr(tokens, part)], np.int64) for e, part in parts.items()})[0]
+        if row.ndim != 2 or len(row) != 1 or row.shape != (rows or [row])[0].shape or not np.isfinite(row).all():
+            raise InputError(f"{model.path} gives {row.shape} for one text; [1, C] is needed: export it again")
+        rows.append(row)
+    return np.concatenate(rows)

@@ -11,7 +11,7 @@ from chebsplat.errors import DataFailure
 from chebsplat.stages.command import Job, command, n_threads
 from chebsplat.stages.resume import Saves
 from chebsplat.stages.stopping import deferred
-from chebsplat.stages.train_inputs import first_regions, knowledge, trainer_of
+from chebsplat.stages.train_inputs import described, first_regions, knowledge, trainer_of, within_cap
 
 if TYPE_CHECKING:
     import numpy as np
@@ -22,8 +22,6 @@ log = logging.getLogger("chebsplat")
 
 
 def run(job: Job) -> None:
-    import torch
-
     from chebsplat.formats.cameras import Cameras
     from chebsplat.formats.capture import read_capture
     from chebsplat.formats.features import read_features
@@ -31,14 +29,17 @@ def run(job: Job) -> None:
     from chebsplat.formats.points import read_points
 
     train, describe = job.config.train.model_dump(), job.config.describe.model_dump()
-    capture, points = read_capture(job.inputs["capture"]), read_points(job.inputs["points"])
+    capture, given = read_capture(job.inputs["capture"]), read_points(job.inputs["points"])
+    found, points = described(job, given, describe), within_cap(job, given, train)
     features = read_features(job.inputs["features"]) if "features" in job.inputs and train["semantics"] else None
     note_left_out(job, train, features is not None)
+    import torch  # once its inputs are known to be usable
+
     torch.set_num_threads(n_threads())  # sums of torch depend on it; the same bytes are promised for the same number
     trainer = trainer_of(capture, points, features, train, describe)
     model = trainer.model
     trainer.basis = knowledge(job, model, train)
-    first_regions(job, trainer, len(points.means))
+    first_regions(trainer, found if points is given else None)
     trace = follow(job, trainer, train)
     parameters, people = trainer.finish(), trainer.population
     if people.n_broken:

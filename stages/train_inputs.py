@@ -9,6 +9,7 @@ from chebsplat.stages.command import Job
 
 if TYPE_CHECKING:
     from chebsplat.formats.capture import Capture
+    from chebsplat.formats.descriptors import Descriptors
     from chebsplat.formats.features import Features
     from chebsplat.formats.points import Points
     from chebsplat.training.trainer import Trainer
@@ -96,21 +97,45 @@ def knowledge(job: Job, model: Any, train: dict[str, Any]) -> dict[str, Any]:
     return {name: torch.from_numpy(basis.bases[name]) for name in projections} if train["weight_basis"] > 0 else {}
 
 
-def first_regions(job: Job, trainer: Trainer, n_points: int) -> None:
-    """Start from the describe stage's regions where there are any."""
-    import torch
+def within_cap(job: Job, points: Points, train: dict[str, Any]) -> Points:
+    """The points that a training starts from: all, or as many as `max_gaussians` lets in."""
+    from chebsplat.formats.points import thinned
 
+    n, most = len(points.means), train["max_gaussians"]
+    if n > most:
+        job.left_out(f"{n - most} of {n} initial points, and regions of all", f"train.max_gaussians is {most}")
+    return thinned(points, most, train["seed"])
+
+
+def described(job: Job, points: Points, describe: dict[str, Any]) -> Descriptors | None:
+    """The describe stage's regions where there are any. Raises InputError unless they are of these points and settings.
+
+    They are read before anything is built, so that a wrong artifact costs no time.
+    """
     from chebsplat.formats.descriptors import read_descriptors
-    from chebsplat.shape.regions import Regions
 
     if "descriptors" not in job.inputs:
+        return None
+    path = job.inputs["descriptors"]
+    found = read_descriptors(path)
+    if max(found.members.max(initial=-1), found.centers.max(initial=-1)) >= len(points.means):
+        raise InputError(f"{path} describes other points; run the describe stage on these points")
+    wrong = [f"describe.{name}" for name, value in describe.items() if found.settings.get(name) != value]
+    if wrong:
+        raise InputError(f"{path} has another {wrong[0]}; run the describe stage with this config")
+    if found.values.shape[1:3] != (found.members.shape[1], describe["n_angles"]):
+        raise InputError(f"{path} has descriptors of another shape; run the describe stage again")
+    return found
+
+
+def first_regions(trainer: Trainer, found: Descriptors | None) -> None:
+    """Start from the describe stage's regions, or make them."""
+    import torch
+
+    from chebsplat.shape.regions import Regions
+
+    if found is None:
         trainer.refresh()
         return
-    found = read_descriptors(job.inputs["descriptors"])
-    if found.members.max(initial=-1) >= n_points:
-        raise InputError(f"{job.inputs['descriptors']} describes other points; run the describe stage on these points")
-    wrong = [f"describe.{k}" for k, value in trainer.describe.items() if found.settings.get(k) != value]
-    if wrong:
-        raise InputError(f"{job.inputs['descriptors']} has another {wrong[0]}; run the describe stage with this config")
     regions = Regions(found.centers, found.members, found.settings["radius"], found.settings["share"])
     trainer.refresh(regions, torch.from_numpy(found.values))

@@ -105,7 +105,9 @@ def make_evaluation():
         "renders": rng.integers(0, 255, (2, 3, 4, 3), dtype=np.uint8),
         "labels": np.zeros((2, 3, 4), np.int16),
     }
-    return evaluation.Evaluation({"psnr": 30.0, "lpips": None}, pictures)
+    figures = {"names": ["a", "b"], "image": {"psnr": 30.0, "ssim": 0.9, "per_view": {"psnr": [29.0, 31.0]}}}
+    figures |= {"n_gaussians": 5, "bytes": {"ply": 7}, "frames_per_second": {}, "left_out": {}, "lpips": None}
+    return evaluation.Evaluation(figures, pictures)
 
 
 CASES = {
@@ -198,7 +200,7 @@ def test_non_finite_values_are_never_published(tmp_path):
 def test_a_capture_with_a_repeated_name_is_refused(tmp_path):
     record = make_capture()
     record.names = ["a", "b", "a"]
-    with pytest.raises(InputError, match="a occurs twice"):
+    with pytest.raises(InputError, match="'a' occurs 2 times"):
         capture.write_capture(tmp_path, record)
 
 

@@ -350,11 +350,11 @@ def test_a_bad_teacher_is_a_clear_error(tmp_path, capture, case, capsys):
     ("content", "message"),
     [
         (None, "is missing"),
-        (b"", "holds no label"),
-        (b"# nothing\n", "holds no label"),
+        (b"", "holds 0 labels"),
+        (b"# nothing\n", "holds 0 labels"),
         (b"red\nred\n", "line 2: a name is given twice"),
         (b": blue\n", "line 1: a name is missing"),
-        (b"PK\x03\x04\xff\xfe", "not a text file"),
+        (b"PK\x03\x04\xff\xfe", "no UTF-8 text"),
     ],
 )
 def test_a_bad_label_file_is_a_clear_error(tmp_path, content, message):

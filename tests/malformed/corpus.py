@@ -6,10 +6,12 @@ from malformed import (
     arguments,
     colmap,
     commands,
+    documents,
     images,
     manifests,
     photos,
     replica,
+    resealed,
     scannet,
     settings,
     seven_scenes,
@@ -17,7 +19,9 @@ from malformed import (
 )
 from malformed.case import Case
 
-MODULES = (settings, commands, manifests, arguments, photos, images, colmap, transforms, replica, scannet, seven_scenes)
+ARTIFACTS = (manifests, resealed)
+SOURCES = (photos, images, colmap, transforms, replica, scannet, seven_scenes)
+MODULES = (settings, documents, commands, arguments, *ARTIFACTS, *SOURCES)
 CASES: list[Case] = [case for module in MODULES for case in module.cases()]
 
 

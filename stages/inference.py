@@ -1,0 +1,85 @@
+"""Models in ONNX that somebody brings: the one door to running them. What declares too much is refused, and every run
+ends.
+
+onnxruntime itself refuses weights outside the model's folder and folds no constant above 1 GiB.
+"""
+
+from __future__ import annotations
+
+import math
+import mmap
+from collections.abc import Mapping
+from pathlib import Path
+from threading import Timer
+from typing import TYPE_CHECKING, Any
+
+from chebsplat.errors import InputError
+from chebsplat.formats.files import regular
+
+if TYPE_CHECKING:
+    import numpy as np
+
+SECONDS = 600.0  # of one run, of a window or of a text
+LOOPING = 10.0  # of one run of a model that holds a Loop or a Scan: only such a one may never end
+LARGEST = 1 << 30  # bytes of one output, where the graph says them
+LOOPS = (b'"\x04Loop', b'"\x04Scan')  # as protobuf writes a node's operator
+
+
+class Model:
+    """An ONNX model in onnxruntime on the CPU.
+
+    Args: remedy: what the user can do, for messages; options: onnxruntime's SessionOptions.
+    Raises: InputError naming the file.
+    """
+
+    def __init__(self, path: Path, remedy: str, options: Any = None):
+        import onnxruntime
+
+        self.path, self.remedy = Path(path), remedy
+        size = regular(self.path, remedy).st_size
+        options = options or onnxruntime.SessionOptions()
+        options.log_severity_level = 4  # what fails is raised, and told once
+        try:
+            self._session: Any = onnxruntime.InferenceSession(str(path), options, providers=["CPUExecutionProvider"])
+        except Exception as error:  # onnxruntime's own exception types are not public
+            raise InputError(f"{path} is not a usable ONNX model ({_line(error)}); {remedy}") from None
+        self.inputs: list[Any] = self._session.get_inputs()
+        self.outputs: list[Any] = self._session.get_outputs()
+        if not self.inputs or not self.outputs:
+            what = "output" if self.inputs else "input"
+            raise InputError(f"{path} has no {what}: nothing can be asked of it; {remedy}")
+        for entry in self.outputs:
+            declared = 4 * math.prod(side for side in entry.shape or () if isinstance(side, int))
+            if declared > LARGEST:
+                raise InputError(f"{path} gives {entry.shape}, {declared:,} bytes; at most {LARGEST:,} are possible")
+        self.seconds = LOOPING if size and _loops(self.path) else SECONDS
+
+    def run(self, feeds: Mapping[str, np.ndarray]) -> list[np.ndarray]:
+        """All outputs. Raises InputError if the model fails or is not done in its time."""
+        import numpy as np
+        import onnxruntime
+
+        options = onnxruntime.RunOptions()
+        late = Timer(self.seconds, lambda: setattr(options, "terminate", True))
+        late.daemon = True
+        late.start()
+        try:
+            found = self._session.run(None, dict(feeds), options)
+        except Exception as error:  # onnxruntime's own exception types are not public
+            why = f"not done after {self.seconds:g} s" if options.terminate else _line(error)
+            sizes = ", ".join(str(list(value.shape)) for value in feeds.values())
+            raise InputError(f"{self.path} fails on {sizes} ({why}); {self.remedy}") from None
+        finally:
+            late.cancel()
+        if not all(isinstance(value, np.ndarray) and value.dtype.kind in "fiub" for value in found):
+            raise InputError(f"{self.path} gives more than tensors of numbers; {self.remedy}")
+        return found
+
+
+def _loops(path: Path) -> bool:
+    with path.open("rb") as handle, mmap.mmap(handle.fileno(), 0, access=mmap.ACCESS_READ) as held:
+        return any(held.find(operator) >= 0 for operator in LOOPS)
+
+
+def _line(error: Exception) -> str:
+    return " ".join(str(error).split())[:200] or type(error).__name__
