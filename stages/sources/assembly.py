@@ -150,9 +150,9 @@ def read_view(
     """images u8 [H, W, 3], loss_mask bool [H, W]; where `wanted`, depth, labels, pseudo_labels, confidence [H, W]."""
     camera, size = frame.camera, (frame.camera.width, frame.camera.height)
     inside = within(at, size)
-    with open_photo(frame.image, size, listing.upright) as (image, opaque):
-        counts = inside.copy() if opaque is None else inside & nearest(opaque, at, size)
-        fields = {"images": resampled(image, camera, view, at), "loss_mask": counts}
+    pixels, counts = photo(frame, listing, view, at)
+    counts &= inside
+    fields = {"images": pixels, "loss_mask": counts}
     if frame.mask is not None:
         counts &= companion(frame.mask, size, at) > 0
     if "depth" in wanted and frame.depth is not None:
@@ -170,6 +170,14 @@ def read_view(
         sure = nearest(confidences(frame.confidence), at, size)
         fields["confidence"] = np.where(inside & (fields["pseudo_labels"] > 0), sure, 0).astype(np.float16)
     return fields
+
+
+def photo(frame: Frame, listing: Listing, view: Geometry, at: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """The view's pixels u8 [H, W, 3] and where they are opaque, bool [H, W]; the whole photo is gone on return."""
+    size = (frame.camera.width, frame.camera.height)
+    with open_photo(frame.image, size, listing.upright) as (image, opaque):
+        seen = np.ones(at.shape[1:], bool) if opaque is None else nearest(opaque, at, size)
+        return resampled(image, frame.camera, view, at), seen
 
 
 def within(at: np.ndarray, size: tuple[int, int]) -> np.ndarray:

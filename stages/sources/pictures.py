@@ -18,7 +18,7 @@ EIGHT_BIT = {"1", "L", "LA", "P", "PA", "RGB", "RGBA", "CMYK", "YCbCr"}  # PIL's
 DEEP = {"I", "I;16", "I;16B"}  # 16-bit
 GREY = DEEP | {"L", "P"}
 SAME_SHAPE = 0.02  # difference in aspect ratio that still counts as another resolution of the same picture
-LARGEST = 64 << 20  # bytes of a view's confidences: 16 million in single precision
+LARGEST = 16 << 20  # bytes of a view's confidences: 4 million in single precision
 
 
 @contextmanager
@@ -44,7 +44,8 @@ def open_photo(path: Path, size: tuple[int, int], upright: bool) -> Iterator[tup
             return
         image = image if image.mode == "RGBA" else image.convert("RGBA")
         opaque = np.asarray(image.getchannel("A")) >= 128
-        yield image.convert("RGB"), None if opaque.all() else opaque
+        image = image.convert("RGB")
+        yield image, None if opaque.all() else opaque
 
 
 def companion(
