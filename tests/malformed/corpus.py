@@ -10,6 +10,7 @@ from malformed import (
     images,
     manifests,
     photos,
+    references,
     replica,
     resealed,
     scannet,
@@ -20,7 +21,7 @@ from malformed import (
 from malformed.case import Case
 
 ARTIFACTS = (manifests, resealed)
-SOURCES = (photos, images, colmap, transforms, replica, scannet, seven_scenes)
+SOURCES = (photos, images, references, colmap, transforms, replica, scannet, seven_scenes)
 MODULES = (settings, documents, commands, arguments, *ARTIFACTS, *SOURCES)
 CASES: list[Case] = [case for module in MODULES for case in module.cases()]
 

@@ -5,11 +5,10 @@ from __future__ import annotations
 from collections.abc import Iterator
 from pathlib import Path
 
-from malformed.case import Asked, Case
+from chebsplat.teachers import EMBEDDED
+from malformed.case import Asked, Case, stage
 from malformed.edits import NO_FILES, Edit, Row, cut, declared_png, no_files, picture, put, remove
 from malformed.photos import EPS
-
-from chebsplat.teachers import EMBEDDED
 
 KIND = "reference images"
 PHOTO = "photos/b.jpg"
@@ -31,14 +30,12 @@ def _case(name: str, named: str, edit: Edit, projected: bool) -> Case:
         picture(PHOTO, (64, 48), form="JPEG")(folder)
         edit(folder)
         if projected:
-            setting = f"projection.reference={folder / 'photos'}"
-            return Asked(["plan", "--scene", "toy", "--set", setting], named)
+            return stage("projection", folder, {"projection": {"reference": str(folder / "photos")}}, named)
         return Asked(["check-teacher", EMBEDDED, "--photo", folder / PHOTO], named)
 
-    return Case(KIND, f"{name}, in {'plan' if projected else 'check-teacher'}", build)
+    return Case(KIND, f"{name}, in {'projection' if projected else 'check-teacher'}", build)
 
 
 def cases() -> Iterator[Case]:
     yield from (_case(*row, projected=False) for row in rows())
-    unread = [*no_files(PHOTO, kinds=NO_FILES), (f"{PHOTO} is missing", "photos", remove(PHOTO))]
-    yield from (_case(*row, projected=True) for row in unread)
+    yield from (_case(*row, projected=True) for row in rows())
