@@ -16,6 +16,7 @@ import chebsplat  # isort: skip  # before torch: a busy machine punishes OpenMP 
 import torch
 from prepared import prepared
 
+from chebsplat.pipelines.plan import merged
 from chebsplat.pipelines.scenes import read_toml
 from chebsplat.stages.config import Config
 from chebsplat.training.trainer import Trainer
@@ -24,10 +25,8 @@ BAR, TURN, REHEARSAL = 1.6, 50, 100
 
 
 def begun(work: Path, ablation: str, steps: int) -> Trainer:
-    config = Config.model_validate(read_toml("ablations", ablation) if ablation != "full" else {})
-    trainer = prepared(work, config.train.model_dump() | {"steps": steps}, config.describe.model_dump())
-    trainer.refresh()
-    return trainer
+    values = read_toml("ablations", ablation) if ablation != "full" else {}
+    return prepared(work, Config.model_validate(merged(values, {"train": {"steps": steps}})))
 
 
 def main() -> None:

@@ -22,16 +22,17 @@ from chebsplat.formats.encoder import DYNAMIC, FLOAT, read_encoder
 from chebsplat.formats.gaussians import read_gaussians
 from chebsplat.formats.scene import read_scene
 from chebsplat.labels.decode import decode_labels
+from chebsplat.settings import DescribeSection
 from chebsplat.shape.encoder import RegionEncoder
-from chebsplat.shape.encoding import Given, prepare
+from chebsplat.shape.region_inputs import RegionInputs
 from chebsplat.stages.command import n_threads
-from chebsplat.stages.encode import CHUNK, gaussians, opened
+from chebsplat.stages.encode import CHUNK, gaussians, inputs_of, opened
 from chebsplat.stages.onnx import restored_fusion
 
 
-def chunks(given: Given) -> list[dict[str, np.ndarray]]:
-    values = {"inputs": given.inputs, "positions": given.positions, "mask": given.mask}
-    return [{k: v[s : s + CHUNK] for k, v in values.items()} for s in range(0, len(given.mask), CHUNK)]
+def chunks(inputs: RegionInputs) -> list[dict[str, np.ndarray]]:
+    values = {"inputs": inputs.inputs, "positions": inputs.positions, "mask": inputs.mask}
+    return [{k: v[s : s + CHUNK] for k, v in values.items()} for s in range(0, len(inputs.mask), CHUNK)]
 
 
 def torch_route(encoder: RegionEncoder, parts: list[dict[str, np.ndarray]], dtype: torch.dtype) -> Any:
@@ -72,8 +73,8 @@ def main() -> None:
     scene, held = read_scene(arguments.work / "export"), read_encoder(arguments.work / "onnx")
     settings = held.contract["settings"]
     p, order = gaussians(arguments.work / "export", None, settings["n_channels"])
-    given = prepare(p["means"], p["quats"], p["log_scales"], p["raw_features"], settings)
-    checkpoint, parts = read_gaussians(arguments.work / "train"), chunks(given)
+    inputs = inputs_of(p, DescribeSection.model_validate(settings["describe"]), settings)
+    checkpoint, parts = read_gaussians(arguments.work / "train"), chunks(inputs)
     single, double = (RegionEncoder.restored(*checkpoint.encoder()) for _ in range(2))
     double, fusion = double.double(), restored_fusion(checkpoint, settings["n_channels"])
     exact = torch_route(double, parts, torch.float64)()
@@ -84,12 +85,12 @@ def main() -> None:
     }
 
     def fused(encodings: np.ndarray) -> np.ndarray:
-        centers = given.regions.centers
-        values = (p["raw_features"], encodings.astype(np.float32), given.cover, p["means"], p["means"][centers])
+        centers = inputs.regions.centers
+        values = (p["raw_features"], encodings.astype(np.float32), inputs.cover, p["means"], p["means"][centers])
         values += (p["quats"][centers], np.exp(p["log_scales"][centers]))
         with torch.no_grad():
             tensors = [torch.from_numpy(v) for v in values]
-            return fusion(*tensors, torch.tensor(given.regions.radius, dtype=torch.float32))[0].numpy()
+            return fusion(*tensors, torch.tensor(inputs.regions.radius, dtype=torch.float32))[0].numpy()
 
     wanted = fused(exact)
     assert scene.label_embeddings is not None
@@ -114,7 +115,7 @@ def main() -> None:
         writer = csv.DictWriter(handle, list(rows[0]))
         writer.writeheader()
         writer.writerows(rows)
-    m, n = given.mask.shape
+    m, n = inputs.mask.shape
     print(f"{m} regions of up to {n} Gaussians, {len(order)} Gaussians, {n_threads()} threads; largest encoding "
           f"{np.abs(exact).max():.2f}")  # fmt: skip
     widths = {key: max(len(key), *(len(row[key]) for row in rows)) for key in rows[0]}

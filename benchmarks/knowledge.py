@@ -33,18 +33,15 @@ def main() -> None:
     options = parser.parse_args()
     print(f"chebsplat {chebsplat.__version__}, torch {torch.__version__} on {torch.get_num_threads()} threads; "
           f"{os.cpu_count()} cores, load {os.getloadavg()[0]:.1f}")  # fmt: skip
-    config = Config()
-    train = config.train.model_dump()
-    train |= {"coarse_until": 0.0, "encode_from": 0.0, "n_densify": 0, "refresh_every": 10**9}
-    trainer = prepared(options.work, train, config.describe.model_dump())
-    trainer.refresh()
+    train = {"coarse_until": 0.0, "encode_from": 0.0, "n_densify": 0, "refresh_every": 1_000_000}
+    trainer = prepared(options.work, Config.model_validate({"train": train}))
     assert trainer.model.shape is not None
     projections = trainer.model.shape.encoder.projections()
     began = time.perf_counter()
     bases = {name: cks.update(None, W.detach())[0] for name, W in projections.items()}
     update = time.perf_counter() - began
     times: dict[bool, list[float]] = {False: [], True: []}
-    rounds, period = trainer.steps(), trainer.settings["encode_every"]
+    rounds, period = trainer.steps(), trainer.settings.encode_every
     for turn in range(2 * options.turns + 10):
         trainer.basis = bases if turn % 2 else {}
         before = trainer.seconds
@@ -58,7 +55,7 @@ def main() -> None:
         cks.basis_loss(trainer.model.shape.encoder.projections(), bases).backward()
         alone.append(time.perf_counter() - began)
     without, with_it = (statistics.median(times[which]) for which in (False, True))
-    n_steps = config.train.steps
+    n_steps = trainer.settings.steps
     share = 100 * (statistics.median(alone) * n_steps + update) / (without * n_steps)
     found = {
         "projections": len(bases),

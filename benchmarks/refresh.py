@@ -31,10 +31,9 @@ INTERVALS = (25, 50, 100, 200, 400)
 
 
 def prepared(options: argparse.Namespace) -> Trainer:
-    config = Config()
-    train = config.train.model_dump() | {"n_densify": 0, "refresh_every": 10**9}
+    config = Config.model_validate({"train": {"n_densify": 0, "refresh_every": 1_000_000}})
     capture, points = read_capture(options.capture), read_points(options.points)
-    return trainer_of(capture, points, read_features(options.features), train, config.describe.model_dump())
+    return trainer_of(capture, points, read_features(options.features), config.train, config.describe)
 
 
 def descriptors(trainer: Trainer) -> torch.Tensor:
@@ -42,7 +41,8 @@ def descriptors(trainer: Trainer) -> torch.Tensor:
     shape, raw = trainer.model.shape, trainer.model.raw
     assert shape is not None
     arguments = raw["means"].detach(), raw["quats"].detach(), raw["log_scales"].detach().exp(), shape.members
-    return describe_members(*arguments, **shape.described.parameters).values
+    options = shape.describe.model_dump(exclude={"n_regions", "region_size", "seed"})
+    return describe_members(*arguments, **options).values
 
 
 def staleness(old: torch.Tensor, new: torch.Tensor) -> tuple[float, float]:
@@ -58,8 +58,7 @@ def main() -> None:
     parser.add_argument("--out", type=Path, default=Path("build/bench"))
     options = parser.parse_args()
     trainer = prepared(options)
-    trainer.refresh()
-    begin = round(trainer.settings["encode_from"] * trainer.settings["steps"])
+    begin = round(trainer.settings.encode_from * trainer.settings.steps)
     before, spent, began = torch.zeros(0), 0.0, 0.0
     rows: list[dict[str, Any]] = []
     for _ in trainer.steps():

@@ -13,10 +13,8 @@ import argparse
 import csv
 import os
 import time
-from functools import partial
 from pathlib import Path
 from typing import Any
-from unittest import mock
 
 import numba
 import numpy as np
@@ -25,9 +23,10 @@ from prepared import prepared
 
 from chebsplat.formats.capture import read_capture
 from chebsplat.formats.points import read_points
-from chebsplat.rasterize import rasterize
 from chebsplat.stages.config import Config
 from chebsplat.views import Views
+
+NEVER = 1_000_000  # steps
 
 
 def test_views(work: Path) -> Views:
@@ -40,18 +39,14 @@ def test_views(work: Path) -> Views:
 
 
 def train(work: Path, backend: str, steps: int, seed: int) -> dict[str, Any]:
-    config = Config()
-    settings, describe = config.train.model_dump(), config.describe.model_dump()
-    settings |= {"steps": steps, "seed": seed, "encoder": "off", "max_gaussians": 20_000, "refresh_every": 10**9}
-    trainer = prepared(work, settings, describe)
-    with mock.patch("chebsplat.training.model.rasterize", partial(rasterize, backend=backend)):
-        trainer.refresh()
-        began = time.perf_counter()
-        for _ in trainer.steps():
-            pass
-        seconds = time.perf_counter() - began
-        trainer.views = test_views(work)
-        psnr = trainer.held_in_psnr(list(range(len(trainer.views.names))))
+    settings = {"steps": steps, "seed": seed, "encoder": "off", "max_gaussians": 20_000, "refresh_every": NEVER}
+    trainer = prepared(work, Config.model_validate({"train": settings}), backend)
+    began = time.perf_counter()
+    for _ in trainer.steps():
+        pass
+    seconds = time.perf_counter() - began
+    trainer.views = test_views(work)
+    psnr = trainer.held_in_psnr(list(range(len(trainer.views.names))))
     found = {"backend": backend, "steps": steps, "seed": seed, "seconds": seconds, "psnr": psnr}
     return found | {"gaussians": len(trainer.model), "channels": trainer.model.raw["features"].shape[-1]}
 

@@ -27,6 +27,7 @@ def installed() -> dict[str, Path]:
 
 
 PLUMBING = {f"stages.{name}" for name in ("config", "settings", "registry", "command", "progress", "stopping")}
+PLUMBING |= {"chebsplat.settings"}
 LAYERS = ("formats", "stages", "pipelines", "teachers")
 OPTIONAL = {"gsplat", "tokenizers", "transformers"}  # of extras: their versions count only where a scene uses them
 

@@ -11,8 +11,8 @@ from pydantic import BaseModel, ValidationError
 
 from chebsplat.errors import ChebsplatError, ConfigError
 from chebsplat.formats.files import parse_json, parse_toml
+from chebsplat.settings import DescribeSection, Section, TrainSection
 from chebsplat.stages import settings as parts
-from chebsplat.stages.settings import Section
 
 Model = TypeVar("Model", bound=BaseModel)
 WORDS = {  # pydantic's kinds of error, in a user's words
@@ -36,8 +36,8 @@ class Config(Section):
     sfm: parts.SfmSection = parts.SfmSection()
     projection: parts.ProjectionSection = parts.ProjectionSection()
     teacher: parts.TeacherSection = parts.TeacherSection()
-    describe: parts.DescribeSection = parts.DescribeSection()
-    train: parts.TrainSection = parts.TrainSection()
+    describe: DescribeSection = DescribeSection()
+    train: TrainSection = TrainSection()
     export: parts.ExportSection = parts.ExportSection()
     onnx: parts.OnnxSection = parts.OnnxSection()
     cks: parts.CksSection = parts.CksSection()

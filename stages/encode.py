@@ -14,7 +14,8 @@ from chebsplat.stages.inference import Model
 if TYPE_CHECKING:
     import numpy as np
 
-    from chebsplat.shape.encoding import Given
+    from chebsplat.settings import DescribeSection
+    from chebsplat.shape.region_inputs import RegionInputs
 
 CHUNK = 256  # regions that the encoder sees at once
 
@@ -34,9 +35,8 @@ def encode(scene: Path, encoder: Path, features: Path | None, out: Path) -> dict
     import numpy as np
 
     from chebsplat.formats.encoder import DYNAMIC, FLOAT, FUSED, read_encoder
-    from chebsplat.shape.encoding import prepare
+    from chebsplat.settings import DescribeSection
     from chebsplat.stages.config import checked
-    from chebsplat.stages.settings import DescribeSection
 
     if out.suffix != ".npz":
         raise ConfigError(f"{out}: the result is a .npz; name it so")
@@ -49,39 +49,55 @@ def encode(scene: Path, encoder: Path, features: Path | None, out: Path) -> dict
     held = read_encoder(folder)
     settings = held.contract["settings"]
     file = f"{folder / 'contract.json'}: settings.describe"
-    settings |= {"describe": checked(DescribeSection, settings["describe"], file, InputError).model_dump()}
+    describe = checked(DescribeSection, settings["describe"], file, InputError)
     p, order = gaussians(scene, features, settings["n_channels"])
     began = time.perf_counter()
     try:
-        given = prepare(p["means"], p["quats"], p["log_scales"], p["raw_features"], settings)
+        inputs = inputs_of(p, describe, settings)
     except ValueError as error:
         raise InputError(f"{scene} cannot be encoded: {error}") from None
     described = time.perf_counter()
-    encodings = encoded(held.models[name], given)
+    encodings = encoded(held.models[name], inputs)
     done = time.perf_counter()
-    centers = given.regions.centers
+    centers = inputs.regions.centers
     fused, gate = opened(held.models[FUSED]).run(
         {
             "features": p["raw_features"],
             "encodings": encodings,
-            "cover": given.cover,
+            "cover": inputs.cover,
             "means": p["means"],
             "centers": p["means"][centers],
             "quats": p["quats"][centers],
             "scales": np.exp(p["log_scales"][centers]),
-            "radius": np.array(given.regions.radius, np.float32),
+            "radius": np.array(inputs.regions.radius, np.float32),
         },
     )
     if any(values.shape != p["raw_features"].shape for values in (fused, gate)):
         raise InputError(f"{held.models[FUSED]} is of another scene's encoder; {artifact.remedy(folder)}")
     finished = time.perf_counter()
     place = np.argsort(order)  # of each Gaussian in the scene's files
-    members = given.regions.members
+    members = inputs.regions.members
     result = {"fused": fused[order], "gate": gate[order], "encodings": encodings, "centers": place[centers]}
-    result |= {"members": np.where(members >= 0, place[members], -1), "radius": np.float64(given.regions.radius)}
+    result |= {"members": np.where(members >= 0, place[members], -1), "radius": np.float64(inputs.regions.radius)}
     write(out, result)
     seconds = {"describing": described - began, "encoding": done - described, "fusing": finished - done}
     return {"gaussians": len(order), "regions": len(centers)} | {f"{k} s": round(v, 3) for k, v in seconds.items()}
+
+
+def inputs_of(p: dict[str, np.ndarray], describe: DescribeSection, settings: dict[str, Any]) -> RegionInputs:
+    """What the models are fed with of raw parameters; settings: of the contract. Raises as `region_inputs`."""
+    from chebsplat.shape.region_inputs import region_inputs
+
+    return region_inputs(
+        p["means"],
+        p["quats"],
+        p["log_scales"],
+        p["raw_features"],
+        describe,
+        n_covers=settings["n_covers"],
+        described=settings["described"],
+        context=settings["context"],
+    )
 
 
 def gaussians(scene: Path, features: Path | None, n_channels: int) -> tuple[dict[str, np.ndarray], np.ndarray]:
@@ -135,15 +151,15 @@ def opened(path: Path) -> Model:
     return Model(path, artifact.remedy(path.parent), options)
 
 
-def encoded(model: Path, given: Given) -> np.ndarray:
+def encoded(model: Path, inputs: RegionInputs) -> np.ndarray:
     """Encodings f32 [M, C] of all regions."""
     import numpy as np
 
     runner = opened(model)
-    feed = {"inputs": given.inputs, "positions": given.positions, "mask": given.mask}
-    starts = range(0, len(given.mask), CHUNK)
+    feed = {"inputs": inputs.inputs, "positions": inputs.positions, "mask": inputs.mask}
+    starts = range(0, len(inputs.mask), CHUNK)
     found = np.concatenate([runner.run({k: v[s : s + CHUNK] for k, v in feed.items()})[0] for s in starts])
-    if found.ndim != 2 or len(found) != len(given.mask) or not np.isfinite(found).all():
+    if found.ndim != 2 or len(found) != len(inputs.mask) or not np.isfinite(found).all():
         raise InputError(f"{model} gives {found.shape} or values that are not finite; {artifact.remedy(model.parent)}")
     return found
 

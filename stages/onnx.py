@@ -58,8 +58,8 @@ def run(job: Job) -> None:
 def trained_with(path: Path) -> dict[str, Any]:
     """The sections `describe` and `train` that the checkpoint was made with. Raises InputError if it names none."""
     from chebsplat.formats.artifact import read_manifest
+    from chebsplat.settings import DescribeSection, TrainSection
     from chebsplat.stages.config import checked
-    from chebsplat.stages.settings import DescribeSection, TrainSection
 
     config, file = read_manifest(path).config, path / "artifact.json"
     if not {"describe", "train"} <= set(config):

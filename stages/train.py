@@ -11,46 +11,56 @@ from chebsplat.errors import DataFailure
 from chebsplat.stages.command import Job, command, n_threads
 from chebsplat.stages.resume import Saves
 from chebsplat.stages.stopping import deferred
-from chebsplat.stages.train_inputs import described, first_regions, knowledge, trainer_of, within_cap
+from chebsplat.stages.train_inputs import described, first_regions, knowledge, model_of, training_views, within_cap
 
 if TYPE_CHECKING:
     import numpy as np
 
+    from chebsplat.settings import TrainSection
     from chebsplat.training.trainer import Trainer
 
 log = logging.getLogger("chebsplat")
 
 
 def run(job: Job) -> None:
+    from chebsplat.cameras import extent
     from chebsplat.formats.cameras import Cameras
     from chebsplat.formats.capture import read_capture
     from chebsplat.formats.features import read_features
     from chebsplat.formats.gaussians import Gaussians, write_gaussians
     from chebsplat.formats.points import read_points
+    from chebsplat.training.trainer import Trainer
 
-    train, describe = job.config.train.model_dump(), job.config.describe.model_dump()
+    train = job.config.train
     capture, given = read_capture(job.inputs["capture"]), read_points(job.inputs["points"])
-    found, points = described(job, given, describe), within_cap(job, given, train)
-    features = read_features(job.inputs["features"]) if "features" in job.inputs and train["semantics"] else None
+    found, points = described(job, given), within_cap(job, given)
+    features = read_features(job.inputs["features"]) if "features" in job.inputs and train.semantics else None
     note_left_out(job, train, features is not None)
     import torch  # once its inputs are known to be usable
 
     torch.set_num_threads(n_threads())  # sums of torch depend on it; the same bytes are promised for the same number
-    trainer = trainer_of(capture, points, features, train, describe)
-    model = trainer.model
-    trainer.basis = knowledge(job, model, train)
-    first_regions(trainer, found if points is given else None)
+    model = model_of(points, features, train, job.config.describe)
+    regions, descriptors = first_regions(found if points is given else None)
+    trainer = Trainer(
+        model,
+        training_views(capture, points, features),
+        train,
+        extent(points.cam_from_world),
+        basis=knowledge(job, model, train),
+        regions=regions,
+        descriptors=descriptors,
+    )
     trace = follow(job, trainer, train)
-    parameters, people = trainer.finish(), trainer.population
-    if people.n_broken:
-        log.warning("%d Gaussians became non-finite and were removed", people.n_broken)
+    parameters, population = trainer.finish(), trainer.population
+    if population.n_broken:
+        log.warning("%d Gaussians became non-finite and were removed", population.n_broken)
     left = parameters["degrees"].size
     if left == 0:
         raise DataFailure("no Gaussian is left; lower train.weight_mask or raise train.min_gaussians")
     modules = {f"{n}.{k}": v.detach().numpy() for n, m in model.modules.items() for k, v in m.state_dict().items()}
     cameras = Cameras(points.names, points.Ks, points.cam_from_world, *capture.size)
-    notes: dict[str, Any] = {"left_out": job.facts.get("left_out", {}), "n_added": people.n_added}
-    notes |= {"n_removed": people.n_removed, "n_broken": people.n_broken, "n_initial": len(points.means)}
+    notes: dict[str, Any] = {"left_out": job.facts.get("left_out", {}), "n_added": population.n_added}
+    notes |= {"n_removed": population.n_removed, "n_broken": population.n_broken, "n_initial": len(points.means)}
     if features is not None:
         notes |= {"label_names": features.label_names, "convention": features.convention}
     if model.shape is not None:
@@ -77,16 +87,16 @@ def agreement(alone: np.ndarray, features: np.ndarray, embeddings: np.ndarray) -
     return {"agreement": float((found == wanted).mean()), "commonest": float(np.bincount(wanted).max() / len(wanted))}
 
 
-def note_left_out(job: Job, train: dict[str, Any], has_semantics: bool) -> None:
+def note_left_out(job: Job, train: TrainSection, has_semantics: bool) -> None:
     """Say what this training does without, and why."""
     if not has_semantics:
-        why = "no teacher features: rendering only" if train["semantics"] else "train.semantics is false"
+        why = "no teacher features: rendering only" if train.semantics else "train.semantics is false"
         job.left_out("semantic branch", why)
     unneeded = {
-        "shape encoder": [(not has_semantics, "no semantics to encode"), (train["encoder"] == "off", "encoder is off")],
-        "pruning": [(not train["prune"], "train.prune is false")],
-        "densification": [(train["densify"] == "off", "train.densify is off")],
-        "SH pruning": [(not train["sh_prune"], "train.sh_prune is false")],
+        "shape encoder": [(not has_semantics, "no semantics to encode"), (train.encoder == "off", "encoder is off")],
+        "pruning": [(not train.prune, "train.prune is false")],
+        "densification": [(train.densify == "off", "train.densify is off")],
+        "SH pruning": [(not train.sh_prune, "train.sh_prune is false")],
         "knowledge basis": [("basis" not in job.inputs, "no sequence is named: this scene starts from nothing")],
     }
     for what, reasons in unneeded.items():
@@ -95,7 +105,7 @@ def note_left_out(job: Job, train: dict[str, Any], has_semantics: bool) -> None:
             job.left_out(what, applying[0])
 
 
-def follow(job: Job, trainer: Trainer, train: dict[str, Any]) -> list[dict[str, float]]:
+def follow(job: Job, trainer: Trainer, train: TrainSection) -> list[dict[str, float]]:
     """Run the steps, from the last save where there is one; returns the trace.
 
     A row holds means of the losses since the row before; its seconds count training alone, not the held-in
@@ -109,16 +119,16 @@ def follow(job: Job, trainer: Trainer, train: dict[str, Any]) -> list[dict[str, 
     trace: list[dict[str, float]] = []
     since: list[dict[str, float]] = []
     if (held := saves.load()) is not None:
-        trainer.restore(held["trainer"])
+        trainer.load_state_dict(held["trainer"])
         trace, since = held["trace"], held["since"]
         job.facts["resumed_at"] = [*held["resumed_at"], trainer.step]
         log.info("resumed at step %d", trainer.step)
     with deferred() as asked:
-        losses: deque[float] = deque(maxlen=train["encode_every"])  # some terms are in one step of so many alone
+        losses: deque[float] = deque(maxlen=train.encode_every)  # some terms are in one step of so many alone
         rounds = job.progress.track(trainer.steps(), lambda: expected(trainer), "train", start=trainer.step)
         for figures, status in rounds:
             since.append(figures)
-            if trainer.step % train["report_every"] == 0 or trainer.share >= 1:
+            if trainer.step % train.report_every == 0 or trainer.share >= 1:
                 trace.append(measured(trainer, since, watched))
                 since = []
                 job.progress.record(**trace[-1])
@@ -153,7 +163,7 @@ def expected(trainer: Trainer) -> int:
 
 def state(trainer: Trainer, trace: list[dict[str, float]], since: list[dict[str, float]], job: Job) -> dict[str, Any]:
     resumed = job.facts.get("resumed_at", [])
-    return {"trainer": trainer.state(), "trace": trace, "since": since, "resumed_at": resumed}
+    return {"trainer": trainer.state_dict(), "trace": trace, "since": since, "resumed_at": resumed}
 
 
 def optimizer_state(trainer: Trainer) -> dict[str, np.ndarray]:

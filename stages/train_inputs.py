@@ -2,16 +2,21 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 from chebsplat.errors import DataFailure, InputError
 from chebsplat.stages.command import Job
 
 if TYPE_CHECKING:
+    from torch import Tensor
+
     from chebsplat.formats.capture import Capture
     from chebsplat.formats.descriptors import Descriptors
     from chebsplat.formats.features import Features
     from chebsplat.formats.points import Points
+    from chebsplat.settings import DescribeSection, TrainSection
+    from chebsplat.shape.regions import Regions
+    from chebsplat.training.model import SceneModel
     from chebsplat.training.trainer import Trainer
     from chebsplat.views import Views
 
@@ -57,24 +62,36 @@ def training_views(capture: Capture, points: Points, features: Features | None) 
 
 
 def trainer_of(
-    capture: Capture, points: Points, features: Features | None, train: dict[str, Any], describe: dict[str, Any]
+    capture: Capture,
+    points: Points,
+    features: Features | None,
+    train: TrainSection,
+    describe: DescribeSection,
+    backend: str = "auto",
 ) -> Trainer:
-    """The training before its first refresh, without earlier knowledge; `train` and `describe` as in the config."""
-    import torch
-
+    """A training before its first step, without earlier knowledge; backend: of the rasterizer."""
     from chebsplat.cameras import extent
-    from chebsplat.splats.gaussians import initial_gaussians
-    from chebsplat.training.model import SceneModel
     from chebsplat.training.trainer import Trainer
 
-    torch.manual_seed(train["seed"])
+    model = model_of(points, features, train, describe, backend)
+    return Trainer(model, training_views(capture, points, features), train, extent(points.cam_from_world))
+
+
+def model_of(
+    points: Points, features: Features | None, train: TrainSection, describe: DescribeSection, backend: str = "auto"
+) -> SceneModel:
+    """The scene before training: a Gaussian at each point, modules drawn by the training's seed."""
+    import torch
+
+    from chebsplat.splats.gaussians import initial_gaussians
+    from chebsplat.training.model import SceneModel
+
+    torch.manual_seed(train.seed)
     raw = initial_gaussians(points.means, points.colors, points.covariances)
-    model = SceneModel(raw, describe, train, None if features is None else features.features.shape[-1])
-    views = training_views(capture, points, features)
-    return Trainer(model, views, train, describe, extent(points.cam_from_world), {})
+    return SceneModel(raw, describe, train, None if features is None else features.features.shape[-1], backend)
 
 
-def knowledge(job: Job, model: Any, train: dict[str, Any]) -> dict[str, Any]:
+def knowledge(job: Job, model: SceneModel, train: TrainSection) -> dict[str, Tensor]:
     """Bases of earlier scenes; with `train.warm_start` the encoder also starts from their weights."""
     if "basis" not in job.inputs or model.shape is None:
         return {}
@@ -86,7 +103,7 @@ def knowledge(job: Job, model: Any, train: dict[str, Any]) -> dict[str, Any]:
     wrong = [n for n, w in projections.items() if n not in basis.bases or len(basis.bases[n]) != len(w)]
     if wrong:
         raise InputError(f"{job.inputs['basis']} does not fit the encoder at {wrong[0]}; start another sequence")
-    if train["warm_start"]:
+    if train.warm_start:
         state = model.shape.encoder.state_dict()
         fitting = {k: torch.from_numpy(v) for k, v in basis.weights.items() if k in state and state[k].shape == v.shape}
         model.shape.encoder.load_state_dict(state | fitting)
@@ -94,20 +111,20 @@ def knowledge(job: Job, model: Any, train: dict[str, Any]) -> dict[str, Any]:
         job.facts["warm_started"] = len(fitting)
         if other := sorted(state.keys() - fitting.keys()):
             job.left_out(f"warm start of {', '.join(other)}", "the earlier encoder has none of this shape")
-    return {name: torch.from_numpy(basis.bases[name]) for name in projections} if train["weight_basis"] > 0 else {}
+    return {name: torch.from_numpy(basis.bases[name]) for name in projections} if train.weight_basis > 0 else {}
 
 
-def within_cap(job: Job, points: Points, train: dict[str, Any]) -> Points:
+def within_cap(job: Job, points: Points) -> Points:
     """The points that a training starts from: all, or as many as `max_gaussians` lets in."""
     from chebsplat.formats.points import thinned
 
-    n, most = len(points.means), train["max_gaussians"]
+    n, most = len(points.means), job.config.train.max_gaussians
     if n > most:
         job.left_out(f"{n - most} of {n} initial points, and regions of all", f"train.max_gaussians is {most}")
-    return thinned(points, most, train["seed"])
+    return thinned(points, most, job.config.train.seed)
 
 
-def described(job: Job, points: Points, describe: dict[str, Any]) -> Descriptors | None:
+def described(job: Job, points: Points) -> Descriptors | None:
     """The describe stage's regions where there are any. Raises InputError unless they are of these points and settings.
 
     They are read before anything is built, so that a wrong artifact costs no time.
@@ -120,22 +137,22 @@ def described(job: Job, points: Points, describe: dict[str, Any]) -> Descriptors
     found = read_descriptors(path)
     if max(found.members.max(initial=-1), found.centers.max(initial=-1)) >= len(points.means):
         raise InputError(f"{path} describes other points; run the describe stage on these points")
-    wrong = [f"describe.{name}" for name, value in describe.items() if found.settings.get(name) != value]
+    describe = job.config.describe
+    wrong = [f"describe.{name}" for name, value in describe.model_dump().items() if found.settings.get(name) != value]
     if wrong:
         raise InputError(f"{path} has another {wrong[0]}; run the describe stage with this config")
-    if found.values.shape[1:3] != (found.members.shape[1], describe["n_angles"]):
+    if found.values.shape[1:3] != (found.members.shape[1], describe.n_angles):
         raise InputError(f"{path} has descriptors of another shape; run the describe stage again")
     return found
 
 
-def first_regions(trainer: Trainer, found: Descriptors | None) -> None:
-    """Start from the describe stage's regions, or make them."""
+def first_regions(found: Descriptors | None) -> tuple[Regions | None, Tensor | None]:
+    """The describe stage's regions and descriptors for a training to start from; None: it makes its own."""
     import torch
 
     from chebsplat.shape.regions import Regions
 
     if found is None:
-        trainer.refresh()
-        return
+        return None, None
     regions = Regions(found.centers, found.members, found.settings["radius"], found.settings["share"])
-    trainer.refresh(regions, torch.from_numpy(found.values))
+    return regions, torch.from_numpy(found.values)

@@ -18,15 +18,16 @@ MAY_IMPORT = {
 PACKAGES = {
     "kernels": set(),
     "cameras": set(),
+    "settings": set(),
     "synthetic": set(),
     "labels": set(),
     "splats": {"kernels"},
     "views": set(),
     "rasterize": {"kernels", "splats"},
     "render": {"rasterize", "splats", "views"},
-    "shape": {"kernels", "splats"},
+    "shape": {"kernels", "settings", "splats"},
     "evaluation": {"labels", "rasterize", "render", "views"},
-    "training": {"evaluation", "kernels", "rasterize", "shape", "splats", "views"},
+    "training": {"evaluation", "kernels", "rasterize", "settings", "shape", "splats", "views"},
 }
 SOURCES = [p for layer in LAYERS for p in sorted((ROOT / layer).rglob("*.py"))]
 

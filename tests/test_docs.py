@@ -68,3 +68,21 @@ def test_citations_of_the_method_lead_to_a_section():
             cited |= set(re.findall(r"docs/method\.md, section (\d+)", path.read_text()))
     assert cited
     assert cited <= sections
+
+
+@pytest.mark.xdist_group("toy")
+def test_the_python_of_the_readme_renders_a_scene(toy):
+    text = (ROOT / "README.md").read_text()
+    code = re.search(r"```python\n(.*?)```", text, re.DOTALL)[1]
+    assert '"work/office0/export"' in code
+    found = {}
+    exec(code.replace("work/office0/export", str(toy["export"])), found)
+    assert found["image"].shape[2] == 3 and found["image"].std() > 0
+    assert found["features"].shape[:2] == found["image"].shape[:2]
+
+
+def test_the_readme_is_short_and_answers_a_newcomer():
+    text = (ROOT / "README.md").read_text()
+    assert len(text.split()) <= 900
+    headings = re.findall(r"^## (.*)$", text, re.MULTILINE)
+    assert {"Install", "Your own photos", "Look at the result", "Use it from Python", "GPU"} <= set(headings)

@@ -183,15 +183,16 @@ def test_arguments_that_do_not_fit_are_errors_that_name_the_remedy(toy, tmp_path
 
 
 def test_a_cut_spectrum_and_an_empty_scene_are_refused_by_name():
-    from chebsplat.shape.encoding import prepare
+    from chebsplat.settings import DescribeSection
+    from chebsplat.shape.region_inputs import region_inputs
 
-    describe = {"n_regions": 2, "region_size": 4, "seed": 0, "spectrum": "taper"}
-    settings = {"describe": describe, "described": True, "context": False, "n_covers": 2}
+    describe = DescribeSection(n_regions=2, region_size=4, spectrum="taper")
+    tokens = {"described": True, "context": False, "n_covers": 2}
     rows = [np.ones((3, k), np.float32) for k in (3, 4, 3, 2)]
     with pytest.raises(ValueError, match=r"spectrum = taper is computed by torch only"):
-        prepare(*rows, settings)
+        region_inputs(*rows, describe, **tokens)
     with pytest.raises(ValueError, match="no Gaussians"):
-        prepare(*(row[:0] for row in rows), settings)
+        region_inputs(*(row[:0] for row in rows), describe, **tokens)
 
 
 @pytest.mark.slow

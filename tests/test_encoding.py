@@ -211,7 +211,7 @@ def two_shapes() -> tuple[SceneModel, torch.Tensor]:
     spread = np.concatenate([np.tile(np.diag([0.04, 0.04, 1e-5]), (n, 1, 1)), np.tile(np.eye(3) * 0.02, (n, 1, 1))])
     config = Config.model_validate({"describe": {"n_regions": 60, "n_angles": 2}, "train": {"context": "none"}})
     raw = initial_gaussians(means, np.full((2 * n, 3), 128, np.uint8), spread)
-    model = SceneModel(raw, config.describe.model_dump(), config.train.model_dump(), 2)
+    model = SceneModel(raw, config.describe, config.train, 2)
     kind = (torch.arange(2 * n) >= n).long()
     with torch.no_grad():
         model.raw["features"].copy_(torch.eye(2)[kind])

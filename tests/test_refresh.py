@@ -3,8 +3,8 @@
 import pytest
 import torch
 
+from chebsplat.shape.branch import ShapeBranch
 from chebsplat.stages.config import Config
-from chebsplat.training.model import Shape
 
 
 def scene(n=600, seed=0):
@@ -17,7 +17,7 @@ def scene(n=600, seed=0):
 def shape_of(**train):
     config = Config.model_validate({"describe": {"n_regions": 40, "region_size": 12}, "train": train})
     torch.manual_seed(0)
-    return Shape(6, config.describe.model_dump(), config.train.model_dump())
+    return ShapeBranch(6, config.describe, config.train)
 
 
 def full(shape, raw):

@@ -32,9 +32,9 @@ def test_closed_bands_leave_parameters_and_moments_and_the_picture_stays(tiny_tr
         raw["sh_logits"].copy_(torch.randn(raw["sh_logits"].shape, generator=torch.Generator().manual_seed(3)) * 6)
     degrees = (made.model.sh_mask(torch.arange(len(made.model))) > 0.5).sum(-1)
     moments = {name: dict(made.optimizer.state[value]) for name, value in raw.items()}
-    before, means = made.model.render(made.views.camera(0, 1), 3)[0].rgb, raw["means"].detach().clone()
+    before, means = made.model.render(made.views.camera(0, 1), 3).rgb, raw["means"].detach().clone()
     made.population.freeze_bands(made.optimizer)
-    after = made.model.render(made.views.camera(0, 1), 3)[0].rgb
+    after = made.model.render(made.views.camera(0, 1), 3).rgb
     assert (after - before).abs().max() < 2e-6  # the order of equal depths may change
     order = torch.argsort(degrees, descending=True, stable=True)
     assert torch.equal(raw["means"], means[order])
@@ -101,13 +101,13 @@ def test_a_resumed_training_takes_the_same_steps_to_the_bit(tiny_trainer, tmp_pa
     settings = {"steps": 24, "refresh_every": 5, "densify": densify, "grow_threshold": 1e-6}
     whole, sizes = tiny_trainer(**settings), []
     for _ in whole.steps():
-        torch.save(whole.state(), tmp_path / f"{whole.step}.pt")
+        torch.save(whole.state_dict(), tmp_path / f"{whole.step}.pt")
         sizes.append(len(whole.model))
     assert len(set(sizes)) > 1 and "sh_logits" not in whole.model.raw
     wanted, parameters = bits(whole), whole.finish()
     for step in (1, 5, 9, 14, 16, 20, 23):
         resumed = tiny_trainer(**settings)
-        resumed.restore(torch.load(tmp_path / f"{step}.pt", weights_only=True))
+        resumed.load_state_dict(torch.load(tmp_path / f"{step}.pt", weights_only=True))
         assert resumed.step == step
         for _ in resumed.steps():
             pass
@@ -129,7 +129,7 @@ def test_the_bands_guidance_is_found_when_wanted_and_anew_after_a_refresh(tiny_t
 
 def test_a_picture_without_features_has_the_colours_of_one_with_them(tiny_trainer):
     made = tiny_trainer()
-    pictures = [made.model.render(made.views.camera(0, 1), 3, semantic=k)[0] for k in (True, False)]
+    pictures = [made.model.render(made.views.camera(0, 1), 3, semantic=k) for k in (True, False)]
     torch.testing.assert_close(pictures[1].rgb, pictures[0].rgb, rtol=0, atol=1e-6)
     assert pictures[0].features is not None and pictures[1].features is None
 

@@ -43,7 +43,7 @@ def sphere(n: int) -> np.ndarray:
 
 
 def tiny_trainer(means: np.ndarray | None = None, views: Views | None = None, **settings: Any) -> Trainer:
-    """A trainer of few Gaussians, by default 300 on a unit sphere, after its first refresh.
+    """A trainer of few Gaussians, by default 300 on a unit sphere.
 
     Args: settings: what differs in the config's train section.
     """
@@ -52,12 +52,9 @@ def tiny_trainer(means: np.ndarray | None = None, views: Views | None = None, **
     shapes = local_shape(means, 8)[0] if len(means) > 1 else np.eye(3, dtype=np.float32)[None] * 0.01
     small = {"steps": 20, "min_gaussians": 8, "max_gaussians": len(means) + 100, "n_densify": 2, "width": 16}
     config = Config.model_validate({"train": small | settings, "describe": {"n_regions": 24, "region_size": 16}})
-    train, describe = config.train.model_dump(), config.describe.model_dump()
-    torch.manual_seed(train["seed"])
-    model = SceneModel(initial_gaussians(means, colors, shapes, opacity=0.5), describe, train, CHANNELS)
-    trainer = Trainer(model, four_views() if views is None else views, train, describe, 1.0, {})
-    trainer.refresh()
-    return trainer
+    torch.manual_seed(config.train.seed)
+    model = SceneModel(initial_gaussians(means, colors, shapes, opacity=0.5), config.describe, config.train, CHANNELS)
+    return Trainer(model, four_views() if views is None else views, config.train, 1.0)
 
 
 def ended(trainer: Trainer) -> tuple[str, float]:

@@ -8,10 +8,11 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from chebsplat.settings import DescribeSection
 from chebsplat.shape.descriptor import describe_members, n_degrees
 
 
-class Names:
+class GaussianIds:
     """A number for each Gaussian that it keeps while others are removed or added behind the last."""
 
     def __init__(self) -> None:
@@ -27,22 +28,29 @@ class Names:
         return self.ids
 
     def keep(self, rows: np.ndarray) -> None:
-        """Those where `rows` [N] is false are gone."""
+        """Those where `rows` [N] is false are gone; an order i64 [N] instead sorts them anew."""
         self.ids = self.of(len(rows))[rows]
+
+    def state_dict(self, n: int) -> dict[str, Any]:
+        """Of n Gaussians."""
+        return {"ids": torch.from_numpy(self.of(n)), "next": self.next}
+
+    def load_state_dict(self, state: dict[str, Any]) -> None:
+        self.ids, self.next = state["ids"].numpy(), state["next"]
 
 
 class Descriptors:
     """Descriptors of regions beside the Gaussians that they were computed from.
 
     Args:
-      parameters: keyword arguments of `describe_members`.
-      tolerance:  what a region's members may change by before it is described anew: centres as a fraction of the
+      settings:  of the descriptor.
+      tolerance: what a region's members may change by before it is described anew: centres as a fraction of the
         region's radius, log-scales and quaternions as they are. At 0 the values are those of `describe_members`,
         bit for bit.
     """
 
-    def __init__(self, parameters: dict[str, Any], tolerance: float = 0.0):
-        self.parameters, self.tolerance = parameters, tolerance
+    def __init__(self, settings: DescribeSection, tolerance: float = 0.0):
+        self.settings, self.tolerance = settings, tolerance
         self.n_described = self.n_regions = 0  # over all calls
         self.forget()
 
@@ -52,7 +60,7 @@ class Descriptors:
         return self.n_described / max(self.n_regions, 1)
 
     def forget(self, region_size: int = 0) -> None:
-        size = self.parameters["n_angles"] * n_degrees(self.parameters["spectrum"], self.parameters["max_degree"])
+        size = self.settings.n_angles * n_degrees(self.settings.spectrum, self.settings.max_degree)
         self.given = torch.zeros(0, region_size, 10)
         self.mask = torch.zeros(0, region_size, dtype=torch.bool)
         self.values = torch.zeros(0, region_size, size)
@@ -61,6 +69,15 @@ class Descriptors:
         """Of the regions, only `rows` [M] bool are left; the Gaussians' own indices do not matter here."""
         if len(rows) == len(self.values):
             self.given, self.mask, self.values = self.given[rows], self.mask[rows], self.values[rows]
+
+    def state_dict(self) -> dict[str, Any]:
+        """What the next `update` compares with, and the counts: tensors, not copied, and plain values."""
+        counts = {"n_described": self.n_described, "n_regions": self.n_regions}
+        return {"given": self.given, "mask": self.mask, "values": self.values} | counts
+
+    def load_state_dict(self, state: dict[str, Any]) -> None:
+        self.given, self.mask, self.values = state["given"], state["mask"], state["values"]
+        self.n_described, self.n_regions = state["n_described"], state["n_regions"]
 
     def update(
         self,
@@ -89,7 +106,18 @@ class Descriptors:
         same = ((given[:held] - self.given[:held]).abs() <= limit).all(-1).all(-1)
         same &= (mask[:held] == self.mask[:held]).all(-1)
         changed = torch.cat([~same, torch.ones(len(members) - held, dtype=torch.bool)])
-        described = describe_members(means, quats, log_scales.exp(), members[changed], **self.parameters)
+        described = describe_members(
+            means,
+            quats,
+            log_scales.exp(),
+            members[changed],
+            n_angles=self.settings.n_angles,
+            max_degree=self.settings.max_degree,
+            anisotropy=self.settings.anisotropy,
+            bandwidth=self.settings.bandwidth,
+            spectrum=self.settings.spectrum,
+            n_eigs=self.settings.n_eigs,
+        )
         values = described.values.new_zeros(len(members), members.shape[1], self.values.shape[2])
         before = values.new_zeros(len(members), *given.shape[1:])
         values[:held], before[:held] = self.values[:held], self.given[:held]

@@ -2,44 +2,47 @@
 
 from __future__ import annotations
 
-from typing import Any
-
 import torch
 
+from chebsplat.settings import TrainSection
 from chebsplat.splats.sh import MAX_DEGREE
 from chebsplat.training.model import SceneModel
 
-RATES = {
-    "means": "lr_means",
-    "log_scales": "lr_scales",
-    "quats": "lr_quats",
-    "logit_opacities": "lr_opacities",
-    "sh0": "lr_sh0",
-    "sh1": "lr_sh",
-    "sh2": "lr_sh",
-    "sh3": "lr_sh",
-    "features": "lr_features",
-    "prune_logits": "lr_masks",
-    "sh_logits": "lr_sh_masks",
-}
 TRAVEL, MOST = 10.0, 5e-2  # a rate that is not given: less than TRAVEL over all steps does not arrive
 FASTER = {"means": 0.01, "features": 0.01, "modules": 0.01}  # what a rate has fallen to at the end; 0.1 elsewhere
 
 
-def adam(model: SceneModel, settings: dict[str, Any], extent: float) -> torch.optim.Adam:
+def rates(settings: TrainSection) -> dict[str, float]:
+    """Learning rate of each raw parameter before any schedule; that of `means` is relative to the scene's extent."""
+    features = settings.lr_features
+    return {
+        "means": settings.lr_means,
+        "log_scales": settings.lr_scales,
+        "quats": settings.lr_quats,
+        "logit_opacities": settings.lr_opacities,
+        "sh0": settings.lr_sh0,
+        "sh1": settings.lr_sh,
+        "sh2": settings.lr_sh,
+        "sh3": settings.lr_sh,
+        "features": min(TRAVEL / settings.steps, MOST) if features is None else features,
+        "prune_logits": settings.lr_masks,
+        "sh_logits": settings.lr_sh_masks,
+    }
+
+
+def adam(model: SceneModel, settings: TrainSection, extent: float) -> torch.optim.Adam:
     """A group for each raw parameter of the model and one for its modules, with their `rate` before any schedule.
 
     Args: settings: the train section; extent: scene units, scales the means' rate.
     """
     groups = []
+    found = rates(settings)
     for name, value in model.raw.items():
-        given = settings[RATES[name]]  # 0 holds a parameter where it is
-        rate = min(TRAVEL / settings["steps"], MOST) if given is None else given
-        rate *= extent if name == "means" else 1
+        rate = found[name] * (extent if name == "means" else 1)
         groups.append({"params": [value], "rate": rate, "name": name})
     weights = [p for module in model.modules.values() for p in module.parameters()]
     if weights:
-        groups.append({"params": weights, "rate": settings["lr_encoder"], "name": "modules"})
+        groups.append({"params": weights, "rate": settings.lr_encoder, "name": "modules"})
     return torch.optim.Adam(groups, eps=1e-15, fused=True)
 
 
@@ -48,24 +51,24 @@ class Schedule:
     two runs are not the same.
     """
 
-    def __init__(self, settings: dict[str, Any]):
+    def __init__(self, settings: TrainSection):
         self.settings = settings
-        self.seconds: float | None = settings["seconds"]
-        first, last, n = settings["densify_from"], settings["densify_until"], settings["n_densify"]
+        self.seconds: float | None = settings.seconds
+        first, last, n = settings.densify_from, settings.densify_until, settings.n_densify
         self.growth = [first + (last - first) * (k + 1) / (n + 1) for k in range(n)]
-        if settings["densify"] == "off":
+        if settings.densify == "off":
             self.growth = []
 
     def share(self, step: int, seconds: float) -> float:
         """Part of the budget, in [0, 1], that is spent once `step` is done."""
         if self.seconds is None:
-            return step / self.settings["steps"]
+            return step / self.settings.steps
         return min(seconds / self.seconds, 1.0)
 
     def last_step(self, step: int, seconds: float) -> int:
         """How many steps there will be, after `step` of them in `seconds`."""
         if self.seconds is None:
-            return int(self.settings["steps"])
+            return int(self.settings.steps)
         return max(step, round(step * self.seconds / seconds)) if seconds > 0 else step + 1
 
     def rate(self, name: str, share: float) -> float:
@@ -74,16 +77,25 @@ class Schedule:
 
     def degree(self, share: float) -> int:
         """SH bands in use: one more every tenth of the training."""
-        return min(int(share * 10 + 1e-9), self.settings["sh_degree"], MAX_DEGREE)
+        return min(int(share * 10 + 1e-9), self.settings.sh_degree, MAX_DEGREE)
 
     def factor(self, share: float) -> int:
         """What images are reduced by."""
-        return 2 if share <= self.settings["coarse_until"] else 1
+        return 2 if share <= self.settings.coarse_until else 1
 
     def grown(self, share: float) -> int:
         """How many times Gaussians were to be added until now."""
         return sum(share >= at for at in self.growth)
 
-    def has(self, what: str, share: float) -> bool:
-        """Has `what` begun: encode_from, prune_from, densify_until, sh_freeze?"""
-        return bool(share >= self.settings[what])
+    def encodes(self, share: float) -> bool:
+        return share >= self.settings.encode_from
+
+    def prunes(self, share: float) -> bool:
+        return share >= self.settings.prune_from
+
+    def has_grown(self, share: float) -> bool:
+        """Is growth over?"""
+        return share >= self.settings.densify_until
+
+    def freezes_bands(self, share: float) -> bool:
+        return share >= self.settings.sh_freeze

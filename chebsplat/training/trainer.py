@@ -12,51 +12,55 @@ from torch import Tensor
 
 from chebsplat.errors import DataFailure
 from chebsplat.evaluation.metrics import psnr
+from chebsplat.settings import TrainSection
 from chebsplat.shape import cks
 from chebsplat.shape.regions import Regions, build_regions
 from chebsplat.training import sh_prune
 from chebsplat.training.laps import Laps
 from chebsplat.training.losses import feature_distance, photometric
 from chebsplat.training.model import SceneModel
-from chebsplat.training.population import HELD as POPULATION
 from chebsplat.training.population import Population, broken
 from chebsplat.training.schedule import Schedule, adam
 from chebsplat.views import Views
 
-HELD = ("step", "seconds", "order", "members", "guidance")
+PROGRESS = ("step", "seconds", "order", "members", "guidance")
 
 
 class Trainer:
-    """Call `refresh()` once, iterate over `steps()`, then call `finish()`.
+    """Iterate over `steps()`, then call `finish()`.
 
     Args:
-      settings, describe: the config's sections; extent: scene units, scales the means' learning rate.
-      basis:    matrices [q, r] by name of an earlier scene's knowledge, empty for none.
-    `state()` between two steps holds all that the steps to come depend on: a trainer that is given it by `restore`
-    takes them as this one does, to the bit, with as many threads.
+      extent:   scene units, scales the means' learning rate.
+      basis:    matrices [q, r] by name of an earlier scene's knowledge; None: of none.
+      regions, descriptors: of the model's Gaussians as they are; None: they are computed.
+    `state_dict()` between two steps holds all that the steps to come depend on: a trainer that loads it takes them as
+    this one does, to the bit, with as many threads.
     """
 
     def __init__(
         self,
         model: SceneModel,
         views: Views,
-        settings: dict[str, Any],
-        describe: dict[str, Any],
+        settings: TrainSection,
         extent: float,
-        basis: dict[str, Tensor],
+        *,
+        basis: dict[str, Tensor] | None = None,
+        regions: Regions | None = None,
+        descriptors: Tensor | None = None,
     ):
-        self.model, self.views, self.settings, self.describe, self.extent = model, views, settings, describe, extent
-        self.basis = basis if model.shape is not None else {}
+        self.model, self.views, self.settings, self.extent = model, views, settings, extent
+        self.basis = basis if basis and model.shape is not None else {}
         self.schedule = Schedule(settings)
         self.guidance: Tensor | None = None
         self.optimizer = adam(self.model, self.settings, self.extent)
-        self.order_generator = np.random.default_rng(settings["seed"])
-        self.generator = torch.Generator().manual_seed(settings["seed"])
+        self.order_generator = np.random.default_rng(settings.seed)
+        self.generator = torch.Generator().manual_seed(settings.seed)
         self.order: list[int] = []  # views still to be seen before any is seen again
         self.step = 0
         self.seconds = 0.0  # of the steps but the first
         self.population = Population(model, settings, extent)
         self.laps = Laps()  # of the same steps; after a resume, from there on
+        self.refresh(regions, descriptors)
 
     @property
     def share(self) -> float:
@@ -84,9 +88,9 @@ class Trainer:
 
     def _adapt(self, share: float) -> None:
         """Growth, pruning, the freeze and refreshes that are due after a step."""
-        due = self.step % self.settings["refresh_every"] == 0
+        due = self.step % self.settings.refresh_every == 0
         growing = self.schedule.grown(share) > self.population.n_grown
-        removing = growing or (self.schedule.has("densify_until", share) and self.step % 200 == 0)
+        removing = growing or (self.schedule.has_grown(share) and self.step % 200 == 0)
         if growing or due:
             self._drop_broken()
         mask = self._soft_mask(share) if removing else None
@@ -96,7 +100,7 @@ class Trainer:
             self.population.remove(self.optimizer, mask)
         if removing or due:
             self.refresh()
-        if self.schedule.has("sh_freeze", share) and self.population.freeze_bands(self.optimizer):
+        if self.schedule.freezes_bands(share) and self.population.freeze_bands(self.optimizer):
             self.refresh()
 
     def _drop_broken(self) -> None:
@@ -108,44 +112,44 @@ class Trainer:
     @torch.no_grad()
     def _soft_mask(self, share: float) -> Tensor | None:
         """Of all Gaussians, once pruning has begun; encodings are as the last refresh or step left them."""
-        if not self.schedule.has("prune_from", share):
+        if not self.schedule.prunes(share):
             return None
         everyone, features, shape = torch.arange(len(self.model)), self.model.raw.get("features"), self.model.shape
         if shape is not None and features is not None and self._encodes(share) and self.model.semantic_gate is not None:
             features = shape.fuse(features, everyone)
         return self.model.soft_mask(everyone, features)
 
-    def state(self) -> dict[str, Any]:
+    def state_dict(self) -> dict[str, Any]:
         """All that the steps to come depend on: tensors (shared, not copied) and plain values."""
         return {
             "raw": {name: value.detach() for name, value in self.model.raw.items()},
             "modules": {name: module.state_dict() for name, module in self.model.modules.items()},
-            "shape": None if self.model.shape is None else self.model.shape.state(),
+            "regions": None if self.model.shape is None else self.model.shape.region_state(),
             "optimizer": self.optimizer.state_dict(),
             "order_generator": self.order_generator.bit_generator.state,
             "generator": self.generator.get_state(),
-            "population": {name: getattr(self.population, name) for name in POPULATION},
-        } | {name: getattr(self, name) for name in HELD}
+            "population": self.population.state_dict(),
+            "progress": {name: getattr(self, name) for name in PROGRESS},
+        }
 
-    def restore(self, state: dict[str, Any]) -> None:
-        """Go on as the trainer whose `state()` this is; it is not to be used otherwise afterwards."""
+    def load_state_dict(self, state: dict[str, Any]) -> None:
+        """Go on as the trainer whose `state_dict()` this is; that one is not to be used afterwards."""
         model = self.model
         model.raw = {name: value.requires_grad_(True) for name, value in state["raw"].items()}
         for name, module in model.modules.items():
             module.load_state_dict(state["modules"][name])
         if model.shape is not None:
-            model.shape.restore(state["shape"])
+            model.shape.load_region_state(state["regions"])
         self.optimizer = adam(self.model, self.settings, self.extent)
         self.optimizer.load_state_dict(state["optimizer"])
         self.order_generator.bit_generator.state = state["order_generator"]
         self.generator.set_state(state["generator"])
-        for name, value in ({k: state[k] for k in HELD}).items():
+        for name, value in state["progress"].items():
             setattr(self, name, value)
-        for name, value in state["population"].items():
-            setattr(self.population, name, value)
+        self.population.load_state_dict(state["population"])
 
     def _encodes(self, share: float) -> bool:
-        return self.model.shape is not None and self.schedule.has("encode_from", share)
+        return self.model.shape is not None and self.schedule.encodes(share)
 
     def refresh(self, regions: Regions | None = None, descriptors: Tensor | None = None) -> None:
         """Regions and descriptors of the Gaussians as they are now."""
@@ -156,14 +160,15 @@ class Trainer:
             regions = shape.regions
         elif regions is None:
             means = self.model.raw["means"].detach().double().numpy()
-            regions = build_regions(means, *(self.describe[k] for k in ("n_regions", "region_size", "seed")))
+            describe = self.model.describe
+            regions = build_regions(means, describe.n_regions, describe.region_size, describe.seed)
         assert regions is not None
         self.members, self.guidance = torch.as_tensor(regions.members), None
         self.laps.mark("refresh")
 
     def _guided(self, index: Tensor) -> Tensor | None:
         """Weights [V, 3] of the bands' penalty, found when they are first wanted after a refresh; None: all alike."""
-        if not self.settings["sh_guided"]:
+        if not self.settings.sh_guided:
             return None
         if self.guidance is None:
             self.laps.mark("losses")
@@ -175,30 +180,31 @@ class Trainer:
     def _step(self, index: int, share: float) -> dict[str, float]:
         settings, factor = self.settings, self.schedule.factor(share)
         target, mask = self.views.target(index, factor)
-        pruning = self.schedule.has("prune_from", share)
+        pruning = self.schedule.prunes(share)
         wanted = None if self.views.features is None else self.views.features(index)
-        rendered, aside = self.model.render(
+        rendered = self.model.render(
             self.views.camera(index, factor),
             self.schedule.degree(share),
             masked=pruning,
             fused=self._encodes(share),
-            generator=self.generator if self.step % settings["encode_every"] == 0 else None,
+            generator=self.generator if self.step % settings.encode_every == 0 else None,
             grid=None if wanted is None else (wanted.shape[0], wanted.shape[1]),
         )
         self.laps.mark("render")
-        losses = {"color": photometric(rendered.rgb, target, mask, settings["weight_ssim"])}
+        losses = {"color": photometric(rendered.rgb, target, mask, settings.weight_ssim)}
         if rendered.features is not None and wanted is not None:
-            distance = feature_distance(rendered.features, wanted, mask, settings["feature_loss"])
-            losses["features"] = settings["weight_features"] * distance
-        if "mask" in aside and pruning:
-            losses["mask"] = settings["weight_mask"] * aside["mask"].mean()
-        if "shape" in aside and settings["weight_shape"] > 0:
-            losses["shape"] = settings["weight_shape"] * aside["shape"]
-        if "bands" in aside:
-            losses["sh"] = settings["weight_sh"] * sh_prune.sh_loss(aside["bands"], self._guided(rendered.index))
+            distance = feature_distance(rendered.features, wanted, mask, settings.feature_loss)
+            losses["features"] = settings.weight_features * distance
+        auxiliary = rendered.auxiliary
+        if auxiliary.soft_mask is not None and pruning:
+            losses["mask"] = settings.weight_mask * auxiliary.soft_mask.mean()
+        if auxiliary.shape_distance is not None and settings.weight_shape > 0:
+            losses["shape"] = settings.weight_shape * auxiliary.shape_distance
+        if auxiliary.band_masks is not None:
+            losses["sh"] = settings.weight_sh * sh_prune.sh_loss(auxiliary.band_masks, self._guided(rendered.index))
         if self.basis and self.model.shape is not None:
             projections = self.model.shape.encoder.projections()
-            losses["basis"] = settings["weight_basis"] * cks.basis_loss(projections, self.basis)
+            losses["basis"] = settings.weight_basis * cks.basis_loss(projections, self.basis)
         loss = torch.stack(list(losses.values())).sum()
         if not torch.isfinite(loss):
             bad = [name for name, value in losses.items() if not torch.isfinite(value)]
@@ -206,7 +212,7 @@ class Trainer:
             raise DataFailure(f"{where}; {broken(self.model) or 'all parameters are finite: look at the view itself'}")
         self.laps.mark("losses")
         self.optimizer.zero_grad(set_to_none=True)
-        if settings["densify_semantic"]:
+        if settings.densify_semantic:
             loss.backward()
             self.population.note_gradients(rendered)
         else:
@@ -224,7 +230,7 @@ class Trainer:
         scores = []
         for index in indices:
             camera, degree = self.views.camera(index, 1), self.schedule.degree(self.share)
-            rendered, _ = self.model.render(camera, degree, semantic=False)
+            rendered = self.model.render(camera, degree, semantic=False)
             image = (rendered.rgb.clamp(0, 1) * 255).round().byte().numpy()
             mask = None if self.views.masks is None else self.views.masks[index].numpy()
             truth = self.views.images[index].numpy()

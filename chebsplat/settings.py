@@ -1,0 +1,131 @@
+"""The settings of descriptor and training: default, range and meaning. The other stages' are in `stages/settings.py`.
+
+Values are part of an artifact's key; this code is not. Upper bounds lie where a machine of 64 GB or a day of computing
+ends, far beyond what helps a scene. Types are strict: 1.0 and true are no whole numbers, and no number is infinite.
+"""
+
+from __future__ import annotations
+
+from typing import Any, Literal
+
+from pydantic import BaseModel, ConfigDict, Field, model_validator
+
+DESCRIPTOR_BYTES = 4 << 30  # of one scene's descriptors, at most
+
+
+def setting(default: Any, meaning: str, **bounds: Any) -> Any:
+    """A field with what it means in words, for `chebsplat settings`, and its bounds."""
+    return Field(default, description=meaning, **bounds)
+
+
+def number(default: float | None, meaning: str, low: float, high: float) -> Any:
+    """A field from `low` to `high`, both allowed."""
+    return setting(default, meaning, ge=low, le=high)
+
+
+def seed(meaning: str) -> Any:
+    return number(0, meaning, 0, 2**31 - 1)  # what pycolmap takes
+
+
+class Section(BaseModel):
+    model_config = ConfigDict(extra="forbid", frozen=True, strict=True, allow_inf_nan=False)
+
+
+class DescribeSection(Section):
+    """docs/method.md, section 2; shared by the describe stage and the refresh inside training."""
+
+    # with 10 for a, 8 angles are better than 4 and 30 at ghosts and noisy frames (make bench-shapes)
+    n_angles: int = number(8, "rotations of the anisotropic metric (J)", 1, 64)
+    max_degree: int = number(8, "degree of the Chebyshev descriptor (D)", 2, 64)
+    anisotropy: float = number(10.0, "of the metric (a); 0: isotropic", 0, 1e4)
+    bandwidth: float = number(0.7, "of the edge weights, relative to a region's radius", 1e-3, 1e3)
+    spectrum: Literal["full", "taper", "hard"] = setting("full", "eigenvalues that count; hard: the paper's cut")
+    n_eigs: int = number(16, "eigenvalues kept by taper and hard (K)", 1, 64)
+    region_size: int = number(32, "Gaussians in a region, at most", 4, 64)
+    n_regions: int = number(768, "regions that cover the scene", 1, 200_000)
+    seed: int = seed("of the choice of regions")
+
+    @model_validator(mode="after")
+    def _fits_in_memory(self) -> DescribeSection:
+        size = 4 * self.n_regions * self.region_size * self.n_angles * (self.max_degree + 1)
+        if size > DESCRIPTOR_BYTES:
+            raise ValueError(
+                f"n_regions, region_size, n_angles and max_degree make descriptors of {size / 2**30:.0f} GB; "
+                f"lower one, {DESCRIPTOR_BYTES >> 30} GB are possible"
+            )
+        return self
+
+
+class TrainSection(Section):
+    steps: int = number(3000, "of training; the schedule's fractions are of these", 1, 1_000_000)
+    seconds: float | None = number(None, "of training, instead of steps: the schedule follows the clock", 0.1, 604_800)
+    seed: int = seed("of the order of views and of all that is drawn in training")
+    # what is built
+    semantics: bool = setting(True, "false: colour only")
+    encoder: Literal["transformer", "mlp", "off"] = setting(
+        "transformer", 'of regions; mlp: the paper\'s "no TLE"; off: no shape branch'
+    )
+    albo: bool = setting(True, 'tokens hold descriptors; false: the paper\'s "no AGCD"')
+    prune: bool = setting(True, "remove Gaussians that add nothing")
+    prune_semantic: bool = setting(True, 'features guard Gaussians from pruning; false: "no semantic guidance"')
+    densify: Literal["mixed", "region", "classic", "off"] = setting(
+        "mixed", "where Gaussians grow; mixed: region and classic by turns"
+    )
+    densify_semantic: bool = setting(True, "false: the rendering loss alone says where Gaussians grow")
+    grow_threshold: float = number(
+        1e-4, "gradient to the 2D means that grows a Gaussian, half image widths", 1e-12, 1e3
+    )
+    sh_prune: bool = setting(True, "close SH bands that add nothing")
+    sh_guided: bool = setting(True, 'false: the paper\'s "no semantic guidance" of SH pruning')
+    # sizes
+    sh_degree: int = number(3, "of colour, at most", 0, 3)
+    max_gaussians: int = number(40_000, "growing stops here; more initial points are thinned", 16, 5_000_000)
+    min_gaussians: int = number(64, "pruning stops here", 1, 5_000_000)
+    width: int = number(32, "of the encoder's tokens", 4, 1024)
+    n_layers: int = number(2, "of the encoder", 1, 64)
+    n_heads: int = number(4, "of the encoder's attention; divides width", 1, 64)
+    encode_every: int = number(4, "steps from one that encodes regions anew to the next", 1, 1_000_000)
+    regions_per_step: int = number(32, "encoded anew in such a step; the others come from the cache", 1, 4096)
+    n_covers: int = number(4, "regions that reach a Gaussian, at most", 1, 64)
+    context: Literal["features", "none"] = setting("features", "what tokens hold beside the descriptor")
+    # schedule, as fractions of the budget
+    coarse_until: float = number(0.1, "fraction of the training at half resolution", 0, 1)
+    encode_from: float = number(0.1, "fraction after which regions are encoded", 0, 1)
+    densify_from: float = number(0.1, "fraction after which Gaussians grow", 0, 1)
+    densify_until: float = number(0.6, "fraction after which they no longer do", 0, 1)
+    n_densify: int = number(12, "how often they grow between the two", 0, 1000)
+    prune_from: float = number(0.4, "fraction after which Gaussians are pruned", 0, 1)
+    sh_freeze: float = number(0.8, "fraction after which SH bands stay as they are", 0, 1)
+    refresh_every: int = number(200, "steps between refreshes of regions and descriptors", 1, 1_000_000)
+    refresh_tolerance: float = number(0.0, "change, in radii, that leaves a region's descriptors as they are", 0, 1e3)
+    report_every: int = number(100, "steps between rows of the trace", 1, 1_000_000)
+    # rates
+    lr_means: float = number(1.6e-4, "learning rate of centres, relative to the scene's size", 0, 10)
+    lr_scales: float = number(5e-3, "learning rate of log scales", 0, 10)
+    lr_quats: float = number(1e-3, "learning rate of rotations", 0, 10)
+    lr_opacities: float = number(5e-2, "learning rate of opacities before the sigmoid", 0, 10)
+    lr_sh0: float = number(2.5e-3, "learning rate of SH band 0", 0, 10)
+    lr_sh: float = number(1.25e-4, "learning rate of SH bands 1 to 3", 0, 10)
+    lr_features: float | None = number(
+        None, "of features; default: 10 / steps, at most 5e-2; more fits each view's errors", 0, 10
+    )
+    lr_encoder: float = number(3e-3, "learning rate of the encoder", 0, 10)
+    lr_masks: float = number(5e-2, "learning rate of pruning masks", 0, 10)
+    lr_sh_masks: float = number(0.4, "learning rate of SH masks; fast, under a weak penalty: docs/results.md", 0, 10)
+    # weights
+    weight_ssim: float = number(0.2, "share of SSIM in the colour loss", 0, 1)
+    weight_features: float = number(1.0, "of the feature loss", 0, 1e4)
+    feature_loss: Literal["length", "l1"] = setting("length", "l1: the paper's and Feature-3DGS'")
+    weight_shape: float = number(1.0, "of encodings' distance to their members' features; 0: the printed loss", 0, 1e4)
+    weight_mask: float = number(1e-2, "of the penalty that closes pruning masks", 0, 1e4)
+    weight_sh: float = number(4e-5, "of the penalty that closes SH bands", 0, 1e4)
+    weight_basis: float = number(1.0, "of the pull towards the earlier scenes' knowledge", 0, 1e4)
+    warm_start: bool = setting(True, "start the encoder from the basis' stored weights")
+
+    @model_validator(mode="after")
+    def _fits_together(self) -> TrainSection:
+        if self.sh_prune and self.densify != "off" and self.densify_until > self.sh_freeze:
+            raise ValueError("densify_until must not lie after sh_freeze, when SH bands are closed for good")
+        if self.encoder == "transformer" and self.width % self.n_heads:
+            raise ValueError(f"width {self.width} must be a multiple of n_heads {self.n_heads}")
+        return self

@@ -1,0 +1,173 @@
+"""The shape branch of a training: regions of the Gaussians as they are, their encodings, and the gate (Eqs 4-10)."""
+
+from __future__ import annotations
+
+from typing import Any, NamedTuple
+
+import numpy as np
+import torch
+from torch import Tensor, nn
+
+from chebsplat.settings import DescribeSection, TrainSection
+from chebsplat.shape.descriptor import n_degrees
+from chebsplat.shape.encoder import RegionEncoder
+from chebsplat.shape.fusion import Gate, propagate, propagation_weights
+from chebsplat.shape.fusion_kernels import fuse_in_view
+from chebsplat.shape.refresh import Descriptors, GaussianIds
+from chebsplat.shape.region_inputs import placed
+from chebsplat.shape.regions import Regions, build_regions
+from chebsplat.splats.rotations import rotation_matrices
+
+CHUNK = 256  # regions that are encoded at once
+OF_REGIONS = ("members", "centers", "descriptors", "positions", "cover", "weights", "cache")
+
+
+class Encoded(NamedTuple):
+    """Encodings [R, C] with a gradient, of the regions i64 [R], none twice."""
+
+    values: Tensor
+    regions: Tensor
+
+
+class ShapeBranch(nn.Module):
+    """Regions of the current Gaussians, their descriptors, and the encoder and gate that use them.
+
+    `encoder` and `gate` are learned. All else follows the Gaussians: `refresh` finds it, before any other use.
+    """
+
+    members: Tensor  # i64 [M, n], -1 where padded
+    centers: Tensor  # i64 [M] Gaussians
+    descriptors: Tensor  # [M, n, J P]
+    positions: Tensor  # [M, n, 3] in radii
+    cover: Tensor  # i64 [N, k] regions, -1 where fewer reach a Gaussian
+    weights: Tensor  # [N, k] of Eq 8
+    cache: Tensor  # [M, C] encodings, as last computed
+
+    def __init__(self, n_channels: int, describe: DescribeSection, train: TrainSection):
+        super().__init__()
+        self.describe, self.train_settings = describe, train
+        per_angle = n_degrees(describe.spectrum, describe.max_degree)
+        self.n_described = describe.n_angles * per_angle if train.albo else 0
+        n_context = n_channels if train.context == "features" else 0
+        n_layers = train.n_layers if train.encoder == "transformer" else 0
+        self.encoder = RegionEncoder(self.n_described + n_context, n_channels, train.width, n_layers, train.n_heads)
+        if n_context:  # unit vectors
+            rms = torch.full((n_context,), n_context**-0.5)
+            self.encoder.norm_input.set(self.n_described, torch.zeros(n_context), rms)
+        self.keeps_norm = False  # an earlier scene's constants are kept, with its weights
+        self.gate = Gate(n_channels)
+        self.regions: Regions | None = None
+        self.described = Descriptors(describe, train.refresh_tolerance)
+        self.ids = GaussianIds()
+
+    def keep(self, rows: Tensor) -> None:
+        """Gaussians were removed, all but `rows` [N] bool; those that are added go behind the others unannounced."""
+        kept = rows.numpy()
+        self.ids.keep(kept)
+        if self.regions is not None:
+            centers = self.regions.centers
+            self.described.keep(rows[torch.as_tensor(centers)])
+            self.regions = self.regions._replace(centers=(np.cumsum(kept) - 1)[centers[kept[centers]]])
+
+    def reorder(self, order: Tensor) -> None:
+        """The Gaussians were put into another order i64 [N]."""
+        self.ids.keep(order.numpy())
+        if self.regions is not None:
+            place = np.empty(len(order), np.int64)
+            place[order.numpy()] = np.arange(len(order))
+            self.regions = self.regions._replace(centers=place[self.regions.centers])
+
+    @torch.no_grad()
+    def refresh(
+        self,
+        raw: dict[str, Tensor],
+        regions: Regions | None = None,
+        descriptors: Tensor | None = None,
+        *,
+        anew: bool = False,
+    ) -> None:
+        """Regions of the Gaussians as they are now; `regions` and `descriptors` spare their computation.
+
+        Centres stay where they still cover the scene, unless `anew`; then the result owes nothing to earlier calls.
+        """
+        means, log_scales, quats = (raw[name].detach() for name in ("means", "log_scales", "quats"))
+        if anew:
+            self.regions, self.ids = None, GaussianIds()
+            self.described.forget()
+        if regions is None:
+            sizes = self.describe.n_regions, self.describe.region_size, self.describe.seed
+            regions = build_regions(means.double().numpy(), *sizes, ids=self.ids.of(len(means)), earlier=self.regions)
+        self.regions = regions
+        self.members, self.centers = torch.as_tensor(regions.members), torch.as_tensor(regions.centers)
+        if not self.n_described:
+            self.descriptors = torch.zeros(*self.members.shape, 0)
+        else:
+            around = self.members, regions.radius, descriptors
+            self.descriptors = self.described.update(means, quats, log_scales, *around)
+        seen = self.descriptors[self.members >= 0]
+        if self.n_described and len(seen) and not self.keeps_norm:
+            self.encoder.norm_input.set(0, seen.mean(0), seen.std(0, unbiased=False))
+        found = placed(means.numpy(), regions, self.train_settings.n_covers)
+        self.positions, self.cover = (torch.from_numpy(part) for part in found)
+        frames, scales = rotation_matrices(quats[self.centers]), log_scales.exp()[self.centers]
+        self.weights = propagation_weights(means, self.cover, means[self.centers], frames, scales, regions.radius)
+        parts = torch.arange(len(self.members)).split(CHUNK)
+        self.cache = torch.cat([self.encode(raw["features"], part) for part in parts])
+
+    def region_state(self) -> dict[str, Any]:
+        """What `refresh` found and steps have changed since, beside the learned weights: tensors and plain values."""
+        regions = self.regions
+        assert regions is not None
+        return {name: getattr(self, name) for name in OF_REGIONS} | {
+            "regions": [torch.from_numpy(a) for a in regions[:2]] + [float(v) for v in regions[2:]],
+            "ids": self.ids.state_dict(len(self.cover)),
+            "described": self.described.state_dict(),
+        }
+
+    def load_region_state(self, state: dict[str, Any]) -> None:
+        for name in OF_REGIONS:
+            setattr(self, name, state[name])
+        centers, members, radius, share = state["regions"]
+        self.regions = Regions(centers.numpy(), members.numpy(), radius, share)
+        self.ids.load_state_dict(state["ids"])
+        self.described.load_state_dict(state["described"])
+
+    def encode(self, features: Tensor, chosen: Tensor) -> Tensor:
+        """Encodings [R, C] of the regions `chosen` [R]; tokens see the features without a gradient."""
+        members = self.members[chosen]
+        inputs = self.descriptors[chosen]
+        if self.encoder.n_inputs > self.n_described:
+            inputs = torch.cat([inputs, features.detach()[members.clamp_min(0)]], -1)
+        return self.encoder(inputs, self.positions[chosen], members >= 0)
+
+    def sample(self, features: Tensor, index: Tensor, generator: torch.Generator) -> Encoded:
+        """Encode anew `regions_per_step` of the regions that reach the Gaussians `index` [V]; the cache keeps them."""
+        cover, is_reached = self.cover[index], torch.zeros(len(self.members), dtype=torch.bool)
+        is_reached[cover[cover >= 0]] = True
+        reached = is_reached.nonzero()[:, 0]
+        order = torch.randperm(len(reached), generator=generator)[: self.train_settings.regions_per_step]
+        chosen = reached[order]
+        fresh = Encoded(self.encode(features, chosen), chosen)
+        self.cache = self.cache.index_copy(0, chosen, fresh.values.detach())
+        return fresh
+
+    def fuse(self, features: Tensor, index: Tensor, fresh: Encoded | None = None) -> Tensor:
+        """Fused features [V, C] of the Gaussians `index` [V]; encodings are fresh ones, or as the cache has them."""
+        fresh = fresh or Encoded(self.cache[:0], torch.zeros(0, dtype=torch.int64))
+        return fuse_in_view(self.gate, features, (self.cache, *fresh), self.cover, self.weights, index)
+
+    def alone(self) -> Tensor:
+        """Features [N, C] of all Gaussians by the cached encodings alone (Eq 9), zero where no region reaches."""
+        return propagate(self.cache, self.cover, self.weights)
+
+    def distance(self, features: Tensor, fresh: Encoded) -> Tensor:
+        """Mean distance of encodings to the features of their regions' members, which get no gradient.
+
+        Choices: beside the printed losses, which reach the encoder through what the gate lets pass, a few percent:
+          by them alone it stays at one vector for all regions. The distance, not its square: a region across an edge
+          takes the side that has more members.
+        """
+        members = self.members[fresh.regions]
+        wanted = features.detach()[members.clamp_min(0)]
+        mask = members >= 0
+        return ((fresh.values[:, None] - wanted).square().sum(-1) + 1e-12).sqrt()[mask].mean()
