@@ -127,7 +127,7 @@ def _flat() -> np.ndarray:
 
 SCENES: dict[str, Callable[[], Trainer]] = {
     "all masks closing": lambda: tiny_trainer(weight_mask=1e4, lr_masks=10.0, prune_from=0.1),
-    "all bands closing": lambda: tiny_trainer(weight_sh=1e6, lr_sh_masks=10.0),
+    "all bands closing": lambda: tiny_trainer(weight_sh=1e4, lr_sh_masks=10.0),
     "one Gaussian": lambda: tiny_trainer(sphere(1), min_gaussians=1),
     "two coincident Gaussians": lambda: tiny_trainer(np.zeros((2, 3), np.float32), min_gaussians=1),
     "one plane": lambda: tiny_trainer(_flat()),
