@@ -7,9 +7,10 @@ import signal
 import subprocess
 import sys
 import time
-from collections.abc import Mapping
-from contextlib import suppress
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager, suppress
 from pathlib import Path
+from types import FrameType
 
 from chebsplat.stages.stopping import LIFELINE, PATIENCE
 
@@ -46,11 +47,28 @@ def snakemake(words: Path, cache: Path, arguments: list[str], environment: Mappi
                                    stdin=lifeline, stdout=subprocess.DEVNULL, start_new_session=True,
                                    env=os.environ | environment)  # fmt: skip
         try:
-            return process.wait()
+            with paused_together(process):
+                return process.wait()
         finally:
             held.close()
             if process.poll() != 0:
                 end(process)
+
+
+@contextmanager
+def paused_together(process: subprocess.Popen[bytes]) -> Iterator[None]:
+    """A terminal's Ctrl-Z, which reaches this process alone, pauses the session of `process` as well."""
+
+    def pause(_number: int, _frame: FrameType | None) -> None:
+        os.killpg(process.pid, signal.SIGSTOP)
+        os.kill(os.getpid(), signal.SIGSTOP)  # until someone has us go on
+        os.killpg(process.pid, signal.SIGCONT)
+
+    before = signal.signal(signal.SIGTSTP, pause)
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGTSTP, before)
 
 
 def end(process: subprocess.Popen[bytes]) -> None:

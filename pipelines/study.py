@@ -209,12 +209,14 @@ def execute(name: str, runs: list[Run], cores: int, threads: int, device: str = 
         parts.setdefault((run.sequence or run.scene, run.seed), []).append(run)
     for (scene, seed), part in parts.items():
         waiting = outstanding(part)
-        if waiting:
-            say(f"  {scene}, seed {seed}: {describe(waiting)}; {cores // threads} at once, {threads} threads each")
-            with counted(runs, cores // threads, say):
-                found = snakemake(waiting, cores, threads, device)
-            outcome = Outcome(max(outcome.code, found.code), outcome.failed | found.failed)
-        store.link(f"study-{name}", {run.name: run.plan.targets[LAST] for run in runs})
+        try:
+            if waiting:
+                say(f"  {scene}, seed {seed}: {describe(waiting)}; {cores // threads} at once, {threads} threads each")
+                with counted(runs, cores // threads, say):
+                    found = snakemake(waiting, cores, threads, device)
+                outcome = Outcome(max(outcome.code, found.code), outcome.failed | found.failed)
+        finally:  # a study that is stopped names what it has finished
+            store.link(f"study-{name}", {run.name: run.plan.targets[LAST] for run in runs})
     return outcome
 
 

@@ -5,6 +5,7 @@ import signal
 import subprocess
 import sys
 import time
+from pathlib import Path
 
 import click
 import pytest
@@ -35,8 +36,18 @@ def test_a_stopped_command_says_what_is_kept_and_leaves_as_shells_know_it(number
     assert f"stopped by {number.name}; what was finished is kept" in result.stderr
 
 
-def test_a_stopped_run_ends_its_jobs_and_leaves_nothing_half(tmp_path):
+def is_paused(number):
+    return Path(f"/proc/{number}/stat").read_text().rpartition(")")[2].split()[0] == "T"
+
+
+def test_a_run_pauses_with_its_jobs_and_ends_with_them_and_leaves_nothing_half(tmp_path):
     run = in_a_job(Run(tmp_path / "work"))
+    kill(run.process.pid, signal.SIGTSTP)
+    until = time.monotonic() + 10
+    while not all(is_paused(number) for number in run.alive()):
+        assert time.monotonic() < until
+        time.sleep(0.02)
+    kill(run.process.pid, signal.SIGCONT)
     kill(run.process.pid, signal.SIGTERM)
     assert run.finish(10) == 143
     assert not run.alive()
