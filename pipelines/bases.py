@@ -75,7 +75,7 @@ def before(planner: Planner, text: str, settings: str, ablation: str) -> tuple[l
     Raises: ConfigError on a name or revision that does not exist; InputError on a damaged artifact.
     """
     if is_folder(text):
-        path = taken_in(Path(text).expanduser())
+        path = taken_in(Path(text).expanduser(), planner.running)
         return [], path, path.name
     reference = parse(text)
     if is_sequence(reference.name):
@@ -124,11 +124,11 @@ def revisions(text: str) -> list[Path]:
     return found
 
 
-def taken_in(folder: Path) -> Path:
-    """The artifact in the store; one from elsewhere is copied there, under its own key, and the copy verified."""
+def taken_in(folder: Path, running: bool) -> Path:
+    """The artifact's place in the store; to run, one from elsewhere is copied there, and the copy verified."""
     manifest = artifact.verify(folder, SCHEMA)
     path = store.artifact_path("cks", manifest.key)
-    if not store.is_fresh(path):
+    if running and not store.is_fresh(path):
         artifact.copy(folder, path, manifest)
     return path
 

@@ -151,7 +151,10 @@ def test_what_is_exported_starts_scenes_elsewhere(chain, tmp_path, monkeypatch):
     monkeypatch.setenv("CHEBSPLAT_WORK", str(tmp_path / "elsewhere"))
     from chebsplat.pipelines.cli.runs import plans
 
-    (plan,) = plans(scene="toy", sequence=None, settings="", ablation="", basis=f"{tmp_path}/knowledge/")
+    asked = {"scene": "toy", "sequence": None, "settings": "", "ablation": "", "basis": f"{tmp_path}/knowledge/"}
+    assert plans(**asked)[0].title == f"toy@basis={key_of(2)}"
+    assert not (tmp_path / "elsewhere").exists()  # planning copies nothing
+    (plan,) = plans(**asked, running=True)
     train = next(step for step in plan.steps if step.stage == "train")
     assert train.inputs["basis"] == store.artifact_path("cks", key_of(2))
     assert plan.title == f"toy@basis={key_of(2)}"
