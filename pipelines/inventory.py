@@ -10,9 +10,9 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from chebsplat.errors import InputError
+from chebsplat.errors import ConfigError, InputError
 from chebsplat.pipelines import folders, store, summary
-from chebsplat.pipelines.finished import links, titles
+from chebsplat.pipelines.finished import is_artifact, links, scene_folder, titles
 from chebsplat.stages.registry import STAGES
 
 QUERIES = "query"  # answers of `chebsplat query`, in a scene's folder
@@ -76,8 +76,13 @@ def _source(title: str, ingest: Any) -> str:
         return "damaged"
 
 
-def in_work(folder: Path) -> Path:
-    """A scene's folder of links. Raises InputError if it lies elsewhere: nothing is removed there."""
+def in_work(scene: str) -> Path:
+    """A scene's folder of links. Raises InputError if it lies elsewhere: nothing is removed there; ConfigError if an
+    artifact is named.
+    """
+    folder = scene_folder(scene)
+    if is_artifact(Path(os.path.expanduser(scene))):
+        raise ConfigError(f"{scene} is an artifact; whole scenes are removed: name {folder.name}")
     if folder.absolute().parent.resolve() != store.work().resolve() or folder.is_symlink():
         raise InputError(f"{folder} does not lie in {store.work()}: nothing is removed there")
     return store.work() / folder.name

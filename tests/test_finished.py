@@ -135,3 +135,6 @@ def test_rm_removes_nothing_outside_work(tmp_path, work):
     done = CliRunner().invoke(main, ["rm", "./elsewhere", "--yes"])
     assert done.exit_code == 3
     assert (elsewhere / "train").is_symlink()
+    done = CliRunner().invoke(main, ["rm", "work/toy/train", "--yes"])
+    assert (done.exit_code, "name toy" in done.stderr) == (2, True)
+    assert (work / "toy/train").is_symlink()

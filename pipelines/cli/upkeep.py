@@ -29,9 +29,9 @@ def list_scenes() -> None:
 @click.option("--yes", is_flag=True, help="remove what is listed")
 def rm(scenes: tuple[str, ...], yes: bool) -> None:
     """Remove SCENES: their links, their queries, and the artifacts that nothing else names."""
-    from chebsplat.pipelines import finished, folders, inventory, store
+    from chebsplat.pipelines import folders, inventory, store
 
-    chosen = list(dict.fromkeys(inventory.in_work(finished.scene_folder(scene)) for scene in scenes))
+    chosen = list(dict.fromkeys(inventory.in_work(scene) for scene in scenes))
     found = inventory.only_of(chosen)
     for folder in chosen:
         kept = inventory.others(folder)
