@@ -14,10 +14,11 @@ import signal
 import stat
 import sys
 import threading
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
 from types import FrameType
+from typing import Any
 
 from chebsplat.errors import Stopped
 
@@ -61,8 +62,28 @@ class Asked:
                 print(stop, file=sys.stderr, flush=True)
             os._exit(stop.exit_code)
 
+    def ignored(self, hook: Callable[[Any], object]) -> Callable[[Any], None]:
+        """A hook for what Python has to ignore: in a destructor a stop is none, and no fault either."""
+
+        def told(unraisable: Any) -> None:
+            if self.stop is None:
+                hook(unraisable)
+
+        return told
+
 
 _asked: Asked | None = None
+
+
+@contextmanager
+def _unbroken() -> Iterator[None]:
+    """What breaks because a stop has come, an import that it fell into, is the stop and no crash."""
+    try:
+        yield
+    except Exception as error:
+        if _asked is not None and _asked.stop is not None:
+            raise _asked.stop from error
+        raise
 
 
 @contextmanager
@@ -70,7 +91,8 @@ def heeded() -> Iterator[None]:
     """Signals raise `Stopped` within; one that is ignored (nohup) stays so. Of nested ones the outermost rules."""
     global _asked
     if _asked is not None or threading.current_thread() is not threading.main_thread():
-        yield
+        with _unbroken():
+            yield
         return
     _asked, over, (reader, writer) = Asked(), threading.Event(), os.pipe()
     os.set_blocking(writer, False)
@@ -81,9 +103,12 @@ def heeded() -> Iterator[None]:
     for number, handler in before.items():
         if handler is not signal.SIG_IGN:
             signal.signal(number, _asked.heed)
+    hook, sys.unraisablehook = sys.unraisablehook, _asked.ignored(sys.unraisablehook)
     try:
-        yield
+        with _unbroken():
+            yield
     finally:
+        sys.unraisablehook = hook
         for number, handler in before.items():
             signal.signal(number, handler)
         signal.set_wakeup_fd(earlier)

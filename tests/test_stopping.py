@@ -98,6 +98,20 @@ def test_a_signal_is_heeded_where_the_block_looks_for_it():
     assert signal.getsignal(signal.SIGTERM) == signal.SIG_DFL
 
 
+def test_what_breaks_because_of_a_stop_is_the_stop(capsys):
+    class Deaf:
+        def __del__(self):
+            os.kill(os.getpid(), signal.SIGTERM)
+
+    def deaf_then_broken():
+        Deaf()
+        raise ImportError("partially initialized module")
+
+    result = CliRunner().invoke(Guarded(commands={"wait": click.Command("wait", callback=deaf_then_broken)}), ["wait"])
+    assert result.exit_code == 143
+    assert "Traceback" not in result.stderr + capsys.readouterr().err
+
+
 def test_an_ignored_signal_stays_ignored():
     before = signal.signal(signal.SIGHUP, signal.SIG_IGN)
     try:

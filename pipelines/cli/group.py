@@ -27,16 +27,15 @@ class Guarded(click.Group):
     """A group whose commands return an exit code (nothing: 0) and may raise typed errors."""
 
     def invoke(self, context: click.Context) -> NoReturn:
-        with heeded():
-            try:
-                with explained(store.work(), CLICK):
-                    code = super().invoke(context)
-            except ChebsplatError as error:
-                say(f"{error}")
-                code = error.exit_code
-            except Stopped as stop:
-                say(f"{stop}; {KEPT}")
-                code = stop.exit_code
+        try:
+            with heeded(), explained(store.work(), CLICK):
+                code = super().invoke(context)
+        except ChebsplatError as error:
+            say(f"{error}")
+            code = error.exit_code
+        except Stopped as stop:
+            say(f"{stop}; {KEPT}")
+            code = stop.exit_code
         context.exit(code or 0)
 
     def list_commands(self, context: click.Context) -> list[str]:
