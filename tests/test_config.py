@@ -49,3 +49,24 @@ def test_every_setting_says_what_it_means():
     sections = {name: field.annotation.model_fields for name, field in config.Config.model_fields.items()}
     silent = [f"{name}.{key}" for name, fields in sections.items() for key in fields if not fields[key].description]
     assert not silent
+
+
+def test_a_setting_has_a_lower_and_an_upper_bound():
+    for name, field in config.Config.model_fields.items():
+        for key, setting in field.annotation.model_fields.items():
+            if setting.annotation in (int, float, int | None, float | None):
+                bounds = {type(rule).__name__ for rule in setting.metadata}
+                assert {"Ge", "Le"} <= bounds, f"{name}.{key}"
+
+
+@pytest.mark.parametrize("value", [True, 1.0, "5", float("nan"), float("inf"), 10**400, None, [5]])
+def test_types_are_strict_and_no_number_is_infinite(value):
+    with pytest.raises(ConfigError, match=r"x\.toml: train\.steps: "):
+        config.build({"train": {"steps": value}}, "x.toml")
+
+
+def test_a_message_is_one_short_line():
+    for values in ({"train": dict.fromkeys(map(str, range(10_000)), 1)}, {"train": [0] * 10_000}, {"a\nb" * 999: 1}):
+        with pytest.raises(ConfigError) as error:
+            config.build(values, "x.toml")
+        assert len(str(error.value)) < 300 and "\n" not in str(error.value)

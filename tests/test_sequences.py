@@ -136,3 +136,12 @@ def test_a_sequence_of_scenes_without_encoder_carries_nothing(sequence):
     for plan in chain(Planner(), sequence("toy", "office0"), ablation="no-tle"):
         assert plan.left_out["cks"] == "train.encoder is mlp: it has no projections"
         assert all("basis" not in step.inputs for step in plan.steps)
+
+
+def test_settings_may_have_spaces_about_their_commas_and_are_given_once():
+    from chebsplat.pipelines.plan import overrides
+
+    wanted = {"train": {"steps": 5, "albo": False}, "teacher": {"scales": [0.5, 1.0]}}
+    assert overrides("train.steps=5, train.albo = off ,teacher.scales=[0.5, 1.0]") == wanted
+    with pytest.raises(ConfigError, match=r"train\.steps is given twice"):
+        overrides("train.steps=5,train.albo=off,train.steps=6")

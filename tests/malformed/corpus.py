@@ -16,11 +16,12 @@ from malformed import (
     scannet,
     settings,
     seven_scenes,
+    teachers,
     transforms,
 )
 from malformed.case import Case
 
-ARTIFACTS = (manifests, resealed)
+ARTIFACTS = (manifests, resealed, teachers)
 SOURCES = (photos, images, references, colmap, transforms, replica, scannet, seven_scenes)
 MODULES = (settings, documents, commands, arguments, *ARTIFACTS, *SOURCES)
 CASES: list[Case] = [case for module in MODULES for case in module.cases()]
