@@ -127,7 +127,10 @@ def check_place(out: Path, schema: str, key: str, force: bool = False) -> None:
         return
     if not is_published(out):
         raise InputError(f"{out} exists and is not an artifact: nothing was replaced; choose another --out")
-    found = parse_manifest(out)
+    try:
+        found = parse_manifest(out)
+    except InputError:  # it may be anyone's: nobody is told to delete it
+        raise InputError(f"{out / MANIFEST} is no manifest: nothing was replaced; choose another --out") from None
     if found.schema != schema:
         raise InputError(f"{out} holds {found.schema}, not {schema}: nothing was replaced; choose another --out")
     if extra := _unlisted(out, found):

@@ -95,6 +95,7 @@ RULES = {
     "seconds": ("a number", lambda v: type(v) in (int, float) and math.isfinite(v)),
     "files": ("names below the artifact's folder with bytes and sha256 each", _is_member_table),
 }
+NEEDED = {"schema", "key", "stage"}
 
 
 def remedy(path: Path) -> str:
@@ -105,10 +106,9 @@ def parse_manifest(path: Path) -> Manifest:
     """The manifest of the artifact `path`, whose members are not looked at. Raises InputError naming the file."""
     file = path / MANIFEST
     document = parse_json(file, remedy(path))
-    try:
-        manifest = Manifest(**document)
-    except TypeError as error:  # no object, or one with other fields
-        raise InputError(f"{file} is damaged ({error}); {remedy(path)}") from None
+    if not isinstance(document, dict) or not NEEDED <= document.keys() <= RULES.keys():
+        raise InputError(f"{file} is damaged: it does not say what a manifest says; {remedy(path)}")
+    manifest = Manifest(**document)
     for name, (wanted, holds) in RULES.items():
         if not holds(getattr(manifest, name)):
             raise InputError(f"{file} is damaged: {name} is not {wanted}; {remedy(path)}")

@@ -148,9 +148,10 @@ def test_what_is_not_this_stage_s_artifact_is_never_replaced(tmp_path, place, fo
             pass
         (out / "thesis.tex").write_text("years")
     before = {p: p.read_bytes() for p in tmp_path.rglob("*") if p.is_file()}
-    with pytest.raises(InputError, match=r"nothing was replaced|is damaged") as error:
+    with pytest.raises(InputError, match="nothing was replaced") as error:
         artifact.check_place(out, SCHEMA, key_of("another"), force)
     assert str(out) in str(error.value)
+    assert "delete" not in str(error.value)
     if place not in ("link", "with a note") or force:
         with pytest.raises(InputError), artifact.publish(out, Manifest(SCHEMA, key_of("another"), "s"), force):
             pass
