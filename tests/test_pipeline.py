@@ -399,6 +399,8 @@ def test_clean_stale_names_a_damaged_manifest_and_removes_nothing(work):
 
 def test_a_failed_run_tells_a_stage_that_failed_from_one_that_was_killed(tmp_path, capfd):
     steps = {step.stage: step for step in Planner().plan("toy").steps}
+    for step in steps.values():  # as a plan is written
+        (tmp_path / f"{step.stage}-{step.key}.exit").write_text("0")
     for stage in ("onnx", "train"):
         (tmp_path / f"{stage}-{steps[stage].key}.log").touch()
     (tmp_path / f"onnx-{steps['onnx'].key}.exit").write_text("4")
