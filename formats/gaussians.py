@@ -134,8 +134,10 @@ def read_trace(path: Path, manifest: Manifest) -> list[dict[str, float]]:
     """The trace alone, without the parameters. Raises InputError naming file and remedy."""
     file, remedy = artifact.checked(path, manifest, "trace.csv"), artifact.remedy(path)
     try:
-        rows = list(csv.DictReader(read_text(file, remedy).splitlines()))
-        trace = [{name: float(value) for name, value in row.items()} for row in rows]
+        table = csv.DictReader(read_text(file, remedy).splitlines())
+        trace = [{name: float(value) for name, value in row.items()} for row in table]
+        if not {"step", "seconds"} <= set(table.fieldnames or ()):
+            raise ValueError("it has no columns step and seconds")
     except (csv.Error, ValueError, TypeError) as error:
         raise InputError(f"{file} is no table of numbers ({error}); {remedy}") from None
     if not all(map(math.isfinite, (value for row in trace for value in row.values()))):

@@ -9,17 +9,19 @@ from chebsplat.stages.command import Job, command
 
 
 def run(job: Job) -> None:
-    import torch
-
     from chebsplat.formats.artifact import read_manifest
     from chebsplat.formats.basis import Basis, read_basis, write_basis
     from chebsplat.formats.gaussians import read_gaussians
-    from chebsplat.shape.cks import update
     from chebsplat.stages.restored import restored_encoder
 
     settings = job.config.cks
-    encoder = restored_encoder(job.inputs["gaussians"], read_gaussians(job.inputs["gaussians"]))
     old = read_basis(job.inputs["basis"]) if "basis" in job.inputs else Basis({}, {})
+    checkpoint = read_gaussians(job.inputs["gaussians"])
+    import torch  # once its inputs are known to be usable
+
+    from chebsplat.shape.cks import update
+
+    encoder = restored_encoder(job.inputs["gaussians"], checkpoint)
     projections = encoder.projections()
     if not projections:
         raise DataFailure("the encoder has no projections (train.encoder = mlp); there is no knowledge to carry")
