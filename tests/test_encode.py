@@ -172,7 +172,7 @@ def test_arguments_that_do_not_fit_are_errors_that_name_the_remedy(toy, tmp_path
         (3, "not a readable .npy", [ply, *onnx, "--features", tmp_path / "text.npy", *out]),
         (2, "neither", [toy["export"], "--encoder", tmp_path / "mine.onnx", *out]),
         (3, "no finished", [toy["export"], "--encoder", tmp_path, *out]),
-        (3, "no finished", [toy["train"], *onnx, *out]),
+        (3, "expected chebsplat.scene", [toy["train"], *onnx, *out]),
         (2, ".npz", [toy["export"], *onnx, "--out", tmp_path / "a.zarr"]),
         (2, "exists", [toy["export"], *onnx, "--out", tmp_path / "there.npz"]),
     ]

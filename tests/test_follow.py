@@ -8,13 +8,14 @@ import pytest
 import torch
 
 from chebsplat.errors import Stopped
+from chebsplat.settings import TrainSection
 from chebsplat.stages import config as configs
 from chebsplat.stages.command import Job
 from chebsplat.stages.progress import Progress
 from chebsplat.stages.stopping import heeded
 from chebsplat.stages.train import follow
 
-SETTINGS = {"encode_every": 4, "report_every": 6}
+SETTINGS = TrainSection(encode_every=4, report_every=6)
 
 
 class Alternating:
@@ -40,7 +41,7 @@ class Alternating:
     def held_in_psnr(self, indices):
         return 30.0
 
-    def state(self):
+    def state_dict(self):
         return {"step": self.step}
 
 

@@ -28,7 +28,18 @@ def in_a_job(run, seconds=120):
     return run
 
 
+@pytest.fixture
+def unmuted():
+    """Signals as a terminal's shell leaves them, however the tests were started (nohup, in the background)."""
+    before = {number: signal.signal(number, signal.SIG_DFL) for number in (signal.SIGTERM, signal.SIGHUP)}
+    before |= {signal.SIGINT: signal.signal(signal.SIGINT, signal.default_int_handler)}
+    yield
+    for number, handler in before.items():
+        signal.signal(number, handler)
+
+
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM, signal.SIGHUP])
+@pytest.mark.usefixtures("unmuted")
 def test_a_stopped_command_says_what_is_kept_and_leaves_as_shells_know_it(number):
     group = Guarded(commands={"wait": click.Command("wait", callback=lambda: os.kill(os.getpid(), number))})
     result = CliRunner().invoke(group, ["wait"])

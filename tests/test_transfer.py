@@ -86,5 +86,5 @@ def test_a_variant_that_has_not_finished_leaves_nothing_to_compare(finished, tmp
 
 
 def test_pairs_name_variants():
-    with pytest.raises(ConfigError, match="pairs: nothing"):
+    with pytest.raises(ConfigError, match="'nothing' is none of its variants"):
         study(pairs=[("full", "nothing")])
