@@ -75,6 +75,7 @@ def end(process: subprocess.Popen[bytes]) -> None:
     """Wait for the session of a process, whose lifeline has ended; kill what is left of it."""
     until = time.monotonic() + PATIENCE
     with suppress(ProcessLookupError):
+        os.killpg(process.pid, signal.SIGCONT)  # a stop may come in the middle of a pause
         while time.monotonic() < until:
             process.poll()
             os.killpg(process.pid, 0)
