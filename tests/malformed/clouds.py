@@ -27,7 +27,7 @@ CLOUDS: dict[str, bytes] = {
     "empty": b"",
     "text": b"a cloud of points\n",
     "a header without an end": header()[:-11],
-    "a header of a megabyte": header(more="comment a\n" * 100_000) + points(),
+    "a header of two megabytes": header(more="comment a\n" * 200_000) + points(),
     "no format": header().replace(b"format", b"comment") + points(),
     "another format": header(form="binary_middle_endian 1.0") + points(),
     "cut in a row": header() + points()[:-5],

@@ -18,10 +18,11 @@ from malformed import (
     seven_scenes,
     teachers,
     transforms,
+    uses,
 )
 from malformed.case import Case
 
-ARTIFACTS = (manifests, resealed, teachers)
+ARTIFACTS = (manifests, resealed, teachers, uses)
 SOURCES = (photos, images, references, colmap, transforms, replica, scannet, seven_scenes)
 MODULES = (settings, documents, commands, arguments, *ARTIFACTS, *SOURCES)
 CASES: list[Case] = [case for module in MODULES for case in module.cases()]
