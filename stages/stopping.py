@@ -14,6 +14,7 @@ import signal
 import stat
 import sys
 import threading
+import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
@@ -54,13 +55,20 @@ class Asked:
         wakened: file descriptor where signals arrive."""
         while (data := os.read(wakened, 1)) and data[0] not in SIGNALS:
             pass
-        if data and not over.wait(self.seconds):
-            stop = self.stop or self.stop_by(data[0])
-            for folder in list(self.half):
-                shutil.rmtree(folder, ignore_errors=True)
-            with suppress(OSError, ValueError):
-                print(stop, file=sys.stderr, flush=True)
-            os._exit(stop.exit_code)
+        until = time.monotonic() + self.seconds
+        while data and not over.wait(0.1):
+            if time.monotonic() > until:
+                self.leave(self.stop or self.stop_by(data[0]))
+            if self.stop is None:  # the signal woke this thread, and the main one may sleep on in a system call
+                signal.pthread_kill(threading.main_thread().ident or 0, data[0])
+
+    def leave(self, stop: Stopped) -> None:
+        """End the process at once, without what is half made."""
+        for folder in list(self.half):
+            shutil.rmtree(folder, ignore_errors=True)
+        with suppress(OSError, ValueError):
+            print(stop, file=sys.stderr, flush=True)
+        os._exit(stop.exit_code)
 
     def ignored(self, hook: Callable[[Any], object]) -> Callable[[Any], None]:
         """A hook for what Python has to ignore: in a destructor a stop is none, and no fault either."""
