@@ -3,6 +3,7 @@
 import json
 import os
 import shutil
+import threading
 import time
 from types import SimpleNamespace
 
@@ -102,11 +103,11 @@ def test_photos_changed_in_the_middle_of_reading_are_not_published(photos, chang
     from chebsplat.stages.sources import pictures
 
     step, plan = planned("ingest", photos)
-    open_photo, named = pictures.open_photo, []
+    open_photo, named, once = pictures.open_photo, [], threading.Lock()
 
     def opened(path, *arguments):
         found = open_photo(path, *arguments)
-        if not named:
+        if once.acquire(blocking=False):  # photos are read by several threads
             named.append(change(photos))
         return found
 
