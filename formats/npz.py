@@ -21,8 +21,8 @@ from chebsplat.errors import InputError
 from chebsplat.formats.files import regular
 
 LARGEST = 256 << 20  # bytes that the arrays asked for may take in all, unpacked
-# what numpy and zipfile raise
-_BROKEN = (OSError, ValueError, EOFError, RuntimeError, NotImplementedError, MemoryError, KeyError, TypeError,
+# what numpy and zipfile raise, of which a RuntimeError is an unknown compression
+_BROKEN = (OSError, ValueError, EOFError, RuntimeError, MemoryError, KeyError, TypeError,
            zipfile.BadZipFile, zlib.error, lzma.LZMAError, tokenize.TokenError)  # fmt: skip
 
 

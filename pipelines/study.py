@@ -61,9 +61,7 @@ class Study(Section):
     settings: Sections = Field({})
     conditions: dict[Name, Sections] = Field({"": {}}, max_length=1000)
     variants: dict[Name, dict[str, Any]] = Field(min_length=1, max_length=1000)
-    pairs: list[Annotated[tuple[str, str], Field(strict=False)]] = Field(
-        []
-    )  # compared besides, the second with the first
+    pairs: list[Annotated[tuple[str, str], Field(strict=False)]] = Field([])  # compared besides: second with first
     against: str = ""  # section.key whose value is the figure's horizontal axis, instead of run time
 
     @model_validator(mode="after")

@@ -29,7 +29,6 @@ def run(job: Job) -> None:
     from chebsplat.formats.features import read_features
     from chebsplat.formats.gaussians import Gaussians, write_gaussians
     from chebsplat.formats.points import read_points
-    from chebsplat.training.trainer import Trainer
 
     train = job.config.train
     capture, given = read_capture(job.inputs["capture"]), read_points(job.inputs["points"])
@@ -37,6 +36,8 @@ def run(job: Job) -> None:
     features = read_features(job.inputs["features"]) if "features" in job.inputs and train.semantics else None
     note_left_out(job, train, features is not None)
     import torch  # once its inputs are known to be usable
+
+    from chebsplat.training.trainer import Trainer
 
     torch.set_num_threads(n_threads())  # sums of torch depend on it; the same bytes are promised for the same number
     model = model_of(points, features, train, job.config.describe)

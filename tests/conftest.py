@@ -4,7 +4,7 @@ import chebsplat  # noqa: F401  # isort: skip  # before torch: OpenMP threads th
 import json
 
 import pytest
-from shared import INPUTS, KEY, TOY, run_stage
+from shared import INPUTS, KEY, ROOT, TOY, remember, run_stage
 from tiny_teachers import color_reference, color_teacher
 
 
@@ -71,3 +71,11 @@ def quick_plans(tmp_path, monkeypatch):
     monkeypatch.setenv("CHEBSPLAT_WORK", str(tmp_path / "work"))
     monkeypatch.chdir(tmp_path)
     return tmp_path / "work"
+
+
+@pytest.fixture
+def own_work(tmp_path, monkeypatch, code_memo):
+    """A work folder of the test's own, which remembers the hashes of the code."""
+    monkeypatch.setenv("CHEBSPLAT_WORK", str(tmp_path / "work"))
+    monkeypatch.chdir(ROOT)
+    return remember(tmp_path / "work", code_memo)

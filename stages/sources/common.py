@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import os
-import re
 from collections import Counter
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, field
@@ -14,6 +13,7 @@ import numpy as np
 from chebsplat.errors import InputError
 from chebsplat.evaluation.protocols.split import natural
 from chebsplat.formats.images import SUFFIXES, is_image
+from chebsplat.formats.names import unprintable
 from chebsplat.stages.sources.cameras import Camera
 
 # What phones and cameras leave beside JPEGs, or instead of them, and what makes JPEGs of it.
@@ -25,7 +25,6 @@ UNREAD = (
     | dict.fromkeys((".avif", ".webp", ".tif", ".tiff", ".bmp", ".gif", ".jp2", ".jxl", ".exr", ".psd"),
                     "magick a{0} a.jpg")
 )  # fmt: skip
-UNPRINTABLE = re.compile("[\x00-\x1f\x7f-\x9f\u2028\u2029\ud800-\udfff]")
 
 
 @dataclass
@@ -141,7 +140,7 @@ def names_below(folder: Path) -> Iterator[str]:
 def printable(place: str | Path, names: Iterable[str]) -> Iterator[str]:
     """Names of files, which become names of views. Raises InputError on bytes that are no UTF-8, and on newlines."""
     for name in names:
-        if UNPRINTABLE.search(name):
+        if unprintable(name):
             raise InputError(f"{place}: the file name {name!a} holds bytes that cannot be printed; rename the file")
         yield name
 
