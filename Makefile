@@ -115,9 +115,8 @@ lint: $(READY)  ## ruff (lint, format) and mypy
 	@for layer in formats stages pipelines teachers; do ln -sfn $(CURDIR)/$$layer build/types/chebsplat/$$layer; done
 	@cd build/types && ../../$(PY) -m mypy --config-file ../../pyproject.toml -p chebsplat
 
-lock: $(READY)  ## resolve requirements.lock anew
-	@links="$$($(PY) -m pip config get global.find-links 2>/dev/null || true)"; \
-	{ echo "# Exact versions for Python 3.11, resolved together; \`make lock\` writes this file."; \
-	  $(PY) -m uv pip compile pyproject.toml --group dev --python-version 3.11 --no-header --no-annotate \
-	    $${links:+--find-links $$links} -q | sed 's/^torch==.*/torch==2.13.0/'; } > requirements.lock.new
+lock: $(READY)  ## resolve requirements.lock anew, for Python 3.11 to 3.13 at once
+	@{ echo "# Exact versions for Python 3.11 to 3.13, resolved together; \`make lock\` writes this file."; \
+	  $(PY) -m uv pip compile pyproject.toml --group dev --universal --python-version 3.11 --fork-strategy fewest \
+	    --no-header --no-annotate --excludes pipelines/cuda-packages.txt -q; } > requirements.lock.new
 	@mv requirements.lock.new requirements.lock

@@ -2,12 +2,31 @@
 # Create .venv and install the lock: no root, nothing global, never a CUDA torch on a machine without a GPU.
 set -euo pipefail
 cd "$(dirname "$0")/.."
+py=.venv/bin/python
 
-python=""
-for candidate in python3.11 python3; do
-  if "$candidate" -c 'import sys; sys.exit(sys.version_info[:2] != (3, 11))' 2>/dev/null; then python=$candidate; break; fi
-done
-[ -n "$python" ] || { echo "setup: Python 3.11 is needed (python3.11 or python3 on PATH); the lock is resolved for it" >&2; exit 2; }
+# A torch that lies in a folder which pip is told to look in (find-links) decides for the Pythons it is built for.
+links=$(python3 -m pip config get global.find-links 2>/dev/null || true)
+wheels=$(for folder in $links; do compgen -G "$folder/torch-2.13.0*.whl" || true; done)
+
+# The newest Python on the PATH that the lock is resolved for and that can make a .venv; PYTHON=... names another.
+newest_python() {
+  local candidate tag why=""
+  for candidate in ${PYTHON:-python3.13 python3.12 python3.11 python3}; do
+    tag=$("$candidate" -c 'import sys; print("cp%d%d" % sys.version_info[:2])' 2>/dev/null) || continue
+    if [[ ! $tag =~ ^cp31[123]$ ]]; then
+      why+="; $candidate is $tag"
+    elif [[ -n $wheels && $wheels != *-$tag-* ]]; then
+      why+="; the torch in $links is not built for $candidate"
+    elif ! "$candidate" -c 'import ensurepip, venv' 2>/dev/null; then
+      why+="; $candidate has no venv (Debian, Ubuntu: apt install $candidate-venv)"
+    else
+      echo "$candidate" && return
+    fi
+  done
+  echo "setup: Python 3.11, 3.12 or 3.13 is needed on the PATH (Debian, Ubuntu: apt install python3 python3-venv;" \
+    "elsewhere: https://www.python.org/downloads), or make PYTHON=/path/to/python3.12$why" >&2
+  exit 2
+}
 
 # Programs in .venv begin with its path: one that was made elsewhere (a renamed or copied clone) runs nothing here.
 made=$(sed -n 's|^command = .* -m venv [^/]*/|/|p' .venv/pyvenv.cfg 2>/dev/null || true)
@@ -15,18 +34,18 @@ if [ -n "$made" ] && [ "$made" != "$(realpath .venv)" ]; then
   echo "setup: .venv was made for $made; making it anew" >&2
   rm -rf .venv
 fi
-[ -x .venv/bin/python ] || "$python" -m venv .venv
-py=.venv/bin/python
+if [ ! -x $py ]; then
+  python=$(newest_python)
+  echo "setup: making .venv with $("$python" --version)" >&2
+  "$python" -m venv .venv
+fi
 $py -m pip install --quiet "uv==0.13.8"
 
-# uv does not read pip's configuration: hand over its find-links. Without a CPU torch there, uv picks the build
-# that fits the machine (`--torch-backend auto`: CPU where there is no NVIDIA GPU).
-links=$($py -m pip config get global.find-links 2>/dev/null || true)
-options=(--torch-backend auto)
-for folder in $links; do
-  options=("${options[@]}" --find-links "$folder")
-  if compgen -G "$folder/torch-2.13.0*" >/dev/null; then options=(--find-links "$folder"); break; fi
-done
+# uv does not read pip's configuration: hand over its find-links. Without a torch there, uv picks the build that fits
+# the machine (`--torch-backend auto`: CPU where there is no NVIDIA GPU).
+options=()
+for folder in $links; do options+=(--find-links "$folder"); done
+[ -n "$wheels" ] || options+=(--torch-backend auto)
 $py -m uv pip install --quiet --python $py -r requirements.lock "${options[@]}"
 $py -m uv pip install --quiet --python $py --no-deps --editable .
 

@@ -1,4 +1,4 @@
-"""A clone that was renamed or copied sets itself up anew: nothing of another folder's .venv is run."""
+"""The set-up takes the newest Python it can use; a renamed or copied clone is set up anew and runs nothing of another."""
 
 import os
 import shutil
@@ -18,7 +18,9 @@ case "$*" in
     printf '#!%s/.venv/bin/python\\n' "$here" > .venv/bin/chebsplat
     printf 'home = /usr/bin\\ncommand = /usr/bin/python3.11 -m venv %s/.venv\\n' "$here" > .venv/pyvenv.cfg ;;
   *purelib*) echo .venv/site ;;
-  *sys.version_info*) exit 0 ;;
+  *sys.version_info*) echo cp${TAG:-311} ;;
+  --version) echo "Python of the test" ;;
+  *ensurepip*) exit ${NO_VENV:-0} ;;
 esac
 """
 
@@ -31,15 +33,19 @@ def clone(tmp_path):
     for name in ("Makefile", "pipelines/setup.sh", "requirements.lock", "pyproject.toml"):
         shutil.copy(ROOT / name, folder / name)
     (tmp_path / "bin").mkdir()
-    python = tmp_path / "bin/python3.11"
-    python.write_text(PYTHON)
-    python.chmod(0o755)
+    for name in ("python3.11", "python3"):
+        (tmp_path / "bin" / name).write_text(PYTHON)
+        (tmp_path / "bin" / name).chmod(0o755)
     return folder
 
 
+def run(folder, *command, **variables):
+    environment = os.environ | {"PATH": f"{folder.parent}/bin:{os.environ['PATH']}"} | variables
+    return subprocess.run(command, cwd=folder, capture_output=True, text=True, env=environment)
+
+
 def make(folder, *targets):
-    environment = os.environ | {"PATH": f"{folder.parent}/bin:{os.environ['PATH']}"}
-    done = subprocess.run(["make", *targets], cwd=folder, capture_output=True, text=True, env=environment)
+    done = run(folder, "make", *targets)
     assert done.returncode == 0, done.stderr
     return done.stderr
 
@@ -59,8 +65,7 @@ def test_a_renamed_or_copied_clone_makes_its_venv_anew(clone, change):
     assert made_in(clone) == str(clone)
     other = clone.with_name("another clone")
     change(clone, other)
-    told = make(other, "setup")
-    assert f"was made for {clone}/.venv" in told
+    assert f"was made for {clone}/.venv" in make(other, "setup")
     assert made_in(other) == str(other)
     assert make(other, "setup") == ""
 
@@ -74,3 +79,44 @@ def test_a_venv_of_another_making_is_left_alone(clone):
     (shared / "pyvenv.cfg").write_text(f"command = /usr/bin/python3.11 -m venv {shared}\n")
     (clone / ".venv").symlink_to(shared)
     assert make(clone, "setup") == ""
+
+
+def python(clone, name, tag, pip="", venv=True):
+    """A Python `name` of version `tag` beside the others on the PATH; `pip`: the folder where its pip looks for wheels."""
+    file = clone.parent / "bin" / name
+    lines = f"#!/bin/bash\nexport TAG={tag} NO_VENV={int(not venv)}\n"
+    if pip:
+        lines += f'[[ "$*" == *find-links* ]] && echo "{pip}" && exit\n'
+    file.write_text(PYTHON.replace("#!/bin/bash\n", lines + f'[ "$1" = --version ] && echo "Python {tag}" && exit\n'))
+    file.chmod(0o755)
+
+
+def test_the_newest_supported_python_that_can_make_a_venv_is_taken(clone):
+    python(clone, "python3.13", 313, venv=False)
+    python(clone, "python3.12", 312)
+    python(clone, "python3", 314)
+    done = run(clone, "bash", "pipelines/setup.sh")
+    assert done.returncode == 0, done.stderr
+    assert "making .venv with Python 312" in done.stderr
+
+
+def test_a_torch_that_pip_finds_in_a_folder_decides_for_the_python_it_is_built_for(clone, tmp_path):
+    (tmp_path / "torch-2.13.0+cpu-cp311-cp311-linux_x86_64.whl").touch()
+    for name, tag in (("python3.13", 313), ("python3.12", 312), ("python3.11", 311), ("python3", 313)):
+        python(clone, name, tag, pip=tmp_path)
+    done = run(clone, "bash", "pipelines/setup.sh")
+    assert "making .venv with Python 311" in done.stderr
+    refused = run(clone, "bash", "-c", "rm -rf .venv; bash pipelines/setup.sh", PYTHON="python3.13")
+    assert refused.returncode == 2
+    assert f"the torch in {tmp_path} is not built for python3.13" in refused.stderr
+
+
+def test_without_a_python_that_will_do_the_setup_says_which_and_how_to_get_one(clone):
+    python(clone, "python3.10", 310)
+    python(clone, "python3.12", 312, venv=False)
+    done = run(clone, "bash", "pipelines/setup.sh", PYTHON="python3.10 python3.12 no-such-python")
+    assert done.returncode == 2
+    assert "Python 3.11, 3.12 or 3.13 is needed" in done.stderr
+    assert "python3.10 is cp310" in done.stderr
+    assert "apt install python3.12-venv" in done.stderr
+    assert not (clone / ".venv").exists()
