@@ -14,6 +14,7 @@ from typing import Any
 import numpy as np
 
 from chebsplat.formats import artifact
+from chebsplat.formats.manifest import Manifest
 from chebsplat.formats.points import SCHEMA, Points, write_points
 from chebsplat.shape.regions import build_regions, covering, farthest_points
 
@@ -58,7 +59,7 @@ def stage_rows() -> list[dict[str, Any]]:
             normals, tracks = np.tile(np.float32([0, 0, 1]), (n, 1)), np.zeros((0, 2), np.int32)
             view = (["a"], np.eye(3)[None], np.eye(4)[None])
             path = Path(folder) / f"points-{n}"
-            with artifact.publish(path, artifact.Manifest(SCHEMA, "0" * 16, "sfm")) as tmp:
+            with artifact.publish(path, Manifest(SCHEMA, "0" * 16, "sfm")) as tmp:
                 write_points(tmp, Points(*view, means, colors, normals, shapes, tracks))
             for text in ("", "[describe]\nn_regions = 2048\nregion_size = 64\n"):
                 config, what = Path(folder) / "c.toml", "2048 of 64" if text else "default regions"

@@ -26,8 +26,9 @@ import click
 import numpy as np
 from scipy.ndimage import gaussian_filter
 
-from chebsplat.formats.artifact import Manifest, publish
+from chebsplat.formats.artifact import publish
 from chebsplat.formats.features import PATCH, SCHEMA, FeatureWriter, read_features
+from chebsplat.formats.manifest import Manifest
 from chebsplat.labels.channels import ROWS, Moments, projection
 from chebsplat.teachers import EMBEDDED
 

@@ -18,9 +18,9 @@ from annotated_types import Ge, Len
 
 from chebsplat.errors import InputError
 from chebsplat.formats import artifact
-from chebsplat.formats.artifact import Manifest
 from chebsplat.formats.documents import Count, NotRequired, Positive, TypedDict, conform
 from chebsplat.formats.files import parse_json
+from chebsplat.formats.manifest import Manifest, remedy_of
 
 TIGHTEST = 32_768  # bytes that zstd packs into one
 
@@ -94,7 +94,8 @@ def chunk_names(array: Any) -> list[str]:
 
 def _file_shape(array: Any) -> tuple[int, ...]:
     """Entries that one file holds: a shard, or a chunk of an array without shards."""
-    return array.shards or array.chunks
+    entries: tuple[int, ...] = array.shards or array.chunks
+    return entries
 
 
 class StoredArray:
@@ -109,11 +110,11 @@ class StoredArray:
 
         self.root, self.path, self.within = root, root / name, within
         metadata = artifact.checked(root, manifest, f"{name}/zarr.json")
-        _check_metadata(metadata, manifest, name, artifact.remedy(root))
+        _check_metadata(metadata, manifest, name, remedy_of(root))
         try:
             self._array: Any = zarr.open_array(str(self.path), mode="r")
         except (ValueError, KeyError, TypeError, AttributeError, OSError) as error:
-            raise InputError(f"{metadata} is not zarr metadata ({error}); {artifact.remedy(root)}") from None
+            raise InputError(f"{metadata} is not zarr metadata ({error}); {remedy_of(root)}") from None
         self.shape: tuple[int, ...] = self._array.shape
         self.dtype: np.dtype = self._array.dtype
         attributes: Any = self._array.attrs
@@ -128,13 +129,13 @@ class StoredArray:
         except IndexError:
             raise
         except (ValueError, RuntimeError, OSError) as error:
-            raise InputError(f"{self.path}: {self._culprit()}: {error}; {artifact.remedy(self.root)}") from None
+            raise InputError(f"{self.path}: {self._culprit()}: {error}; {remedy_of(self.root)}") from None
         if self.within is not None and values.size:
             low, high = self.within
             if not (values.min() >= low and values.max() <= high):
                 raise InputError(
                     f"{self.path} holds {values.min():g} to {values.max():g}, {low:g} to {high:g} are possible; "
-                    + artifact.remedy(self.root)
+                    + remedy_of(self.root)
                 )
         return values
 
@@ -166,7 +167,7 @@ def open_array(
     fits = len(array.shape) == len(shape) and all(w in (None, n) for n, w in zip(array.shape, shape, strict=True))
     if not fits or array.dtype != np.dtype(dtype):
         raise InputError(
-            f"{array.path} is {array.dtype} {array.shape}, expected {dtype} {tuple(shape)}; {artifact.remedy(root)}"
+            f"{array.path} is {array.dtype} {array.shape}, expected {dtype} {tuple(shape)}; {remedy_of(root)}"
         )
     return array
 

@@ -20,7 +20,7 @@ from typing import Any
 
 from chebsplat.errors import ConfigError, InputError
 from chebsplat.formats import disk
-from chebsplat.formats.manifest import MANIFEST, Manifest, parse_manifest, remedy
+from chebsplat.formats.manifest import MANIFEST, Manifest, parse_manifest, remedy_of
 
 
 def sha256_file(path: Path) -> str:
@@ -157,9 +157,9 @@ def read_manifest(path: Path, schema: str | None = None) -> Manifest:
         except OSError:
             state = None
         if state is None or not stat.S_ISREG(state.st_mode):
-            raise InputError(f"{member} is missing; {remedy(path)}")
+            raise InputError(f"{member} is missing; {remedy_of(path)}")
         if state.st_size != entry["bytes"]:
-            raise InputError(f"{member} has {state.st_size} bytes, expected {entry['bytes']}; {remedy(path)}")
+            raise InputError(f"{member} has {state.st_size} bytes, expected {entry['bytes']}; {remedy_of(path)}")
     return manifest
 
 
@@ -172,7 +172,7 @@ def stated(path: Path, manifest: Manifest, *names: str, kind: type | tuple[type,
     for name in names:
         value = value.get(name) if isinstance(value, dict) else None
     if not isinstance(value, kind):
-        raise InputError(f"{path / MANIFEST} is damaged: {'.'.join(names)} is {value!r:.60}; {remedy(path)}")
+        raise InputError(f"{path / MANIFEST} is damaged: {'.'.join(names)} is {value!r:.60}; {remedy_of(path)}")
     return value
 
 
@@ -183,7 +183,7 @@ def verify(path: Path, schema: str | None = None) -> Manifest:
     for name in manifest.files:
         checked(path, manifest, name)
     if extra := _unlisted(path, manifest):
-        raise InputError(f"{path / extra[0]} is not listed in {MANIFEST} ({len(extra)} such); {remedy(path)}")
+        raise InputError(f"{path / extra[0]} is not listed in {MANIFEST} ({len(extra)} such); {remedy_of(path)}")
     return manifest
 
 
@@ -191,9 +191,9 @@ def checked(path: Path, manifest: Manifest, name: str) -> Path:
     """Path of one listed file after comparing its digest. Raises InputError if it differs."""
     entry = manifest.files.get(name)
     if entry is None:
-        raise InputError(f"{path / name} is not part of this {manifest.schema} artifact; {remedy(path)}")
+        raise InputError(f"{path / name} is not part of this {manifest.schema} artifact; {remedy_of(path)}")
     if sha256_file(path / name) != entry["sha256"]:
-        raise InputError(f"{path / name} does not match its sha256; {remedy(path)}")
+        raise InputError(f"{path / name} does not match its sha256; {remedy_of(path)}")
     return path / name
 
 

@@ -11,6 +11,7 @@ import numpy as np
 from chebsplat.errors import InputError
 from chebsplat.formats import artifact
 from chebsplat.formats.documents import Count, TypedDict, read_document, write_document
+from chebsplat.formats.manifest import remedy_of
 from chebsplat.formats.tensors import read_tensors, write_tensors
 
 SCHEMA = "chebsplat.basis/2"
@@ -67,14 +68,12 @@ def read_basis(path: Path) -> Basis:
     file = path / "bases.safetensors"
     for name, columns in bases.items():
         if columns.ndim != 2 or columns.dtype != np.float32:
-            raise InputError(f"{file}: {name} is no float32 matrix; {artifact.remedy(path)}")
+            raise InputError(f"{file}: {name} is no float32 matrix; {remedy_of(path)}")
         if (error := off_orthonormal(columns)) > ORTHONORMAL:
-            raise InputError(f"{file}: {name} is not orthonormal ({error:.1e}); {artifact.remedy(path)}")
+            raise InputError(f"{file}: {name} is not orthonormal ({error:.1e}); {remedy_of(path)}")
         rank = lineage[-1]["projections"].get(name, {}).get("rank_after") if lineage else 0
         if rank != columns.shape[1]:
-            raise InputError(
-                f"{file}: {name} has {columns.shape[1]} columns, its lineage {rank}; {artifact.remedy(path)}"
-            )
+            raise InputError(f"{file}: {name} has {columns.shape[1]} columns, its lineage {rank}; {remedy_of(path)}")
     return Basis(bases, weights, lineage)
 
 

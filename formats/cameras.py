@@ -8,9 +8,8 @@ from pathlib import Path
 import numpy as np
 
 from chebsplat.errors import InputError
-from chebsplat.formats import artifact
-from chebsplat.formats.artifact import Manifest
 from chebsplat.formats.documents import Side, TypedDict, read_document, write_document
+from chebsplat.formats.manifest import Manifest, remedy_of
 from chebsplat.formats.names import check_names
 from chebsplat.formats.tensors import FLOAT, Spec, read_tensors, write_tensors
 
@@ -45,9 +44,9 @@ def read_cameras(path: Path, manifest: Manifest) -> Cameras:
     """Raises: InputError naming the damaged file and the remedy."""
     document, file = read_document(path, manifest, "cameras.json", Document), path / "cameras.safetensors"
     names = document["names"]
-    check_names(names, "names", path / "cameras.json", artifact.remedy(path))
+    check_names(names, "names", path / "cameras.json", remedy_of(path))
     arrays = read_tensors(path, manifest, file.name, POSES)
-    check_cameras(names, arrays["Ks"], arrays["cam_from_world"], file, artifact.remedy(path))
+    check_cameras(names, arrays["Ks"], arrays["cam_from_world"], file, remedy_of(path))
     return Cameras(names, arrays["Ks"], arrays["cam_from_world"], document["width"], document["height"])
 
 

@@ -13,6 +13,7 @@ from chebsplat.formats import artifact
 from chebsplat.formats.arrays import StoredArray, has_array, open_array, write_array
 from chebsplat.formats.cameras import POSES, check_cameras
 from chebsplat.formats.documents import TypedDict, read_document, write_document
+from chebsplat.formats.manifest import remedy_of
 from chebsplat.formats.names import check_names
 from chebsplat.formats.tensors import read_tensors, write_tensors
 
@@ -126,7 +127,7 @@ def read_capture(path: Path) -> Capture:
         source=document["source"],
         protocol=document["protocol"],
     )
-    _check(capture, str(path), artifact.remedy(path))
+    _check(capture, str(path), remedy_of(path))
     return capture
 
 
@@ -149,5 +150,5 @@ def _check(capture: Capture, where: str, remedy: str) -> None:
         raise InputError(f"{where}: cameras are no matrices 3x3 and 4x4; {remedy}")
     check_cameras(capture.names, capture.Ks, poses, where, remedy)
     points, colors = capture.points, capture.point_colors
-    if points is not None and colors is not None and (colors.shape, colors.dtype) != (points.shape, np.uint8):
+    if points is not None and colors is not None and (colors.shape != points.shape or colors.dtype != np.uint8):
         raise InputError(f"{where}: points {points.shape} with colours {colors.dtype} {colors.shape}; {remedy}")

@@ -11,6 +11,7 @@ import numpy as np
 from chebsplat.errors import InputError
 from chebsplat.formats import artifact
 from chebsplat.formats.documents import Positive, TypedDict, read_document, write_document
+from chebsplat.formats.manifest import remedy_of
 from chebsplat.formats.tensors import Spec, read_tensors, write_tensors
 
 SCHEMA = "chebsplat.descriptors/1"
@@ -53,6 +54,6 @@ def read_descriptors(path: Path) -> Descriptors:
     arrays = read_tensors(path, manifest, "descriptors.safetensors", SPECS)
     centers, members = arrays["centers"], arrays["members"]
     if min(centers.min(initial=0), members.min(initial=0) + 1) < 0:
-        raise InputError(f"{path / 'descriptors.safetensors'}: an index is negative; {artifact.remedy(path)}")
+        raise InputError(f"{path / 'descriptors.safetensors'}: an index is negative; {remedy_of(path)}")
     settings = read_document(path, manifest, "settings.json", Settings)
     return Descriptors(**{name: arrays[name] for name in SPECS}, settings=settings)

@@ -4,18 +4,19 @@ from __future__ import annotations
 
 import json
 from pathlib import Path
-from typing import Annotated, Any, NotRequired
+from typing import Annotated, Any, NotRequired, TypeVar
 
 from annotated_types import Ge, Gt, Le
 from typing_extensions import TypedDict
 
 from chebsplat.errors import InputError
 from chebsplat.formats import artifact
-from chebsplat.formats.artifact import Manifest
 from chebsplat.formats.files import parse_json
+from chebsplat.formats.manifest import Manifest, remedy_of
 
 __all__ = ["Count", "NotRequired", "Positive", "Side", "TypedDict", "conform", "read_document", "write_document"]
 
+Value = TypeVar("Value")
 Count = Annotated[int, Ge(0)]
 Positive = Annotated[float, Gt(0)]
 Side = Annotated[int, Ge(1), Le(65_536)]  # of an image, pixels
@@ -29,10 +30,10 @@ def write_document(path: Path, value: Any) -> None:
 def read_document(root: Path, manifest: Manifest, name: str, kind: Any = dict[str, Any]) -> Any:
     """Read a listed document of a type, such as a TypedDict. Raises InputError naming file, field and remedy."""
     path = artifact.checked(root, manifest, name)
-    return conform(parse_json(path, artifact.remedy(root), finite=True), kind, path, artifact.remedy(root))
+    return conform(parse_json(path, remedy_of(root), finite=True), kind, path, remedy_of(root))
 
 
-def conform(value: Any, kind: Any, where: object, remedy: str) -> Any:
+def conform(value: Value, kind: Any, where: object, remedy: str) -> Value:
     """`value` itself, if it is of a type. Raises InputError naming the first field that is not."""
     from pydantic import TypeAdapter, ValidationError
 

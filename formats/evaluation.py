@@ -12,8 +12,8 @@ from annotated_types import Ge, Le
 from chebsplat.errors import InputError
 from chebsplat.formats import artifact
 from chebsplat.formats.arrays import StoredArray, has_array, open_array, write_array
-from chebsplat.formats.artifact import Manifest
 from chebsplat.formats.documents import Count, NotRequired, TypedDict, read_document, write_document
+from chebsplat.formats.manifest import Manifest, remedy_of
 from chebsplat.formats.names import check_names
 
 SCHEMA = "chebsplat.evaluation/1"
@@ -89,7 +89,7 @@ def read_evaluation(path: Path) -> Evaluation:
         if has_array(manifest, name):
             shape = (None, None, None, 3) if dtype == "uint8" else (None, None, None)
             pictures[name] = open_array(path, manifest, name, shape, dtype, (-1, np.iinfo(dtype).max))
-    figures, remedy = read_figures(path, manifest), artifact.remedy(path)
+    figures, remedy = read_figures(path, manifest), remedy_of(path)
     shapes = {data.shape[:3] for data in pictures.values()}
     if len(shapes) > 1 or (shapes and shapes.pop()[0] != len(figures["names"])):
         raise InputError(f"{path}: its pictures are not of {len(figures['names'])} views of one size; {remedy}")
@@ -99,7 +99,7 @@ def read_evaluation(path: Path) -> Evaluation:
 def read_figures(path: Path, manifest: Manifest) -> dict[str, Any]:
     """The figures alone. Raises InputError naming file and remedy."""
     figures: dict[str, Any] = read_document(path, manifest, "figures.json", Figures)
-    file, remedy = path / "figures.json", artifact.remedy(path)
+    file, remedy = path / "figures.json", remedy_of(path)
     check_names(figures["names"], "names", file, remedy)
     for name, values in figures["image"]["per_view"].items():
         if len(values) != len(figures["names"]):

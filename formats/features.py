@@ -16,6 +16,7 @@ from chebsplat.errors import InputError
 from chebsplat.formats import artifact
 from chebsplat.formats.arrays import StoredArray, create_array, has_array, open_array
 from chebsplat.formats.documents import NotRequired, TypedDict, read_document, write_document
+from chebsplat.formats.manifest import remedy_of
 from chebsplat.formats.names import check_names
 from chebsplat.formats.projection import SPECS, Projection, from_parts, tensors
 from chebsplat.formats.projection import Document as ProjectionDocument
@@ -220,8 +221,8 @@ def read_features(path: Path) -> Features:
     manifest = artifact.read_manifest(path, SCHEMA)
     document, file = read_document(path, manifest, "features.json", Document), path / "features.json"
     names, label_names = document["names"], document["label_names"]
-    check_names(names, "names", file, artifact.remedy(path))
-    check_names(label_names, "label names", file, artifact.remedy(path))
+    check_names(names, "names", file, remedy_of(path))
+    check_names(label_names, "label names", file, remedy_of(path))
     features = open_array(path, manifest, "features", (len(names), None, None, None), "float16", (-LARGEST, LARGEST))
     spec = {"embeddings": ("float32", len(label_names), features.shape[3])}
     embeddings = read_tensors(path, manifest, "labels.safetensors", spec)["embeddings"]
@@ -234,8 +235,7 @@ def read_features(path: Path) -> Features:
     longest = np.linalg.norm(embeddings, axis=1).max(initial=0)
     if longest > 1 + 1e-3:
         raise InputError(
-            f"{path / 'labels.safetensors'}: an embedding is {longest:.3g} long, at most 1 is right; "
-            f"{artifact.remedy(path)}"
+            f"{path / 'labels.safetensors'}: an embedding is {longest:.3g} long, at most 1 is right; {remedy_of(path)}"
         )
     projection = None
     if "projection" in document:

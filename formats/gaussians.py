@@ -13,10 +13,10 @@ from annotated_types import Ge, Le
 
 from chebsplat.errors import InputError
 from chebsplat.formats import artifact
-from chebsplat.formats.artifact import Manifest
 from chebsplat.formats.cameras import Cameras, read_cameras, write_cameras
 from chebsplat.formats.documents import Count, NotRequired, TypedDict, conform, read_document, write_document
 from chebsplat.formats.files import read_text
+from chebsplat.formats.manifest import Manifest, remedy_of
 from chebsplat.formats.ply import REST
 from chebsplat.formats.tensors import Spec, read_tensors, write_tensors
 
@@ -108,7 +108,7 @@ def write_gaussians(out: Path, gaussians: Gaussians) -> None:
 def read_gaussians(path: Path) -> Gaussians:
     """Raises: InputError naming the damaged file and the remedy."""
     manifest = artifact.read_manifest(path, SCHEMA)
-    file, remedy = path / "parameters.safetensors", artifact.remedy(path)
+    file, remedy = path / "parameters.safetensors", remedy_of(path)
     parameters = read_tensors(path, manifest, file.name, SPECS)
     if held := {name: spec for name, spec in SEMANTIC.items() if name in parameters}:
         parameters = read_tensors(path, manifest, file.name, SPECS | held)
@@ -132,7 +132,7 @@ def read_gaussians(path: Path) -> Gaussians:
 
 def read_trace(path: Path, manifest: Manifest) -> list[dict[str, float]]:
     """The trace alone, without the parameters. Raises InputError naming file and remedy."""
-    file, remedy = artifact.checked(path, manifest, "trace.csv"), artifact.remedy(path)
+    file, remedy = artifact.checked(path, manifest, "trace.csv"), remedy_of(path)
     try:
         table = csv.DictReader(read_text(file, remedy).splitlines())
         trace = [{name: float(value) for name, value in row.items()} for row in table]

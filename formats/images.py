@@ -98,7 +98,7 @@ def _exif(image: Any) -> Any:
 
 
 def _opened(path: Path, look: Callable[[Any], None], remedy: str) -> Any:
-    from PIL import Image
+    from PIL import Image, UnidentifiedImageError
 
     regular(path, remedy)
     warnings.simplefilter("error", Image.DecompressionBombWarning)  # Pillow's own limit lies above ours
@@ -113,7 +113,7 @@ def _opened(path: Path, look: Callable[[Any], None], remedy: str) -> Any:
             f"{path} is too large ({error}; {MAX_PIXELS // 10**6} megapixels and {MAX_SIDE} pixels a side are read); "
             "reduce it"
         ) from None
-    except Image.UnidentifiedImageError:
+    except UnidentifiedImageError:
         raise InputError(f"{path} is no PNG or JPEG image, whatever its name; convert it") from None
     except DAMAGE as error:
         raise InputError(f"{path} is not a readable image ({error}); copy it again") from None

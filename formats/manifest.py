@@ -98,18 +98,18 @@ RULES = {
 NEEDED = {"schema", "key", "stage"}
 
 
-def remedy(path: Path) -> str:
+def remedy_of(path: Path) -> str:
     return f"delete {path} and run its stage again"
 
 
 def parse_manifest(path: Path) -> Manifest:
     """The manifest of the artifact `path`, whose members are not looked at. Raises InputError naming the file."""
     file = path / MANIFEST
-    document = parse_json(file, remedy(path))
+    document = parse_json(file, remedy_of(path))
     if not isinstance(document, dict) or not NEEDED <= document.keys() <= RULES.keys():
-        raise InputError(f"{file} is damaged: it does not say what a manifest says; {remedy(path)}")
+        raise InputError(f"{file} is damaged: it does not say what a manifest says; {remedy_of(path)}")
     manifest = Manifest(**document)
     for name, (wanted, holds) in RULES.items():
         if not holds(getattr(manifest, name)):
-            raise InputError(f"{file} is damaged: {name} is not {wanted}; {remedy(path)}")
+            raise InputError(f"{file} is damaged: {name} is not {wanted}; {remedy_of(path)}")
     return manifest

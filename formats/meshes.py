@@ -37,7 +37,8 @@ class RayCaster:
 
     def is_blocked(self, origins: np.ndarray, directions: np.ndarray) -> np.ndarray:
         """Bool [N]: something lies within one length of the direction."""
-        return self._scene.test_occlusions(self._rays(origins, directions), 0.0, 1.0).numpy()
+        blocked: np.ndarray = self._scene.test_occlusions(self._rays(origins, directions), 0.0, 1.0).numpy()
+        return blocked
 
     def _rays(self, origins: np.ndarray, directions: np.ndarray) -> Any:
         return self._tensor(np.concatenate(np.broadcast_arrays(origins, directions), -1), np.float32)

@@ -11,6 +11,7 @@ import numpy as np
 from chebsplat.formats import artifact
 from chebsplat.formats.cameras import POSES, check_cameras
 from chebsplat.formats.documents import TypedDict, read_document, write_document
+from chebsplat.formats.manifest import remedy_of
 from chebsplat.formats.names import check_names
 from chebsplat.formats.tensors import FLOAT, Spec, read_tensors, write_tensors
 
@@ -74,7 +75,7 @@ def read_points(path: Path) -> Points:
     manifest = artifact.read_manifest(path, SCHEMA)
     document, file = read_document(path, manifest, "points.json", Document), path / "points.safetensors"
     names = document["names"]
-    check_names(names, "names", path / "points.json", artifact.remedy(path))
+    check_names(names, "names", path / "points.json", remedy_of(path))
     arrays = read_tensors(path, manifest, file.name, SPECS)
-    check_cameras(names, arrays["Ks"], arrays["cam_from_world"], file, artifact.remedy(path))
+    check_cameras(names, arrays["Ks"], arrays["cam_from_world"], file, remedy_of(path))
     return Points(names, **{name: arrays[name] for name in SPECS}, notes=document["notes"])

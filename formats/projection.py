@@ -41,7 +41,8 @@ class Projection:
 
     def apply(self, features: np.ndarray) -> np.ndarray:
         """Features [..., C] -> f32 [..., d]."""
-        return np.asarray(features, np.float32) @ self.matrix
+        projected: np.ndarray = np.asarray(features, np.float32) @ self.matrix
+        return projected
 
     def embed(self, embeddings: np.ndarray) -> np.ndarray:
         """Unit embeddings [L, C] of words -> f32 [L, d].
@@ -49,11 +50,13 @@ class Projection:
         Choices: not made unit again, so that an inner product with projected features is the teacher's own; unit
           rows would favour the words that the reference shows least.
         """
-        return np.asarray(embeddings, np.float32) @ self.matrix
+        projected: np.ndarray = np.asarray(embeddings, np.float32) @ self.matrix
+        return projected
 
     def restore(self, features: np.ndarray) -> np.ndarray:
         """Projected features [..., d] -> f32 [..., C]."""
-        return np.asarray(features, np.float32) @ self.inverse
+        restored: np.ndarray = np.asarray(features, np.float32) @ self.inverse
+        return restored
 
 
 def tensors(projection: Projection) -> dict[str, np.ndarray]:

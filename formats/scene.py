@@ -11,9 +11,9 @@ import numpy as np
 from chebsplat.errors import InputError
 from chebsplat.formats import artifact
 from chebsplat.formats.arrays import has_array, open_array, write_array
-from chebsplat.formats.artifact import Manifest
 from chebsplat.formats.cameras import Cameras, read_cameras, write_cameras
 from chebsplat.formats.documents import Count, NotRequired, TypedDict, read_document, write_document
+from chebsplat.formats.manifest import Manifest, remedy_of
 from chebsplat.formats.names import check_names
 from chebsplat.formats.ply import REST, write_ply
 from chebsplat.formats.tensors import read_tensors, write_tensors
@@ -107,7 +107,7 @@ def read_scene(path: Path) -> Scene:
     manifest = artifact.read_manifest(path, SCHEMA)
     unsorted = read_tensors(path, manifest, "degrees.safetensors", {"degrees": ("uint8", "n")})["degrees"]
     if len(unsorted) == 0 or unsorted.max() > 3:
-        raise InputError(f"{path / 'degrees.safetensors'} holds a degree beyond 3, or none; {artifact.remedy(path)}")
+        raise InputError(f"{path / 'degrees.safetensors'} holds a degree beyond 3, or none; {remedy_of(path)}")
     order = np.argsort(unsorted, kind="stable")
     n, degrees = len(order), unsorted[order]
 
@@ -139,7 +139,7 @@ def read_scene(path: Path) -> Scene:
     if not -1 <= labels.min() <= labels.max() < len(names):
         raise InputError(
             f"{path / 'labels.safetensors'}: labels {labels.min()} to {labels.max()} of {len(names)}; "
-            + artifact.remedy(path)
+            + remedy_of(path)
         )
     return Scene(parameters, cameras, order, found["labels"], names, found["embeddings"], summary)
 
@@ -149,8 +149,8 @@ def read_label_names(path: Path, manifest: Manifest) -> list[str]:
     held = read_document(path, manifest, "labels.json", dict[str, str])
     names, file = list(held.values()), path / "labels.json"
     if list(held) != [str(k) for k in range(len(names))]:
-        raise InputError(f"{file}: the ids are not 0, 1, ... in order; {artifact.remedy(path)}")
-    check_names(names, "labels", file, artifact.remedy(path))
+        raise InputError(f"{file}: the ids are not 0, 1, ... in order; {remedy_of(path)}")
+    check_names(names, "labels", file, remedy_of(path))
     return names
 
 

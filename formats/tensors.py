@@ -12,7 +12,7 @@ from safetensors.numpy import load_file, save_file
 
 from chebsplat.errors import InputError
 from chebsplat.formats import artifact
-from chebsplat.formats.artifact import Manifest
+from chebsplat.formats.manifest import Manifest, remedy_of
 
 Spec = tuple[Any, ...]  # of an array: its dtype, then its sizes
 FLOAT = "float32 or float64"
@@ -39,21 +39,21 @@ def read_tensors(
     try:
         arrays = load_file(path)
     except (SafetensorError, ValueError, KeyError, TypeError, AttributeError, OSError) as error:  # of odd dtypes, too
-        raise InputError(f"{path} is not a safetensors file ({error}); {artifact.remedy(root)}") from None
+        raise InputError(f"{path} is not a safetensors file ({error}); {remedy_of(root)}") from None
     sizes: dict[str, int] = {}
     for key, (dtype, *shape) in (specs or {}).items():
         if key not in arrays:
-            raise InputError(f"{path} has no array {key}; {artifact.remedy(root)}")
+            raise InputError(f"{path} has no array {key}; {remedy_of(root)}")
         found = arrays[key].shape
         if arrays[key].dtype.name not in dtype.split(" or "):
-            raise InputError(f"{path}: {key} is {arrays[key].dtype}, expected {dtype}; {artifact.remedy(root)}")
+            raise InputError(f"{path}: {key} is {arrays[key].dtype}, expected {dtype}; {remedy_of(root)}")
         fits = len(found) == len(shape) and all(
             n == (sizes.setdefault(want, n) if isinstance(want, str) else want)
             for n, want in zip(found, shape, strict=True)
         )
         if not fits:
-            raise InputError(f"{path}: {key} has shape {found}, expected {tuple(shape)}; {artifact.remedy(root)}")
+            raise InputError(f"{path}: {key} has shape {found}, expected {tuple(shape)}; {remedy_of(root)}")
     for key, array in arrays.items():
         if np.issubdtype(array.dtype, np.floating) and not np.isfinite(array).all():
-            raise InputError(f"{path}: {key} holds non-finite values; {artifact.remedy(root)}")
+            raise InputError(f"{path}: {key} holds non-finite values; {remedy_of(root)}")
     return arrays

@@ -10,6 +10,7 @@ import numpy as np
 from chebsplat.errors import InputError
 from chebsplat.formats import artifact
 from chebsplat.formats.basis import SCHEMA, Basis, off_orthonormal, read_basis
+from chebsplat.formats.manifest import remedy_of
 from chebsplat.pipelines import store
 
 Table = list[list[str]]  # header first
@@ -132,7 +133,7 @@ def verify(path: Path | None, earlier: Path | None) -> str:
         raise InputError(f"{path}: its lineage does not continue that of {earlier}; delete it and run its stage again")
     for name, columns in before.bases.items():
         if not np.array_equal(basis.bases[name][:, : columns.shape[1]], columns):
-            raise InputError(f"{path}: {name} does not begin with the columns of {earlier}; {artifact.remedy(path)}")
+            raise InputError(f"{path}: {name} does not begin with the columns of {earlier}; {remedy_of(path)}")
     return said + f", continues revision {before.revision}"
 
 

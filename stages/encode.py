@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from chebsplat.errors import ConfigError, InputError
-from chebsplat.formats import artifact
+from chebsplat.formats.manifest import remedy_of
 from chebsplat.stages.inference import Model
 
 if TYPE_CHECKING:
@@ -73,7 +73,7 @@ def encode(scene: Path, encoder: Path, features: Path | None, out: Path) -> dict
         },
     )
     if any(values.shape != p["raw_features"].shape for values in (fused, gate)):
-        raise InputError(f"{held.models[FUSED]} is of another scene's encoder; {artifact.remedy(folder)}")
+        raise InputError(f"{held.models[FUSED]} is of another scene's encoder; {remedy_of(folder)}")
     finished = time.perf_counter()
     place = np.argsort(order)  # of each Gaussian in the scene's files
     members = inputs.regions.members
@@ -148,7 +148,7 @@ def opened(path: Path) -> Model:
 
     options = onnxruntime.SessionOptions()
     options.intra_op_num_threads = n_threads()
-    return Model(path, artifact.remedy(path.parent), options)
+    return Model(path, remedy_of(path.parent), options)
 
 
 def encoded(model: Path, inputs: RegionInputs) -> np.ndarray:
@@ -160,7 +160,7 @@ def encoded(model: Path, inputs: RegionInputs) -> np.ndarray:
     starts = range(0, len(inputs.mask), CHUNK)
     found = np.concatenate([runner.run({k: v[s : s + CHUNK] for k, v in feed.items()})[0] for s in starts])
     if found.ndim != 2 or len(found) != len(inputs.mask) or not np.isfinite(found).all():
-        raise InputError(f"{model} gives {found.shape} or values that are not finite; {artifact.remedy(model.parent)}")
+        raise InputError(f"{model} gives {found.shape} or values that are not finite; {remedy_of(model.parent)}")
     return found
 
 

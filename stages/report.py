@@ -40,10 +40,11 @@ FRAMES = {"color": "colour", "color_and_features": "colour and features"}
 def run(job: Job) -> None:
     import json
 
-    from chebsplat.formats.artifact import read_manifest, remedy
+    from chebsplat.formats.artifact import read_manifest
     from chebsplat.formats.documents import conform
     from chebsplat.formats.evaluation import read_evaluation
     from chebsplat.formats.gaussians import read_gaussians
+    from chebsplat.formats.manifest import remedy_of
     from chebsplat.stages import figures as draw
     from chebsplat.stages import report_parts as parts
     from chebsplat.stages.page import PAGE
@@ -57,7 +58,7 @@ def run(job: Job) -> None:
     manifests = {role: read_manifest(job.inputs[role]) for role in STAGE_OF if role in job.inputs}
     facts = {role: facts_of(role, job.inputs[role], manifest) for role, manifest in manifests.items()}
     evaluated = job.inputs["evaluation"]
-    figures = conform(evaluation.figures, Reported, evaluated / "figures.json", remedy(evaluated))
+    figures = conform(evaluation.figures, Reported, evaluated / "figures.json", remedy_of(evaluated))
     left_out = absent_stages(job, gaussians) | figures["left_out"]
     for said in facts.values():
         left_out |= said.get("left_out", {})

@@ -6,11 +6,11 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
-from chebsplat.formats.artifact import remedy
 from chebsplat.formats.documents import Count, NotRequired, Positive, TypedDict, conform
+from chebsplat.formats.manifest import remedy_of
 
 if TYPE_CHECKING:
-    from chebsplat.formats.artifact import Manifest
+    from chebsplat.formats.manifest import Manifest
 
 
 class Facts(TypedDict):
@@ -100,5 +100,5 @@ FACTS: dict[str, Any] = {"features": Teacher, "gaussians": Trained, "scene": Exp
 def facts_of(role: str, path: Path, manifest: Manifest) -> dict[str, Any]:
     """The facts of an input's manifest. Raises InputError naming the file and what is wrong in it."""
     file = path / "artifact.json"
-    conform(asdict(manifest), Told, file, remedy(path))
-    return conform(manifest.facts, FACTS.get(role, Facts), file, remedy(path))
+    conform(asdict(manifest), Told, file, remedy_of(path))
+    return conform(manifest.facts, FACTS.get(role, Facts), file, remedy_of(path))

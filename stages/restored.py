@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, TypeVar
 
 from chebsplat.errors import InputError
-from chebsplat.formats.artifact import remedy
+from chebsplat.formats.manifest import remedy_of
 
 if TYPE_CHECKING:
     from chebsplat.formats.gaussians import Gaussians
@@ -30,4 +30,6 @@ def fitting(path: Path, build: Callable[[], T]) -> T:
         return build()
     except (RuntimeError, ValueError, TypeError) as error:  # torch's, of names, shapes and dtypes
         line = " ".join(str(error).split())[:200]
-        raise InputError(f"{path / 'modules.safetensors'} does not fit notes.json ({line}); {remedy(path)}") from None
+        raise InputError(
+            f"{path / 'modules.safetensors'} does not fit notes.json ({line}); {remedy_of(path)}"
+        ) from None

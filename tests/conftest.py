@@ -39,8 +39,8 @@ def mixed(toy, tmp_path_factory):
     import numpy as np
 
     from chebsplat.formats import artifact
-    from chebsplat.formats.artifact import Manifest
     from chebsplat.formats.gaussians import read_gaussians
+    from chebsplat.formats.manifest import Manifest
     from chebsplat.formats.scene import SCHEMA, read_scene, write_scene
 
     checkpoint = read_gaussians(toy["train"])

@@ -9,7 +9,7 @@ from shared import KEY, key_of
 
 from chebsplat.errors import InputError
 from chebsplat.formats import artifact
-from chebsplat.formats.artifact import Manifest
+from chebsplat.formats.manifest import MANIFEST, Manifest
 from chebsplat.formats.tensors import write_tensors
 
 SCHEMA = "chebsplat.capture/1"
@@ -68,7 +68,7 @@ def test_damage_is_named_with_the_remedy(tmp_path, damage):
         named = path / "extra.bin"
         named.write_bytes(b"?")
     else:
-        named = path / artifact.MANIFEST
+        named = path / MANIFEST
         named.write_text("{") if damage == "manifest" else named.unlink()
     with pytest.raises(InputError) as error:
         artifact.verify(path)
@@ -110,7 +110,7 @@ def test_a_damaged_artifact_is_replaced_in_the_folder_that_bears_its_key_and_a_t
         tear(path)
         (tmp / "b.txt").write_text("ours")
         assert (path / "data/a.txt").is_file()  # what stands there stays until the block has ended
-        (path / artifact.MANIFEST).write_text("{")
+        (path / MANIFEST).write_text("{")
     assert sorted(artifact.verify(path).files) == ["b.txt"]
     assert os.listdir(tmp_path) == [KEY]
 
@@ -194,7 +194,7 @@ BAD_MANIFESTS = {
 @pytest.mark.parametrize("change", BAD_MANIFESTS.values(), ids=BAD_MANIFESTS)
 def test_a_manifest_that_breaks_a_rule_is_damaged_for_every_reader(tmp_path, change):
     path = make(tmp_path / "x")
-    file = path / artifact.MANIFEST
+    file = path / MANIFEST
     file.write_text(json.dumps(change(json.loads(file.read_text()))))
     for read in (artifact.read_manifest, artifact.verify):
         with pytest.raises(InputError, match=f"{file} is damaged"):
@@ -204,7 +204,7 @@ def test_a_manifest_that_breaks_a_rule_is_damaged_for_every_reader(tmp_path, cha
 
 def test_a_manifest_that_is_nested_too_deeply_is_damaged(tmp_path):
     path = make(tmp_path / "x")
-    (path / artifact.MANIFEST).write_text("[" * 100_000)
+    (path / MANIFEST).write_text("[" * 100_000)
     with pytest.raises(InputError, match="too deeply"):
         artifact.verify(path)
 

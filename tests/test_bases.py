@@ -11,8 +11,8 @@ from click.testing import CliRunner
 from shared import ROOT, key_of
 
 from chebsplat.formats import artifact, heads
-from chebsplat.formats.artifact import Manifest
 from chebsplat.formats.basis import SCHEMA, Basis, read_basis, write_basis
+from chebsplat.formats.manifest import Manifest
 from chebsplat.pipelines import bases, store
 from chebsplat.pipelines.cli.basis import basis as command
 from chebsplat.shape.cks import update

@@ -9,7 +9,7 @@ from shared import KEY
 
 from chebsplat.errors import DataFailure
 from chebsplat.formats import artifact
-from chebsplat.formats.artifact import Manifest
+from chebsplat.formats.manifest import Manifest
 from chebsplat.stages.command import command
 from chebsplat.stages.registry import STAGES
 

@@ -15,7 +15,7 @@ from soak.disk import namespace
 from chebsplat.errors import DiskFailure, InputError
 from chebsplat.formats import artifact, disk
 from chebsplat.formats.arrays import write_array
-from chebsplat.formats.artifact import Manifest
+from chebsplat.formats.manifest import Manifest
 
 MOUNT = 'mount -t tmpfs -o "$0" tmpfs "$1" && shift && exec "$@"'
 

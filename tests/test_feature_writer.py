@@ -14,8 +14,8 @@ from shared import KEY
 
 from chebsplat.errors import InputError
 from chebsplat.formats import artifact, features
-from chebsplat.formats.artifact import Manifest
 from chebsplat.formats.features import Features, FeatureWriter
+from chebsplat.formats.manifest import Manifest
 
 NAMES = ["a", "b", "c", "d"]
 SHAPE = (70, 130, 3)

@@ -9,8 +9,8 @@ from shared import KEY, gaussian_parameters
 
 from chebsplat.errors import InputError
 from chebsplat.formats import artifact, capture, descriptors, evaluation, features, ply, points, scene
-from chebsplat.formats.artifact import Manifest
 from chebsplat.formats.cameras import Cameras
+from chebsplat.formats.manifest import Manifest
 
 DATA = Path(os.environ.get("CHEBSPLAT_TEST_DATA", Path(__file__).parents[1] / "../shared/data"))
 

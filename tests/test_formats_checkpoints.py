@@ -7,10 +7,10 @@ from shared import KEY
 
 from chebsplat.errors import InputError
 from chebsplat.formats import artifact
-from chebsplat.formats.artifact import Manifest
 from chebsplat.formats.basis import Basis, read_basis, write_basis
 from chebsplat.formats.cameras import Cameras
 from chebsplat.formats.gaussians import Gaussians, read_gaussians, write_gaussians
+from chebsplat.formats.manifest import Manifest
 
 CAMERAS = Cameras(["a"], np.eye(3)[None], np.eye(4)[None], 5, 4)
 

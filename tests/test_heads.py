@@ -13,10 +13,10 @@ from shared import ROOT, gaussian_parameters, key_of
 
 from chebsplat.errors import ConfigError, InputError
 from chebsplat.formats import artifact, heads
-from chebsplat.formats.artifact import Manifest
 from chebsplat.formats.basis import Basis, off_orthonormal, read_basis, read_lineage, write_basis
 from chebsplat.formats.cameras import Cameras
 from chebsplat.formats.gaussians import SCHEMA, Gaussians, write_gaussians
+from chebsplat.formats.manifest import Manifest
 
 COUNTING = """
 import sys
@@ -24,6 +24,7 @@ from hashlib import sha256
 from pathlib import Path
 from chebsplat.formats import artifact, heads
 from chebsplat.formats.basis import SCHEMA, Basis, read_lineage, write_basis
+from chebsplat.formats.manifest import Manifest
 
 root, who = Path(sys.argv[1]), sys.argv[2]
 for number in range(int(sys.argv[3])):
@@ -34,7 +35,7 @@ for number in range(int(sys.argv[3])):
         if name in {entry["gaussians"] for entry in lineage}:
             return None
         out = root / "store/cks" / sha256(f"{len(lineage)} {name}".encode()).hexdigest()[:16]
-        with artifact.publish(out, artifact.Manifest(SCHEMA, out.name, "cks")) as tmp:
+        with artifact.publish(out, Manifest(SCHEMA, out.name, "cks")) as tmp:
             write_basis(tmp, Basis({}, {}, [*lineage, {"scene": who, "gaussians": name, "projections": {}}]))
         return out
 

@@ -6,8 +6,8 @@ from shared import gaussian_parameters
 
 from chebsplat.errors import InputError
 from chebsplat.formats import artifact
-from chebsplat.formats.artifact import Manifest
 from chebsplat.formats.cameras import Cameras
+from chebsplat.formats.manifest import Manifest
 from chebsplat.formats.names import check_names
 from chebsplat.formats.ply import read_ply
 from chebsplat.formats.scene import SCHEMA, Scene, read_scene, write_scene

@@ -8,7 +8,7 @@ from shared import KEY
 
 from chebsplat.errors import InputError
 from chebsplat.formats import artifact
-from chebsplat.formats.artifact import Manifest
+from chebsplat.formats.manifest import Manifest
 from chebsplat.formats.projection import SCHEMA, Projection, read_projection, write_projection
 from chebsplat.labels.channels import ROWS, Moments, projection
 

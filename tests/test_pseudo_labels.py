@@ -7,9 +7,10 @@ from shared import KEY, TOY, run_stage
 from chebsplat.errors import ConfigError
 from chebsplat.evaluation.protocols import labels, scannet_closed
 from chebsplat.evaluation.protocols.task import Seen, Task
-from chebsplat.formats.artifact import Manifest, publish
+from chebsplat.formats.artifact import publish
 from chebsplat.formats.capture import read_capture, write_capture
 from chebsplat.formats.features import read_features
+from chebsplat.formats.manifest import Manifest
 from chebsplat.labels.pseudo_labels import voted
 
 CODES = np.eye(3, dtype=np.float32)

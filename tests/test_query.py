@@ -10,10 +10,11 @@ from PIL import Image
 from shared import KEY
 
 from chebsplat.formats import artifact
-from chebsplat.formats.artifact import Manifest, sha256_file
+from chebsplat.formats.artifact import sha256_file
 from chebsplat.formats.cameras import Cameras
 from chebsplat.formats.capture import Capture, write_capture
 from chebsplat.formats.features import Features, write_features
+from chebsplat.formats.manifest import Manifest
 from chebsplat.formats.projection import Projection
 from chebsplat.formats.scene import Scene, write_scene
 from chebsplat.labels.relevancy import relevancy

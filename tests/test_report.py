@@ -13,8 +13,9 @@ from browser import BROWSER, browsed
 from shared import INPUTS, KEY, run_stage
 
 from chebsplat.errors import InputError
-from chebsplat.formats.artifact import Manifest, publish, read_manifest
+from chebsplat.formats.artifact import publish, read_manifest
 from chebsplat.formats.evaluation import read_evaluation
+from chebsplat.formats.manifest import Manifest
 from chebsplat.stages import figures as draw
 from chebsplat.stages.report_parts import class_rows, label_names, legend, picture_rows
 

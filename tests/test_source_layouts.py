@@ -13,8 +13,8 @@ from chebsplat.cameras import centers, unproject
 from chebsplat.errors import InputError
 from chebsplat.evaluation.protocols import scannet_closed, scannet_open
 from chebsplat.formats import artifact
-from chebsplat.formats.artifact import Manifest
 from chebsplat.formats.capture import Capture, write_capture
+from chebsplat.formats.manifest import Manifest
 from chebsplat.formats.points import read_points
 from chebsplat.stages.settings import IngestSection
 from chebsplat.stages.sources import colmap, common, generated, replica, scannet, scannet_labels, seven_scenes

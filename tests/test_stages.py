@@ -10,10 +10,10 @@ import pytest
 from shared import INPUTS, KEY, TOY, run_stage
 
 from chebsplat.formats import artifact
-from chebsplat.formats.artifact import Manifest
 from chebsplat.formats.capture import read_capture, write_capture
 from chebsplat.formats.evaluation import read_evaluation
 from chebsplat.formats.gaussians import read_gaussians, write_gaussians
+from chebsplat.formats.manifest import Manifest
 from chebsplat.formats.points import read_points, write_points
 from chebsplat.formats.scene import read_scene
 from chebsplat.stages.registry import STAGES

@@ -12,9 +12,10 @@ from browser import BROWSER, browsed
 from shared import ROOT
 
 from chebsplat.errors import ConfigError
-from chebsplat.formats.artifact import Manifest, publish
+from chebsplat.formats.artifact import publish
 from chebsplat.formats.capture import Capture, write_capture
 from chebsplat.formats.evaluation import Evaluation, write_evaluation
+from chebsplat.formats.manifest import Manifest
 from chebsplat.pipelines.results import compare, row_of
 from chebsplat.pipelines.scenes import names
 from chebsplat.pipelines.sequences import scenes_of

@@ -17,9 +17,9 @@ from tiny_teachers import COLORS, color_teacher, write_model, write_settings, wr
 
 from chebsplat.errors import InputError
 from chebsplat.formats import artifact
-from chebsplat.formats.artifact import Manifest
 from chebsplat.formats.capture import Capture, write_capture
 from chebsplat.formats.features import read_features
+from chebsplat.formats.manifest import Manifest
 from chebsplat.formats.projection import Projection, write_projection
 from chebsplat.formats.teacher_model import read_label_set, read_teacher
 from chebsplat.stages.image_encoder import ImageEncoder

@@ -78,7 +78,7 @@ def set_tensor(file: Path, name: str, change: Callable[[np.ndarray], np.ndarray 
 
 def _publish(path: Path, schema: str, stage: str, write: Callable[[Path], Any]) -> None:
     from chebsplat.formats import artifact
-    from chebsplat.formats.artifact import Manifest
+    from chebsplat.formats.manifest import Manifest
     from chebsplat.stages.config import Config
 
     config = Config.model_validate({"describe": DESCRIBED | {"n_regions": 4, "region_size": 8}, "sfm": {}})
