@@ -69,6 +69,12 @@ def test_packages_of_the_maths_import_one_another_one_way():
     assert found == PACKAGES
 
 
+def test_of_pipelines_only_the_command_knows_studies():
+    for path in (ROOT / "pipelines").rglob("*.py"):
+        if path.relative_to(ROOT / "pipelines").parts[0] not in ("studies", "cli"):
+            assert not [name for name in imported_modules(path) if name.startswith("chebsplat.pipelines.studies")], path
+
+
 def test_formats_know_no_torch():
     for path in (ROOT / "formats").rglob("*.py"):
         assert not any(name.split(".")[0] == "torch" for name in imported_modules(path)), path

@@ -16,14 +16,13 @@ from chebsplat.formats.artifact import publish
 from chebsplat.formats.capture import Capture, write_capture
 from chebsplat.formats.evaluation import Evaluation, write_evaluation
 from chebsplat.formats.manifest import Manifest
-from chebsplat.pipelines.results import compare, row_of
 from chebsplat.pipelines.scenes import names
 from chebsplat.pipelines.sequences import scenes_of
-from chebsplat.pipelines.study import Study, checked_study, execute, expand, outstanding, read_study
-from chebsplat.pipelines.study_page import write
-from chebsplat.pipelines.study_pictures import gallery
-from chebsplat.pipelines.study_tables import stability
-from chebsplat.pipelines.transfer import Section
+from chebsplat.pipelines.studies.page import write
+from chebsplat.pipelines.studies.pictures import gallery
+from chebsplat.pipelines.studies.results import compare, row_of
+from chebsplat.pipelines.studies.study import Study, checked_study, execute, expand, outstanding, read_study
+from chebsplat.pipelines.studies.tables import Section, stability
 from chebsplat.stages.registry import STAGES
 
 

@@ -5,11 +5,11 @@ from shared import ROOT
 from test_study import finish, study
 
 from chebsplat.errors import ConfigError
-from chebsplat.pipelines import transfer
-from chebsplat.pipelines.results import row_of
-from chebsplat.pipelines.study import expand
-from chebsplat.pipelines.study_page import write
-from chebsplat.pipelines.transfer import Reach, reach
+from chebsplat.pipelines.studies import transfer
+from chebsplat.pipelines.studies.page import write
+from chebsplat.pipelines.studies.results import row_of
+from chebsplat.pipelines.studies.study import expand
+from chebsplat.pipelines.studies.transfer import Reach, reach
 
 
 @pytest.fixture(autouse=True)

@@ -32,6 +32,7 @@ def test_a_wheel_mounts_every_layer_under_chebsplat(tmp_path):
         "chebsplat/teachers/quality.json",
         "chebsplat/teachers/training.csv",
         "chebsplat/pipelines/Snakefile",
+        "chebsplat/pipelines/studies/page.html",
         "chebsplat/pipelines/cli/__main__.py",
         "chebsplat/pipelines/profiles/default/config.yaml",
         "chebsplat/pipelines/configs/scenes/office0.toml",

@@ -114,9 +114,9 @@ def plan(**choice: Any) -> None:
 @ON_DEVICE
 def study(name: str, cores: int, threads: int, out: Path | None, only_plan: bool, no_run: bool, device: str) -> int:
     """Run a study (of pipelines/configs/studies, or a .toml): its table, figure and page; goes on where it stopped."""
-    from chebsplat.pipelines import results, study_page, transfer
-    from chebsplat.pipelines import study as studies
     from chebsplat.pipelines.run import Outcome, device_of, say
+    from chebsplat.pipelines.studies import page, results, transfer
+    from chebsplat.pipelines.studies import study as studies
 
     computing, asked = device_of(device), studies.read_study(name)
     runs = studies.expand(asked, running=not (only_plan or no_run))
@@ -130,7 +130,7 @@ def study(name: str, cores: int, threads: int, out: Path | None, only_plan: bool
     rows = [results.row_of(run, outcome.failed) for run in runs]
     command = f"make study={name} cores={cores} threads={used}"
     more = transfer.sections(folder, asked, rows) if asked.sequences else []
-    print(study_page.write(folder, asked, runs, rows, command, more).absolute())
+    print(page.write(folder, asked, runs, rows, command, more).absolute())
     return outcome.code
 
 

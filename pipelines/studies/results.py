@@ -14,7 +14,7 @@ from chebsplat.formats import artifact
 from chebsplat.formats.documents import Count, TypedDict, read_document
 from chebsplat.formats.evaluation import read_figures
 from chebsplat.formats.gaussians import read_trace
-from chebsplat.pipelines.study import Run
+from chebsplat.pipelines.studies.study import Run
 
 Row = dict[str, Any]
 

@@ -12,13 +12,13 @@ from typing import TYPE_CHECKING
 from chebsplat.pipelines.plan import Step
 
 if TYPE_CHECKING:
-    from chebsplat.pipelines.study import Run
+    from chebsplat.pipelines.studies.study import Run
 
 EVERY = 1.0  # seconds between looks at what is finished
 
 
-class Counter:
-    """Tells of every run when it is measured. at_once: jobs that run side by side."""
+class Progress:
+    """Which runs of a study are measured, and how long the others will take. at_once: jobs that run side by side."""
 
     def __init__(self, runs: Sequence[Run], at_once: int, say: Callable[[str], None]):
         self.n_runs, self.at_once, self.say = len(runs), max(at_once, 1), say
@@ -33,7 +33,7 @@ class Counter:
             del self.waiting[name]
             done = f"  run {self.n_runs - len(self.waiting)} of {self.n_runs} is done: {name}"
             left = self.left() if self.waiting else None
-            self.say(done if left is None else f"{done}; about {spoken(left)} left")
+            self.say(done if left is None else f"{done}; about {estimate_text(left)} left")
 
     def left(self) -> float | None:
         """Seconds until all is done; None as long as there is a stage that has never been finished.
@@ -73,21 +73,21 @@ def measure(step: Step) -> tuple[tuple[str, bool], float]:
     return (step.stage, by_clock), float(settings["seconds" if by_clock else "steps"] if settings else 1)
 
 
-def spoken(seconds: float) -> str:
-    """A length of time as an estimate is said."""
+def estimate_text(seconds: float) -> str:
+    """A length of time, rounded as an estimate is: `40 s`, `12 min`, `2.5 h`."""
     if seconds < 100:
         return f"{max(round(seconds), 1)} s"
     return f"{seconds / 60:.0f} min" if seconds < 6000 else f"{seconds / 3600:.1f} h"
 
 
 @contextmanager
-def counted(runs: Sequence[Run], at_once: int, say: Callable[[str], None]) -> Iterator[None]:
-    """Tell of the runs that are finished inside the block."""
-    counter, over = Counter(runs, at_once, say), threading.Event()
+def reported(runs: Sequence[Run], at_once: int, say: Callable[[str], None]) -> Iterator[None]:
+    """Say which runs are finished while the block runs, each when it is."""
+    progress, over = Progress(runs, at_once, say), threading.Event()
 
     def watch() -> None:
         while not over.wait(EVERY):
-            counter.look()
+            progress.look()
 
     thread = threading.Thread(target=watch, daemon=True)
     thread.start()
@@ -96,4 +96,4 @@ def counted(runs: Sequence[Run], at_once: int, say: Callable[[str], None]) -> It
     finally:
         over.set()
         thread.join()
-        counter.look()
+        progress.look()

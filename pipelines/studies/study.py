@@ -14,11 +14,11 @@ from pydantic import AfterValidator, Field, model_validator
 from chebsplat.errors import ConfigError
 from chebsplat.formats.files import parse_toml
 from chebsplat.pipelines import store
-from chebsplat.pipelines.counters import counted
 from chebsplat.pipelines.plan import Plan, Planner, Step, merged, suffix
 from chebsplat.pipelines.run import Outcome, say, snakemake, wanted_steps
 from chebsplat.pipelines.scenes import read_toml, scene_values
 from chebsplat.pipelines.sequences import scenes_of
+from chebsplat.pipelines.studies.progress import reported
 from chebsplat.stages.config import checked
 from chebsplat.stages.settings import Section, Text, printable
 
@@ -210,7 +210,7 @@ def execute(name: str, runs: list[Run], cores: int, threads: int, device: str = 
         try:
             if waiting:
                 say(f"  {scene}, seed {seed}: {describe(waiting)}; {cores // threads} at once, {threads} threads each")
-                with counted(runs, cores // threads, say):
+                with reported(runs, cores // threads, say):
                     found = snakemake(waiting, cores, threads, device)
                 outcome = Outcome(max(outcome.code, found.code), outcome.failed | found.failed)
         finally:  # a study that is stopped names what it has finished

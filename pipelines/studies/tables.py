@@ -4,13 +4,24 @@ from __future__ import annotations
 
 import csv
 import math
+from dataclasses import dataclass
 from pathlib import Path
 
 from chebsplat.evaluation.statistics import Difference, Summary, summarize
-from chebsplat.pipelines.results import FIGURES, Figure, Line, Row, counted, groups
+from chebsplat.pipelines.studies.results import FIGURES, Figure, Line, Row, counted, groups
 
 COSTS = ("n_gaussians", "sh_kept", "bytes_ply", "bytes_ragged", "frames_per_second", "train_seconds")
 BY_SCENE = ("miou", "miou_gain", "psnr", "n_gaussians", "train_seconds")
+
+
+@dataclass(frozen=True)
+class Section:
+    """A part of the page; `table` begins with its header, `picture` lies beside the page."""
+
+    heading: str
+    note: str
+    table: list[list[str]]
+    picture: str = ""
 
 
 def number(value: float, figure: Figure) -> str:

@@ -10,24 +10,14 @@ from pathlib import Path
 import numpy as np
 
 from chebsplat.evaluation.statistics import paired_difference
-from chebsplat.pipelines.results import FIGURES, Figure, Row, compare, counted, groups
-from chebsplat.pipelines.study import Study
-from chebsplat.pipelines.study_tables import difference_text
+from chebsplat.pipelines.studies.results import FIGURES, Figure, Row, compare, counted, groups
+from chebsplat.pipelines.studies.study import Study
+from chebsplat.pipelines.studies.tables import Section, difference_text
 
 PICTURE = "transfer.png"
 PLACE = ("sequence", "place", "scene", "seed")  # what a run shares with the run of another variant or budget
 SHOWN = {figure.key: figure for figure in FIGURES}
 X = {"steps": "steps", "train_seconds": "seconds"}
-
-
-@dataclass(frozen=True)
-class Section:
-    """A part of the page; `table` begins with its header, `picture` lies beside the page."""
-
-    heading: str
-    note: str
-    table: list[list[str]]
-    picture: str = ""
 
 
 @dataclass(frozen=True)

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from chebsplat.evaluation.statistics import summarize
-from chebsplat.pipelines.results import Row, counted, groups
+from chebsplat.pipelines.studies.results import Row, counted, groups
 
 MARKERS = "osD^vP*X<>"
 Traces = list[tuple[Row, list[dict[str, float]]]]

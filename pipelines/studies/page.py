@@ -6,15 +6,16 @@ import base64
 import csv
 from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from chebsplat.errors import DataFailure
 from chebsplat.evaluation import protocols
 from chebsplat.formats import artifact
-from chebsplat.pipelines import study_figures
-from chebsplat.pipelines.results import COLUMNS, Row, compare, traces
-from chebsplat.pipelines.study import Run, Study
-from chebsplat.pipelines.study_tables import (
+from chebsplat.pipelines.studies import figures
+from chebsplat.pipelines.studies.results import COLUMNS, Row, compare, traces
+from chebsplat.pipelines.studies.study import Run, Study
+from chebsplat.pipelines.studies.tables import (
+    Section,
     labels,
     left_out,
     missing,
@@ -25,9 +26,7 @@ from chebsplat.pipelines.study_tables import (
     tables,
 )
 
-if TYPE_CHECKING:
-    from chebsplat.pipelines.transfer import Section
-
+PAGE = Path(__file__).with_name("page.html")  # a jinja2 template; it fetches nothing from anywhere
 PICTURE = "error-against-time.png"
 STABILITY = Path("build/bench/stability.csv")  # of `make stability`
 NARROW = 1100  # pixels of a screen; the comparison's tables take more
@@ -46,7 +45,7 @@ def write(
         writer.writeheader()
         writer.writerows(rows)
     settings = settings_of(study) if study.against else None
-    study_figures.draw(out / PICTURE, rows, traces(runs, rows), settings, study.against)
+    figures.draw(out / PICTURE, rows, traces(runs, rows), settings, study.against)
     lines = compare(rows, study.baseline)
     parts = {
         "study": study,
@@ -63,8 +62,7 @@ def write(
         "left_out": left_out(rows),
     }
     (out / "results.md").write_text(markdown(parts))
-    from chebsplat.pipelines.study_pictures import gallery
-    from chebsplat.pipelines.study_template import PAGE
+    from chebsplat.pipelines.studies.pictures import gallery
     from chebsplat.stages.report import LARGEST
     from chebsplat.stages.viewer import rendered
 
@@ -73,7 +71,12 @@ def write(
         for name in (PICTURE, *(section.picture for section in more if section.picture))
     }
     page = rendered(
-        PAGE, narrow=NARROW, picture=drawings[PICTURE], drawings=drawings, **parts, **gallery(study, runs, rows)
+        PAGE.read_text(encoding="utf-8"),
+        narrow=NARROW,
+        picture=drawings[PICTURE],
+        drawings=drawings,
+        **parts,
+        **gallery(study, runs, rows),
     )
     if len(page) > LARGEST:
         raise DataFailure(f"the page would have {len(page) / 1e6:.0f} MB; name fewer scenes or variants in the study")

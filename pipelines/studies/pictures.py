@@ -8,8 +8,8 @@ from typing import Any
 import numpy as np
 
 from chebsplat.formats.evaluation import Evaluation, read_evaluation
-from chebsplat.pipelines.results import Row
-from chebsplat.pipelines.study import Run, Study
+from chebsplat.pipelines.studies.results import Row
+from chebsplat.pipelines.studies.study import Run, Study
 from chebsplat.stages import figures as draw
 from chebsplat.stages.report_parts import class_rows, counted, label_names, legend, side
 

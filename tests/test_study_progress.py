@@ -5,7 +5,7 @@ from types import SimpleNamespace
 
 import pytest
 
-from chebsplat.pipelines.counters import Counter, counted, spoken
+from chebsplat.pipelines.studies.progress import Progress, estimate_text, reported
 
 
 def step(folder, stage, name, **train):
@@ -32,33 +32,33 @@ def runs(tmp_path):
 
 
 def test_the_time_left_is_that_of_steps_like_those_that_are_finished(runs):
-    counter = Counter(runs, 2, print)
-    assert counter.left() is None
+    progress = Progress(runs, 2, print)
+    assert progress.left() is None
     for one, seconds in zip(runs[0].steps, (4.0, 30.0, 6.0), strict=True):
         finish(one, seconds)
-    assert counter.left() == (30 + 6 + 90 + 6) / 2
+    assert progress.left() == (30 + 6 + 90 + 6) / 2
 
 
 def test_every_run_is_told_once_when_it_is_done(runs):
     told = []
     for one in runs[0].steps:
         finish(one, 1.0)
-    with counted(runs, 1, told.append):  # the first was there before
+    with reported(runs, 1, told.append):  # the first was there before
         for one in runs[1].steps[1:]:
             finish(one, 10.0)
-    counter = Counter(runs, 1, told.append)
+    progress = Progress(runs, 1, told.append)
     for one in runs[2].steps[1:]:
         finish(one, 10.0)
-    counter.look()
-    counter.look()
+    progress.look()
+    progress.look()
     assert told == ["  run 2 of 3 is done: run-1; about 22 s left", "  run 3 of 3 is done: run-2"]
 
 
 def test_a_damaged_manifest_counts_as_not_done(runs):
     runs[0].steps[-1].path.mkdir()
     (runs[0].steps[-1].path / "artifact.json").write_text("[]")
-    assert len(Counter(runs, 1, print).waiting) == 3
+    assert len(Progress(runs, 1, print).waiting) == 3
 
 
 def test_times_are_said_in_the_unit_that_fits():
-    assert [spoken(s) for s in (0.2, 40, 700, 10_000)] == ["1 s", "40 s", "12 min", "2.8 h"]
+    assert [estimate_text(s) for s in (0.2, 40, 700, 10_000)] == ["1 s", "40 s", "12 min", "2.8 h"]
