@@ -8,7 +8,8 @@ import numpy as np
 def centers(cam_from_world: np.ndarray) -> np.ndarray:
     """Camera centres [V, 3] in the world, of poses [V, 4, 4]."""
     rotations, translations = cam_from_world[:, :3, :3], cam_from_world[:, :3, 3]
-    return -np.einsum("vji,vj->vi", rotations, translations)
+    eyes: np.ndarray = -np.einsum("vji,vj->vi", rotations, translations)
+    return eyes
 
 
 def extent(cam_from_world: np.ndarray) -> float:
@@ -19,7 +20,8 @@ def extent(cam_from_world: np.ndarray) -> float:
 
 def resized(K: np.ndarray, factor_x: float, factor_y: float) -> np.ndarray:
     """Intrinsics [..., 3, 3] after the image is resized; with half-integer pixel centres every entry just scales."""
-    return K * np.array([[factor_x], [factor_y], [1.0]])
+    scaled: np.ndarray = K * np.array([[factor_x], [factor_y], [1.0]])
+    return scaled
 
 
 def unproject(depth: np.ndarray, K: np.ndarray, cam_from_world: np.ndarray, pixels: np.ndarray) -> np.ndarray:
@@ -34,4 +36,5 @@ def unproject(depth: np.ndarray, K: np.ndarray, cam_from_world: np.ndarray, pixe
     image = np.stack([pixels[:, 1] + 0.5, pixels[:, 0] + 0.5, np.ones(len(pixels))], 1)
     rays = image @ np.linalg.inv(K).T
     camera = rays * z[:, None]
-    return (camera - cam_from_world[:3, 3]) @ cam_from_world[:3, :3]
+    world: np.ndarray = (camera - cam_from_world[:3, 3]) @ cam_from_world[:3, :3]
+    return world

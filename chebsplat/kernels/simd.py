@@ -15,7 +15,7 @@ import numpy as np
 from llvmlite import ir
 from numba import extending
 from numba.core import cgutils, types
-from numba.core.typing import signature
+from numba.core.typing.templates import signature
 from numba.extending import models, overload, register_model
 
 intrinsic: Any = extending.intrinsic  # its own type takes the typing context for an argument of the call
@@ -31,7 +31,7 @@ class Vector(types.Type):
 
 
 @register_model(Vector)
-class _VectorModel(models.PrimitiveModel):  # type: ignore[misc]
+class _VectorModel(models.PrimitiveModel):
     def __init__(self, manager: Any, vector: Vector):
         element = FLOAT if vector.kind == "float32" else ir.IntType(1)
         super().__init__(manager, vector, ir.VectorType(element, 16))
@@ -80,26 +80,26 @@ def _constant(value: float) -> ir.Constant:
 
 
 @intrinsic
-def splat(_typing, scalar):  # type: ignore[no-untyped-def]
+def splat(_typing, scalar):
     """All lanes equal to `scalar`."""
     return signature(F16, types.float32), lambda context, builder, sig, args: broadcast(builder, args[0])
 
 
 @intrinsic
-def load(_typing, array, index):  # type: ignore[no-untyped-def]
+def load(_typing, array, index):
     """array.flat[index : index + 16]."""
 
-    def build(context, builder, sig, args):  # type: ignore[no-untyped-def]
+    def build(context, builder, sig, args):
         return builder.load(address(context, builder, sig.args[0], args[0], args[1], WIDE), align=4)
 
     return signature(F16, array, types.intp), build
 
 
 @intrinsic
-def store(_typing, array, index, value):  # type: ignore[no-untyped-def]
+def store(_typing, array, index, value):
     """array.flat[index : index + 16] = value."""
 
-    def build(context, builder, sig, args):  # type: ignore[no-untyped-def]
+    def build(context, builder, sig, args):
         builder.store(args[2], address(context, builder, sig.args[0], args[0], args[1], WIDE), align=4)
         return context.get_dummy_value()
 
@@ -107,23 +107,23 @@ def store(_typing, array, index, value):  # type: ignore[no-untyped-def]
 
 
 @intrinsic
-def fma(_typing, a, b, c):  # type: ignore[no-untyped-def]
+def fma(_typing, a, b, c):
     """a b + c."""
     return signature(F16, F16, F16, F16), lambda context, builder, sig, args: multiply_add(builder, *args)
 
 
 @intrinsic
-def fnma(_typing, a, b, c):  # type: ignore[no-untyped-def]
+def fnma(_typing, a, b, c):
     """c − a b."""
 
-    def build(context, builder, sig, args):  # type: ignore[no-untyped-def]
+    def build(context, builder, sig, args):
         return multiply_add(builder, builder.fneg(args[0]), *args[1:])
 
     return signature(F16, F16, F16, F16), build
 
 
 @intrinsic
-def magnitude(_typing, value):  # type: ignore[no-untyped-def]
+def magnitude(_typing, value):
     """|value|."""
 
     return signature(F16, F16), lambda context, builder, sig, args: _call(builder, "fabs", args[0])
@@ -131,7 +131,7 @@ def magnitude(_typing, value):  # type: ignore[no-untyped-def]
 
 def _binary(name: str) -> Any:
     @intrinsic
-    def apply(_typing, a, b):  # type: ignore[no-untyped-def]
+    def apply(_typing, a, b):
         return signature(F16, F16, F16), lambda context, builder, sig, args: getattr(builder, name)(*args)
 
     return apply
@@ -139,7 +139,7 @@ def _binary(name: str) -> Any:
 
 def _compare(symbol: str) -> Any:
     @intrinsic
-    def apply(_typing, a, b):  # type: ignore[no-untyped-def]
+    def apply(_typing, a, b):
         return signature(M16, F16, F16), lambda context, builder, sig, args: builder.fcmp_ordered(symbol, *args)
 
     return apply
@@ -147,7 +147,7 @@ def _compare(symbol: str) -> Any:
 
 def _operate(function: Any, apply: Any) -> None:
     @overload(function, inline="always")
-    def implement(a, b):  # type: ignore[no-untyped-def]
+    def implement(a, b):
         if a == F16 and b == F16:
             return lambda a, b: apply(a, b)
         return None
@@ -165,26 +165,26 @@ for _function, _symbol in ((operator.lt, "<"), (operator.le, "<="), (operator.gt
 
 
 @intrinsic
-def where(_typing, mask, a, b):  # type: ignore[no-untyped-def]
+def where(_typing, mask, a, b):
     """a where the mask holds, else b."""
     return signature(F16, M16, F16, F16), lambda context, builder, sig, args: builder.select(*args)
 
 
 @intrinsic
-def bits(_typing, mask):  # type: ignore[no-untyped-def]
+def bits(_typing, mask):
     """The mask as an integer, lane 0 in the lowest bit."""
 
-    def build(context, builder, sig, args):  # type: ignore[no-untyped-def]
+    def build(context, builder, sig, args):
         return builder.zext(builder.bitcast(args[0], ir.IntType(16)), ir.IntType(32))
 
     return signature(types.int32, M16), build
 
 
 @intrinsic
-def scale_by_power(_typing, value, shifted):  # type: ignore[no-untyped-def]
+def scale_by_power(_typing, value, shifted):
     """value · 2^k, where `shifted` is k + 1.5·2²³, which holds k in its low bits; no over- or underflow."""
 
-    def build(context, builder, sig, args):  # type: ignore[no-untyped-def]
+    def build(context, builder, sig, args):
         whole = ir.VectorType(INT, 16)
         power = builder.shl(builder.bitcast(args[1], whole), ir.Constant(whole, [23] * 16))
         return builder.bitcast(builder.add(builder.bitcast(args[0], whole), power), WIDE)
@@ -193,10 +193,10 @@ def scale_by_power(_typing, value, shifted):  # type: ignore[no-untyped-def]
 
 
 @intrinsic
-def total(_typing, value):  # type: ignore[no-untyped-def]
+def total(_typing, value):
     """Sum of the lanes, as a tree."""
 
-    def build(context, builder, sig, args):  # type: ignore[no-untyped-def]
+    def build(context, builder, sig, args):
         name = "llvm.vector.reduce.fadd.v16f32"
         kind = ir.FunctionType(FLOAT, [FLOAT, WIDE])
         function = cgutils.get_or_insert_function(builder.module, kind, name)
@@ -206,20 +206,20 @@ def total(_typing, value):  # type: ignore[no-untyped-def]
 
 
 @intrinsic
-def spread(_typing, array, index):  # type: ignore[no-untyped-def]
+def spread(_typing, array, index):
     """array.flat[index] in every lane."""
 
-    def build(context, builder, sig, args):  # type: ignore[no-untyped-def]
+    def build(context, builder, sig, args):
         return broadcast(builder, builder.load(address(context, builder, sig.args[0], args[0], args[1], FLOAT)))
 
     return signature(F16, array, types.intp), build
 
 
 @intrinsic
-def exp2(_typing, x):  # type: ignore[no-untyped-def]
+def exp2(_typing, x):
     """2^x to 1e-7 for x <= 100; 2^-120 below x = -120."""
 
-    def build(context, builder, sig, args):  # type: ignore[no-untyped-def]
+    def build(context, builder, sig, args):
         whole_numbers = ir.VectorType(INT, 16)
         x = _call(builder, "maxnum", args[0], _constant(-120.0))
         whole = _call(builder, "nearbyint", x)
@@ -233,10 +233,10 @@ def exp2(_typing, x):  # type: ignore[no-untyped-def]
 
 
 @intrinsic
-def transpose(_typing, array, source, target, stride):  # type: ignore[no-untyped-def]
+def transpose(_typing, array, source, target, stride):
     """Copy the transpose of the 16×16 block that begins at `source` to the one at `target`; rows are `stride` apart."""
 
-    def build(context, builder, sig, args):  # type: ignore[no-untyped-def]
+    def build(context, builder, sig, args):
         array, source, target, stride = args
         places = [builder.mul(stride, stride.type(row)) for row in range(16)]
         at = [address(context, builder, sig.args[0], array, builder.add(source, place), WIDE) for place in places]

@@ -36,7 +36,8 @@ def _placed(name: str, frame: np.ndarray) -> np.ndarray:
     """Of 512 vectors drawn from the name's hash, the one least like any of the vocabulary."""
     seed = int.from_bytes(hashlib.sha256(name.encode()).digest()[:8], "big")
     drawn = _unit(np.random.default_rng(seed).normal(size=(512, frame.shape[1])))
-    return drawn[np.argmin((drawn @ frame.T).max(1))]
+    loneliest: np.ndarray = drawn[np.argmin((drawn @ frame.T).max(1))]
+    return loneliest
 
 
 @functools.cache
@@ -52,4 +53,5 @@ def _frame(n_channels: int) -> np.ndarray:
 
 
 def _unit(rows: np.ndarray) -> np.ndarray:
-    return rows / np.linalg.norm(rows, axis=1, keepdims=True)
+    unit: np.ndarray = rows / np.linalg.norm(rows, axis=1, keepdims=True)
+    return unit

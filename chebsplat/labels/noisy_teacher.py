@@ -26,7 +26,8 @@ def confusable(colors: np.ndarray, width: float = 0.15) -> np.ndarray:
     weights = np.where(np.isfinite(distance), np.exp(-0.5 * (distance / width) ** 2) + 1e-6, 0.0)
     np.fill_diagonal(weights, 0)
     totals = weights.sum(1, keepdims=True)
-    return np.divide(weights, totals, out=np.zeros_like(weights), where=totals > 0)
+    probabilities: np.ndarray = np.divide(weights, totals, out=np.zeros_like(weights), where=totals > 0)
+    return probabilities
 
 
 def reduced(labels: np.ndarray, factor: int) -> np.ndarray:
@@ -74,4 +75,5 @@ def noisy_features(
     if blur > 0:
         features = gaussian_filter(features, (blur, blur, 0))
     features = features + generator.normal(0, noise, features.shape)
-    return features / np.linalg.norm(features, axis=-1, keepdims=True).clip(1e-6)
+    unit: np.ndarray = features / np.linalg.norm(features, axis=-1, keepdims=True).clip(1e-6)
+    return unit

@@ -29,6 +29,6 @@ def voted(
     features = np.divide(mean, length, out=np.zeros_like(mean), where=length > 1e-6)
     pixels = np.bincount(cell.ravel(), minlength=h * w)
     winner = np.where(votes.sum(1) > 0, votes.argmax(1), IGNORE)
-    shapes = ((h, w, codes.shape[1]), (h, w), (h, w))
-    values = (features.astype(np.float32), winner.astype(np.int16), (votes.max(1) / pixels).astype(np.float32))
-    return tuple(value.reshape(shape) for value, shape in zip(values, shapes, strict=True))  # type: ignore[return-value]
+    shares = (votes.max(1) / pixels).astype(np.float32)
+    features = features.astype(np.float32).reshape(h, w, codes.shape[1])
+    return features, winner.astype(np.int16).reshape(h, w), shares.reshape(h, w)

@@ -31,7 +31,8 @@ def rasterize(
         from chebsplat.rasterize import reference as chosen
     else:
         raise ValueError(f"backend {backend!r} is none of auto, cpu, cuda, reference")
-    return chosen.rasterize(means, *args, **options)
+    rendered: tuple[Tensor, Tensor, dict[str, Any]] = chosen.rasterize(means, *args, **options)
+    return rendered
 
 
 __all__ = ["CELL", "rasterize"]

@@ -4,16 +4,16 @@ from __future__ import annotations
 
 from llvmlite import ir
 from numba.core import cgutils, types
-from numba.core.typing import signature
+from numba.core.typing.templates import signature
 
 from chebsplat.kernels.simd import FLOAT, INT, WIDE, address, broadcast, intrinsic, multiply_add, shuffle
 
 
 @intrinsic
-def prefetch(_typing, array, index):  # type: ignore[no-untyped-def]
+def prefetch(_typing, array, index):
     """Ask for the cache line of array.flat[index]."""
 
-    def build(context, builder, sig, args):  # type: ignore[no-untyped-def]
+    def build(context, builder, sig, args):
         byte = ir.IntType(8).as_pointer()
         place = builder.bitcast(address(context, builder, sig.args[0], args[0], args[1], FLOAT), byte)
         kind = ir.FunctionType(ir.VoidType(), [byte, INT, INT, INT])
@@ -25,11 +25,11 @@ def prefetch(_typing, array, index):  # type: ignore[no-untyped-def]
 
 
 @intrinsic
-def to_lanes(_typing, out, out_at, a, a_at, a_step):  # type: ignore[no-untyped-def]
+def to_lanes(_typing, out, out_at, a, a_at, a_step):
     """Transpose 16 rows of 4: out.flat[out_at + 16 c + lane] = a.flat[a_at + lane a_step + c] for c < 4."""
     four = ir.VectorType(FLOAT, 4)
 
-    def build(context, builder, sig, args):  # type: ignore[no-untyped-def]
+    def build(context, builder, sig, args):
         out, out_at, a, a_at, a_step = args
         parts = []
         for lane in range(16):
@@ -51,11 +51,11 @@ def to_lanes(_typing, out, out_at, a, a_at, a_step):  # type: ignore[no-untyped-
 
 
 @intrinsic
-def from_lanes(_typing, out, out_at, out_step, a, a_at):  # type: ignore[no-untyped-def]
+def from_lanes(_typing, out, out_at, out_step, a, a_at):
     """The way back of `to_lanes`: out.flat[out_at + lane out_step + c] = a.flat[a_at + 16 c + lane] for c < 4."""
     four = ir.VectorType(FLOAT, 4)
 
-    def build(context, builder, sig, args):  # type: ignore[no-untyped-def]
+    def build(context, builder, sig, args):
         out, out_at, out_step, a, a_at = args
         rows = []
         for c in range(4):
@@ -76,7 +76,7 @@ def from_lanes(_typing, out, out_at, out_step, a, a_at):  # type: ignore[no-unty
 
 @intrinsic(prefer_literal=True)
 def multiply(_typing, out, out_at, order, order_at, out_step, a, a_at, a_row, a_step, b, b_at, b_step, depth, rows,
-             width, add):  # type: ignore[no-untyped-def]  # fmt: skip
+             width, add):  # fmt: skip
     """out[order[i], :width] (+)= Σ_k a[i, k] b[k, :width] for i < rows, k < depth; the sums stay in registers.
 
     Args: rows, width (4, 8 or 16) and add (0 or 1) are literals. Row i of out is at out_at + order[order_at + i]
@@ -85,7 +85,7 @@ def multiply(_typing, out, out_at, order, order_at, out_step, a, a_at, a_row, a_
     n, wide, adds = rows.literal_value, width.literal_value, add.literal_value
     vector = ir.VectorType(FLOAT, wide)
 
-    def build(context, builder, sig, args):  # type: ignore[no-untyped-def]
+    def build(context, builder, sig, args):
         out, out_at, order, order_at, out_step, a, a_at, a_row, a_step, b, b_at, b_step, depth = args[:13]
         integer = depth.type
         targets = []

@@ -22,7 +22,7 @@ class _Project(torch.autograd.Function):
     """
 
     @staticmethod
-    def forward(ctx: Any, means, quats, scales, camera):  # type: ignore[no-untyped-def, override]
+    def forward(ctx: Any, means: Tensor, quats: Tensor, scales: Tensor, camera: tuple[Any, ...]) -> tuple[Tensor, ...]:
         gaussians = [t.detach().contiguous().numpy() for t in (means, quats, scales)]
         found = [torch.from_numpy(a) for a in ellipses.project(*gaussians, *camera)]
         means2d, covariances, whitening, conics, depths, radii, compensations = found
@@ -31,7 +31,7 @@ class _Project(torch.autograd.Function):
         return means2d, covariances, whitening, conics, depths, radii, compensations
 
     @staticmethod
-    def backward(ctx: Any, grad_means2d, moments, *others):  # type: ignore[no-untyped-def, override]
+    def backward(ctx: Any, grad_means2d: Tensor, moments: Tensor, *others: Tensor) -> tuple[Tensor | None, ...]:
         slopes = [g.contiguous().numpy() for g in (grad_means2d, moments, others[-1])]
         found = ellipses.project_adjoint(*ctx.gaussians, *ctx.camera, ctx.radii, *slopes)
         return *(torch.from_numpy(a) for a in found), None
@@ -41,7 +41,7 @@ class _Composite(torch.autograd.Function):
     """Render [H, W, D], means over cells, and alpha [H, W] of one view; backward also adds to `absgrad` if given."""
 
     @staticmethod
-    def forward(  # type: ignore[override]
+    def forward(
         ctx: Any, means2d: Tensor, covariances: Tensor, opacities: Tensor, colors: Tensor, cell_colors: Tensor,
         whitening: Tensor, depths: Tensor, radii: Tensor, absgrad: Tensor | None, size: tuple[int, int],
         max_alpha: float, view: int,
@@ -61,7 +61,7 @@ class _Composite(torch.autograd.Function):
         return torch.from_numpy(render), torch.from_numpy(cells), 1 - torch.from_numpy(transmittance)
 
     @staticmethod
-    def backward(ctx: Any, *grads):  # type: ignore[no-untyped-def, override]
+    def backward(ctx: Any, *grads: Tensor) -> tuple[Tensor | None, ...]:
         slopes = [g.contiguous().numpy() for g in grads]
         *found, finite = tiles.backward(*ctx.arrays, *slopes, ctx.absgrad is not None)
         if not finite:

@@ -227,7 +227,7 @@ class _Weights(torch.autograd.Function):
     """
 
     @staticmethod
-    def forward(ctx: Any, log_alphas: Tensor, max_alpha: float) -> Tensor:  # type: ignore[override]
+    def forward(ctx: Any, log_alphas: Tensor, max_alpha: float) -> Tensor:
         alphas = hardshrink(log_alphas.exp().clamp_max_(max_alpha), math.nextafter(ALPHA_MIN, 0))
         after = torch.cumprod(1 - alphas, -1)
         weights = alphas.clone()
@@ -248,4 +248,5 @@ class _Weights(torch.autograd.Function):
 
 
 def _weights(log_alphas: Tensor, max_alpha: float) -> Tensor:
-    return _Weights.apply(log_alphas, max_alpha)
+    weights: Tensor = _Weights.apply(log_alphas, max_alpha)
+    return weights

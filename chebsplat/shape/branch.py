@@ -138,7 +138,8 @@ class ShapeBranch(nn.Module):
         inputs = self.descriptors[chosen]
         if self.encoder.n_inputs > self.n_described:
             inputs = torch.cat([inputs, features.detach()[members.clamp_min(0)]], -1)
-        return self.encoder(inputs, self.positions[chosen], members >= 0)
+        encodings: Tensor = self.encoder(inputs, self.positions[chosen], members >= 0)
+        return encodings
 
     def sample(self, features: Tensor, index: Tensor, generator: torch.Generator) -> Encoded:
         """Encode anew `regions_per_step` of the regions that reach the Gaussians `index` [V]; the cache keeps them."""

@@ -144,7 +144,7 @@ class _Outside(torch.autograd.Function):
     """
 
     @staticmethod
-    def forward(ctx: Any, bases: list[Tensor], *weights: Tensor) -> Tensor:  # type: ignore[override]
+    def forward(ctx: Any, bases: list[Tensor], *weights: Tensor) -> Tensor:
         shares, ctx.slopes = [], []
         for weight, basis in zip(weights, bases, strict=True):
             W, B = weight.detach().numpy(), basis.numpy()
@@ -161,7 +161,7 @@ class _Outside(torch.autograd.Function):
         return weights[0].new_tensor(shares)
 
     @staticmethod
-    def backward(ctx: Any, slope: Tensor) -> tuple[Tensor | None, ...]:  # type: ignore[override]
+    def backward(ctx: Any, slope: Tensor) -> tuple[Tensor | None, ...]:
         return (None, *(own * factor for own, factor in zip(ctx.slopes, slope.unbind(), strict=True)))
 
 
@@ -180,4 +180,5 @@ def basis_loss(projections: dict[str, Tensor], bases: dict[str, Tensor]) -> Tens
     """Mean over projections of `regularizer`; 0 without bases (the first scene)."""
     if not bases:
         return torch.tensor(0.0)
-    return _Outside.apply(list(bases.values()), *(projections[name] for name in bases)).mean()
+    loss: Tensor = _Outside.apply(list(bases.values()), *(projections[name] for name in bases)).mean()
+    return loss

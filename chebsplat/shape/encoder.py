@@ -63,7 +63,8 @@ class Attention(nn.Module):
         q, k, v = self._heads(self.query(asking)), self._heads(self.key(tokens)), self._heads(self.value(tokens))
         scores = q @ k.transpose(-1, -2) / math.sqrt(q.shape[-1])
         weights = scores.masked_fill(~mask[:, None, None, :], -1e9).softmax(-1)
-        return self.output((weights @ v).transpose(1, 2).reshape(asking.shape))
+        mixed: Tensor = self.output((weights @ v).transpose(1, 2).reshape(asking.shape))
+        return mixed
 
     def _heads(self, values: Tensor) -> Tensor:
         """[M, n, width] -> [M, heads, n, width / heads]."""
@@ -82,7 +83,8 @@ class Block(nn.Module):
 
     def forward(self, tokens: Tensor, mask: Tensor, wanted: int) -> Tensor:
         tokens = tokens[:, :wanted] + self.attention(self.norm_attention(tokens), mask, wanted)
-        return tokens + self.forward_2(nn.functional.gelu(self.forward_1(self.norm_forward(tokens))))
+        mixed: Tensor = tokens + self.forward_2(nn.functional.gelu(self.forward_1(self.norm_forward(tokens))))
+        return mixed
 
 
 class RegionEncoder(nn.Module):
@@ -126,13 +128,16 @@ class RegionEncoder(nn.Module):
         if not self.blocks:
             pooled = tokens.masked_fill(~mask[..., None], -1e9).amax(1)
             present = mask.any(1, keepdim=True)
-            return self.decode(self.norm(torch.where(present, pooled, torch.zeros_like(pooled))))
+            pooled = torch.where(present, pooled, torch.zeros_like(pooled))
+            encodings: Tensor = self.decode(self.norm(pooled))
+            return encodings
         region = self.region_token.expand(tokens.shape[0], 1, -1)
         tokens = torch.cat([region, tokens], 1)
         mask = torch.cat([torch.ones_like(mask[:, :1]), mask], 1)
         for depth, block in enumerate(self.blocks, 1):  # only the region token is read: the last block makes no other
             tokens = block(tokens, mask, 1 if depth == len(self.blocks) else tokens.shape[1])
-        return self.decode(self.norm(tokens[:, 0]))
+        encodings = self.decode(self.norm(tokens[:, 0]))
+        return encodings
 
     @classmethod
     def restored(cls, settings: dict[str, int], weights: dict[str, np.ndarray]) -> RegionEncoder:

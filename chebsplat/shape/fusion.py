@@ -88,4 +88,5 @@ class Fusion(nn.Module):
         of `propagation_weights`; quats [M, 4] of the Gaussians at the centres -> fused [N, C], gate [N, C].
         """
         weights = propagation_weights(means, cover, centers, rotation_matrices(quats), scales, radius)
-        return self.gate(features, propagate(encodings, cover, weights), cover[:, 0] >= 0)
+        fused: tuple[Tensor, Tensor] = self.gate(features, propagate(encodings, cover, weights), cover[:, 0] >= 0)
+        return fused

@@ -137,7 +137,7 @@ def _padded(array: Tensor, *shape: int) -> np.ndarray:
 
 class _Fuse(torch.autograd.Function):
     @staticmethod
-    def forward(ctx: Any, features, fresh, matrix, bias, cache, chosen, cover, weights, index):  # type: ignore[no-untyped-def, override]
+    def forward(ctx: Any, features, fresh, matrix, bias, cache, chosen, cover, weights, index):
         channels = features.shape[1]
         width = -(-channels // LANES) * LANES
         encodings = _padded(cache, -(-len(cache) // 4) * 4, width)
@@ -157,7 +157,7 @@ class _Fuse(torch.autograd.Function):
         return torch.from_numpy(_forward(*ctx.arrays))
 
     @staticmethod
-    def backward(ctx: Any, grad):  # type: ignore[no-untyped-def, override]
+    def backward(ctx: Any, grad: Tensor) -> tuple[Tensor | None, ...]:
         features, encodings = ctx.arrays[:2]
         channels = features.shape[1]
         slot = np.full(len(encodings), -1)
@@ -187,4 +187,5 @@ def fuse_in_view(
     """
     cache, fresh, chosen = encodings
     linear = gate.linear
-    return _Fuse.apply(features, fresh, linear.weight, linear.bias, cache, chosen, cover, weights, index)
+    fused: Tensor = _Fuse.apply(features, fresh, linear.weight, linear.bias, cache, chosen, cover, weights, index)
+    return fused

@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
+
+if TYPE_CHECKING:
+    from scipy.spatial import cKDTree
 
 SAMPLE = 65536  # points that stand for all where only a density is wanted
 
@@ -140,7 +143,7 @@ def _neighbourhoods(
     return _centre_first(members, centers)
 
 
-def _tree(points: np.ndarray):  # type: ignore[no-untyped-def]
+def _tree(points: np.ndarray) -> cKDTree:
     from scipy.spatial import cKDTree
 
     return cKDTree(points, balanced_tree=False, compact_nodes=False)

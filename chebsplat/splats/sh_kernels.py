@@ -121,14 +121,14 @@ def _backward(sh1, sh2, sh3, bands, index, means, eye, degree, out, grad, for_ba
 
 class _Colors(torch.autograd.Function):
     @staticmethod
-    def forward(ctx: Any, sh0, sh1, sh2, sh3, masks, index, means, eye, degree):  # type: ignore[no-untyped-def, override]
+    def forward(ctx: Any, sh0, sh1, sh2, sh3, masks, index, means, eye, degree):
         arrays = [t.detach().contiguous().numpy() for t in (sh0, sh1, sh2, sh3, masks, index, means, eye)]
         out = _forward(*arrays, degree)
         ctx.arrays, ctx.degree, ctx.out = arrays, degree, out
         return torch.from_numpy(out)
 
     @staticmethod
-    def backward(ctx: Any, grad):  # type: ignore[no-untyped-def, override]
+    def backward(ctx: Any, grad: Tensor) -> tuple[Tensor | None, ...]:
         for_bands = ctx.needs_input_grad[4]
         found = _backward(*ctx.arrays[1:], ctx.degree, ctx.out, grad.contiguous().numpy(), for_bands)
         parts = [torch.from_numpy(a) for a in found]
@@ -153,4 +153,5 @@ def colors_in_view(
     used += [bands[0].new_zeros(0, 2 * at + 1, 3) for at in range(len(used), 4)]
     if masks is None:
         masks = torch.ones(1, 3).expand(len(index), 3)
-    return _Colors.apply(*used, masks, index, means.detach(), eye, degree)
+    colors: Tensor = _Colors.apply(*used, masks, index, means.detach(), eye, degree)
+    return colors

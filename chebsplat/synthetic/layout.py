@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -10,6 +11,7 @@ from chebsplat.synthetic import furniture as put
 from chebsplat.synthetic.mesh import Builder, Frame, Soup
 from chebsplat.synthetic.textures import Material
 
+Tone = Sequence[float] | np.ndarray  # red, green, blue; linear, in [0, 1]
 WHITE = (0.78, 0.77, 0.74)
 
 
@@ -46,7 +48,16 @@ class Palette:
         self.other_fabric = self.add("check", *self.two_tones(0.3), 0.12)
         self.books = [self.add("stripes", *self.two_tones(0.35), 0.15) for _ in range(6)]
 
-    def add(self, pattern: str, first, second=(0.0, 0.0, 0.0), scale=0.2, gloss=0.0, shininess=30.0) -> int:  # type: ignore[no-untyped-def]
+    def add(
+        self,
+        pattern: str,
+        first: Tone,
+        second: Tone = (0.0, 0.0, 0.0),
+        scale: float = 0.2,
+        gloss: float = 0.0,
+        shininess: float = 30.0,
+    ) -> int:
+        """A material's index in the table."""
         seed = int(self.rng.integers(2**20))
         a, b = ((float(tone[0]), float(tone[1]), float(tone[2])) for tone in (first, second))
         self.table.append(Material(pattern, a, b, scale, gloss, shininess, seed))

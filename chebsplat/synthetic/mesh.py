@@ -64,7 +64,9 @@ class Builder:
         self.tags.append((CLASS_NAMES.index(label), material, len(triangles)))
         self.count += len(vertices)
 
-    def box(self, label: str, material: int, frame: Frame, low: tuple, high: tuple) -> None:
+    def box(
+        self, label: str, material: int, frame: Frame, low: tuple[float, float, float], high: tuple[float, float, float]
+    ) -> None:
         """An axis-aligned box between two local corners."""
         corners = np.array([low, high], float)
         index = np.array([[i, j, k] for i in (0, 1) for j in (0, 1) for k in (0, 1)])

@@ -42,7 +42,8 @@ def _hashed(x: np.ndarray, y: np.ndarray, z: np.ndarray, seed: int) -> np.ndarra
     h = h + np.uint32(seed * 0x9E3779B1 & 0xFFFFFFFF)
     h = (h ^ (h >> np.uint32(15))) * np.uint32(0x2C1B3C6D)
     h = (h ^ (h >> np.uint32(12))) * np.uint32(0x297A2D39)
-    return (h ^ (h >> np.uint32(15))).astype(np.float32) * np.float32(2.0**-32)
+    values: np.ndarray = (h ^ (h >> np.uint32(15))).astype(np.float32) * np.float32(2.0**-32)
+    return values
 
 
 def _edge(x: np.ndarray, softness: float) -> np.ndarray:
@@ -65,7 +66,8 @@ def _planks(p: np.ndarray, m: Material) -> np.ndarray:
 
 def _tiles(p: np.ndarray, m: Material) -> np.ndarray:
     gap = np.minimum(np.abs((p[:, :2] / m.scale) % 1 - 0.5).max(1), 1)
-    return np.clip((gap - 0.44) / 0.05, 0, 1)
+    shade: np.ndarray = np.clip((gap - 0.44) / 0.05, 0, 1)
+    return shade
 
 
 def _cloud(p: np.ndarray, m: Material) -> np.ndarray:
@@ -78,7 +80,8 @@ def _stripes(p: np.ndarray, m: Material) -> np.ndarray:
 
 def _check(p: np.ndarray, m: Material) -> np.ndarray:
     a, b = _edge(p[:, 0] / m.scale, 0.4), _edge(p[:, 1] / m.scale, 0.4)
-    return a + b - 2 * a * b
+    shade: np.ndarray = a + b - 2 * a * b
+    return shade
 
 
 def _rings(p: np.ndarray, m: Material) -> np.ndarray:
@@ -87,7 +90,8 @@ def _rings(p: np.ndarray, m: Material) -> np.ndarray:
 
 def _dots(p: np.ndarray, m: Material) -> np.ndarray:
     inside = np.linalg.norm((p / m.scale) % 1 - 0.5, axis=1)
-    return np.clip((0.42 - inside) / 0.12, 0, 1)
+    shade: np.ndarray = np.clip((0.42 - inside) / 0.12, 0, 1)
+    return shade
 
 
 def _painting(p: np.ndarray, m: Material) -> np.ndarray:

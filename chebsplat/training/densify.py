@@ -2,13 +2,16 @@
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 import torch
 from torch import Tensor
 
 from chebsplat.splats.rotations import rotation_matrices
+
+if TYPE_CHECKING:
+    from scipy.spatial import cKDTree
 
 SHRINK = 1.6  # 3DGS's divisor of the scales of two Gaussians that replace one
 
@@ -96,7 +99,7 @@ def densify(
     return Additions(parent, rows | changed | {"means": rows["means"] + offsets}, changed)
 
 
-def _balls(tree, means: np.ndarray, inside: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:  # type: ignore[no-untyped-def]
+def _balls(tree: cKDTree, means: np.ndarray, inside: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Centres [R, 3], radii [R] and local spacings [R] of regions of members [R, n], -1 where padded."""
     present = inside >= 0
     where = np.where(present[..., None], means[inside], np.nan)
@@ -114,7 +117,10 @@ def _balls(tree, means: np.ndarray, inside: np.ndarray) -> tuple[np.ndarray, np.
 
 def _in_unit_ball(rng: np.random.Generator, count: int) -> np.ndarray:
     directions = rng.normal(size=(count, 3))
-    return directions * (rng.random((count, 1)) ** (1 / 3) / np.linalg.norm(directions, axis=1, keepdims=True))
+    points: np.ndarray = directions * (
+        rng.random((count, 1)) ** (1 / 3) / np.linalg.norm(directions, axis=1, keepdims=True)
+    )
+    return points
 
 
 def _apart(places: np.ndarray, least: np.ndarray) -> np.ndarray:

@@ -46,7 +46,7 @@ class _Photometric(torch.autograd.Function):
     """The fused loss: its gradient is computed with its value."""
 
     @staticmethod
-    def forward(ctx: Any, render: Tensor, target: Tensor, weight: Tensor, weight_ssim: float) -> Tensor:  # type: ignore[override]
+    def forward(ctx: Any, render: Tensor, target: Tensor, weight: Tensor, weight_ssim: float) -> Tensor:
         from chebsplat.training.ssim import photometric
 
         a, b, w = (t.detach().numpy() for t in (render, target, weight))
@@ -55,7 +55,7 @@ class _Photometric(torch.autograd.Function):
         return render.new_tensor(loss)
 
     @staticmethod
-    def backward(ctx: Any, grad: Tensor):  # type: ignore[no-untyped-def, override]
+    def backward(ctx: Any, grad: Tensor) -> tuple[Tensor, None, None, None]:
         (gradient,) = ctx.saved_tensors
         return grad * gradient, None, None, None
 
@@ -74,7 +74,8 @@ def photometric(render: Tensor, target: Tensor, mask: Tensor | None, weight_ssim
         render = torch.where(mask[..., None] > 0, render, target)
         weight = mask[..., None].to(target.dtype).expand_as(target)
         weight = weight / weight.sum().clamp_min(1e-6)
-    return _Photometric.apply(render, target, weight, weight_ssim)
+    loss: Tensor = _Photometric.apply(render, target, weight, weight_ssim)
+    return loss
 
 
 def photometric_reference(render: Tensor, target: Tensor, mask: Tensor | None, weight_ssim: float) -> Tensor:
@@ -90,7 +91,7 @@ class _FeatureDistance(torch.autograd.Function):
     """The fused loss: its gradient is computed with its value."""
 
     @staticmethod
-    def forward(ctx: Any, render: Tensor, target: Tensor, share: Tensor, by_channel: bool) -> Tensor:  # type: ignore[override]
+    def forward(ctx: Any, render: Tensor, target: Tensor, share: Tensor, by_channel: bool) -> Tensor:
         from chebsplat.training.pooling import feature_distance
 
         arrays = (t.detach().contiguous().numpy() for t in (render, target, share))
@@ -99,7 +100,7 @@ class _FeatureDistance(torch.autograd.Function):
         return render.new_tensor(values.sum())
 
     @staticmethod
-    def backward(ctx: Any, grad: Tensor):  # type: ignore[no-untyped-def, override]
+    def backward(ctx: Any, grad: Tensor) -> tuple[Tensor, None, None, None]:
         (gradient,) = ctx.saved_tensors
         return grad * gradient, None, None, None
 
@@ -122,7 +123,8 @@ def feature_distance(render: Tensor, target: Tensor, mask: Tensor | None = None,
       most common vector; the median channel by channel, where L1 is least, may be near none of them.
     """
     share = _cell_shares(mask, (target.shape[0], target.shape[1]), render.dtype)
-    return _FeatureDistance.apply(render, target.to(render.dtype), share, kind == "l1")
+    loss: Tensor = _FeatureDistance.apply(render, target.to(render.dtype), share, kind == "l1")
+    return loss
 
 
 def feature_distance_reference(

@@ -22,7 +22,8 @@ class SemanticGate(nn.Module):
         nn.init.constant_(self.linear.bias, initial)
 
     def forward(self, features: Tensor) -> Tensor:
-        return self.linear(features)[:, 0]
+        logits: Tensor = self.linear(features)[:, 0]
+        return logits
 
 
 def soft_mask(render_logits: Tensor, semantic_logits: Tensor | None) -> Tensor:

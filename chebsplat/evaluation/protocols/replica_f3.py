@@ -39,13 +39,14 @@ def measure(views: Iterable[Seen], task: Task) -> dict[str, Any]:
             f"the protocol asks for the 150 labels of ADE20K in their order (label {wrong[0]}: {SPELT[wrong[0]]}); "
             f"the teacher has {len(task.names)}; give it these, or use another protocol"
         )
-    rows, by_label = [], {k: [] for k in range(1, N_LABELS + 1)}  # type: ignore[var-annotated]
+    rows: list[tuple[float, float]] = []  # (mIoU, OA) of each image
+    by_label: dict[int, list[float]] = {k: [] for k in range(1, N_LABELS + 1)}
     for view in views:
         if view.teacher is None:
             raise DataFailure(f"view {view.name} has no features of a teacher, which the protocol compares with")
         student, teacher = (_labels(f, view, task.embeddings) for f in (view.features, view.teacher))
         ious = frequent_ious(student, teacher)
-        rows.append((np.mean(list(ious.values())), np.mean(student == teacher)))
+        rows.append((float(np.mean(list(ious.values()))), float(np.mean(student == teacher))))
         for k, value in ious.items():
             by_label[k].append(value)
     miou, oa = np.mean(rows, 0)
@@ -65,7 +66,8 @@ def merged(ids: np.ndarray) -> np.ndarray:
     """Ids from 1 with the merges applied; none is the target of another, so their order does not matter."""
     table = np.arange(N_LABELS + 1)
     table[list(MERGED)] = list(MERGED.values())
-    return table[ids]
+    result: np.ndarray = table[ids]
+    return result
 
 
 def frequent_ious(student: np.ndarray, teacher: np.ndarray) -> dict[int, float]:

@@ -66,7 +66,8 @@ class Named(Mapping[str, np.ndarray]):
 def translated(labels: np.ndarray, names: list[str], classes: list[str], unknown: int) -> np.ndarray:
     """Labels among `names` as indices into `classes`, IGNORE kept; a name that is no class becomes `unknown`."""
     table = np.array([*(classes.index(name) if name in classes else unknown for name in names), IGNORE])
-    return table[labels]
+    result: np.ndarray = table[labels]
+    return result
 
 
 def predicted(labels: np.ndarray, names: list[str], classes: list[str], unknown: int) -> np.ndarray:
@@ -90,7 +91,8 @@ def resized(labels: np.ndarray, size: tuple[int, int], centred: bool = False) ->
     rows, columns = (
         np.minimum((2 * np.arange(n) + centred) * m // (2 * n), m - 1) for n, m in zip(size, labels.shape, strict=True)
     )
-    return labels[rows[:, None], columns]
+    nearest: np.ndarray = labels[rows[:, None], columns]
+    return nearest
 
 
 def bilinear(features: np.ndarray, size: tuple[int, int]) -> np.ndarray:
