@@ -109,7 +109,7 @@ teacher-quality: $(READY)  ## measure the shipped embedded teacher on held-out r
 	@$(PY) -m uv pip install --quiet --python $(PY) --editable '.[text]'
 	@$(PY) -m chebsplat.teachers.quality $(args)
 
-lint: $(READY)  ## ruff (lint, format) and mypy, which is strict about the maths
+lint: $(READY)  ## ruff (lint, format) and mypy, strict about the maths and the formats
 	@$(PY) -m ruff check . && $(PY) -m ruff format --check .
 	@rm -rf build/types/chebsplat && mkdir -p build/types/chebsplat && ln -sfn $(CURDIR)/chebsplat/* build/types/chebsplat/
 	@for layer in formats stages pipelines teachers; do ln -sfn $(CURDIR)/$$layer build/types/chebsplat/$$layer; done

@@ -36,9 +36,9 @@ def main() -> None:
     train = {"coarse_until": 0.0, "encode_from": 0.0, "n_densify": 0, "refresh_every": 1_000_000}
     trainer = prepared(options.work, Config.model_validate({"train": train}))
     assert trainer.model.shape is not None
-    projections = trainer.model.shape.encoder.projections()
+    weights = trainer.model.shape.encoder.attention_weights()
     began = time.perf_counter()
-    bases = {name: cks.update(None, W.detach())[0] for name, W in projections.items()}
+    bases = {name: cks.update(None, W.detach())[0] for name, W in weights.items()}
     update = time.perf_counter() - began
     times: dict[bool, list[float]] = {False: [], True: []}
     rounds, period = trainer.steps(), trainer.settings.encode_every
@@ -52,7 +52,7 @@ def main() -> None:
     alone = []
     for _ in range(200):
         began = time.perf_counter()
-        cks.basis_loss(trainer.model.shape.encoder.projections(), bases).backward()
+        cks.basis_loss(trainer.model.shape.encoder.attention_weights(), bases).backward()
         alone.append(time.perf_counter() - began)
     without, with_it = (statistics.median(times[which]) for which in (False, True))
     n_steps = trainer.settings.steps

@@ -47,11 +47,11 @@ def remembered(read: Callable[[int], Tensor], budget: int) -> Callable[[int], Te
         nonlocal left
         if index in kept:
             return kept[index]
-        found = read(index)
-        if found.nbytes <= left:
-            kept[index] = found
-            left -= found.nbytes
-        return found
+        value = read(index)
+        if value.nbytes <= left:
+            kept[index] = value
+            left -= value.nbytes
+        return value
 
     return recall
 

@@ -22,14 +22,14 @@ def run(job: Job) -> None:
     from chebsplat.shape.cks import update
 
     encoder = restored_encoder(job.inputs["gaussians"], checkpoint)
-    projections = encoder.projections()
-    if not projections:
+    attention = encoder.attention_weights()
+    if not attention:
         raise DataFailure("the encoder has no projections (train.encoder = mlp); there is no knowledge to carry")
-    if old.bases and set(old.bases) != set(projections):
+    if old.bases and set(old.bases) != set(attention):
         raise DataFailure("the basis belongs to an encoder of another depth; start another sequence")
     bases: dict[str, Any] = {}
     reports: dict[str, Any] = {}
-    for name, weight in projections.items():
+    for name, weight in attention.items():
         start = torch.from_numpy(old.bases[name]) if name in old.bases else None
         if start is not None and len(start) != len(weight):
             raise DataFailure(f"the basis has {len(start)} rows at {name}, the encoder {len(weight)}")

@@ -136,8 +136,8 @@ def _run(name: str, run: Callable[[Job], None], options: dict[str, Any], out: Pa
         manifest.seconds = round(time.perf_counter() - began, 3)
         manifest.versions = _versions()
     artifact.discard(scratch)
-    if (jit := sys.modules.get("chebsplat.kernels.jit")) and jit.told.kernels:
-        log.info("compiled %d kernels in %.0f s, once", jit.told.kernels, jit.told.seconds)
+    if (jit := sys.modules.get("chebsplat.kernels.jit")) and jit.compilation.kernels:
+        log.info("compiled %d kernels in %.0f s, once", jit.compilation.kernels, jit.compilation.seconds)
     log.info("done in %.1f s", manifest.seconds)
 
 

@@ -12,7 +12,7 @@ from chebsplat.stages.command import Job, command
 if TYPE_CHECKING:
     import numpy as np
 
-    from chebsplat.evaluation.protocols.task import Seen
+    from chebsplat.evaluation.protocols.task import EvaluatedView
     from chebsplat.formats.capture import Capture
     from chebsplat.formats.scene import Scene
     from chebsplat.render import SceneRenderer
@@ -50,7 +50,7 @@ def run(job: Job) -> None:
     pictures: dict[str, Any] = {"truth": np.stack([capture.images[row[name]] for name in names])}
     figures: dict[str, Any] = {"names": names, "protocol": capture.protocol, "source": capture.source}
     shown: dict[str, list[np.ndarray]] = {"renders": []}
-    views = seen(job, renderer, dict(zip(names, cameras, strict=True)), capture, scene, shown)
+    views = evaluated_views(job, renderer, dict(zip(names, cameras, strict=True)), capture, scene, shown)
     segmentation = None
     if scene.labels is None:
         job.left_out("segmentation", "the scene has no semantics")
@@ -123,18 +123,18 @@ def task(job: Job, capture: Capture, scene: Scene, renderer: SceneRenderer) -> A
     return Task(scene.label_names, scene.label_embeddings, names, boundary, at)
 
 
-def seen(
+def evaluated_views(
     job: Job,
     renderer: SceneRenderer,
     cameras: dict[str, View],
     capture: Capture,
     scene: Scene,
     shown: dict[str, list[np.ndarray]],
-) -> Iterator[Seen]:
+) -> Iterator[EvaluatedView]:
     """Render one view after another; `shown` collects the pictures. Everything is joined on the view's name."""
     import numpy as np
 
-    from chebsplat.evaluation.protocols.task import Named, Seen, resized, translated
+    from chebsplat.evaluation.protocols.task import EvaluatedView, MapsByName, resized, translated
     from chebsplat.formats.features import read_features
     from chebsplat.labels.decode import decode_labels
 
@@ -144,29 +144,32 @@ def seen(
             return labels
         return translated(labels, scene.label_names, capture.class_names, -1)
 
-    truths = None if capture.labels is None else Named(capture.names, capture.labels, "labels")
+    truths = None if capture.labels is None else MapsByName(capture.names, capture.labels, "labels")
     depths = None  # in the scene's units only where the scene was built on the capture's own poses
     if capture.depth is not None and capture.cam_from_world is not None:
-        depths = Named(capture.names, capture.depth, "depth")
-    teachers = told = None
+        depths = MapsByName(capture.names, capture.depth, "depth")
+    teachers = pseudo_labels = None
     if "features" in job.inputs and scene.labels is not None:
         teacher = read_features(job.inputs["features"])
         own = scene.label_embeddings
         if teacher.label_names != scene.label_names or own is None or teacher.label_embeddings.shape != own.shape:
             raise InputError(f"{job.inputs['features']} has other labels than the scene; export the scene again")
-        teachers = Named(teacher.names, teacher.features, "features of a teacher")
+        teachers = MapsByName(teacher.names, teacher.features, "features of a teacher")
         if teacher.pseudo_labels is not None:  # its own, before any projection
-            told = Named(teacher.names, teacher.pseudo_labels, "labels of a teacher")
+            pseudo_labels = MapsByName(teacher.names, teacher.pseudo_labels, "labels of a teacher")
     for name, _ in job.progress.track(list(cameras), len(cameras), "evaluate"):
         image, features = renderer.render(cameras[name], with_features=scene.labels is not None)
         shown["renders"].append(image)
         if features is None or scene.label_embeddings is None:
             continue
-        view = Seen(name, features, decode_labels(features, scene.label_embeddings))
+        view = EvaluatedView(name, features, decode_labels(features, scene.label_embeddings))
         shown.setdefault("predicted", []).append(as_classes(view.labels))
         if teachers is not None:
             view.teacher = teachers[name].astype(np.float32)
-            small = decode_labels(view.teacher, scene.label_embeddings) if told is None else told[name]
+            if pseudo_labels is None:
+                small = decode_labels(view.teacher, scene.label_embeddings)
+            else:
+                small = pseudo_labels[name]
             view.teacher_labels = resized(small, view.labels.shape)
             shown.setdefault("teacher", []).append(as_classes(view.teacher_labels))
         if truths is not None:

@@ -85,14 +85,14 @@ def closed_set(teacher: TeacherModel, labels: dict[str, list[str]] | None, n_cha
     Args: labels: where a file was asked for: classes that are words of one label become that label; the others keep
       their own names.
     Raises: InputError where names and channels differ in number, or a label has no class.
-    Choices: a pixel's feature is the unit mean of the class codes (`chebsplat.labels.codes`), weighted by its
+    Choices: a pixel's feature is the unit mean of the class codes (`chebsplat.labels.class_codes`), weighted by its
       probabilities, so that training is the same as for features; its label is the likeliest, its confidence that
       probability.
     """
     import numpy as np
 
     from chebsplat.formats.teacher_model import read_label_table
-    from chebsplat.labels.codes import class_codes
+    from chebsplat.labels.class_codes import class_codes
     from chebsplat.stages.image_encoder import unit
 
     assert teacher.labels is not None  # `read_teacher` has seen to it

@@ -107,7 +107,7 @@ def from_labels(job: Job, capture: Capture, settings: TeacherSection) -> Feature
 
     from chebsplat.formats.features import Features
     from chebsplat.labels import noisy_teacher as model
-    from chebsplat.labels.codes import class_codes
+    from chebsplat.labels.class_codes import class_codes
     from chebsplat.labels.decode import decode
 
     if capture.labels is None or not capture.class_names:
@@ -136,7 +136,7 @@ def from_pseudo_labels(job: Job, capture: Capture, settings: TeacherSection) -> 
     import numpy as np
 
     from chebsplat.formats.features import Features
-    from chebsplat.labels.codes import class_codes
+    from chebsplat.labels.class_codes import class_codes
     from chebsplat.labels.pseudo_labels import voted
 
     if capture.pseudo_labels is None or capture.confidence is None or not capture.class_names:

@@ -99,8 +99,8 @@ def knowledge(job: Job, model: SceneModel, train: TrainSection) -> dict[str, Ten
 
     from chebsplat.formats.basis import read_basis
 
-    basis, projections = read_basis(job.inputs["basis"]), model.shape.encoder.projections()
-    wrong = [n for n, w in projections.items() if n not in basis.bases or len(basis.bases[n]) != len(w)]
+    basis, attention = read_basis(job.inputs["basis"]), model.shape.encoder.attention_weights()
+    wrong = [n for n, w in attention.items() if n not in basis.bases or len(basis.bases[n]) != len(w)]
     if wrong:
         raise InputError(f"{job.inputs['basis']} does not fit the encoder at {wrong[0]}; start another sequence")
     if train.warm_start:
@@ -111,7 +111,7 @@ def knowledge(job: Job, model: SceneModel, train: TrainSection) -> dict[str, Ten
         job.facts["warm_started"] = len(fitting)
         if other := sorted(state.keys() - fitting.keys()):
             job.left_out(f"warm start of {', '.join(other)}", "the earlier encoder has none of this shape")
-    return {name: torch.from_numpy(basis.bases[name]) for name in projections} if train.weight_basis > 0 else {}
+    return {name: torch.from_numpy(basis.bases[name]) for name in attention} if train.weight_basis > 0 else {}
 
 
 def within_cap(job: Job, points: Points) -> Points:

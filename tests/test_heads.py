@@ -109,7 +109,7 @@ def trained(path, key, seed):
     torch.manual_seed(seed)
     encoder = RegionEncoder(4, 3, width=32, n_layers=1)
     with torch.no_grad():
-        for weight in encoder.projections().values():
+        for weight in encoder.attention_weights().values():
             weight.copy_(torch.randn(32, 1) @ torch.randn(1, 32))
     modules = {f"shape.encoder.{name}": value.numpy() for name, value in encoder.state_dict().items()}
     notes = {"encoder": {"n_inputs": 4, "n_channels": 3} | encoder.settings}

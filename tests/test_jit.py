@@ -15,7 +15,7 @@ from chebsplat.kernels import jit
 from pathlib import Path
 sys.path.insert(0, str(Path(sys.argv[1]).parent))
 from chebsplat_kernels_of_a_test import double
-print(double(3), jit.told.kernels, jit.FOLDER)
+print(double(3), jit.compilation.kernels, jit.FOLDER)
 """
 
 KERNEL = """

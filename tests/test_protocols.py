@@ -18,7 +18,7 @@ from chebsplat.evaluation.protocols import (
     scannet_open,
 )
 from chebsplat.evaluation.protocols.split import every
-from chebsplat.evaluation.protocols.task import Named, Seen, Task, bilinear, resized
+from chebsplat.evaluation.protocols.task import EvaluatedView, MapsByName, Task, bilinear, resized
 from chebsplat.stages.ingest import split
 from chebsplat.stages.settings import IngestSection
 
@@ -34,7 +34,7 @@ def one_hot(ids, n):
 def view(ids, n, **fields):
     """A view of certain labels [H, W] among n."""
     ids = np.asarray(ids)
-    return Seen(fields.pop("name", "a"), one_hot(ids, n), ids.astype(np.int16), **fields)
+    return EvaluatedView(fields.pop("name", "a"), one_hot(ids, n), ids.astype(np.int16), **fields)
 
 
 # splits
@@ -173,7 +173,7 @@ def test_wide_views_are_resized_as_the_peers_do():
             found[found == old] = new
         ids.append(torch.nn.functional.interpolate(found[None, None].float(), (119, 159), mode="nearest")[0, 0].numpy())
     task = Task(ADE, np.eye(150, dtype=np.float32))
-    seen = Seen("a", student, np.zeros((40, 500), np.int16), teacher)
+    seen = EvaluatedView("a", student, np.zeros((40, 500), np.int16), teacher)
     found = replica_f3.measure([seen], task)["scene"]
     assert found["oa"] == pytest.approx(np.mean(ids[0] == ids[1]), abs=2e-4)  # rounding of a few ties
     assert found["miou"] == pytest.approx(np.mean(list(replica_f3.frequent_ious(*ids).values())), abs=1e-3)
@@ -201,7 +201,7 @@ def open_view(names, second, truth, classes):
         for share, rows in ((1.0, names), (0.5, second))
     )
     ids = [[classes.index(name) if name else -1 for name in row] for row in truth]
-    return Seen("a", features, features.argmax(-1).astype(np.int16), truth=np.array(ids, np.int16))
+    return EvaluatedView("a", features, features.argmax(-1).astype(np.int16), truth=np.array(ids, np.int16))
 
 
 @pytest.mark.parametrize("classes", [scannet_open.CLASSES, scannet_closed.CLASSES])
@@ -294,7 +294,7 @@ def test_scannet_closeds_scenes_weigh_alike():
 
 
 def test_views_are_joined_on_names():
-    rows = Named(["b", "a"], np.array([[2], [1]]), "labels")
+    rows = MapsByName(["b", "a"], np.array([[2], [1]]), "labels")
     assert [rows[name][0] for name in ("a", "b")] == [1, 2]
     with pytest.raises(DataFailure, match="view c has no labels"):
         rows["c"]

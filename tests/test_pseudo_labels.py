@@ -6,7 +6,7 @@ from shared import KEY, TOY, run_stage
 
 from chebsplat.errors import ConfigError
 from chebsplat.evaluation.protocols import labels, scannet_closed
-from chebsplat.evaluation.protocols.task import Seen, Task
+from chebsplat.evaluation.protocols.task import EvaluatedView, Task
 from chebsplat.formats.artifact import publish
 from chebsplat.formats.capture import read_capture, write_capture
 from chebsplat.formats.features import read_features
@@ -38,10 +38,11 @@ def test_a_cell_without_a_label_or_without_confidence_is_taught_nothing():
 def test_where_a_teacher_has_no_label_it_is_wrong():
     classes = list(scannet_closed.CLASSES)
     truth, told = np.array([[0, 0, 1, 1]]), np.array([[0, -1, 1, 1]], np.int16)
-    seen = Seen("a", np.eye(21, dtype=np.float32)[truth], truth.astype(np.int16), teacher_labels=told, truth=truth)
+    features, drawn = np.eye(21, dtype=np.float32)[truth], truth.astype(np.int16)
+    view = EvaluatedView("a", features, drawn, teacher_labels=told, truth=truth)
     task = Task(classes, np.eye(21), classes, boundary=1)
-    assert labels.measure([seen], task)["teacher"]["iou"]["wall"] == 0.5
-    closed = scannet_closed.measure([seen], task)["teacher"]
+    assert labels.measure([view], task)["teacher"]["iou"]["wall"] == 0.5
+    closed = scannet_closed.measure([view], task)["teacher"]
     assert (closed["iou"]["wall"], closed["iou"]["floor"], closed["iou"]["void"]) == (0.5, 1, 0)
 
 

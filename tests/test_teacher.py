@@ -185,7 +185,7 @@ def segmenter(folder, names="red\ngreen\nblue\n"):
 
 def test_a_closed_set_segmenter_gives_its_likeliest_classes_and_their_probabilities(tmp_path, capture):
     from chebsplat.formats.capture import read_capture
-    from chebsplat.labels.codes import class_codes
+    from chebsplat.labels.class_codes import class_codes
 
     code, found = encoded(tmp_path, capture, segmenter(tmp_path))
     assert code == 0

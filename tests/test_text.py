@@ -10,7 +10,7 @@ from shared import ROOT
 
 from chebsplat.errors import InputError
 from chebsplat.formats.teacher_model import TeacherModel, read_label_set, read_label_table
-from chebsplat.labels.codes import VOCABULARY
+from chebsplat.labels.class_codes import VOCABULARY
 from chebsplat.stages import text
 from chebsplat.stages.text import folded, text_embeddings
 from chebsplat.synthetic import CLASS_NAMES

@@ -32,12 +32,12 @@ class Lpips:
           3DGS' copy of it name them; taps `linK.model.1.weight`.
         Raises: ValueError naming the first tensor that is missing or of another shape.
         """
-        found: dict[tuple[str, int], Tensor] = {}
+        tensors: dict[tuple[str, int], Tensor] = {}
         for name, tensor in state.items():
             if match := CONV.match(name):
-                found[match[2], int(match[1])] = tensor.float()
+                tensors[match[2], int(match[1])] = tensor.float()
             elif match := TAP.match(name):
-                found["tap", int(match[1])] = tensor.float()
+                tensors["tap", int(match[1])] = tensor.float()
         before = 3
         wanted: dict[tuple[str, int], tuple[int, ...]] = {}
         for k, block in enumerate(BLOCKS):
@@ -47,13 +47,13 @@ class Lpips:
             wanted["tap", k] = (1, before, 1, 1)
         for key, shape in wanted.items():
             title = f"lin{key[1]}.model.1.weight" if key[0] == "tap" else f"features.{key[1]}.{key[0]}"
-            if key not in found:
+            if key not in tensors:
                 raise ValueError(f"no tensor {title}")
-            if tuple(found[key].shape) != shape:
-                raise ValueError(f"{title} is {tuple(found[key].shape)}, not {shape}")
-            if not found[key].isfinite().all():
+            if tuple(tensors[key].shape) != shape:
+                raise ValueError(f"{title} is {tuple(tensors[key].shape)}, not {shape}")
+            if not tensors[key].isfinite().all():
                 raise ValueError(f"{title} is not finite")
-        self.tensors = {key: found[key] for key in wanted}
+        self.tensors = {key: tensors[key] for key in wanted}
 
     @torch.no_grad()
     def distance(self, image: np.ndarray, truth: np.ndarray) -> float:

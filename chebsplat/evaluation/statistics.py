@@ -52,7 +52,7 @@ def summarize(values: Values) -> Summary:
 def paired_difference(values: Values, baseline: Values, scenes: list[str], ratio: bool = False) -> Difference:
     """values − baseline (or values / baseline) over pairs of the same scene and seed.
 
-    Args: values, baseline [N], the same scene and seed at each place; scenes: N names; ratio: positive values whose
+    Args: values, baseline [N], the same scene and seed at each index; scenes: N names; ratio: positive values whose
       quotient is meant; the mean is then geometric.
     Raises: ValueError on no pair, lengths that disagree, a value that is not finite, or a ratio of one that is not > 0.
     Choices: seeds of one scene are not independent of each other, so the interval is Student's over the scenes' means;

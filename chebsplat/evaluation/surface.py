@@ -39,13 +39,13 @@ def features_at(
     for start in range(0, len(means), CHUNK):
         rows = slice(start, start + CHUNK)
         near = tree.query_ball_point(means[rows], REACH * scales[rows].max(1))
-        which = np.repeat(np.arange(len(near)), [len(found) for found in near])
-        at = np.fromiter((k for found in near for k in found), np.int64, len(which))
-        whole = which + start
-        local = np.einsum("pi,pij->pj", points[at] - means[whole], axes[whole]) / scales[whole]
+        row = np.repeat(np.arange(len(near)), [len(indices) for indices in near])
+        point = np.fromiter((k for indices in near for k in indices), np.int64, len(row))
+        gaussian = row + start
+        local = np.einsum("pi,pij->pj", points[point] - means[gaussian], axes[gaussian]) / scales[gaussian]
         squared = (local**2).sum(1)
-        weight = np.where(squared <= REACH**2, opacities[whole] * np.exp(-0.5 * squared), 0.0)
-        matrix = coo_matrix((weight, (at, which)), (len(points), len(near))).tocsr()
+        weight = np.where(squared <= REACH**2, opacities[gaussian] * np.exp(-0.5 * squared), 0.0)
+        matrix = coo_matrix((weight, (point, row)), (len(points), len(near))).tocsr()
         sums += matrix @ features[rows]
         weights += np.asarray(matrix.sum(1))[:, 0]
     reached = np.maximum(weights, 1e-12)[:, None]

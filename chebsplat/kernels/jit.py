@@ -25,7 +25,7 @@ log = logging.getLogger("chebsplat")
 EVERY = 10.0  # seconds between two lines on what is being compiled
 
 
-def _places() -> list[Path]:
+def _folders() -> list[Path]:
     """Folders for compiled kernels, the best first."""
     root = Path(__file__).parents[1]
     sources = [path.read_bytes() for path in sorted(root.rglob("*.py"))]
@@ -33,9 +33,9 @@ def _places() -> list[Path]:
     name = f"numba-{hashlib.sha256(text).hexdigest()[:16]}"
     chosen, cache, work = (os.environ.get(key) for key in ("CHEBSPLAT_CACHE", "XDG_CACHE_HOME", "CHEBSPLAT_WORK"))
     user = Path(cache or Path(os.path.expanduser("~")) / ".cache")
-    found = [Path(chosen or user / "chebsplat") / name] + ([Path(work) / ".cache" / name] if work else [])
+    defaults = [Path(chosen or user / "chebsplat") / name] + ([Path(work) / ".cache" / name] if work else [])
     own = os.environ.get("NUMBA_CACHE_DIR")  # numba's word for it; what a user says there is left alone
-    return [folder for folder in ([Path(own)] if own else []) + found if own or folder.is_absolute()]
+    return [folder for folder in ([Path(own)] if own else []) + defaults if own or folder.is_absolute()]
 
 
 def _writable(folder: Path) -> bool:
@@ -48,7 +48,7 @@ def _writable(folder: Path) -> bool:
     return True
 
 
-FOLDER = next(filter(_writable, _places()), None)
+FOLDER = next(filter(_writable, _folders()), None)
 settings: Any = numba.config
 # open3d brings a TBB that numba refuses with a warning: OpenMP comes first.
 settings.THREADING_LAYER_PRIORITY = ["omp", "workqueue", "tbb"]
@@ -58,8 +58,8 @@ else:
     settings.CACHE_DIR = str(FOLDER)
 
 
-class _Kept(FunctionCache):
-    """A kernel's place on disk. A disk that is full costs the keeping, a damaged file another compilation."""
+class _KernelCache(FunctionCache):
+    """A kernel's files on disk. A disk that is full costs the keeping, a damaged file another compilation."""
 
     def load_overload(self, signature: Any, context: Any) -> Any:
         try:
@@ -79,7 +79,7 @@ class _Kept(FunctionCache):
                         "another folder", self.cache_path, error.strerror)  # fmt: skip
 
 
-class _Told(event.Listener):
+class _CompilationLog(event.Listener):
     """Says what is being compiled, now and then: it takes a minute or two, once for each version of the kernels."""
 
     def __init__(self) -> None:
@@ -107,15 +107,15 @@ class _Told(event.Listener):
         return self.seconds + (now - self.began if self.depth else 0)
 
 
-told = _Told()
-event.register("numba:compile", told)
+compilation = _CompilationLog()
+event.register("numba:compile", compilation)
 
 
 def _compiled(**options: Any) -> Callable[[Callable[..., Any]], Any]:
     def decorate(function: Callable[..., Any]) -> Any:
         dispatcher = numba.njit(error_model="numpy", **options)(function)
         if FOLDER is not None:
-            dispatcher._cache = _Kept(function)  # as `cache=True` does with numba's own
+            dispatcher._cache = _KernelCache(function)  # as `cache=True` does with numba's own
         return dispatcher
 
     return decorate

@@ -238,9 +238,10 @@ def transpose(_typing, array, source, target, stride):
 
     def build(context, builder, sig, args):
         array, source, target, stride = args
-        places = [builder.mul(stride, stride.type(row)) for row in range(16)]
-        at = [address(context, builder, sig.args[0], array, builder.add(source, place), WIDE) for place in places]
-        rows = [builder.load(place, align=4) for place in at]
+        offsets = [builder.mul(stride, stride.type(row)) for row in range(16)]
+        starts = [builder.add(source, offset) for offset in offsets]
+        pointers = [address(context, builder, sig.args[0], array, start, WIDE) for start in starts]
+        rows = [builder.load(pointer, align=4) for pointer in pointers]
         for step in (8, 4, 2, 1):  # swap the off-diagonal quarters of ever smaller blocks
             low = [k if k & step == 0 else k - step + 16 for k in range(16)]
             high = [k + step if k & step == 0 else k + 16 for k in range(16)]
@@ -250,8 +251,8 @@ def transpose(_typing, array, source, target, stride):
                     pair = rows[row], rows[row + step]
                     swapped[row], swapped[row + step] = shuffle(builder, *pair, low), shuffle(builder, *pair, high)
             rows = swapped
-        for place, row in zip(places, rows, strict=True):
-            to = address(context, builder, sig.args[0], array, builder.add(target, place), WIDE)
+        for offset, row in zip(offsets, rows, strict=True):
+            to = address(context, builder, sig.args[0], array, builder.add(target, offset), WIDE)
             builder.store(row, to, align=4)
         return context.get_dummy_value()
 

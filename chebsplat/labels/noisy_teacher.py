@@ -62,16 +62,16 @@ def confuse_segments(
 
 
 def noisy_features(
-    labels: np.ndarray, codes: np.ndarray, blur: float, noise: float, generator: np.random.Generator
+    labels: np.ndarray, class_codes: np.ndarray, blur: float, noise: float, generator: np.random.Generator
 ) -> np.ndarray:
     """Unit features [h, w, C]: code vectors of labels, blurred over boundaries, with Gaussian noise.
 
-    Args: labels [h, w], codes [L, C] unit; blur: sigma in feature pixels; noise: deviation a channel.
+    Args: labels [h, w], class_codes [L, C] unit; blur: sigma in feature pixels; noise: deviation a channel.
     Choices: ignored pixels hold the zero vector before blur; normalised at the end.
     """
     from scipy.ndimage import gaussian_filter
 
-    features = np.where((labels != IGNORE)[..., None], codes[labels], 0.0)
+    features = np.where((labels != IGNORE)[..., None], class_codes[labels], 0.0)
     if blur > 0:
         features = gaussian_filter(features, (blur, blur, 0))
     features = features + generator.normal(0, noise, features.shape)

@@ -42,18 +42,18 @@ def sampling(length: int, n_out: int, starts: list[int], k: int, window: int, n_
 
 
 def blended(
-    encode: Callable[[int, int], np.ndarray], size: tuple[int, int], window: tuple[int, int], grid: tuple[int, int]
+    window_map: Callable[[int, int], np.ndarray], size: tuple[int, int], window: tuple[int, int], grid: tuple[int, int]
 ) -> np.ndarray:
     """The map [h, w, C] over an image of `size` (H, W), h x w = `grid`, as a weighted mean of its windows' maps.
 
-    Args: encode: (top, left) -> [C, hc, wc], the map of the window whose first pixel that is; what of it lies beyond
-      the image is padding.
+    Args: window_map: (top, left) -> [C, hc, wc], the map of the window whose first pixel that is; what of it lies
+      beyond the image is padding.
     """
     starts = [window_starts(n, side) for n, side in zip(size, window, strict=True)]
     total, weight = np.zeros(0), np.zeros((*grid, 1), np.float32)
     for row, top in enumerate(starts[0]):
         for column, left in enumerate(starts[1]):
-            cells = np.asarray(encode(top, left), np.float32)
+            cells = np.asarray(window_map(top, left), np.float32)
             down = sampling(size[0], grid[0], starts[0], row, window[0], cells.shape[1])
             across = sampling(size[1], grid[1], starts[1], column, window[1], cells.shape[2])
             rows = np.tensordot(down, cells, ([1], [1]))  # [h, C, wc]; two large products, not one a channel

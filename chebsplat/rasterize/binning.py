@@ -22,7 +22,7 @@ DIGIT = 11  # bits of a sorting pass: three passes for 32
 
 
 class Bins(NamedTuple):
-    """order i32 [V]: the Gaussians that touch a tile, front to back; their place in it is their *rank*.
+    """order i32 [V]: the Gaussians that touch a tile, front to back; their position in it is their *rank*.
     tile_starts i64 [tiles + 1] and, in tile order and front to back within, rank and pair, i32 [P];
     pair_starts i32 [bands, V + 1] by rank.
     """

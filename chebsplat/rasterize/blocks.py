@@ -15,10 +15,10 @@ def prefetch(_typing, array, index):
 
     def build(context, builder, sig, args):
         byte = ir.IntType(8).as_pointer()
-        place = builder.bitcast(address(context, builder, sig.args[0], args[0], args[1], FLOAT), byte)
+        pointer = builder.bitcast(address(context, builder, sig.args[0], args[0], args[1], FLOAT), byte)
         kind = ir.FunctionType(ir.VoidType(), [byte, INT, INT, INT])
         function = cgutils.get_or_insert_function(builder.module, kind, "llvm.prefetch.p0")
-        builder.call(function, [place, INT(0), INT(3), INT(1)])
+        builder.call(function, [pointer, INT(0), INT(3), INT(1)])
         return context.get_dummy_value()
 
     return signature(types.none, array, types.intp), build
@@ -90,8 +90,8 @@ def multiply(_typing, out, out_at, order, order_at, out_step, a, a_at, a_row, a_
         integer = depth.type
         targets = []
         for i in range(n):
-            place = address(context, builder, sig.args[2], order, builder.add(order_at, integer(i)), integer)
-            offset = builder.add(out_at, builder.mul(builder.load(place), out_step))
+            entry = address(context, builder, sig.args[2], order, builder.add(order_at, integer(i)), integer)
+            offset = builder.add(out_at, builder.mul(builder.load(entry), out_step))
             targets.append(address(context, builder, sig.args[0], out, offset, vector))
         start = [builder.load(t, align=4) if adds else ir.Constant(vector, [0.0] * wide) for t in targets]
         before, loop, after = builder.block, builder.append_basic_block("products"), builder.append_basic_block("end")
@@ -103,8 +103,8 @@ def multiply(_typing, out, out_at, order, order_at, out_step, a, a_at, a_row, a_
         column = builder.add(a_at, builder.mul(k, a_step))
         sums_after = []
         for i in range(n):
-            place = builder.add(column, builder.mul(a_row, integer(i)))
-            entry = builder.load(address(context, builder, sig.args[5], a, place, FLOAT))
+            offset = builder.add(column, builder.mul(a_row, integer(i)))
+            entry = builder.load(address(context, builder, sig.args[5], a, offset, FLOAT))
             sums_after.append(multiply_add(builder, broadcast(builder, entry, wide), factor, sums[i]))
         following = builder.add(k, integer(1))
         k.add_incoming(integer(0), before)

@@ -21,7 +21,7 @@ SHAPE = 8  # floats of a row of shapes, and of a splat before its channels
 N_GEOMETRY = 8  # of a record: Σg, Σgu, Σgv, Σgu², Σguv, Σgv², Σ|g_x|, Σ|g_y|, where g = dL/d(log₂ α)
 SLACK = 4  # rows of four floats or more that hold 16
 BLOCK = 8  # rows of a product kept in registers at once
-AHEAD = 3  # Gaussians whose α are found together with one
+AHEAD = 3  # Gaussians whose α are computed together with one
 T_MIN, ALPHA_MIN = np.float32(1e-4), np.float32(1 / 255)
 REACH = np.float32(math.log2(255) + 1e-3)  # beyond the ellipse α = 1/255, with slack for rounding
 LN2, FAINT, NEVER = np.float32(math.log(2)), np.float32(-20), np.float32(np.inf)
@@ -68,14 +68,14 @@ def reach(shapes, k):
 
 
 @lanes
-def listed(masks, at, n, cell, found):
-    """Which of masks[at : at + n] hold this cell, into `found`, with AHEAD valid rows after them; returns how many."""
+def listed(masks, at, n, cell, hits):
+    """Which of masks[at : at + n] hold this cell, into `hits`, with AHEAD valid rows after them; returns how many."""
     count = 0
     for k in range(n):
-        found[count] = k
+        hits[count] = k
         count += (masks[at + k] >> cell) & 1
     for k in range(AHEAD):
-        found[count + k] = 0
+        hits[count + k] = 0
     return count
 
 
@@ -94,10 +94,10 @@ def _alpha(shapes, k, x, y, dx, dy, ceiling):
 
 
 @lanes
-def sweep(shapes, found, n, cell, max_alpha, states, alphas, weights, rows):
+def sweep(shapes, hits, n, cell, max_alpha, states, alphas, weights, rows):
     """Composite one cell front to back, α and α T of what contributes into rows [16] of `alphas` and `weights`.
 
-    Args: found [n + AHEAD] rows of `shapes`; states [cells, 2, 16]: transmittance, and the T at which a pixel is done,
+    Args: hits [n + AHEAD] rows of `shapes`; states [cells, 2, 16]: transmittance, and the T at which a pixel is done,
       which is infinite once it is, or outside the image; alphas holds AHEAD more rows than the others.
     Returns: how many contribute; rows[:count] says which.
     """
@@ -106,7 +106,7 @@ def sweep(shapes, found, n, cell, max_alpha, states, alphas, weights, rows):
     count, n_open = 0, 1
     for first in range(0, n, AHEAD + 1):
         for j in range(first, first + AHEAD + 1):  # none waits for another, as the transmittances below do
-            store(alphas, LANES * j, _alpha(shapes, found[j], x, y, dx, dy, splat(max_alpha)))
+            store(alphas, LANES * j, _alpha(shapes, hits[j], x, y, dx, dy, splat(max_alpha)))
         for j in range(first, min(first + AHEAD + 1, n)):
             alpha = load(alphas, LANES * j)  # what is stored below never passes row j
             visible = alpha >= splat(ALPHA_MIN)
@@ -118,7 +118,7 @@ def sweep(shapes, found, n, cell, max_alpha, states, alphas, weights, rows):
             alpha = where(is_open, alpha, splat(ZERO))
             store(alphas, LANES * count, alpha)
             store(weights, LANES * count, alpha * t)
-            rows[count] = found[j]
+            rows[count] = hits[j]
             count += 1
             t, done_at = where(is_open, after, t), where(is_open, done_at, splat(NEVER))
             n_open = bits(is_open)
@@ -178,8 +178,8 @@ def unwind(alphas, weights, out, count, max_alpha):
 
 
 @lanes
-def record_colors(weights, tall_grads, channels, count, cell, places, records):
-    """records[places[m], N_GEOMETRY:] += Σ_lanes weights[m] tall_grads: by cell, 16 rows of D `channels` and a margin.
+def record_colors(weights, tall_grads, channels, count, cell, slots, records):
+    """records[slots[m], N_GEOMETRY:] += Σ_lanes weights[m] tall_grads: by cell, 16 rows of D `channels` and a margin.
 
     The records have a multiple of four columns for them; what the last ones take up beyond D is never read.
     """
@@ -188,15 +188,15 @@ def record_colors(weights, tall_grads, channels, count, cell, places, records):
     for m in range(0, count, BLOCK):
         c = 0
         while c + 16 <= channels:
-            multiply(records, N_GEOMETRY + c, places, m, step, weights, LANES * m, LANES, 1, tall_grads, at + c,
+            multiply(records, N_GEOMETRY + c, slots, m, step, weights, LANES * m, LANES, 1, tall_grads, at + c,
                      row, LANES, 8, 16, 1)  # fmt: skip
             c += 16
         if c + 8 <= channels:
-            multiply(records, N_GEOMETRY + c, places, m, step, weights, LANES * m, LANES, 1, tall_grads, at + c,
+            multiply(records, N_GEOMETRY + c, slots, m, step, weights, LANES * m, LANES, 1, tall_grads, at + c,
                      row, LANES, 8, 8, 1)  # fmt: skip
             c += 8
         if c < channels:
-            multiply(records, N_GEOMETRY + c, places, m, step, weights, LANES * m, LANES, 1, tall_grads, at + c,
+            multiply(records, N_GEOMETRY + c, slots, m, step, weights, LANES * m, LANES, 1, tall_grads, at + c,
                      row, LANES, 8, 4, 1)  # fmt: skip
 
 
@@ -214,8 +214,8 @@ def accumulate_means(splats, column, ranks, start, rows, shares, count, cell, su
         at = cell * sums.shape[1] + d
         summed = load(sums, at)
         for m in range(count):
-            place = np.int64(ranks[start + rows[m]]) * splats.shape[1] + column + d
-            summed = fma(splat(shares[m]), load(splats, place), summed)
+            offset = np.int64(ranks[start + rows[m]]) * splats.shape[1] + column + d
+            summed = fma(splat(shares[m]), load(splats, offset), summed)
         store(sums, at, summed)
 
 
@@ -223,21 +223,21 @@ def accumulate_means(splats, column, ranks, start, rows, shares, count, cell, su
 def add_slopes_of_means(splats, column, ranks, start, rows, count, cell, mean_grads, out):
     """out[m] += the cell's gradient [cells, E] times Gaussian m's cell channels, the same at every lane."""
     for m in range(count):
-        place = np.int64(ranks[start + rows[m]]) * splats.shape[1] + column
+        offset = np.int64(ranks[start + rows[m]]) * splats.shape[1] + column
         slope = splat(ZERO)
         for d in range(0, mean_grads.shape[1], LANES):
-            slope = fma(load(splats, place + d), load(mean_grads, cell * mean_grads.shape[1] + d), slope)
+            slope = fma(load(splats, offset + d), load(mean_grads, cell * mean_grads.shape[1] + d), slope)
         store(out, LANES * m, load(out, LANES * m) + splat(total(slope)))
 
 
 @lanes
-def record_means(shares, mean_grads, count, cell, places, column, records):
-    """records[places[m], column:] += shares[m] times the cell's gradient."""
+def record_means(shares, mean_grads, count, cell, slots, column, records):
+    """records[slots[m], column:] += shares[m] times the cell's gradient."""
     for m in range(count):
-        share, place = splat(shares[m]), places[m] * records.shape[1] + column
+        share, offset = splat(shares[m]), slots[m] * records.shape[1] + column
         for d in range(0, mean_grads.shape[1], LANES):
             slope = load(mean_grads, cell * mean_grads.shape[1] + d)
-            store(records, place + d, fma(share, slope, load(records, place + d)))
+            store(records, offset + d, fma(share, slope, load(records, offset + d)))
 
 
 @lanes
@@ -254,16 +254,16 @@ def clear(records, at):
 def add_means(records, at, column, sums, i):
     """sums[i] += records[at, column:], whole vectors."""
     for d in range(0, sums.shape[1], LANES):
-        place = i * sums.shape[1] + d
-        store(sums, place, load(sums, place) + load(records, at * records.shape[1] + column + d))
+        offset = i * sums.shape[1] + d
+        store(sums, offset, load(sums, offset) + load(records, at * records.shape[1] + column + d))
 
 
 @lanes
-def record_geometry(g, count, cell, places, records):
-    """records[places[m], :6] += Σ_lanes g (1, x, y, x², xy, y²), offsets from the tile's middle."""
+def record_geometry(g, count, cell, slots, records):
+    """records[slots[m], :6] += Σ_lanes g (1, x, y, x², xy, y²), offsets from the tile's middle."""
     at = LANES * SHAPE * cell
     for m in range(0, count, BLOCK):
-        multiply(records, 0, places, m, records.shape[1], g, LANES * m, LANES, 1, MOMENTS, at, SHAPE, LANES, 8, 8, 1)
+        multiply(records, 0, slots, m, records.shape[1], g, LANES * m, LANES, 1, MOMENTS, at, SHAPE, LANES, 8, 8, 1)
 
 
 @lanes
@@ -283,7 +283,7 @@ def whiten(records, at, shapes, k):
 
 
 @lanes
-def record_absolute(g, count, cell, shapes, rows, places, records):
+def record_absolute(g, count, cell, shapes, rows, slots, records):
     """Add Σ |g_x|, Σ |g_y|, the absolute gradient to the 2D means."""
     x, y, dx, dy = load(LANE_X, 0), load(LANE_Y, 0), CELL_X[cell], CELL_Y[cell]
     for m in range(count):
@@ -292,8 +292,8 @@ def record_absolute(g, count, cell, shapes, rows, places, records):
         u = fma(splat(p), x, fma(splat(q), y, splat(shapes[k, 3] + p * dx + q * dy)))
         v = fma(splat(r), y, splat(shapes[k, 4] + r * dy))
         slope = load(g, LANES * m) * splat(TWO)
-        records[places[m], 6] += total(magnitude(slope * splat(p) * u))
-        records[places[m], 7] += total(magnitude(slope * fma(splat(q), u, splat(r) * v)))
+        records[slots[m], 6] += total(magnitude(slope * splat(p) * u))
+        records[slots[m], 7] += total(magnitude(slope * fma(splat(q), u, splat(r) * v)))
 
 
 @lanes

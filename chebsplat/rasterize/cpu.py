@@ -24,8 +24,8 @@ class _Project(torch.autograd.Function):
     @staticmethod
     def forward(ctx: Any, means: Tensor, quats: Tensor, scales: Tensor, camera: tuple[Any, ...]) -> tuple[Tensor, ...]:
         gaussians = [t.detach().contiguous().numpy() for t in (means, quats, scales)]
-        found = [torch.from_numpy(a) for a in ellipses.project(*gaussians, *camera)]
-        means2d, covariances, whitening, conics, depths, radii, compensations = found
+        projected = [torch.from_numpy(a) for a in ellipses.project(*gaussians, *camera)]
+        means2d, covariances, whitening, conics, depths, radii, compensations = projected
         ctx.gaussians, ctx.camera, ctx.radii = gaussians, (*camera[:4], camera[-1]), radii.numpy()
         ctx.mark_non_differentiable(whitening, conics, depths, radii)
         return means2d, covariances, whitening, conics, depths, radii, compensations
@@ -33,8 +33,8 @@ class _Project(torch.autograd.Function):
     @staticmethod
     def backward(ctx: Any, grad_means2d: Tensor, moments: Tensor, *others: Tensor) -> tuple[Tensor | None, ...]:
         slopes = [g.contiguous().numpy() for g in (grad_means2d, moments, others[-1])]
-        found = ellipses.project_adjoint(*ctx.gaussians, *ctx.camera, ctx.radii, *slopes)
-        return *(torch.from_numpy(a) for a in found), None
+        gradients = ellipses.project_adjoint(*ctx.gaussians, *ctx.camera, ctx.radii, *slopes)
+        return *(torch.from_numpy(a) for a in gradients), None
 
 
 class _Composite(torch.autograd.Function):
@@ -54,19 +54,19 @@ class _Composite(torch.autograd.Function):
         splats = tiles.pack(bins.order, centers, whitened, strengths, channels, in_cells)
         limit = np.float32(max_alpha)
         counts = channels.shape[1], in_cells.shape[1]
-        found = tiles.forward(splats, bins.tile_starts, bins.rank, *counts, *size, limit)
-        render, cells, transmittance, *seen = found
-        ctx.arrays, ctx.absgrad = (len(centers), splats, *bins, *seen, limit), absgrad
+        composed = tiles.forward(splats, bins.tile_starts, bins.rank, *counts, *size, limit)
+        render, cells, transmittance, masks, used = composed
+        ctx.arrays, ctx.absgrad = (len(centers), splats, *bins, masks, used, limit), absgrad
         ctx.view = view
         return torch.from_numpy(render), torch.from_numpy(cells), 1 - torch.from_numpy(transmittance)
 
     @staticmethod
     def backward(ctx: Any, *grads: Tensor) -> tuple[Tensor | None, ...]:
         slopes = [g.contiguous().numpy() for g in grads]
-        *found, finite = tiles.backward(*ctx.arrays, *slopes, ctx.absgrad is not None)
+        *gradients, finite = tiles.backward(*ctx.arrays, *slopes, ctx.absgrad is not None)
         if not finite:
             raise ValueError(f"the gradient of the image of view {ctx.view} is not finite")
-        to_means2d, moments, to_opacities, absolute, *to_channels = (torch.from_numpy(a) for a in found)
+        to_means2d, moments, to_opacities, absolute, *to_channels = (torch.from_numpy(a) for a in gradients)
         if ctx.absgrad is not None:
             ctx.absgrad += absolute
         return to_means2d, moments, to_opacities, *to_channels, *[None] * 7
@@ -99,8 +99,8 @@ def rasterize(
     Choices: `conics`, `depths` and `radii` have no gradient here. Bitwise equal for any number of threads.
     """
     in_cells = torch.zeros(len(means), 0) if cell_colors is None else cell_colors
-    given = means, quats, scales, opacities, colors, viewmats, Ks, in_cells
-    for name, tensor in zip(NAMES, given, strict=True):
+    inputs = means, quats, scales, opacities, colors, viewmats, Ks, in_cells
+    for name, tensor in zip(NAMES, inputs, strict=True):
         if tensor.dtype != torch.float32 or tensor.device.type != "cpu":
             raise ValueError(f"{name} is {tensor.dtype} on {tensor.device}; the cpu backend takes float32 on the CPU")
     if viewmats.requires_grad or Ks.requires_grad:
@@ -109,8 +109,8 @@ def rasterize(
     cameras = [(*(t.detach().double().contiguous().numpy() for t in pair), width, height, near_plane, far_plane, eps2d)
                for pair in zip(viewmats, Ks, strict=True)]  # fmt: skip
     views = [_Project.apply(means, quats, scales, camera) for camera in cameras]
-    found = (_stack(parts) for parts in zip(*views, strict=True))
-    means2d, covariances, whitening, conics, depths, radii, compensations = found
+    projected = (_stack(parts) for parts in zip(*views, strict=True))
+    means2d, covariances, whitening, conics, depths, radii, compensations = projected
     if means2d.requires_grad:
         means2d.retain_grad()
     absolute = torch.zeros(means2d.shape if absgrad else (0,))

@@ -65,13 +65,13 @@ def rasterize(
     if backgrounds is not None:
         backgrounds = torch.nn.functional.pad(backgrounds, (0, colors.shape[-1] - n_colors))
     gaussians = _without_broken(means, quats, scales, opacities, colors)
-    renders, alphas, found = rasterization(
+    renders, alphas, gsplat_meta = rasterization(
         *gaussians, viewmats, Ks, width, height,
         near_plane=near_plane, far_plane=far_plane, eps2d=eps2d, sh_degree=None, packed=False, render_mode="RGB",
         backgrounds=backgrounds, absgrad=absgrad, rasterize_mode=rasterize_mode,
         channel_chunk=max(CHUNK, colors.shape[-1]),
     )  # fmt: skip
-    meta = named(found)
+    meta = own_meta(gsplat_meta)
     if cell_colors is not None:
         meta["cells"] = reference.cell_means(renders[..., n_colors:])
     return renders[..., :n_colors], alphas, meta
@@ -96,13 +96,13 @@ def _without_broken(
     )
 
 
-def named(found: dict[str, Any]) -> dict[str, Any]:
+def own_meta(gsplat_meta: dict[str, Any]) -> dict[str, Any]:
     """Our meta of gsplat's: radii [C, N] from its [C, N, 2], and means2d retains its gradient."""
-    means2d, radii = found["means2d"], found["radii"]
+    means2d, radii = gsplat_meta["means2d"], gsplat_meta["radii"]
     if means2d.requires_grad:
         means2d.retain_grad()
     radii = radii.amax(-1) if radii.ndim == 3 else radii
-    return {"means2d": means2d, "conics": found["conics"], "depths": found["depths"], "radii": radii}
+    return {"means2d": means2d, "conics": gsplat_meta["conics"], "depths": gsplat_meta["depths"], "radii": radii}
 
 
 _reported: set[float] = set()

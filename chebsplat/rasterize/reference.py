@@ -95,11 +95,11 @@ def rasterize(
         "depths": torch.stack([view.depths for view in views]),
         "radii": torch.stack([view.radii for view in views]),
     }
-    images, found = torch.stack(renders), torch.stack(alphas)
+    images, coverage = torch.stack(renders), torch.stack(alphas)
     images, cells = images[..., :n_colors], images[..., n_colors:]
     if backgrounds is not None:
-        images = images + (1 - found) * backgrounds[:, None, None]
-    return images, found, meta if cell_colors is None else meta | {"cells": cell_means(cells)}
+        images = images + (1 - coverage) * backgrounds[:, None, None]
+    return images, coverage, meta if cell_colors is None else meta | {"cells": cell_means(cells)}
 
 
 def with_cells(colors: Tensor, cell_colors: Tensor | None) -> Tensor:
@@ -243,8 +243,8 @@ class _Weights(torch.autograd.Function):
         alphas, weights = ctx.saved_tensors
         gain = grad * weights
         behind = gain.flip(-1).cumsum_(-1).flip(-1).sub_(gain)
-        found = gain.addcmul_(behind, alphas / (1 - alphas), value=-1)
-        return found.mul_((ctx.max_alpha - alphas).sign_()), None
+        slope = gain.addcmul_(behind, alphas / (1 - alphas), value=-1)
+        return slope.mul_((ctx.max_alpha - alphas).sign_()), None
 
 
 def _weights(log_alphas: Tensor, max_alpha: float) -> Tensor:

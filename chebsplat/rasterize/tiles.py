@@ -61,8 +61,8 @@ def pack(order, means2d, whitening, opacities, colors, cell_colors):
 
 
 @serial
-def _place(splats, ranks, start, n, left, top, shapes):
-    """The tile's shapes (see `cells`)."""
+def _fill_shapes(splats, ranks, start, n, left, top, shapes):
+    """Fill the tile's rows of shapes (see `cells`)."""
     stop, step = len(ranks) - 1, splats.shape[1]
     for k in range(n):
         following = np.int64(ranks[min(start + k + AHEAD_OF_CACHE, stop)]) * step
@@ -112,18 +112,18 @@ def _forward_tile(
     mean_sums, shares = np.zeros((LANES, splats.shape[1] - column), np.float32), np.empty(CHUNK, np.float32)
     shapes, chosen = np.empty((CHUNK, SHAPE), np.float32), np.empty((CHUNK + SLACK, depth), np.float32)
     alphas, weights = np.empty((CHUNK + AHEAD, LANES), np.float32), np.empty((CHUNK, LANES), np.float32)
-    found, rows = np.empty(CHUNK + AHEAD + 1, np.int64), np.empty(CHUNK, np.int64)
+    hits, rows = np.empty(CHUNK + AHEAD + 1, np.int64), np.empty(CHUNK, np.int64)
     done, first = 0, start
     while done != 0xFFFF and first < stop:
         n = min(CHUNK, stop - first)
-        _place(splats, ranks, first, n, left, top, shapes)
+        _fill_shapes(splats, ranks, first, n, left, top, shapes)
         for k in range(n):
             masks[first + k] = cells.reach(shapes, k)
         for cell in range(LANES):
             if (done >> cell) & 1:
                 continue
-            count = cells.listed(masks, first, n, cell, found)
-            count = cells.sweep(shapes, found, count, cell, max_alpha, states, alphas, weights, rows)
+            count = cells.listed(masks, first, n, cell, hits)
+            count = cells.sweep(shapes, hits, count, cell, max_alpha, states, alphas, weights, rows)
             if count > 0:
                 cells.gather(splats, ranks, first, rows, count, chosen)
                 cells.accumulate(chosen, weights, count, cell, sums)
@@ -214,29 +214,29 @@ def _backward_tile(
     room = (n + AHEAD + BLOCK) // BLOCK * BLOCK
     shapes, chosen = np.empty((n, SHAPE), np.float32), np.zeros((room + SLACK, cells.padded(depth)), np.float32)
     alphas, weights = np.empty((room, LANES), np.float32), np.empty((room, LANES), np.float32)
-    g, places, shares = np.empty((room, LANES), np.float32), np.empty(room, np.int64), np.empty(n, np.float32)
-    found, rows = np.empty(n + AHEAD + 1, np.int64), np.empty(n, np.int64)
-    _place(splats, ranks, start, n, left, top, shapes)
+    g, slots, shares = np.empty((room, LANES), np.float32), np.empty(room, np.int64), np.empty(n, np.float32)
+    hits, rows = np.empty(n + AHEAD + 1, np.int64), np.empty(n, np.int64)
+    _fill_shapes(splats, ranks, start, n, left, top, shapes)
     for cell in range(LANES):
-        count = cells.listed(masks, start, n, cell, found)
-        count = cells.sweep(shapes, found, count, cell, max_alpha, states, alphas, weights, rows)
+        count = cells.listed(masks, start, n, cell, hits)
+        count = cells.sweep(shapes, hits, count, cell, max_alpha, states, alphas, weights, rows)
         if count == 0:
             continue
         for m in range(count):
-            places[m] = pair[start + rows[m]] - base
+            slots[m] = pair[start + rows[m]] - base
         for m in range(count, (count + BLOCK - 1) // BLOCK * BLOCK):
-            places[m] = spare
+            slots[m] = spare
         cells.gather(splats, ranks, start, rows, count, chosen)
         cells.slopes(chosen, grads, count, cell, depth, g)
         if grad_means.shape[2] > 0:
             cells.add_slopes_of_means(splats, column, ranks, start, rows, count, cell, mean_grads, g)
             cells.sum_lanes(weights, count, shares)
-            cells.record_means(shares, mean_grads, count, cell, places, N_GEOMETRY + cells.padded(channels), records)
+            cells.record_means(shares, mean_grads, count, cell, slots, N_GEOMETRY + cells.padded(channels), records)
         cells.unwind(alphas, weights, g, count, max_alpha)
-        cells.record_colors(weights, tall_grads, channels, count, cell, places, records)
-        cells.record_geometry(g, count, cell, places, records)
+        cells.record_colors(weights, tall_grads, channels, count, cell, slots, records)
+        cells.record_geometry(g, count, cell, slots, records)
         if absolute:
-            cells.record_absolute(g, count, cell, shapes, rows, places, records)
+            cells.record_absolute(g, count, cell, shapes, rows, slots, records)
     for k in range(n):
         cells.whiten(records, pair[start + k] - base, shapes, k)
     return finite

@@ -25,7 +25,7 @@ ZERO = np.float32(0)
 
 @serial
 def mirror(a, n):
-    """Copy the blocks above the diagonal to their places below."""
+    """Copy the transposed blocks above the diagonal to below it."""
     for i in range(0, n, 16):
         for j in range(i + 16, n, 16):
             transpose(a, i * n + j, j * n + i, n)

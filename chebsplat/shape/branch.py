@@ -22,7 +22,7 @@ CHUNK = 256  # regions that are encoded at once
 OF_REGIONS = ("members", "centers", "descriptors", "positions", "cover", "weights", "cache")
 
 
-class Encoded(NamedTuple):
+class FreshEncodings(NamedTuple):
     """Encodings [R, C] with a gradient, of the regions i64 [R], none twice."""
 
     values: Tensor
@@ -32,7 +32,7 @@ class Encoded(NamedTuple):
 class ShapeBranch(nn.Module):
     """Regions of the current Gaussians, their descriptors, and the encoder and gate that use them.
 
-    `encoder` and `gate` are learned. All else follows the Gaussians: `refresh` finds it, before any other use.
+    `encoder` and `gate` are learned. All else follows the Gaussians: `refresh` computes it, before any other use.
     """
 
     members: Tensor  # i64 [M, n], -1 where padded
@@ -73,9 +73,9 @@ class ShapeBranch(nn.Module):
         """The Gaussians were put into another order i64 [N]."""
         self.ids.keep(order.numpy())
         if self.regions is not None:
-            place = np.empty(len(order), np.int64)
-            place[order.numpy()] = np.arange(len(order))
-            self.regions = self.regions._replace(centers=place[self.regions.centers])
+            new_index = np.empty(len(order), np.int64)
+            new_index[order.numpy()] = np.arange(len(order))
+            self.regions = self.regions._replace(centers=new_index[self.regions.centers])
 
     @torch.no_grad()
     def refresh(
@@ -104,18 +104,18 @@ class ShapeBranch(nn.Module):
         else:
             around = self.members, regions.radius, descriptors
             self.descriptors = self.described.update(means, quats, log_scales, *around)
-        seen = self.descriptors[self.members >= 0]
-        if self.n_described and len(seen) and not self.keeps_norm:
-            self.encoder.norm_input.set(0, seen.mean(0), seen.std(0, unbiased=False))
-        found = placed(means.numpy(), regions, self.train_settings.n_covers)
-        self.positions, self.cover = (torch.from_numpy(part) for part in found)
+        rows = self.descriptors[self.members >= 0]
+        if self.n_described and len(rows) and not self.keeps_norm:
+            self.encoder.norm_input.set(0, rows.mean(0), rows.std(0, unbiased=False))
+        positions, cover = placed(means.numpy(), regions, self.train_settings.n_covers)
+        self.positions, self.cover = torch.from_numpy(positions), torch.from_numpy(cover)
         frames, scales = rotation_matrices(quats[self.centers]), log_scales.exp()[self.centers]
         self.weights = propagation_weights(means, self.cover, means[self.centers], frames, scales, regions.radius)
         parts = torch.arange(len(self.members)).split(CHUNK)
         self.cache = torch.cat([self.encode(raw["features"], part) for part in parts])
 
     def region_state(self) -> dict[str, Any]:
-        """What `refresh` found and steps have changed since, beside the learned weights: tensors and plain values."""
+        """What `refresh` computed and steps have changed since, beside the learned weights; tensors, plain values."""
         regions = self.regions
         assert regions is not None
         return {name: getattr(self, name) for name in OF_REGIONS} | {
@@ -141,27 +141,27 @@ class ShapeBranch(nn.Module):
         encodings: Tensor = self.encoder(inputs, self.positions[chosen], members >= 0)
         return encodings
 
-    def sample(self, features: Tensor, index: Tensor, generator: torch.Generator) -> Encoded:
+    def sample(self, features: Tensor, index: Tensor, generator: torch.Generator) -> FreshEncodings:
         """Encode anew `regions_per_step` of the regions that reach the Gaussians `index` [V]; the cache keeps them."""
         cover, is_reached = self.cover[index], torch.zeros(len(self.members), dtype=torch.bool)
         is_reached[cover[cover >= 0]] = True
         reached = is_reached.nonzero()[:, 0]
         order = torch.randperm(len(reached), generator=generator)[: self.train_settings.regions_per_step]
         chosen = reached[order]
-        fresh = Encoded(self.encode(features, chosen), chosen)
+        fresh = FreshEncodings(self.encode(features, chosen), chosen)
         self.cache = self.cache.index_copy(0, chosen, fresh.values.detach())
         return fresh
 
-    def fuse(self, features: Tensor, index: Tensor, fresh: Encoded | None = None) -> Tensor:
+    def fuse(self, features: Tensor, index: Tensor, fresh: FreshEncodings | None = None) -> Tensor:
         """Fused features [V, C] of the Gaussians `index` [V]; encodings are fresh ones, or as the cache has them."""
-        fresh = fresh or Encoded(self.cache[:0], torch.zeros(0, dtype=torch.int64))
+        fresh = fresh or FreshEncodings(self.cache[:0], torch.zeros(0, dtype=torch.int64))
         return fuse_in_view(self.gate, features, (self.cache, *fresh), self.cover, self.weights, index)
 
     def alone(self) -> Tensor:
         """Features [N, C] of all Gaussians by the cached encodings alone (Eq 9), zero where no region reaches."""
         return propagate(self.cache, self.cover, self.weights)
 
-    def distance(self, features: Tensor, fresh: Encoded) -> Tensor:
+    def distance(self, features: Tensor, fresh: FreshEncodings) -> Tensor:
         """Mean distance of encodings to the features of their regions' members, which get no gradient.
 
         Choices: beside the printed losses, which reach the encoder through what the gate lets pass, a few percent:

@@ -94,7 +94,7 @@ class RegionEncoder(nn.Module):
       n_inputs:   width of a token's input: flattened descriptor, context, or both; 0 for positions alone.
       n_channels: width of the semantic features.
       n_layers:   0 replaces attention by a maximum over tokens (the paper's ablation without the transformer).
-    Choices: pre-norm, with output projection and feed-forward; each input is standardised; a region without members
+    Choices: pre-norm, with an output map and feed-forward; each input is standardised; a region without members
       gives a finite vector that nothing reads.
     """
 
@@ -146,8 +146,8 @@ class RegionEncoder(nn.Module):
         encoder.load_state_dict({name: torch.from_numpy(value) for name, value in weights.items()})
         return encoder.eval()
 
-    def projections(self) -> dict[str, Tensor]:
-        """The projection matrices that the knowledge space follows, by name."""
+    def attention_weights(self) -> dict[str, Tensor]:
+        """The linear maps of attention that the knowledge space follows, by name."""
         return {
             f"blocks.{index}.{part}": getattr(block.attention, part).weight
             for index, block in enumerate(self.blocks)

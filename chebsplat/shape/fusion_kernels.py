@@ -58,8 +58,8 @@ def _mixed(features, encodings, images, cover, weights, by_input, bias, i, f, s,
         shape, power = splat(ZERO), load(bias, at)
         for k in range(cover.shape[1]):
             if cover[i, k] >= 0:
-                place, weight = cover[i, k] * width + at, splat(weights[i, k])
-                shape, power = fma(weight, load(encodings, place), shape), fma(weight, load(images, place), power)
+                offset, weight = cover[i, k] * width + at, splat(weights[i, k])
+                shape, power = fma(weight, load(encodings, offset), shape), fma(weight, load(images, offset), power)
         power = splat(MINUS_LOG2E) * _times(f, width, by_input, at, power)
         share = splat(ONE) / (splat(ONE) + exp2(where(power > splat(LARGE), splat(LARGE), power)))
         store(s, at, shape)
@@ -113,15 +113,15 @@ def _backward(features, encodings, images, cover, weights, index, by_input, bias
                 store(slope, at, down)
                 store(to_bias, block * width + at, load(to_bias, block * width + at) + down)
                 for j in range(width):
-                    place = (block * width + j) * width + at
-                    store(to_matrix, place, fma(spread(f, j), down, load(to_matrix, place)))
+                    offset = (block * width + j) * width + at
+                    store(to_matrix, offset, fma(spread(f, j), down, load(to_matrix, offset)))
                 for k in range(cover.shape[1]):
                     if cover[i, k] >= 0:
-                        weight, place = splat(weights[i, k]), (block * len(encodings) + cover[i, k]) * width + at
-                        store(to_images, place, fma(weight, down, load(to_images, place)))
+                        weight, offset = splat(weights[i, k]), (block * len(encodings) + cover[i, k]) * width + at
+                        store(to_images, offset, fma(weight, down, load(to_images, offset)))
                         if slot[cover[i, k]] >= 0:
-                            place = (block * n_fresh + slot[cover[i, k]]) * width + at
-                            store(to_fresh, place, fma(weight, up * (splat(ONE) - share), load(to_fresh, place)))
+                            offset = (block * n_fresh + slot[cover[i, k]]) * width + at
+                            store(to_fresh, offset, fma(weight, up * (splat(ONE) - share), load(to_fresh, offset)))
             for at in range(0, width, LANES):
                 store(inward, at, _times(slope, width, by_output, at, load(upper, at) * load(g, at)))
             to_features[i] = inward[:channels]
@@ -162,8 +162,10 @@ class _Fuse(torch.autograd.Function):
         channels = features.shape[1]
         slot = np.full(len(encodings), -1)
         slot[ctx.chosen] = np.arange(len(ctx.chosen))
-        found = _backward(*ctx.arrays, ctx.of_features, slot, len(ctx.chosen), grad.contiguous().numpy())
-        to_features, to_images, to_fresh, to_matrix, to_bias = found[0], *(blocks.sum(0) for blocks in found[1:])
+        to_features, *by_block = _backward(
+            *ctx.arrays, ctx.of_features, slot, len(ctx.chosen), grad.contiguous().numpy()
+        )
+        to_images, to_fresh, to_matrix, to_bias = (blocks.sum(0) for blocks in by_block)
         to_fresh += _product(to_images[ctx.chosen], ctx.of_shape)
         halves = _product(np.ascontiguousarray(to_images.T), encodings), to_matrix.T
         to_matrix = np.concatenate([half[:channels, :channels] for half in halves], 1)

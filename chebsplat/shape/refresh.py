@@ -101,11 +101,11 @@ class Descriptors:
             return self.values
         if self.values.shape[1] != members.shape[1]:
             self.forget(members.shape[1])
-        held = min(len(self.values), len(members))
+        n_before = min(len(self.values), len(members))
         limit = self.tolerance * given.new_tensor([radius] * 3 + [1.0] * 7)
-        same = ((given[:held] - self.given[:held]).abs() <= limit).all(-1).all(-1)
-        same &= (mask[:held] == self.mask[:held]).all(-1)
-        changed = torch.cat([~same, torch.ones(len(members) - held, dtype=torch.bool)])
+        same = ((given[:n_before] - self.given[:n_before]).abs() <= limit).all(-1).all(-1)
+        same &= (mask[:n_before] == self.mask[:n_before]).all(-1)
+        changed = torch.cat([~same, torch.ones(len(members) - n_before, dtype=torch.bool)])
         described = describe_members(
             means,
             quats,
@@ -120,7 +120,7 @@ class Descriptors:
         )
         values = described.values.new_zeros(len(members), members.shape[1], self.values.shape[2])
         before = values.new_zeros(len(members), *given.shape[1:])
-        values[:held], before[:held] = self.values[:held], self.given[:held]
+        values[:n_before], before[:n_before] = self.values[:n_before], self.given[:n_before]
         values[changed], before[changed] = described.values.flatten(2), given[changed]
         self.values, self.given, self.mask = values, before, mask
         self.n_described += int(changed.sum())

@@ -15,7 +15,7 @@ from chebsplat.kernels.jit import serial
 
 @serial
 def canonical(means, scales, rotmats, mask, index, points, sizes, frames):
-    """Canonical members in front: `index` their places, points and sizes [count, 3], frames [count, 3, 3].
+    """Canonical members in front: `index` their rows, points and sizes [count, 3], frames [count, 3, 3].
 
     Args: means, scales [n, 3], rotmats [n, 3, 3], mask [n]; the others are filled.
     Returns: count.

@@ -56,14 +56,14 @@ def build_regions(
     if n == 0:
         return Regions(np.zeros(0, np.int64), np.zeros((0, region_size), np.int64), 0.0)
     keys = _uniform(np.arange(n) if ids is None else ids, seed)
-    held = None if earlier is None else _hold(means, earlier, min(n_regions, n))
-    if held is None:
+    still_covering = None if earlier is None else _hold(means, earlier, min(n_regions, n))
+    if still_covering is None:
         start = int(np.random.default_rng(seed).integers(n))
         centers, reach = farthest_points(means, min(n_regions, n), start)
         radius = 1.5 * reach or 1.0
         share = _share(means, centers, radius, region_size, keys)
     else:
-        centers, radius, share = held
+        centers, radius, share = still_covering
     return Regions(centers, _neighbourhoods(means, centers, radius, share, region_size, keys), radius, share)
 
 

@@ -44,20 +44,20 @@ def cut_spectrum(S: Tensor, mask: Tensor, n_eigs: int, max_degree: int, *, hard:
     laplacian = laplacian + torch.diag_embed(torch.where(mask, 0.0, 3.0).double())
     values, vectors = _eigenpairs(laplacian)
     values = np.clip(values, 0.0, None)
-    place, rows = np.arange(n), np.arange(m)
+    index, rows = np.arange(n), np.arange(m)
     wanted = np.minimum(n_eigs, count)
-    valid = place < count[:, None]
+    valid = index < count[:, None]
     n_cuts = n_clustered = 0
     if hard:
         gaps = np.diff(values, axis=1, append=np.inf)  # behind each eigenvalue
-        gaps = np.where(place < count[:, None] - 1, gaps, np.inf)
-        chained = np.where(place < wanted[:, None] - 1, True, gaps <= SAME)
+        gaps = np.where(index < count[:, None] - 1, gaps, np.inf)
+        chained = np.where(index < wanted[:, None] - 1, True, gaps <= SAME)
         kept = 1 + np.argmin(np.concatenate([chained[:, :-1], np.zeros((m, 1), bool)], 1), axis=1)
         kept = np.minimum(kept, count)
         cuts = wanted < count
         n_cuts = int(cuts.sum())
         n_clustered = int((cuts & (gaps[rows, np.maximum(wanted, 1) - 1] <= CLUSTER)).sum())
-        weights = (place < kept[:, None]).astype(np.float64)
+        weights = (index < kept[:, None]).astype(np.float64)
         largest = np.maximum(values[rows, np.maximum(kept, 1) - 1], SMALLEST)[:, None]
         x = 2 * np.minimum(values / largest, 1.0) - 1
     else:

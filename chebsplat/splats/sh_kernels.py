@@ -40,10 +40,10 @@ def _basis(means, eye, i, degree, out):
 
 
 @inline
-def _kept(bands, held, i, v, degree):
+def _kept(bands, n_held, i, v, degree):
     """The highest band that counts for Gaussian i, row v of the masks: it has it, and so for all bands below."""
     top = 0
-    while top < degree and i < held[top] and bands[v, top] != 0:
+    while top < degree and i < n_held[top] and bands[v, top] != 0:
         top += 1
     return top
 
@@ -59,10 +59,10 @@ def _band(values, first, band, i, c):
 
 @kernel
 def _forward(sh0, sh1, sh2, sh3, bands, index, means, eye, degree):
-    out, held = np.empty((len(index), 3), np.float32), (len(sh1), len(sh2), len(sh3))
+    out, n_held = np.empty((len(index), 3), np.float32), (len(sh1), len(sh2), len(sh3))
     for v in prange(len(index)):
         i, values = index[v], np.empty(16)
-        top = _kept(bands, held, i, v, degree)
+        top = _kept(bands, n_held, i, v, degree)
         _basis(means, eye, i, top, values)
         for c in range(3):
             total = 0.5 + values[0] * sh0[i, 0, c]
@@ -85,21 +85,21 @@ def _to_band(values, first, g, out, i, c):
 @kernel
 def _backward(sh1, sh2, sh3, bands, index, means, eye, degree, out, grad, for_bands):
     """Gradients to sh0, to each band and, if asked for, to the masks [V, 3] (straight through closed ones too)."""
-    n, held = len(means), (len(sh1), len(sh2), len(sh3))
+    n, n_held = len(means), (len(sh1), len(sh2), len(sh3))
     to_sh0, to_sh1 = np.empty((n, 1, 3), np.float32), np.empty(sh1.shape, np.float32)
     to_sh2, to_sh3 = np.empty(sh2.shape, np.float32), np.empty(sh3.shape, np.float32)
     to_bands = np.zeros((len(index) if for_bands else 0, 3), np.float32)
     for i in prange(n):
         to_sh0[i] = np.float32(0)
-        if i < held[0]:
+        if i < n_held[0]:
             to_sh1[i] = np.float32(0)
-        if i < held[1]:
+        if i < n_held[1]:
             to_sh2[i] = np.float32(0)
-        if i < held[2]:
+        if i < n_held[2]:
             to_sh3[i] = np.float32(0)
     for v in prange(len(index)):
         i, values = index[v], np.empty(16)
-        top = _kept(bands, held, i, v, degree)
+        top = _kept(bands, n_held, i, v, degree)
         _basis(means, eye, i, degree if for_bands else top, values)
         for c in range(3):
             g = grad[v, c] if out[v, c] > 0 else np.float32(0)
@@ -110,11 +110,11 @@ def _backward(sh1, sh2, sh3, bands, index, means, eye, degree, out, grad, for_ba
                 _to_band(values, 4, g, to_sh2, i, c)
             if top >= 3:
                 _to_band(values, 9, g, to_sh3, i, c)
-            if for_bands and degree >= 1 and i < held[0]:
+            if for_bands and degree >= 1 and i < n_held[0]:
                 to_bands[v, 0] += _band(values, 1, sh1, i, c) * g
-            if for_bands and degree >= 2 and i < held[1]:
+            if for_bands and degree >= 2 and i < n_held[1]:
                 to_bands[v, 1] += _band(values, 4, sh2, i, c) * g
-            if for_bands and degree >= 3 and i < held[2]:
+            if for_bands and degree >= 3 and i < n_held[2]:
                 to_bands[v, 2] += _band(values, 9, sh3, i, c) * g
     return to_sh0, to_sh1, to_sh2, to_sh3, to_bands
 
@@ -130,8 +130,8 @@ class _Colors(torch.autograd.Function):
     @staticmethod
     def backward(ctx: Any, grad: Tensor) -> tuple[Tensor | None, ...]:
         for_bands = ctx.needs_input_grad[4]
-        found = _backward(*ctx.arrays[1:], ctx.degree, ctx.out, grad.contiguous().numpy(), for_bands)
-        parts = [torch.from_numpy(a) for a in found]
+        gradients = _backward(*ctx.arrays[1:], ctx.degree, ctx.out, grad.contiguous().numpy(), for_bands)
+        parts = [torch.from_numpy(a) for a in gradients]
         return *parts[:4], parts[4] if for_bands else None, None, None, None, None
 
 

@@ -69,7 +69,7 @@ def densify(
     alive = torch.isfinite(raw["means"]).all(1).numpy()
     order = torch.argsort(gradient, descending=True, stable=True)
     steep = order[gradient[order] > threshold]
-    places, index = np.zeros((0, 3)), np.zeros(0, np.int64)
+    positions, index = np.zeros((0, 3)), np.zeros(0, np.int64)
     if budget > 0 and len(steep) and alive.sum() > 3:
         means, ids = raw["means"].detach().double().numpy()[alive], np.flatnonzero(alive)
         tree = cKDTree(means)
@@ -82,16 +82,16 @@ def densify(
         counts[np.cumsum(counts) - counts >= 16 * budget] = 0
         region = np.repeat(np.arange(len(counts)), counts)
         rng = np.random.default_rng(int(torch.randint(2**62, (1,), generator=generator)))
-        places = centers[region] + radii[region, None] * _in_unit_ball(rng, len(region))
-        distance, parents = tree.query(places)
+        positions = centers[region] + radii[region, None] * _in_unit_ball(rng, len(region))
+        distance, parents = tree.query(positions)
         spacing = spacings[region]
         kept = np.flatnonzero((distance >= nearest * spacing) & (distance <= farthest * spacing))
         kept = kept[np.sort(np.unique(parents[kept], return_index=True)[1])]
-        kept = kept[_apart(places[kept], nearest * spacing[kept])][:budget]
-        places, index = places[kept], ids[parents[kept]]
+        kept = kept[_apart(positions[kept], nearest * spacing[kept])][:budget]
+        positions, index = positions[kept], ids[parents[kept]]
     parent = torch.from_numpy(index)
     rows = {name: value.detach()[parent] for name, value in raw.items()}
-    offsets = torch.from_numpy(places).to(rows["means"]) - rows["means"]
+    offsets = torch.from_numpy(positions).to(rows["means"]) - rows["means"]
     changed = {
         "logit_opacities": shared_opacity(rows["logit_opacities"], rows["log_scales"], rows["quats"], offsets),
         "log_scales": shared_scales(rows["log_scales"], rows["quats"], offsets),
@@ -123,14 +123,14 @@ def _in_unit_ball(rng: np.random.Generator, count: int) -> np.ndarray:
     return points
 
 
-def _apart(places: np.ndarray, least: np.ndarray) -> np.ndarray:
-    """Which places [A] to keep, bool: those with no earlier place nearer than `least` [A]."""
+def _apart(positions: np.ndarray, least: np.ndarray) -> np.ndarray:
+    """Which positions [A] to keep, bool: those with no earlier one nearer than `least` [A]."""
     from scipy.spatial import cKDTree
 
-    keep = np.ones(len(places), bool)
-    if len(places) > 1:
-        pairs = cKDTree(places).query_pairs(least.max(), output_type="ndarray")
-        gap = np.linalg.norm(places[pairs[:, 0]] - places[pairs[:, 1]], axis=1)
+    keep = np.ones(len(positions), bool)
+    if len(positions) > 1:
+        pairs = cKDTree(positions).query_pairs(least.max(), output_type="ndarray")
+        gap = np.linalg.norm(positions[pairs[:, 0]] - positions[pairs[:, 1]], axis=1)
         keep[pairs[gap < least[pairs[:, 1]], 1]] = False
     return keep
 

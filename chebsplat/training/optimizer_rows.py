@@ -1,4 +1,4 @@
-"""Rows of parameters, and of the optimizer's moments, when Gaussians come, go and change places."""
+"""Rows of parameters, and of the optimizer's moments, when Gaussians come, go and are put into another order."""
 
 from __future__ import annotations
 

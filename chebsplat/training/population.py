@@ -45,9 +45,9 @@ class Population:
             return
         height, width = rendered.rgb.shape[:2]
         length = (gradient[0] * torch.tensor([0.5 * width, 0.5 * height])).norm(dim=-1)
-        seen = rendered.meta["radii"][0] > 0
-        index = rendered.index[seen]
-        self.gradient_sum[index] += length[seen]
+        visible = rendered.meta["radii"][0] > 0
+        index = rendered.index[visible]
+        self.gradient_sum[index] += length[visible]
         self.gradient_count[index] += 1
 
     def grow(self, optimizer: torch.optim.Optimizer, members: Tensor, generator: torch.Generator) -> None:

@@ -36,9 +36,9 @@ def adam(model: SceneModel, settings: TrainSection, extent: float) -> torch.opti
     Args: settings: the train section; extent: scene units, scales the means' rate.
     """
     groups = []
-    found = rates(settings)
+    base_rates = rates(settings)
     for name, value in model.raw.items():
-        rate = found[name] * (extent if name == "means" else 1)
+        rate = base_rates[name] * (extent if name == "means" else 1)
         groups.append({"params": [value], "rate": rate, "name": name})
     weights = [p for module in model.modules.values() for p in module.parameters()]
     if weights:

@@ -110,8 +110,8 @@ def region_guidance(shN: Tensor, members: Tensor, n: int, n_bins: int = 8) -> Te
     if not present.any():
         return torch.ones(n, 3)
     n_bins += 1 - n_bins % 2
-    used, place = members[present].unique(return_inverse=True)
-    index = torch.zeros_like(members).masked_scatter(present, place)  # of rows of `used`
+    used, slot = members[present].unique(return_inverse=True)
+    index = torch.zeros_like(members).masked_scatter(present, slot)  # of rows of `used`
     colors = band_colors(shN[used], guidance_directions()[:, None].to(shN)).movedim(-1, 0).contiguous()
     highest, lowest = colors.amax(0), colors.amin(0)
     changes = torch.where(highest >= -lowest, highest, lowest).permute(1, 2, 0)  # [used, 3 bands, Q]
@@ -120,13 +120,13 @@ def region_guidance(shN: Tensor, members: Tensor, n: int, n_bins: int = 8) -> Te
         inside = changes[index[rows]].permute(0, 2, 1, 3).flatten(2)  # [M, 3 bands, k * Q]
         valid = present[rows][:, None, :, None].expand(-1, 3, -1, changes.shape[-1]).flatten(2)
         reach = (inside.abs() * valid).amax((1, 2)).clamp_min(n_bins * 0.5 / 255)[:, None].expand(-1, 3)
-        found = soft_histogram(inside, valid, n_bins, -reach, reach)
-        empty = torch.zeros_like(found[..., :1])
+        histogram = soft_histogram(inside, valid, n_bins, -reach, reach)
+        empty = torch.zeros_like(histogram[..., :1])
         without = soft_histogram(empty, torch.ones_like(empty, dtype=torch.bool), n_bins, -reach, reach)
-        spared = (1 - 0.5 * (found - without).abs().sum(-1)).clamp(0.05, 1)
+        spared = (1 - 0.5 * (histogram - without).abs().sum(-1)).clamp(0.05, 1)
         spared = spared.flip(-1).cummin(-1).values.flip(-1)
         weight.index_add_(0, index[rows][present[rows]], spared[:, None].expand(*index[rows].shape, 3)[present[rows]])
-    times.index_add_(0, place, torch.ones(len(place), 1))
+    times.index_add_(0, slot, torch.ones(len(slot), 1))
     return torch.ones(n, 3).index_copy_(0, used, weight / times)
 
 

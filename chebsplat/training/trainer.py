@@ -203,8 +203,8 @@ class Trainer:
         if auxiliary.band_masks is not None:
             losses["sh"] = settings.weight_sh * sh_prune.sh_loss(auxiliary.band_masks, self._guided(rendered.index))
         if self.basis and self.model.shape is not None:
-            projections = self.model.shape.encoder.projections()
-            losses["basis"] = settings.weight_basis * cks.basis_loss(projections, self.basis)
+            weights = self.model.shape.encoder.attention_weights()
+            losses["basis"] = settings.weight_basis * cks.basis_loss(weights, self.basis)
         loss = torch.stack(list(losses.values())).sum()
         if not torch.isfinite(loss):
             bad = [name for name, value in losses.items() if not torch.isfinite(value)]

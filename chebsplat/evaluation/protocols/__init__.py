@@ -4,7 +4,7 @@ A figure measured under one protocol is never put beside one measured under anot
 parameters go with every figure. Every module has
 
     NAME         what `ingest.protocol` calls it
-    TEST_EVERY, TEST_OFFSET   a view is a test view if its place among the names, modulo the one, is the other
+    TEST_EVERY, TEST_OFFSET   a view is a test view if its index among the names, modulo the one, is the other
     ADJUSTABLE   whether a config may change these two (they are recorded)
     OWN_SPLIT    whether a source's own split goes first
     ON_TRAINING  whether the training views are evaluated, and none is held out

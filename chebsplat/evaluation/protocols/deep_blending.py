@@ -1,6 +1,6 @@
 """`deep-blending`: Deep Blending has no labels, so the teacher's are the truth, as in `replica-f3`.
 
-Split: place % 8 == 0 by name, the rule of 3DGS; Feature 3DGS uses 2, so the offset may be set and is recorded. PSNR,
+Split: index % 8 == 0 by name, the rule of 3DGS; Feature 3DGS uses 2, so the offset may be set and is recorded. PSNR,
 SSIM and LPIPS (vgg, images in [0, 1] as 3DGS feeds them); frames per second without the semantic branch. Labels,
 resizing and averaging: see `replica_f3`.
 """

@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 
 from chebsplat.evaluation.metrics import IGNORE, boundary_band, confusion, segmentation
-from chebsplat.evaluation.protocols.task import Seen, Task, predicted
+from chebsplat.evaluation.protocols.task import EvaluatedView, Task, predicted
 from chebsplat.evaluation.surface import thinned
 from chebsplat.labels.decode import decode_labels
 
@@ -26,25 +26,25 @@ TEST_EVERY, TEST_OFFSET, ADJUSTABLE, OWN_SPLIT, ON_TRAINING, TRUTH = 8, 0, True,
 PER_VIEW = 40_000  # pixels of a view that become points, about, on a regular grid
 
 
-def measure(views: Iterable[Seen], task: Task) -> dict[str, Any]:
+def measure(views: Iterable[EvaluatedView], task: Task) -> dict[str, Any]:
     """mIoU (of pixels, boundary pixels and points), mAcc, OA, IoU by class: of the scene, and of its teacher."""
     n = len(task.classes)
     sums: dict[str, np.ndarray] = {}
-    points: list[tuple[np.ndarray, ...]] = []  # (place, truth, teacher's label) of a view's pixels with both
+    points: list[tuple[np.ndarray, ...]] = []  # (position, truth, teacher's label) of a view's pixels with both
     for view in views:
         assert view.truth is not None
         inside = np.where(boundary_band(view.truth, task.boundary), view.truth, IGNORE)
         for side, labels in (("scene", view.labels), ("teacher", view.teacher_labels)):
             if labels is not None:
-                found = predicted(labels, task.names, task.classes, n)
-                counts = np.stack([confusion(found, truth, n + 1) for truth in (view.truth, inside)])
+                prediction = predicted(labels, task.names, task.classes, n)
+                counts = np.stack([confusion(prediction, truth, n + 1) for truth in (view.truth, inside)])
                 sums[side] = sums.get(side, 0) + counts
         if view.surface is not None:
             step = max(round((view.truth.size / PER_VIEW) ** 0.5), 1)
             maps = (view.surface.astype(np.float32), view.truth, view.teacher_labels)
-            place, truth, *told = (of[step // 2 :: step, step // 2 :: step] for of in maps if of is not None)
-            known = (truth != IGNORE) & np.isfinite(place).all(-1)
-            points.append(tuple(of[known] for of in (place, truth, *told)))
+            positions, truth, *of_teacher = (of[step // 2 :: step, step // 2 :: step] for of in maps if of is not None)
+            known = (truth != IGNORE) & np.isfinite(positions).all(-1)
+            points.append(tuple(of[known] for of in (positions, truth, *of_teacher)))
     figures = {side: _figures(whole, edges, task.classes) for side, (whole, edges) in sums.items()}
     of_points = _point_mious(points, task) if points and task.at is not None else {}
     return {"classes": task.classes} | {
@@ -55,14 +55,14 @@ def measure(views: Iterable[Seen], task: Task) -> dict[str, Any]:
 def _point_mious(points: list[tuple[np.ndarray, ...]], task: Task) -> dict[str, float | None]:
     """mIoU of scene and teacher over points of surfaces."""
     assert task.at is not None
-    places, truth, *told = (np.concatenate(parts) for parts in zip(*points, strict=True))
-    kept, n = thinned(places), len(task.classes)
-    features, weights = task.at(places[kept])
+    positions, truth, *of_teacher = (np.concatenate(parts) for parts in zip(*points, strict=True))
+    kept, n = thinned(positions), len(task.classes)
+    features, weights = task.at(positions[kept])
     labels = predicted(decode_labels(features, task.embeddings), task.names, task.classes, n)
     sides = {"scene": np.where(weights > 0, labels, n)}
-    if told:
-        sides["teacher"] = predicted(told[0][kept], task.names, task.classes, n)
-    return {side: _mean(segmentation(confusion(found, truth[kept], n + 1)).iou[:-1]) for side, found in sides.items()}
+    if of_teacher:
+        sides["teacher"] = predicted(of_teacher[0][kept], task.names, task.classes, n)
+    return {side: _mean(segmentation(confusion(labels, truth[kept], n + 1)).iou[:-1]) for side, labels in sides.items()}
 
 
 def _mean(values: np.ndarray) -> float | None:
@@ -70,11 +70,11 @@ def _mean(values: np.ndarray) -> float | None:
 
 
 def _figures(whole: np.ndarray, edges: np.ndarray, classes: list[str]) -> dict[str, Any]:
-    found = segmentation(whole)
+    scores = segmentation(whole)
     return {
-        "miou": _mean(found.iou[:-1]),
-        "macc": _mean(np.array([found.macc])),
-        "oa": _mean(np.array([found.oa])),
+        "miou": _mean(scores.iou[:-1]),
+        "macc": _mean(np.array([scores.macc])),
+        "oa": _mean(np.array([scores.oa])),
         "boundary_miou": _mean(segmentation(edges).iou[:-1]),
-        "iou": {name: None if np.isnan(v) else float(v) for name, v in zip(classes, found.iou, strict=False)},
+        "iou": {name: None if np.isnan(v) else float(v) for name, v in zip(classes, scores.iou, strict=False)},
     }

@@ -1,6 +1,6 @@
 """`replica-f3` (Feature 3DGS): agreement with the teacher's own labels; no ground truth is looked at.
 
-Split: place % 8 == 2 by name. Feature 3DGS sorts its students as text and its teachers as numbers, so that unpadded
+Split: index % 8 == 2 by name. Feature 3DGS sorts its students as text and its teachers as numbers, so that unpadded
 names pair different views; here views are joined on their names. Labels: the 150 names of ADE20K without a prompt
 template; of ids that count from 1, television (90) becomes door (15), rug (29) floor (4), pillow (58) cushion (40).
 Resizing: where a view is wider than 480 pixels, features of both become 480x360, bilinear with aligned corners, which
@@ -17,7 +17,7 @@ from typing import Any
 import numpy as np
 
 from chebsplat.errors import DataFailure
-from chebsplat.evaluation.protocols.task import Seen, Task, bilinear, resized
+from chebsplat.evaluation.protocols.task import EvaluatedView, Task, bilinear, resized
 from chebsplat.labels.decode import decode_labels
 
 NAME = "replica-f3"
@@ -28,7 +28,7 @@ SPELT = {4: "floor", 15: "door", 29: "rug", 40: "cushion", 58: "pillow", 90: "te
 FEATURES, LABELS = (360, 480), (119, 159)  # (H, W)
 
 
-def measure(views: Iterable[Seen], task: Task) -> dict[str, Any]:
+def measure(views: Iterable[EvaluatedView], task: Task) -> dict[str, Any]:
     """Agreement of the scene with its teacher: mean over images of mIoU and OA; `iou` by label, over its images.
 
     Raises: DataFailure unless the teacher's labels are ADE20K's, and without a teacher.
@@ -55,7 +55,7 @@ def measure(views: Iterable[Seen], task: Task) -> dict[str, Any]:
     return {"classes": task.names, "scene": scene}
 
 
-def _labels(features: np.ndarray, view: Seen, embeddings: np.ndarray) -> np.ndarray:
+def _labels(features: np.ndarray, view: EvaluatedView, embeddings: np.ndarray) -> np.ndarray:
     """Merged ids from 1, [119, 159]."""
     if view.labels.shape[1] > FEATURES[1]:
         features = bilinear(features, FEATURES)

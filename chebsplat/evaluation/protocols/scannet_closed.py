@@ -17,7 +17,7 @@ from typing import Any
 import numpy as np
 
 from chebsplat.evaluation.metrics import confusion
-from chebsplat.evaluation.protocols.task import Seen, Task, predicted, required, resized, translated
+from chebsplat.evaluation.protocols.task import EvaluatedView, Task, predicted, required, resized, translated
 
 NAME = "scannet-closed"
 TEST_EVERY, TEST_OFFSET, ADJUSTABLE, OWN_SPLIT, ON_TRAINING, TRUTH = 5, 0, False, True, False, "labels"
@@ -33,7 +33,7 @@ REDUCED = (VOID, *(_KEPT.get(nyu, "otherprop") for nyu in range(1, 41)))  # by N
 SIZE, RARE = (512, 512), 0.005
 
 
-def measure(views: Iterable[Seen], task: Task) -> dict[str, Any]:
+def measure(views: Iterable[EvaluatedView], task: Task) -> dict[str, Any]:
     """mIoU of one scene, and IoU by class, None where it is dropped. Raises DataFailure on other labels."""
     required(task.names, CLASSES, NAME, also=(VOID,))
     classes = [VOID, *CLASSES]
@@ -43,17 +43,17 @@ def measure(views: Iterable[Seen], task: Task) -> dict[str, Any]:
         truth = resized(translated(view.truth, task.classes, classes, 0), SIZE, centred=True)
         for side, labels in (("scene", view.labels), ("teacher", view.teacher_labels)):
             if labels is not None:
-                found = resized(predicted(labels, task.names, classes, 0), SIZE, centred=True)
-                sums[side] = sums.get(side, 0) + confusion(found, np.where(truth == 0, -1, truth), len(classes))
+                prediction = resized(predicted(labels, task.names, classes, 0), SIZE, centred=True)
+                sums[side] = sums.get(side, 0) + confusion(prediction, np.where(truth == 0, -1, truth), len(classes))
     return {"classes": list(CLASSES)} | {side: figures(matrix) for side, matrix in sums.items()}
 
 
 def figures(matrix: np.ndarray) -> dict[str, Any]:
     """Figures of one scene's confusion matrix [22, 22], rows by truth, void first."""
-    right, truth, found = np.diag(matrix).astype(float), matrix.sum(1), matrix.sum(0)
-    kept = np.maximum(truth, found) >= RARE * max(matrix.sum(), 1)
+    n_right, n_true, n_predicted = np.diag(matrix).astype(float), matrix.sum(1), matrix.sum(0)
+    kept = np.maximum(n_true, n_predicted) >= RARE * max(matrix.sum(), 1)
     iou = {name: float(r / (t + f - r)) if k else None
-           for name, r, t, f, k in zip((VOID, *CLASSES), right, truth, found, kept, strict=True)}  # fmt: skip
+           for name, r, t, f, k in zip((VOID, *CLASSES), n_right, n_true, n_predicted, kept, strict=True)}  # fmt: skip
     return {"miou": averaged(list(iou.values())), "macc": None, "oa": None, "boundary_miou": None, "iou": iou}
 
 

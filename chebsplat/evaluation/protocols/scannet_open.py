@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 
 from chebsplat.evaluation.metrics import confusion
-from chebsplat.evaluation.protocols.task import Seen, Task, required, resized, translated
+from chebsplat.evaluation.protocols.task import EvaluatedView, Task, required, resized, translated
 from chebsplat.labels.decode import decode_labels
 
 NAME = "scannet-open"
@@ -27,7 +27,7 @@ OTHER = "other"
 SIZE = (484, 648)  # (H, W)
 
 
-def measure(views: Iterable[Seen], task: Task) -> dict[str, Any]:
+def measure(views: Iterable[EvaluatedView], task: Task) -> dict[str, Any]:
     """Figures of one scene, and its `confusion` [20, 20] by truth, to be summed over scenes. Raises DataFailure."""
     required(task.names, CLASSES, NAME, also=(OTHER,))
     asked = [k for k, name in enumerate(task.names) if name != OTHER]
@@ -39,8 +39,9 @@ def measure(views: Iterable[Seen], task: Task) -> dict[str, Any]:
         truth = resized(translated(view.truth, task.classes, classes, -1), SIZE, centred=True)
         sides = {"scene": view.features} | ({} if view.teacher is None else {"teacher": view.teacher})
         for side, features in sides.items():
-            found = resized(translated(decode_labels(features, embeddings), names, classes, -1), SIZE, centred=True)
-            sums[side] = sums.get(side, 0) + confusion(found, truth, len(classes))
+            labels = translated(decode_labels(features, embeddings), names, classes, -1)
+            prediction = resized(labels, SIZE, centred=True)
+            sums[side] = sums.get(side, 0) + confusion(prediction, truth, len(classes))
     return {"classes": classes} | {side: summed([matrix]) for side, matrix in sums.items()}
 
 

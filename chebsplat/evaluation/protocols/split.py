@@ -1,4 +1,4 @@
-"""Which views are test views: by their place among the names, which are sorted as people count."""
+"""Which views are test views: by their index among the names in natural order."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ def natural(name: str) -> tuple[Any, ...]:
 
 
 def every(names: list[str], step: int, offset: int) -> np.ndarray:
-    """bool [V]: names whose place in natural order is `offset` modulo `step`, whatever order they are given in.
+    """bool [V]: names whose index in natural order is `offset` modulo `step`, whatever order they are given in.
 
     Choices: natural order, which is that of text where numbers are padded; of unpadded names text makes another split.
     """

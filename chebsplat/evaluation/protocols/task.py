@@ -13,7 +13,7 @@ from chebsplat.evaluation.metrics import IGNORE
 
 
 @dataclass
-class Seen:
+class EvaluatedView:
     """One evaluated view of H x W pixels.
 
     features: f32 [H, W, C] as rendered; labels: i16 [H, W] their label among the task's `names`.
@@ -45,7 +45,7 @@ class Task:
     at: Callable[[np.ndarray], tuple[np.ndarray, np.ndarray]] | None = None
 
 
-class Named(Mapping[str, np.ndarray]):
+class MapsByName(Mapping[str, np.ndarray]):
     """Rows of a stack by view name, read when asked for: views are joined on names, never on position."""
 
     def __init__(self, names: list[str], stack: Any, what: str):
