@@ -1,4 +1,4 @@
-"""The set-up takes the newest Python it can use; a renamed or copied clone is set up anew and runs nothing of another."""
+"""The set-up takes the newest Python it can use; a renamed or copied clone is set up anew."""
 
 import os
 import shutil
@@ -82,7 +82,7 @@ def test_a_venv_of_another_making_is_left_alone(clone):
 
 
 def python(clone, name, tag, pip="", venv=True):
-    """A Python `name` of version `tag` beside the others on the PATH; `pip`: the folder where its pip looks for wheels."""
+    """A Python `name` of version `tag` beside the others on the PATH; `pip`: where its pip looks for wheels."""
     file = clone.parent / "bin" / name
     lines = f"#!/bin/bash\nexport TAG={tag} NO_VENV={int(not venv)}\n"
     if pip:
