@@ -58,7 +58,7 @@ def main() -> None:
     n_steps = trainer.settings.steps
     share = 100 * (statistics.median(alone) * n_steps + update) / (without * n_steps)
     found = {
-        "projections": len(bases),
+        "weights": len(bases),
         "step_ms": 1e3 * without,
         "step_with_ms": 1e3 * with_it,
         "regulariser_ms": 1e3 * statistics.median(alone),

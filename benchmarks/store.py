@@ -1,4 +1,4 @@
-"""The feature store against its bars: bytes a view, error and label decisions after projection, bandwidth, memory.
+"""The feature store against its bars: bytes a view, error and label decisions in the few channels, bandwidth, memory.
 
 LSeg's weights cannot be had, so its features are stood in for: 512 channels at 360 x 480, maps of 150 words (a common
 part, cosine about .75 between words, and a scatter whose variance falls as k^-a over the channels) that segments show,
@@ -29,11 +29,11 @@ from scipy.ndimage import gaussian_filter
 from chebsplat.formats.artifact import publish
 from chebsplat.formats.features import PATCH, SCHEMA, FeatureWriter, read_features
 from chebsplat.formats.manifest import Manifest
-from chebsplat.labels.channels import ROWS, Moments, projection
+from chebsplat.labels.channels import ROWS, Moments, channel_map
 from chebsplat.teachers import EMBEDDED
 
 SIZE, N_CHANNELS, N_WORDS = (360, 480), 512, 150
-WIDTH = 32  # the default of projection.n_channels
+WIDTH = 32  # the default of channels.n_channels
 WIDTHS = (13, 16, 24, 32, 48, 57)  # 57: the most that 20 MB a view hold before compression
 REFERENCES = 24
 MAX_BYTES, MAX_ERROR, MAX_GROWTH = 20e6, 0.01, 0.1
@@ -83,9 +83,9 @@ def unit(values: np.ndarray) -> np.ndarray:
 def embedded(n_views: int) -> tuple[np.ndarray, Iterator[np.ndarray], Iterator[np.ndarray]]:
     """Words, features of the reference's views, features of views of a held-out room, of the embedded teacher."""
     from chebsplat.formats.teacher_model import read_label_table, read_teacher
+    from chebsplat.stages.channels import VIEWS, generated
     from chebsplat.stages.command import n_threads
     from chebsplat.stages.image_encoder import ImageEncoder
-    from chebsplat.stages.projection import VIEWS, generated
     from chebsplat.synthetic.seeds import HELD_OUT, REFERENCE
 
     teacher = read_teacher(EMBEDDED)
@@ -107,11 +107,11 @@ def measured(name: str, words: np.ndarray, references: Iterator, views: list[np.
     for features in references:
         moments.add(features)
     cases = [(width, 1.0) for width in WIDTHS] + [(WIDTH, 0.0)]
-    return [row(name, words, views, *projection(moments, words, *case)) | {"weight": case[1]} for case in cases]
+    return [row(name, words, views, *channel_map(moments, words, *case)) | {"weight": case[1]} for case in cases]
 
 
 def row(name: str, words: np.ndarray, views: list[np.ndarray], matrix: np.ndarray, energy: np.ndarray) -> dict:
-    """What one width costs and keeps, on views that the projection was not computed from."""
+    """What one width costs and keeps, on views that the channels were not computed from."""
     few = [(view @ matrix.astype(np.float32)) for view in views]
     lost, whole, same = 0.0, 0.0, []
     with tempfile.TemporaryDirectory(dir=bench()) as folder:

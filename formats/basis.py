@@ -40,7 +40,8 @@ class Basis:
     """`bases[name]` [q, r] has orthonormal columns; `weights[name]` [q, p] is the encoder's own matrix beside it.
 
     `lineage` holds one entry a revision, the oldest first: `scene`, `gaussians` (the checkpoint's key), and
-    `projections`: by name the report of `cks.update`. The scene's columns are those from `rank_before` to `rank_after`.
+    `projections`: by name of an attention weight the report of `cks.update`. The scene's columns are those from
+    `rank_before` to `rank_after`.
     """
 
     bases: dict[str, np.ndarray]

@@ -15,11 +15,11 @@ import numpy as np
 from chebsplat.errors import InputError
 from chebsplat.formats import artifact
 from chebsplat.formats.arrays import StoredArray, create_array, has_array, open_array
+from chebsplat.formats.channels import SPECS, ChannelMap, from_parts, tensors
+from chebsplat.formats.channels import Document as ChannelsDocument
 from chebsplat.formats.documents import NotRequired, TypedDict, read_document, write_document
 from chebsplat.formats.manifest import remedy_of
 from chebsplat.formats.names import check_names
-from chebsplat.formats.projection import SPECS, Projection, from_parts, tensors
-from chebsplat.formats.projection import Document as ProjectionDocument
 from chebsplat.formats.tensors import read_tensors, write_tensors
 
 SCHEMA = "chebsplat.features/1"
@@ -33,7 +33,7 @@ class Document(TypedDict):
     names: list[str]
     label_names: list[str]
     convention: dict[str, Any]
-    projection: NotRequired[ProjectionDocument]
+    projection: NotRequired[ChannelsDocument]  # `Features.channels`; on disk the name stays, so that older files open
 
 
 @dataclass
@@ -43,10 +43,10 @@ class Features:
     names:            of the views, for joins.
     features:         f16 [V, h, w, C].
     label_names:      L names; label_embeddings: f32 [L, C], no row longer than 1; a pixel's label is the one of the
-                      largest inner product. Rows are unit unless a projection took a part of them.
+                      largest inner product. Rows are unit unless `channels` keeps a part of them.
     pseudo_labels:    i16 [V, h, w] or None; confidence: f16 [V, h, w] in [0, 1] or None.
     convention:       n_scales, flips, normalized and the teacher's own parameters: a loss needs to know them.
-    projection:       from the teacher's channels to these C; None: they are the teacher's own.
+    channels:         from the teacher's channels to these C; None: they are the teacher's own.
     """
 
     names: list[str]
@@ -56,7 +56,7 @@ class Features:
     pseudo_labels: np.ndarray | StoredArray | None = None
     confidence: np.ndarray | StoredArray | None = None
     convention: dict[str, Any] = field(default_factory=dict)
-    projection: Projection | None = None
+    channels: ChannelMap | None = None
 
 
 class FeatureWriter:
@@ -131,7 +131,7 @@ class FeatureWriter:
         label_names: list[str],
         label_embeddings: np.ndarray,
         convention: dict[str, Any],
-        projection: Projection | None = None,
+        channels: ChannelMap | None = None,
     ) -> None:
         """Fill the directory that `artifact.publish` yields; the writer's own folder stays as it is.
 
@@ -151,9 +151,9 @@ class FeatureWriter:
         check_names(label_names, "label names", "features", "correct the labels")
         write_tensors(out / "labels.safetensors", {"embeddings": label_embeddings.astype(np.float32)})
         document: dict[str, Any] = {"names": self.names, "label_names": label_names, "convention": convention}
-        if projection is not None:
-            write_tensors(out / "projection.safetensors", tensors(projection))
-            document["projection"] = {"teacher": projection.teacher, "notes": projection.notes}
+        if channels is not None:
+            write_tensors(out / "projection.safetensors", tensors(channels))
+            document["projection"] = {"teacher": channels.teacher, "notes": channels.notes}
         write_document(out / "features.json", document)
 
     def _array(self, name: str) -> Any:
@@ -211,7 +211,7 @@ def write_features(out: Path, features: Features) -> None:
     extra = (features.pseudo_labels, features.confidence)
     for view in range(len(features.names)):
         writer.add(view, features.features[view], *(None if array is None else array[view] for array in extra))
-    writer.finish(out, features.label_names, features.label_embeddings, features.convention, features.projection)
+    writer.finish(out, features.label_names, features.label_embeddings, features.convention, features.channels)
     shutil.rmtree(writer.folder)
 
 
@@ -237,10 +237,10 @@ def read_features(path: Path) -> Features:
         raise InputError(
             f"{path / 'labels.safetensors'}: an embedding is {longest:.3g} long, at most 1 is right; {remedy_of(path)}"
         )
-    projection = None
+    channels = None
     if "projection" in document:
         specs = SPECS | {"matrix": ("float32", "C", features.shape[3])}
         arrays = read_tensors(path, manifest, "projection.safetensors", specs)
-        projection = from_parts(arrays, document["projection"])
+        channels = from_parts(arrays, document["projection"])
     return Features(names, features, label_names, embeddings, **optional, convention=document["convention"],
-                    projection=projection)  # fmt: skip
+                    channels=channels)  # fmt: skip

@@ -12,8 +12,8 @@ from chebsplat.stages.registry import Stage
 # Settings that say where raw files lie. Their content is hashed instead: where it lies is no matter.
 PLACES = (
     ("source", "path"),
-    ("projection", "model"),
-    ("projection", "reference"),
+    ("channels", "model"),
+    ("channels", "reference"),
     ("teacher", "model"),
     ("teacher", "labels"),
     ("evaluate", "lpips_weights"),

@@ -28,16 +28,16 @@ def ancestors(path: Path) -> list[Path | None]:
 
 
 def records(basis: Basis) -> list[dict[str, Any]]:
-    """A row a revision and projection, for the CSV file."""
+    """A row a revision and attention weight, for the CSV file."""
     return [
-        {"revision": number, "scene": entry["scene"], "gaussians": entry["gaussians"], "projection": name} | report
+        {"revision": number, "scene": entry["scene"], "gaussians": entry["gaussians"], "weight": name} | report
         for number, entry in enumerate(basis.lineage, start=1)
         for name, report in entry["projections"].items()
     ]
 
 
 def log_table(basis: Basis) -> Table:
-    """A row a revision, means over projections; `rank` with the largest, ρ after in `rho_after`."""
+    """A row a revision, means over attention weights; `rank` with the largest, ρ after in `rho_after`."""
     table = [["revision", "scene", "rank", "added", "ρ before", "ρ after", "energy", "gaussians"]]
     for number, entry in enumerate(basis.lineage, start=1):
         reports = list(entry["projections"].values())
@@ -49,7 +49,7 @@ def log_table(basis: Basis) -> Table:
 
 
 def columns_by_scene(basis: Basis, name: str) -> str:
-    """`1-10 office0, 11-12 office1`: the columns of one projection, counted from 1."""
+    """`1-10 office0, 11-12 office1`: the columns of one weight's basis, counted from 1."""
     parts = []
     for entry in basis.lineage:
         report = entry["projections"].get(name, {"rank_before": 0, "rank_after": 0})
@@ -60,8 +60,8 @@ def columns_by_scene(basis: Basis, name: str) -> str:
 
 
 def show_table(basis: Basis) -> Table:
-    """A row a projection of one revision."""
-    table = [["projection", "r of q", "ρ before", "ρ after", "energy", "|BᵀB − I|", "columns"]]
+    """A row an attention weight of one revision."""
+    table = [["weight", "r of q", "ρ before", "ρ after", "energy", "|BᵀB − I|", "columns"]]
     reports = basis.lineage[-1]["projections"]
     for name, columns in basis.bases.items():
         figures = [f"{reports[name][key]:.3f}" for key in ("rho", "rho_after", "energy")]
@@ -77,11 +77,11 @@ def common(a: Basis, b: Basis) -> int:
 
 
 def diff_table(a: Basis, b: Basis) -> Table:
-    """A row a projection: ranks, columns that are the same, how far each span lies outside the other.
+    """A row an attention weight: ranks, columns that are the same, how far each span lies outside the other.
 
     `outside` is the largest sine of an angle between a vector of the one span and the other span.
     """
-    table = [["projection", "r", "same columns", "first outside second", "second outside first"]]
+    table = [["weight", "r", "same columns", "first outside second", "second outside first"]]
     for name in sorted(a.bases.keys() | b.bases.keys()):
         if name not in a.bases or name not in b.bases or len(a.bases[name]) != len(b.bases[name]):
             table.append([name, "of one alone, or of another width", "", "", ""])
@@ -138,7 +138,7 @@ def verify(path: Path | None, earlier: Path | None) -> str:
 
 
 def draw(path: Path, basis: Basis, max_rank: float) -> None:
-    """Rank and residual over revisions, as PNG: a thin line a projection, the mean bold; max_rank: as a share of q."""
+    """Rank and residual over revisions, as PNG: a thin line a weight, the mean bold; max_rank: as a share of q."""
     import matplotlib
 
     matplotlib.use("Agg")
@@ -152,7 +152,7 @@ def draw(path: Path, basis: Basis, max_rank: float) -> None:
     figure, (left, right) = plt.subplots(1, 2, figsize=(11, 4), layout="constrained")
     rank, widths = values("rank_after"), sorted({len(columns) for columns in basis.bases.values()})
     left.plot(x, rank, color="C0", linewidth=0.6, alpha=0.5)
-    left.plot(x, rank.mean(1), color="C0", linewidth=2, marker="o", label="rank r: mean, and each projection")
+    left.plot(x, rank.mean(1), color="C0", linewidth=2, marker="o", label="rank r: mean, and each weight")
     left.bar(x, values("added").mean(1), color="C1", alpha=0.6, label="columns added, mean")
     for width in widths:
         left.axhline(int(max_rank * width), color="C0", linestyle="--", linewidth=0.8, label=f"ceiling, of q = {width}")

@@ -48,7 +48,7 @@ def left_out_stages(config: Any, kind: str, why: str, probe: dict[str, bool]) ->
 
 def left_out_knowledge(config: Any, kind: str, why: str, basis: Path | None, keep: bool) -> dict[str, str]:
     """Why a scene does not train on a given basis, or keeps nothing of its knowledge, if so."""
-    reasons = {"off": "train.encoder is off", "mlp": "train.encoder is mlp: it has no projections"}
+    reasons = {"off": "train.encoder is off", "mlp": "train.encoder is mlp: it has no attention weights"}
     unable = f"no encoder is trained ({why})" if kind == "none" else reasons.get(config.train.encoder, "")
     left_out = {} if basis is None or not unable else {"basis": unable}
     if unable or not keep:
@@ -56,12 +56,12 @@ def left_out_knowledge(config: Any, kind: str, why: str, basis: Path | None, kee
     return left_out
 
 
-def left_out_projection(kind: str, model: TeacherModel | None) -> dict[str, str]:
-    """Why there is no projection, if there is none."""
+def left_out_channels(kind: str, model: TeacherModel | None) -> dict[str, str]:
+    """Why a scene keeps its teacher's channels, if it does."""
     if model is None:
-        return {"projection": f"teacher.kind is {kind}: no teacher's channels to reduce"}
+        return {"channels": f"teacher.kind is {kind}: no teacher's channels to reduce"}
     if model.output != "features":
-        return {"projection": f"{model.name} is a closed-set teacher: its classes have codes of few channels"}
+        return {"channels": f"{model.name} is a closed-set teacher: its classes have codes of few channels"}
     return {}
 
 

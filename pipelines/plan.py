@@ -17,8 +17,8 @@ from chebsplat.pipelines import folders, store
 from chebsplat.pipelines.code import Code, installed
 from chebsplat.pipelines.keys import PLACES, step_key
 from chebsplat.pipelines.needs import (
+    left_out_channels,
     left_out_knowledge,
-    left_out_projection,
     left_out_stages,
     source_sentence,
     teacher_kind,
@@ -164,10 +164,10 @@ class Planner:
         teacher = config.teacher.model_copy(update={"kind": kind})
         if kind == "onnx" and teacher.model is None:
             teacher = teacher.model_copy(update={"model": str(EMBEDDED)})
-        projection = config.projection.model_copy(update={"model": teacher.model})
-        config = config.model_copy(update={"source": source, "teacher": teacher, "projection": projection})
+        channels = config.channels.model_copy(update={"model": teacher.model})
+        config = config.model_copy(update={"source": source, "teacher": teacher, "channels": channels})
         model = read_teacher(Path(teacher.model)) if kind == "onnx" and teacher.model else None
-        left_out = left_out_stages(config, kind, why, probe) | left_out_projection(kind, model)
+        left_out = left_out_stages(config, kind, why, probe) | left_out_channels(kind, model)
         left_out |= left_out_knowledge(config, kind, why, basis, keep_knowledge)
         steps: dict[str, Step] = {}
         used = {"teacher": text_packages(model, teacher.labels)}

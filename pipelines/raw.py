@@ -29,8 +29,8 @@ def raw_files(stage: str, sections: dict[str, Any]) -> tuple[Path | None, list[P
         if not folder.is_dir():
             raise InputError(f"{folder} is not a folder; correct source.path")
         return folder, import_module(f"chebsplat.stages.sources.{sections['source']['kind']}").files(folder)
-    if stage == "projection" and sections["projection"]["model"]:
-        return None, _of_projection(sections["projection"])
+    if stage == "channels" and sections["channels"]["model"]:
+        return None, _of_channels(sections["channels"])
     if stage == "teacher" and sections["teacher"]["model"]:
         return None, _of_teacher(sections["teacher"])
     if stage == "evaluate" and sections["evaluate"]["lpips_weights"]:
@@ -46,10 +46,10 @@ def _of_teacher(settings: dict[str, Any]) -> list[Path]:
     return [*read_teacher(Path(settings["model"])).files(), *labels]
 
 
-def _of_projection(settings: dict[str, Any]) -> list[Path]:
+def _of_channels(settings: dict[str, Any]) -> list[Path]:
     """The model's files, and the reference images; none of a scene's."""
     from chebsplat.formats.teacher_model import read_teacher
-    from chebsplat.stages.projection import reference_files
+    from chebsplat.stages.channels import reference_files
 
     images = reference_files(Path(settings["reference"])) if settings["reference"] else []
     return [*read_teacher(Path(settings["model"])).files(), *images]

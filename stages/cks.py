@@ -24,7 +24,7 @@ def run(job: Job) -> None:
     encoder = restored_encoder(job.inputs["gaussians"], checkpoint)
     attention = encoder.attention_weights()
     if not attention:
-        raise DataFailure("the encoder has no projections (train.encoder = mlp); there is no knowledge to carry")
+        raise DataFailure("the encoder has no attention weights (train.encoder = mlp); there is no knowledge to carry")
     if old.bases and set(old.bases) != set(attention):
         raise DataFailure("the basis belongs to an encoder of another depth; start another sequence")
     bases: dict[str, Any] = {}

@@ -34,7 +34,7 @@ class Config(Section):
     source: parts.SourceSection = parts.SourceSection()
     ingest: parts.IngestSection = parts.IngestSection()
     sfm: parts.SfmSection = parts.SfmSection()
-    projection: parts.ProjectionSection = parts.ProjectionSection()
+    channels: parts.ChannelsSection = parts.ChannelsSection()
     teacher: parts.TeacherSection = parts.TeacherSection()
     describe: DescribeSection = DescribeSection()
     train: TrainSection = TrainSection()
@@ -90,6 +90,8 @@ def _advice(error: Any, first: list[str]) -> str:
     loc = [str(part) for part in error["loc"]]
     if len(loc) == 1:
         near = difflib.get_close_matches(loc[0][:60], first, 1)
+        if not near and isinstance(error["input"], dict):  # a section of another name, perhaps an earlier one
+            near = [key for wanted in error["input"] for key in known_keys() if key.endswith(f".{wanted}")]
     else:
         elsewhere = [key for key in known_keys() if key.endswith("." + loc[-1])]
         own = [key.split(".")[1] for key in known_keys() if key.startswith(loc[0] + ".")]

@@ -155,7 +155,7 @@ def evaluated_views(
         if teacher.label_names != scene.label_names or own is None or teacher.label_embeddings.shape != own.shape:
             raise InputError(f"{job.inputs['features']} has other labels than the scene; export the scene again")
         teachers = MapsByName(teacher.names, teacher.features, "features of a teacher")
-        if teacher.pseudo_labels is not None:  # its own, before any projection
+        if teacher.pseudo_labels is not None:  # of its own channels
             pseudo_labels = MapsByName(teacher.names, teacher.pseudo_labels, "labels of a teacher")
     for name, _ in job.progress.track(list(cameras), len(cameras), "evaluate"):
         image, features = renderer.render(cameras[name], with_features=scene.labels is not None)

@@ -12,7 +12,7 @@ from chebsplat.errors import ConfigError, InputError
 if TYPE_CHECKING:
     import numpy as np
 
-    from chebsplat.formats.projection import Projection
+    from chebsplat.formats.channels import ChannelMap
     from chebsplat.formats.teacher_model import TeacherModel
 
 MAX_CHANNELS = 64  # that can be rendered
@@ -44,13 +44,13 @@ def label_set(teacher: TeacherModel, file: str | None, class_names: list[str] | 
 
 
 def open_vocabulary(
-    teacher: TeacherModel, labels: dict[str, list[str]], n_channels: int, projection: Projection | None
+    teacher: TeacherModel, labels: dict[str, list[str]], n_channels: int, channels: ChannelMap | None
 ) -> LabelSpace:
     """The space of an encoder of `n_channels` features.
 
-    Raises: InputError where embeddings or the projection have other channels.
+    Raises: InputError where embeddings or the channel map have other channels.
     Choices: a label's vector is the mean of the unit embeddings of its words, made unit again. Labels and confidence
-      are told before projection: they are the teacher's own.
+      are those of the teacher's own channels.
     """
     import numpy as np
 
@@ -66,17 +66,17 @@ def open_vocabulary(
             f"{teacher.path} gives {n_channels} channels, its text embeddings have {own.shape[1]} "
             f"({teacher.labels or teacher.text}); correct `labels` or `text` in {teacher.settings}"
         )
-    if projection is not None and len(projection.matrix) != n_channels:
+    if channels is not None and len(channels.matrix) != n_channels:
         raise InputError(
-            f"the projection is of {len(projection.matrix)} channels ({projection.teacher}), {teacher.path} has "
-            f"{n_channels}; pass the projection of this teacher"
+            f"the channel map is of {len(channels.matrix)} channels ({channels.teacher}), {teacher.path} has "
+            f"{n_channels}; pass the one of this teacher"
         )
 
     def split(found: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        kept = found if projection is None else projection.apply(found)
+        kept = found if channels is None else channels.apply(found)
         return kept, *decode(found, own)
 
-    return LabelSpace(list(labels), own if projection is None else projection.embed(own), split)
+    return LabelSpace(list(labels), own if channels is None else channels.embed(own), split)
 
 
 def closed_set(teacher: TeacherModel, labels: dict[str, list[str]] | None, n_channels: int, n_codes: int) -> LabelSpace:

@@ -31,7 +31,7 @@ PAGE = """<!doctype html>
 <table><thead><tr><th>stage</th><th class="n">seconds</th><th>device</th><th class="n">threads</th><th>artifact</th></tr></thead><tbody>
 {% for stage, seconds, key, device, threads in stages %}<tr><td class="stay"><i style="display: inline-block; width: .8em; height: .8em; background: hsl({{ loop.index0 * 40 }} 55% 60%)"></i> {{ stage }}</td><td class="n" data-label="seconds">{{ "%.1f"|format(seconds) }}</td><td data-label="device">{{ device }}</td><td class="n" data-label="threads">{{ threads }}</td><td data-label="artifact"><code>{{ key }}</code></td></tr>
 {% endfor %}<tr><td><b>total</b></td><td class="n" data-label="seconds"><b>{{ "%.1f"|format(total) }}</b></td></tr></tbody></table>
-<p class="soft">The total is of all stages before this page{% if "projection" in stages|map("first") %}; the projection is computed once for all scenes of one teacher{% endif %}.</p>
+<p class="soft">The total is of all stages before this page{% if "channels" in stages|map("first") %}; the channels are computed once for all scenes of one teacher{% endif %}.</p>
 <p class="soft">{% if code %}Commit {{ code.commit[:10] }}{{ " with changes" if code.dirty }}. {% endif %}{% for package, version in versions %}{{ package }} {{ version }}{{ ", " if not loop.last else "." }}{% endfor %}</p>
 <details><summary>Every setting</summary><pre>{{ settings }}</pre></details></div>
 </main>{% include "script" %}</body></html>

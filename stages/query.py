@@ -92,8 +92,8 @@ def embedded(words: list[str], features: Features, model: str | None) -> np.ndar
     if sha256_file(teacher.path) != features.convention["sha256"]:
         raise InputError(f"{teacher.path} is not the model that this scene was trained from; run the scene again")
     vectors = text_embeddings(words, teacher)
-    if features.projection is not None:
-        vectors = features.projection.embed(vectors)
+    if features.channels is not None:
+        vectors = features.channels.embed(vectors)
         kept = float(np.linalg.norm(vectors[0]))
         log.info("%.0f %% of the query's length lies in the scene's channels", 100 * kept)
     return vectors

@@ -17,7 +17,7 @@ LARGEST = 20_000_000  # bytes of the page
 STAGE_OF = {
     "capture": "ingest",
     "points": "sfm",
-    "projection": "projection",
+    "channels": "channels",
     "features": "teacher",
     "descriptors": "describe",
     "gaussians": "train",

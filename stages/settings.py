@@ -78,7 +78,7 @@ class TeacherSection(Section):
     seed: int = seed("of the noisy labels")
 
 
-class ProjectionSection(Section):
+class ChannelsSection(Section):
     """What a teacher's channels are reduced to, for all scenes alike.
 
     Choices: at most 32 channels. The embedded teacher's features span fewer (the artifact's facts say how many) and
@@ -90,10 +90,8 @@ class ProjectionSection(Section):
 
     n_channels: int = number(32, "at most; fewer where the teacher's features span fewer", 2, MAX_CHANNELS)
     model: Text | None = setting(None, ".onnx; a run puts teacher.model here; default: the embedded teacher")
-    reference: Text | None = setting(
-        None, "folder of images that the projection is fitted to; default: generated rooms"
-    )
-    n_rooms: int = number(8, "generated rooms that the projection is fitted to", 1, 100)
+    reference: Text | None = setting(None, "folder of images that the channels are fitted to; default: generated rooms")
+    n_rooms: int = number(8, "generated rooms that the channels are fitted to", 1, 100)
 
 
 class ExportSection(Section):
@@ -108,7 +106,7 @@ class OnnxSection(Section):
 class CksSection(Section):
     energy: float = number(0.96, "share of the energy that the basis grows to hold", 1e-3, 1)
     tolerance: float = number(0.2, "relative residual below which a scene adds nothing (ε)", 1e-6, 10)
-    max_rank: float = number(0.5, "columns, at most, as a fraction of the projection's width", 1e-3, 0.999)
+    max_rank: float = number(0.5, "columns, at most, as a fraction of the rows of an attention weight", 1e-3, 0.999)
     energy_rule: Literal["total", "residual"] = setting(
         "total", "of all a scene holds, or (the printed rule) of what the basis misses"
     )

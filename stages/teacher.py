@@ -40,8 +40,8 @@ def from_encoder(job: Job, capture: Capture, settings: TeacherSection) -> None:
     """
     from pathlib import Path
 
+    from chebsplat.formats.channels import read_channels
     from chebsplat.formats.features import FeatureWriter
-    from chebsplat.formats.projection import read_projection
     from chebsplat.formats.teacher_model import read_teacher
     from chebsplat.stages.command import n_threads
     from chebsplat.stages.image_encoder import ImageEncoder
@@ -51,26 +51,26 @@ def from_encoder(job: Job, capture: Capture, settings: TeacherSection) -> None:
     teacher = read_teacher(Path(settings.model) if settings.model else EMBEDDED)
     encoder = ImageEncoder(teacher, n_threads())
     grid, n_channels = encoder.grid(capture.images[0], settings.downscale)
-    projection = None
+    channels = None
     if teacher.output == "logits":
         labels = label_set(teacher, settings.labels, None) if settings.labels else None
         space = closed_set(teacher, labels, n_channels, settings.n_channels)
     else:
-        if "projection" in job.inputs:
-            projection = read_projection(job.inputs["projection"])
+        if "channels" in job.inputs:
+            channels = read_channels(job.inputs["channels"])
         elif n_channels > MAX_CHANNELS:
             raise ConfigError(
                 f"{teacher.path} has {n_channels} channels, at most {MAX_CHANNELS} can be rendered; use "
-                "`chebsplat run`, or make its projection with `chebsplat projection` and pass --in-projection"
+                "`chebsplat run`, or reduce them with `chebsplat channels` and pass --in-channels"
             )
         labels = label_set(teacher, settings.labels, capture.class_names)
-        space = open_vocabulary(teacher, labels, n_channels, projection)
+        space = open_vocabulary(teacher, labels, n_channels, channels)
     convention = {
         "kind": "onnx",
         "teacher": teacher.name,
         "sha256": sha256_file(teacher.path),
         "output": teacher.output,
-        "normalized": True,  # before projection
+        "normalized": True,  # before `channels`
         "n_scales": len(settings.scales),
         "scales": list(settings.scales),
         "flips": settings.flips,
@@ -78,7 +78,7 @@ def from_encoder(job: Job, capture: Capture, settings: TeacherSection) -> None:
     }
     made_with = {
         "capture": read_manifest(job.inputs["capture"]).key,
-        "projection": read_manifest(job.inputs["projection"]).key if projection else None,
+        "channels": read_manifest(job.inputs["channels"]).key if channels else None,
         "teacher": [sha256_file(path) for path in teacher.files()],
         "labels": labels,
         "convention": convention,
@@ -92,7 +92,7 @@ def from_encoder(job: Job, capture: Capture, settings: TeacherSection) -> None:
         name = capture.names[view]
         found = encoder.encode(capture.images[view], grid, settings.scales, settings.flips, name)
         writer.add(view, *space.split(found))
-    writer.finish(job.out, space.names, space.embeddings, convention, projection)
+    writer.finish(job.out, space.names, space.embeddings, convention, channels)
     job.facts |= {"kind": "onnx", "n_labels": len(space.names), "convention": convention}
 
 

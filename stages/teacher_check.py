@@ -45,7 +45,7 @@ def check(model: Path, photo: Path | None = None, labels: str | None = None) -> 
     wide = teacher.output == "features" and n_channels > MAX_CHANNELS
     return [
         ("name", f"{teacher.name} ({model}, {model.stat().st_size / 2**20:.1f} MB)"),
-        ("output", f"{teacher.output}, {n_channels} channels" + (", projected to fewer in a scene" if wide else "")),
+        ("output", f"{teacher.output}, {n_channels} channels" + (", reduced to fewer in a scene" if wide else "")),
         ("image", f"{name}, {image.shape[1]} x {image.shape[0]}, seen at {size[1]} x {size[0]}"),
         (
             "windows",
@@ -68,7 +68,7 @@ def n_windows(size: tuple[int, int], window: tuple[int, int]) -> int:
 def shown(photo: Path | None) -> tuple[str, np.ndarray]:
     """(name, image u8 [H, W, 3])."""
     from chebsplat.formats.images import read_rgb
-    from chebsplat.stages.projection import generated
+    from chebsplat.stages.channels import generated
     from chebsplat.synthetic.seeds import REFERENCE
 
     if photo is None:

@@ -73,8 +73,8 @@ def _twice(x: Tensor) -> Tensor:
 class Encoder(nn.Module):
     """The trunk and the linear map [C, RANK] with orthonormal columns: unit vectors [B, C, H/2, W/2].
 
-    Choices: vectors are of unit length inside the graph, so all pixels weigh the same in averages and projections;
-      the map is fixed (`span`), so the features' rank is RANK and a projection to as many channels is exact.
+    Choices: vectors are of unit length inside the graph, so all pixels weigh the same in averages and in `channels`;
+      the map is fixed (`span`), so the features' rank is RANK and a map to as many channels is exact.
     """
 
     basis: Tensor

@@ -25,7 +25,7 @@ def toy(tmp_path_factory):
     """Paths of toy artifacts by stage."""
     root = tmp_path_factory.mktemp("toy")
     model, reference = color_teacher(root), color_reference(root / "reference")
-    config = TOY | {"projection": {"model": str(model), "reference": str(reference)}}
+    config = TOY | {"channels": {"model": str(model), "reference": str(reference)}}
     made = {}
     for stage, roles in INPUTS.items():
         made[stage] = root / stage

@@ -22,7 +22,7 @@ TOY = {
 INPUTS = {
     "ingest": {},
     "sfm": {"capture": "ingest"},
-    "projection": {},
+    "channels": {},
     "teacher": {"capture": "ingest"},
     "describe": {"points": "sfm"},
     "train": {"capture": "ingest", "points": "sfm", "features": "teacher", "descriptors": "describe"},

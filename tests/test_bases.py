@@ -69,7 +69,7 @@ def test_log_says_which_scene_added_how_much_and_draws_it(chain, tmp_path):
     assert [line.split()[:2] for line in lines[1:]] == [[str(k), scene] for k, scene in enumerate(SCENES, start=1)]
     with (tmp_path / "log/lineage.csv").open() as handle:
         rows = list(csv.DictReader(handle))
-    assert [(row["scene"], row["projection"], row["rank_after"]) for row in rows[::2]] == [
+    assert [(row["scene"], row["weight"], row["rank_after"]) for row in rows[::2]] == [
         ("office0", NAMES[0], "2"), ("room0", NAMES[0], "4"), ("office1", NAMES[0], "6")
     ]  # fmt: skip
     assert all(float(row["rho_after"]) < 0.02 < float(row["rho"]) for row in rows)

@@ -32,7 +32,7 @@ def test_the_code_of_a_stage_is_the_same_in_a_checkout_and_in_a_wheel(wheel):
     with (wheel["teachers"] / "__init__.py").open("a") as file:
         file.write("ANOTHER = 1\n")
     edited = Code(wheel, installation.memo)
-    assert {s for s in STAGES if edited.stage(s) != checkout.stage(s)} == {"teacher", "projection"}
+    assert {s for s in STAGES if edited.stage(s) != checkout.stage(s)} == {"teacher", "channels"}
 
 
 @pytest.fixture
@@ -70,7 +70,7 @@ def test_words_that_a_teacher_s_own_table_knows_need_no_text_encoder(extras, tmp
     assert keys("toy", known) == before
     with_text = keys("toy", unknown)
     changed = [stage for stage in with_text if with_text[stage] != asking[stage]]
-    assert changed[0] == "teacher" and {"ingest", "sfm", "projection", "describe"}.isdisjoint(changed)
+    assert changed[0] == "teacher" and {"ingest", "sfm", "channels", "describe"}.isdisjoint(changed)
     extras("2.0")
     assert keys("toy", unknown)["teacher"] != with_text["teacher"]
 
@@ -86,4 +86,4 @@ def test_a_teacher_with_a_text_encoder_of_its_own_holds_the_version_of_what_runs
     extras()
     after = keys("toy", f"teacher.kind=onnx,teacher.model={model}")
     assert len({found["teacher"] for found in (without, before, after)}) == 3
-    assert before["projection"] == after["projection"]
+    assert before["channels"] == after["channels"]

@@ -14,6 +14,7 @@ from chebsplat.stages.registry import STAGES
     [
         ({"train": {"stpes": 5}}, "train.stpes: no such key; did you mean train.steps?"),
         ({"trian": {}}, "trian: no such key; did you mean train?"),
+        ({"projection": {"n_channels": 9}}, "projection: no such key; did you mean channels.n_channels?"),
         ({"train": {"n_angles": 5}}, "did you mean describe.n_angles?"),
         ({"train": {"steps": 0}}, "train.steps"),
         ({"train": {"encoder": "trnsformer"}}, "train.encoder"),

@@ -101,7 +101,7 @@ def test_processes_that_are_killed_lose_no_update_and_leave_no_half_revision(tmp
 
 
 def trained(path, key, seed):
-    """A checkpoint whose encoder is random and its projections of rank 1, so that many scenes have news."""
+    """A checkpoint whose encoder is random and its attention weights of rank 1, so that many scenes have news."""
     import torch
 
     from chebsplat.shape.encoder import RegionEncoder

@@ -15,11 +15,11 @@ from source_folders import SETTINGS, image
 from chebsplat.errors import InputError
 from chebsplat.formats import images
 from chebsplat.formats.images import header, opened, read_rgb, seen_size, turned
-from chebsplat.stages import projection, teacher_check
+from chebsplat.stages import channels, teacher_check
 from chebsplat.stages.sources import photos
 
 
-@pytest.mark.parametrize("how", ["ingest", "projection", "check-teacher"])
+@pytest.mark.parametrize("how", ["ingest", "channels", "check-teacher"])
 def test_an_image_that_is_a_program_is_never_run(tmp_path, monkeypatch, how):
     """Pillow hands an EPS to Ghostscript, whatever the file is called."""
     tool, ran = tmp_path / "bin/gs", tmp_path / "ran"
@@ -32,7 +32,7 @@ def test_an_image_that_is_a_program_is_never_run(tmp_path, monkeypatch, how):
     (folder / "b.png").write_bytes(EPS)
     read = {
         "ingest": lambda: photos.read(folder, SETTINGS),
-        "projection": lambda: list(projection.photos([folder / "b.png"])),
+        "channels": lambda: list(channels.photos([folder / "b.png"])),
         "check-teacher": lambda: teacher_check.shown(folder / "b.png"),
     }[how]
     with pytest.raises(InputError, match=r"b\.png is no PNG or JPEG"):

@@ -18,7 +18,7 @@ from chebsplat.pipelines.run import failures
 from chebsplat.pipelines.scenes import CONFIGS, names, read_toml
 from chebsplat.stages.registry import STAGES
 
-ALL = [stage for stage in STAGES if stage not in ("projection", "cks")]  # of a scene: a projection is its teacher's
+ALL = [stage for stage in STAGES if stage not in ("channels", "cks")]  # of a scene: channels are its teacher's
 AFTER_TRAIN = ["train", "export", "onnx", "evaluate", "report"]
 
 
@@ -184,7 +184,7 @@ def test_paths_are_those_of_the_user_s_folder_not_of_the_stage_s(tmp_path, monke
         (tmp_path / name).write_text('labels = "table.npz"  # another')
         again = Planner().plan("toy", settings)
         changed = [a.stage for a, b in zip(plan.steps, again.steps, strict=True) if a.key != b.key]
-        assert changed == [*(["projection"] if name != "names.txt" else []), "teacher", *AFTER_TRAIN]
+        assert changed == [*(["channels"] if name != "names.txt" else []), "teacher", *AFTER_TRAIN]
         plan = again
 
 
@@ -247,17 +247,17 @@ def test_generated_and_replica_scenes_never_share_a_key(tmp_path, monkeypatch):
     assert "replica" in real.source
     keys = {s.key for s in generated.steps}
     shared = {s.stage for s in real.steps if s.key in keys}
-    assert shared == {"projection"}  # the teacher's, not the scene's
+    assert shared == {"channels"}  # the teacher's, not the scene's
 
 
 @pytest.mark.parametrize(
     ("settings", "left_out"),
     [
-        ("", {"projection", "cks"}),
-        ("train.semantics=false", {"projection", "teacher", "describe", "onnx", "cks"}),
-        ("teacher.kind=none", {"projection", "teacher", "describe", "onnx", "cks"}),
-        ("train.encoder=off", {"projection", "describe", "onnx", "cks"}),
-        ("train.albo=false", {"projection", "describe", "cks"}),
+        ("", {"channels", "cks"}),
+        ("train.semantics=false", {"channels", "teacher", "describe", "onnx", "cks"}),
+        ("teacher.kind=none", {"channels", "teacher", "describe", "onnx", "cks"}),
+        ("train.encoder=off", {"channels", "describe", "onnx", "cks"}),
+        ("train.albo=false", {"channels", "describe", "cks"}),
     ],
 )
 def test_a_scene_leaves_out_what_it_does_not_need_and_says_why(settings, left_out):

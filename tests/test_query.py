@@ -13,9 +13,9 @@ from chebsplat.formats import artifact
 from chebsplat.formats.artifact import sha256_file
 from chebsplat.formats.cameras import Cameras
 from chebsplat.formats.capture import Capture, write_capture
+from chebsplat.formats.channels import ChannelMap
 from chebsplat.formats.features import Features, write_features
 from chebsplat.formats.manifest import Manifest
-from chebsplat.formats.projection import Projection
 from chebsplat.formats.scene import Scene, write_scene
 from chebsplat.labels.relevancy import relevancy
 from chebsplat.pipelines.cli import main
@@ -53,8 +53,8 @@ def write_toy(folder, teacher=None):
     means = np.concatenate([rng.normal([x, 0, 4], 0.15, (N, 3)) for x in (-1.2, 0, 1.2)]).astype(np.float32)
     labels = np.repeat(np.arange(3), N).astype(np.int32)
     matrix = np.eye(6, 4, dtype=np.float32)
-    projection = Projection(matrix, matrix.T.copy(), np.ones(6, np.float32), "toy", {})
-    known = vectors(LABELS) if teacher is None else projection.embed(vectors(LABELS))
+    channels = ChannelMap(matrix, matrix.T.copy(), np.ones(6, np.float32), "toy", {})
+    known = vectors(LABELS) if teacher is None else channels.embed(vectors(LABELS))
     n = len(means)
     parameters = {
         "means": means, "log_scales": np.full((n, 3), -1.6, np.float32), "quats": np.eye(4, dtype=np.float32)[[0] * n],
@@ -72,7 +72,7 @@ def write_toy(folder, teacher=None):
         convention, model = {"kind": "onnx", "output": "features", "sha256": sha256_file(teacher)}, str(teacher)
     features = Features(
         views, np.zeros((2, 2, 2, known.shape[1]), np.float16), LABELS, known, convention=convention,
-        projection=None if teacher is None else projection,
+        channels=None if teacher is None else channels,
     )  # fmt: skip
     published(folder / "teacher", "features/1", write_features, features, config={"teacher": {"model": model}})
 
@@ -138,7 +138,7 @@ def test_the_table_tells_the_labels_that_fit_best(folder):
     assert rows == ["sofa", "chair"]
 
 
-def test_a_projection_that_holds_the_features_leaves_relevancy_as_it_is(folder):
+def test_a_channel_map_that_holds_the_features_leaves_relevancy_as_it_is(folder):
     asked("words", "seat")
     own = relevancy(vectors(LABELS).repeat(N, 0), vectors(["seat"])[0], vectors(CANONICAL))
     assert np.allclose(held_in(folder / "words/query/seat")["relevancy"], own, atol=2e-3)

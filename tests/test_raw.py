@@ -113,15 +113,15 @@ def test_photos_changed_in_the_middle_of_reading_are_not_published(photos, chang
 
 
 @pytest.mark.parametrize("when", ["before", "while"])
-@pytest.mark.parametrize("stage", ["projection", "teacher"])
+@pytest.mark.parametrize("stage", ["channels", "teacher"])
 def test_a_teacher_that_is_exported_anew_meanwhile_is_noticed(tmp_path, stage, when, capfd, monkeypatch):
     model = color_teacher(tmp_path)
     color_reference(tmp_path / "reference")
     (tmp_path / "colours.txt").write_text("red\ngreen\nblue\n")
-    settings = f"teacher.kind=onnx,teacher.model={model},projection.reference={tmp_path / 'reference'}"
+    settings = f"teacher.kind=onnx,teacher.model={model},channels.reference={tmp_path / 'reference'}"
     settings += f",teacher.labels={tmp_path / 'colours.txt'}"
     step, plan = planned(stage, "toy", settings)
-    for of in ("ingest", "projection") if stage == "teacher" else ():
+    for of in ("ingest", "channels") if stage == "teacher" else ():
         earlier, its_plan = planned(of, "toy", settings)
         assert job.run(its_plan, earlier.key) == 0
     swap = SimpleNamespace(done=False)

@@ -113,8 +113,8 @@ def test_error_pictures_show_where_it_is_wrong_and_nowhere_else():
     assert wrong[..., 3].tolist() == [[0, 255], [0, 0]]
 
 
-def test_the_total_counts_every_stage_with_the_projection_and_no_size_exceeds_plain_3dgs(toy, tmp_path):
-    inputs = {role: toy[of] for role, of in INPUTS["report"].items()} | {"projection": toy["projection"]}
+def test_the_total_counts_every_stage_with_the_channels_and_no_size_exceeds_plain_3dgs(toy, tmp_path):
+    inputs = {role: toy[of] for role, of in INPUTS["report"].items()} | {"channels": toy["channels"]}
     assert run_stage("report", tmp_path / "report", inputs) == 0
     text = (tmp_path / "report/report.html").read_text()
     seconds = [read_manifest(path).seconds for path in inputs.values()]

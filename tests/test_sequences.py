@@ -134,7 +134,7 @@ def test_a_sequence_file_holds_scenes_and_nothing_else(tmp_path, text):
 
 def test_a_sequence_of_scenes_without_encoder_carries_nothing(sequence):
     for plan in chain(Planner(), sequence("toy", "office0"), ablation="no-tle"):
-        assert plan.left_out["cks"] == "train.encoder is mlp: it has no projections"
+        assert plan.left_out["cks"] == "train.encoder is mlp: it has no attention weights"
         assert all("basis" not in step.inputs for step in plan.steps)
 
 

@@ -113,7 +113,7 @@ def teacher_of_nothing(toy, tmp):
     from tiny_teachers import color_reference, color_teacher
 
     model = color_teacher(tmp, weights=np.zeros((3, 3)))
-    return {}, {"projection": {"model": str(model), "reference": str(color_reference(tmp / "reference"))}}
+    return {}, {"channels": {"model": str(model), "reference": str(color_reference(tmp / "reference"))}}
 
 
 def without_labels(toy, tmp):
@@ -147,7 +147,7 @@ def strict_tolerance(toy, tmp):
     return inputs_of(toy, "onnx"), changed(onnx={"tolerance": 1e-12})
 
 
-def encoder_without_projections(toy, tmp):
+def encoder_without_attention(toy, tmp):
     inputs = {role: toy[of] for role, of in INPUTS["train"].items()}
     config = changed(train={"encoder": "mlp", "steps": 8})
     assert run_stage("train", tmp / "mlp", inputs, config) == 0
@@ -171,13 +171,13 @@ def without_trace(toy, tmp):
 FAILURES = {
     "ingest": one_photo,
     "sfm": without_depth,
-    "projection": teacher_of_nothing,
+    "channels": teacher_of_nothing,
     "teacher": without_labels,
     "describe": without_points,
     "train": only_test_views,
     "export": without_gaussians,
     "onnx": strict_tolerance,
-    "cks": encoder_without_projections,
+    "cks": encoder_without_attention,
     "evaluate": no_test_view,
     "report": without_trace,
 }

@@ -18,9 +18,9 @@ from tiny_teachers import COLORS, color_teacher, write_model, write_settings, wr
 from chebsplat.errors import InputError
 from chebsplat.formats import artifact
 from chebsplat.formats.capture import Capture, write_capture
+from chebsplat.formats.channels import ChannelMap, write_channels
 from chebsplat.formats.features import read_features
 from chebsplat.formats.manifest import Manifest
-from chebsplat.formats.projection import Projection, write_projection
 from chebsplat.formats.teacher_model import read_label_set, read_teacher
 from chebsplat.stages.image_encoder import ImageEncoder
 
@@ -133,19 +133,19 @@ def test_scales_keep_the_aspect_ratio_and_count_the_same(tmp_path, capture):
     assert np.allclose(both, mean / np.linalg.norm(mean, axis=-1, keepdims=True), atol=1e-6)
 
 
-def test_a_projection_is_applied_to_every_view_and_the_labels_are_the_teacher_s(tmp_path, capture):
+def test_channels_are_reduced_in_every_view_and_the_labels_are_the_teacher_s(tmp_path, capture):
     rng = np.random.default_rng(0)
     wide = np.linalg.qr(rng.normal(size=(100, 3)))[0]  # 100 channels of rank 3
     color_teacher(tmp_path, weights=wide)
     write_table(tmp_path / "tiny.npz", embeddings=np.array(list(COLORS.values())) @ wide.T)
     matrix = np.linalg.qr(np.concatenate([wide, rng.normal(size=(100, 5))], 1))[0].astype(np.float32)
-    record = Projection(matrix, matrix.T.copy(), np.ones(100, np.float32), "tiny", {})
-    with artifact.publish(tmp_path / "projection", Manifest("chebsplat.projection/1", KEY, "projection")) as tmp:
-        write_projection(tmp, record)
-    code, found = encoded(tmp_path, capture, tmp_path / "tiny.onnx", {"projection": tmp_path / "projection"})
+    record = ChannelMap(matrix, matrix.T.copy(), np.ones(100, np.float32), "tiny", {})
+    with artifact.publish(tmp_path / "channels", Manifest("chebsplat.channels/1", KEY, "channels")) as tmp:
+        write_channels(tmp, record)
+    code, found = encoded(tmp_path, capture, tmp_path / "tiny.onnx", {"channels": tmp_path / "channels"})
     assert code == 0
     assert found.features.shape[3] == 8
-    assert found.projection is not None
+    assert found.channels is not None
     plain = tmp_path / "plain"
     plain.mkdir()
     _, own = encoded(plain, capture, color_teacher(plain))

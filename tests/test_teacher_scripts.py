@@ -112,8 +112,8 @@ def stand_ins(monkeypatch, tmp_path):
 
 
 EXPECTED = {
-    "lseg": ("features, 512 channels, projected", "seen at 520 x 390", "2 of 480 x 480"),
-    "dinotxt": ("features, 96 channels, projected", "seen at 690 x 518", "2 of 518 x 518"),
+    "lseg": ("features, 512 channels, reduced", "seen at 520 x 390", "2 of 480 x 480"),
+    "dinotxt": ("features, 96 channels, reduced", "seen at 690 x 518", "2 of 518 x 518"),
     "segformer": ("logits, 3 channels", "seen at 683 x 512", "2 of 512 x 512"),
 }
 

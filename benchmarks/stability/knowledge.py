@@ -1,4 +1,4 @@
-"""Projections that break the printed knowledge space (Eqs 14-15; docs/method.md, section 7).
+"""Weights that break the printed knowledge space (Eqs 14-15; docs/method.md, section 7).
 
 Errors of `update` are those of orthonormality, max |BᵀB − I|; a ρ outside [0, 1] or not finite is one, too.
 """
@@ -28,7 +28,7 @@ def weights(q: int = Q, p: int = Q, rank: int | None = None, seed: int = 0) -> T
 
 
 def printed(basis: Tensor | None, W: Tensor, energy: float = 0.96) -> Tensor:
-    """Eq 15 as it stands, in float32: one projection, energy of the residual alone, columns appended as they come."""
+    """Eq 15 as it stands, in float32: one weight, energy of the residual alone, columns appended as they come."""
     W = W.float()
     residual = W if basis is None else W - basis @ (basis.T @ W)
     vectors, values, _ = torch.linalg.svd(residual, full_matrices=False)

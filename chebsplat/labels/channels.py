@@ -1,4 +1,4 @@
-"""The projection from a teacher's channels to the few that scenes are trained in (docs/method.md, section 8)."""
+"""The linear map from a teacher's channels to the few that scenes are trained in (docs/method.md, section 8)."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ class Moments:
         self.count += len(rows)
 
 
-def projection(
+def channel_map(
     moments: Moments, vocabulary: np.ndarray, n_channels: int, weight: float = 1.0
 ) -> tuple[np.ndarray, np.ndarray]:
     """The directions to keep, by the features' energy and by what tells the vocabulary's words apart.
@@ -71,7 +71,7 @@ def projection(
 
 
 def agreement(features: np.ndarray, words: np.ndarray, matrix: np.ndarray) -> float:
-    """Share of features [N, C] whose word of the largest inner product, of [L, C], is the same after projection."""
+    """Share of features [N, C] whose word of the largest inner product, of [L, C], is the same in the few."""
     kept, few = words @ matrix, features @ matrix
     same = [
         (features[start : start + ROWS] @ words.T).argmax(1) == (few[start : start + ROWS] @ kept.T).argmax(1)

@@ -12,7 +12,7 @@ BLOCK = 4_000_000  # cosines that are held at once
 def decode(features: np.ndarray, embeddings: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Label of the largest cosine, and its confidence.
 
-    Args: features [..., C] of any length; embeddings [L, C] unit, or what a projection keeps of them.
+    Args: features [..., C] of any length; embeddings [L, C] unit, or what `channels` keeps of them.
     Returns: labels i16 [...], confidence f32 [...]: softmax of cosines at temperature 0.1, its largest entry.
     """
     labels, confidence = (np.zeros(features.shape[:-1], kind) for kind in (np.int16, np.float32))

@@ -15,7 +15,7 @@ def relevancy(features: np.ndarray, query: np.ndarray, against: np.ndarray, temp
     Returns: f32 [...] in [0, 1]; above 0.5 where the query fits better than every one of the phrases.
     Raises:  ValueError on a shape that does not fit, or a temperature that is not positive.
     Choices: temperature 0.1, that of the labels' confidence, which the paper leaves to its code; features are made
-      unit, embeddings are taken as they are, so that a projection keeps the teacher's own inner products; a feature of
+      unit, embeddings are taken as they are, so that `channels` keeps the teacher's own inner products; a feature of
       length zero, of a place that no Gaussian covers, is relevant to nothing: 0.
     """
     n_channels = features.shape[-1]

@@ -1,4 +1,4 @@
-"""The core knowledge space: a basis of the encoder's projections, carried from scene to scene (Eqs 14-15)."""
+"""The core knowledge space: a basis of the encoder's attention weights, carried from scene to scene (Eqs 14-15)."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ def update(
 
     Args:
       basis:     [q, r] orthonormal to 1e-4, or None before the first scene.
-      W:         [q, p] projection of the new scene.
+      W:         [q, p] attention weight of the new scene.
       energy:    fraction of energy to reach: of captured + residual (`total`), or of the residual alone (the
                  printed rule, which always adds a vector).
       tolerance: κ below which the scene is no news and nothing is added (ε = 0.2).
@@ -139,7 +139,7 @@ def _rounded(columns: Tensor, given: Tensor) -> Tensor:
 class _Outside(torch.autograd.Function):
     """Share of each W's energy outside its basis, [n], and its gradient in closed form: 2 (W − B Bᵀ W) / ‖W‖².
 
-    A graph of a dozen small operations a projection takes twice as long; torch instead of NumPy, whose products of so
+    A graph of a dozen small operations a weight takes twice as long; torch instead of NumPy, whose products of so
     small matrices wake no threads, up to ten times.
     """
 
@@ -176,9 +176,9 @@ def regularizer(W: Tensor, basis: Tensor) -> Tensor:
     return basis_loss({"": W}, {"": basis})
 
 
-def basis_loss(projections: dict[str, Tensor], bases: dict[str, Tensor]) -> Tensor:
-    """Mean over projections of `regularizer`; 0 without bases (the first scene)."""
+def basis_loss(attention: dict[str, Tensor], bases: dict[str, Tensor]) -> Tensor:
+    """Mean over attention weights of `regularizer`; 0 without bases (the first scene)."""
     if not bases:
         return torch.tensor(0.0)
-    loss: Tensor = _Outside.apply(list(bases.values()), *(projections[name] for name in bases)).mean()
+    loss: Tensor = _Outside.apply(list(bases.values()), *(attention[name] for name in bases)).mean()
     return loss

@@ -35,7 +35,7 @@ def found(name: str) -> tuple[Path, Basis]:
 @click.argument("name")
 @click.option("--out", type=click.Path(path_type=Path), help="folder for lineage.csv and lineage.png")
 def log(name: str, out: Path | None) -> None:
-    """Revisions: the scene, ranks, ρ before and after, energy; means over projections."""
+    """Revisions: the scene, ranks, ρ before and after, energy; means over attention weights."""
     from chebsplat.formats import artifact
     from chebsplat.pipelines import lineage
 
@@ -56,7 +56,7 @@ def log(name: str, out: Path | None) -> None:
 @basis.command()
 @click.argument("name")
 def show(name: str) -> None:
-    """One revision: each projection, and which scene added which of its columns."""
+    """One revision: each attention weight, and which scene added which of its columns."""
     from chebsplat.pipelines import lineage
 
     path, one = found(name)

@@ -1,4 +1,4 @@
-"""Images that are no scene's: the projection's reference folder, and the photo that a teacher is checked with."""
+"""Images that are no scene's: the reference folder of `channels`, and the photo that a teacher is checked with."""
 
 from __future__ import annotations
 
@@ -25,17 +25,17 @@ def rows() -> Iterator[Row]:
     yield f"{PHOTO} is missing", "photos", remove(PHOTO)
 
 
-def _case(name: str, named: str, edit: Edit, projected: bool) -> Case:
+def _case(name: str, named: str, edit: Edit, reduced: bool) -> Case:
     def build(folder: Path) -> Asked:
         picture(PHOTO, (64, 48), form="JPEG")(folder)
         edit(folder)
-        if projected:
-            return stage("projection", folder, {"projection": {"reference": str(folder / "photos")}}, named)
+        if reduced:
+            return stage("channels", folder, {"channels": {"reference": str(folder / "photos")}}, named)
         return Asked(["check-teacher", EMBEDDED, "--photo", folder / PHOTO], named)
 
-    return Case(KIND, f"{name}, in {'projection' if projected else 'check-teacher'}", build)
+    return Case(KIND, f"{name}, in {'channels' if reduced else 'check-teacher'}", build)
 
 
 def cases() -> Iterator[Case]:
-    yield from (_case(*row, projected=False) for row in rows())
-    yield from (_case(*row, projected=True) for row in rows())
+    yield from (_case(*row, reduced=False) for row in rows())
+    yield from (_case(*row, reduced=True) for row in rows())

@@ -1,4 +1,4 @@
-"""projection: from a teacher's channels to the fewer that scenes are trained in, one for all scenes.
+"""channels: from a teacher's channels to the fewer that scenes are trained in, one for all scenes.
 
 See docs/method.md, section 8.
 
@@ -20,7 +20,7 @@ if TYPE_CHECKING:
     import numpy as np
 
     from chebsplat.formats.teacher_model import TeacherModel
-    from chebsplat.stages.settings import ProjectionSection
+    from chebsplat.stages.settings import ChannelsSection
 
 ENTRY = 4  # pixels of an image that an entry of its map is wide, at least
 VIEWS = 4  # of a generated room
@@ -30,21 +30,21 @@ CHECKED = 20_000  # pixels whose labels before and after are compared
 def run(job: Job) -> None:
     import numpy as np
 
-    from chebsplat.formats.projection import Projection, write_projection
+    from chebsplat.formats.channels import ChannelMap, write_channels
     from chebsplat.formats.teacher_model import read_teacher
     from chebsplat.labels import channels as maths
     from chebsplat.stages.image_encoder import ImageEncoder
     from chebsplat.teachers import EMBEDDED
 
-    settings = job.config.projection
+    settings = job.config.channels
     teacher = read_teacher(Path(settings.model) if settings.model else EMBEDDED)
     if teacher.output != "features":
-        raise ConfigError(f"{teacher.settings}: output is {teacher.output}; only a teacher of features is projected")
+        raise ConfigError(f"{teacher.settings}: output is {teacher.output}; only channels of features are reduced")
     words = vocabulary(job, teacher)
     encoder = ImageEncoder(teacher, n_threads())
     images, count = reference(settings)
     moments, sample = None, []
-    for (name, image), status in job.progress.track(images, count, "projection"):
+    for (name, image), status in job.progress.track(images, count, "channels"):
         grid, n_channels = encoder.grid(image, ENTRY)
         if moments is None:
             moments = maths.Moments(n_channels)
@@ -61,7 +61,7 @@ def run(job: Job) -> None:
     if moments is None or not np.trace(moments.products) > 0:
         raise DataFailure(f"{teacher.path} gives zero features on all {count} reference images; export it again")
     known = np.zeros((0, len(moments.products))) if words is None else words
-    matrix, energy = maths.projection(moments, known, settings.n_channels)
+    matrix, energy = maths.channel_map(moments, known, settings.n_channels)
     notes: dict[str, Any] = {"n_pixels": moments.count, "n_words": len(known), "n_images": count}
     notes |= {"reference": settings.reference or "generated rooms", "digest": digest(teacher)}
     lost = float(np.sqrt(max(1 - energy[matrix.shape[1] - 1], 0)))
@@ -69,7 +69,7 @@ def run(job: Job) -> None:
     if words is not None:
         job.facts["label_agreement"] = maths.agreement(np.concatenate(sample), words, matrix)
     matrix, energy = matrix.astype(np.float32), energy.astype(np.float32)
-    write_projection(job.out, Projection(matrix, matrix.T.copy(), energy, teacher.name, notes))
+    write_channels(job.out, ChannelMap(matrix, matrix.T.copy(), energy, teacher.name, notes))
 
 
 def vocabulary(job: Job, teacher: TeacherModel) -> np.ndarray | None:
@@ -101,11 +101,11 @@ def reference_files(folder: Path) -> list[Path]:
     """The images of a reference folder. Raises InputError if there are none."""
     files = sorted(path for path in folder.rglob("*") if path.suffix.lower() in SUFFIXES)
     if not files:
-        raise InputError(f"{folder} holds no .png or .jpg image; correct projection.reference")
+        raise InputError(f"{folder} holds no .png or .jpg image; correct channels.reference")
     return files
 
 
-def reference(settings: ProjectionSection) -> tuple[Iterator[tuple[str, np.ndarray]], int]:
+def reference(settings: ChannelsSection) -> tuple[Iterator[tuple[str, np.ndarray]], int]:
     """(name, image u8 [H, W, 3]) one by one, and how many."""
     if settings.reference is None:
         from chebsplat.synthetic.seeds import REFERENCE
@@ -117,7 +117,7 @@ def reference(settings: ProjectionSection) -> tuple[Iterator[tuple[str, np.ndarr
 
 def photos(files: list[Path]) -> Iterator[tuple[str, np.ndarray]]:
     for file in files:
-        yield str(file), read_rgb(file, "correct projection.reference")
+        yield str(file), read_rgb(file, "correct channels.reference")
 
 
 def generated(seeds: range) -> Iterator[tuple[str, np.ndarray]]:
@@ -141,4 +141,4 @@ def generated(seeds: range) -> Iterator[tuple[str, np.ndarray]]:
                 yield f"room {seed}, view {view}", image
 
 
-main = command("projection", run)
+main = command("channels", run)

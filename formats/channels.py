@@ -1,4 +1,4 @@
-"""`projection/1`: the linear map from a teacher's channels to the fewer that scenes are trained in."""
+"""`channels/1`: the linear map from a teacher's channels to the fewer that scenes are trained in."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from chebsplat.formats import artifact
 from chebsplat.formats.documents import TypedDict, read_document, write_document
 from chebsplat.formats.tensors import Spec, read_tensors, write_tensors
 
-SCHEMA = "chebsplat.projection/1"
+SCHEMA = "chebsplat.channels/1"
 SPECS: dict[str, Spec] = {"matrix": ("float32", "C", "d"), "inverse": ("float32", "d", "C"), "energy": ("float32", "C")}
 
 
@@ -23,8 +23,8 @@ class Document(TypedDict):
 
 
 @dataclass
-class Projection:
-    """A teacher's projection from C to d channels; one for all scenes, computed by `chebsplat.labels.channels`.
+class ChannelMap:
+    """The linear map from a teacher's C channels to d; one for all scenes, computed by `chebsplat.labels.channels`.
 
     matrix:  f32 [C, d] orthonormal columns, of falling weight.
     inverse: f32 [d, C], back to the teacher's channels.
@@ -41,41 +41,41 @@ class Projection:
 
     def apply(self, features: np.ndarray) -> np.ndarray:
         """Features [..., C] -> f32 [..., d]."""
-        projected: np.ndarray = np.asarray(features, np.float32) @ self.matrix
-        return projected
+        mapped: np.ndarray = np.asarray(features, np.float32) @ self.matrix
+        return mapped
 
     def embed(self, embeddings: np.ndarray) -> np.ndarray:
         """Unit embeddings [L, C] of words -> f32 [L, d].
 
-        Choices: not made unit again, so that an inner product with projected features is the teacher's own; unit
+        Choices: not made unit again, so that an inner product with mapped features is the teacher's own; unit
           rows would favour the words that the reference shows least.
         """
-        projected: np.ndarray = np.asarray(embeddings, np.float32) @ self.matrix
-        return projected
+        embedded: np.ndarray = np.asarray(embeddings, np.float32) @ self.matrix
+        return embedded
 
     def restore(self, features: np.ndarray) -> np.ndarray:
-        """Projected features [..., d] -> f32 [..., C]."""
+        """Mapped features [..., d] -> f32 [..., C]."""
         restored: np.ndarray = np.asarray(features, np.float32) @ self.inverse
         return restored
 
 
-def tensors(projection: Projection) -> dict[str, np.ndarray]:
-    return {name: getattr(projection, name).astype(np.float32) for name in SPECS}
+def tensors(channels: ChannelMap) -> dict[str, np.ndarray]:
+    return {name: getattr(channels, name).astype(np.float32) for name in SPECS}
 
 
-def from_parts(arrays: Mapping[str, np.ndarray], document: Mapping[str, Any]) -> Projection:
-    return Projection(**{name: arrays[name] for name in SPECS}, teacher=document["teacher"], notes=document["notes"])
+def from_parts(arrays: Mapping[str, np.ndarray], document: Mapping[str, Any]) -> ChannelMap:
+    return ChannelMap(**{name: arrays[name] for name in SPECS}, teacher=document["teacher"], notes=document["notes"])
 
 
-def write_projection(out: Path, projection: Projection) -> None:
+def write_channels(out: Path, channels: ChannelMap) -> None:
     """Fill the directory that `artifact.publish` yields. Raises ValueError on a non-finite value."""
-    write_tensors(out / "projection.safetensors", tensors(projection))
-    write_document(out / "projection.json", {"teacher": projection.teacher, "notes": projection.notes})
+    write_tensors(out / "channels.safetensors", tensors(channels))
+    write_document(out / "channels.json", {"teacher": channels.teacher, "notes": channels.notes})
 
 
-def read_projection(path: Path) -> Projection:
+def read_channels(path: Path) -> ChannelMap:
     """Raises InputError naming the damaged file and the remedy."""
     path = Path(path)
     manifest = artifact.read_manifest(path, SCHEMA)
-    arrays = read_tensors(path, manifest, "projection.safetensors", SPECS)
-    return from_parts(arrays, read_document(path, manifest, "projection.json", Document))
+    arrays = read_tensors(path, manifest, "channels.safetensors", SPECS)
+    return from_parts(arrays, read_document(path, manifest, "channels.json", Document))

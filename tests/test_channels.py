@@ -1,4 +1,4 @@
-"""The teacher's projection: exact, streamed, independent of order, and it keeps what words are told apart by."""
+"""The map of a teacher's channels: exact, streamed, independent of order, and it keeps what words are told apart by."""
 
 import numpy as np
 import pytest
@@ -8,9 +8,9 @@ from shared import KEY
 
 from chebsplat.errors import InputError
 from chebsplat.formats import artifact
+from chebsplat.formats.channels import SCHEMA, ChannelMap, read_channels, write_channels
 from chebsplat.formats.manifest import Manifest
-from chebsplat.formats.projection import SCHEMA, Projection, read_projection, write_projection
-from chebsplat.labels.channels import ROWS, Moments, projection
+from chebsplat.labels.channels import ROWS, Moments, channel_map
 
 
 def unit(values):
@@ -39,7 +39,7 @@ def moments(*parts):
 @given(rank=st.integers(1, 8), extra=st.integers(0, 5), seed=st.integers(0, 99))
 def test_features_of_a_rank_come_through_as_many_channels_exactly(rank, extra, seed):
     features, vocabulary = low_rank(rank, 12, seed=seed), words(12, seed=seed)
-    matrix, energy = projection(moments(features), vocabulary, rank + extra)
+    matrix, energy = channel_map(moments(features), vocabulary, rank + extra)
     assert matrix.shape == (12, rank)  # no more than there are
     assert np.allclose(energy[rank - 1 :], 1, atol=1e-12)
     restored = features @ matrix @ matrix.T
@@ -49,7 +49,7 @@ def test_features_of_a_rank_come_through_as_many_channels_exactly(rank, extra, s
 
 @pytest.mark.parametrize("n_channels", [1, 5, 24])
 def test_the_transpose_is_the_inverse(n_channels):
-    matrix, energy = projection(moments(low_rank(24, 24)), words(24), n_channels)
+    matrix, energy = channel_map(moments(low_rank(24, 24)), words(24), n_channels)
     assert np.allclose(matrix.T @ matrix, np.eye(n_channels), atol=1e-12)
     assert np.all(np.diff(energy) >= -1e-15)
     assert energy[-1] == pytest.approx(1)
@@ -57,24 +57,24 @@ def test_the_transpose_is_the_inverse(n_channels):
 
 def test_energy_is_the_share_that_the_kept_channels_hold():
     features = low_rank(24, 24)
-    matrix, energy = projection(moments(features), words(24), 7)
+    matrix, energy = channel_map(moments(features), words(24), 7)
     share = np.linalg.norm(features @ matrix) ** 2 / np.linalg.norm(features) ** 2
     assert energy[6] == pytest.approx(share, abs=1e-9)
 
 
 def test_without_a_vocabulary_no_other_channels_hold_more():
     features = low_rank(24, 24)
-    _, energy = projection(moments(features), np.zeros((0, 24)), 7)
+    _, energy = channel_map(moments(features), np.zeros((0, 24)), 7)
     best = np.cumsum(np.linalg.svd(features, compute_uv=False) ** 2) / np.linalg.norm(features) ** 2
     assert np.allclose(energy, best, atol=1e-12)
 
 
 def test_streaming_equals_batch_in_any_order():
     features = low_rank(20, 24, n=3000)
-    batch = projection(moments(features), words(24), 9)
+    batch = channel_map(moments(features), words(24), 9)
     parts = np.array_split(features, 7)
     np.random.default_rng(0).shuffle(parts := [p.reshape(-1, 1, 24) for p in parts])
-    streamed = projection(moments(*parts), words(24), 9)
+    streamed = channel_map(moments(*parts), words(24), 9)
     assert np.allclose(batch[0], streamed[0], atol=1e-9)
     assert np.allclose(batch[1], streamed[1], atol=1e-12)
 
@@ -97,7 +97,7 @@ def test_the_vocabulary_saves_label_decisions():
     wanted = (features @ vocabulary.T).argmax(1)
 
     def agreement(weight):
-        matrix, _ = projection(moments(features), vocabulary, 20, weight)
+        matrix, _ = channel_map(moments(features), vocabulary, 20, weight)
         return ((features @ matrix) @ (vocabulary @ matrix).T).argmax(1) == wanted
 
     assert agreement(0.0).mean() < 0.5
@@ -112,27 +112,27 @@ def test_the_vocabulary_saves_label_decisions():
         (np.zeros((3, 4)), "no energy"),
     ],
 )
-def test_features_that_give_no_projection_are_refused(bad, message):
+def test_features_that_give_no_channels_are_refused(bad, message):
     def make():
         found = Moments(4)
         found.add(bad)
-        projection(found, words(4), 2)
+        channel_map(found, words(4), 2)
 
     with pytest.raises(ValueError, match=message):
         make()
 
 
 def made(path):
-    matrix, energy = projection(moments(low_rank(8, 12)), words(12), 5)
+    matrix, energy = channel_map(moments(low_rank(8, 12)), words(12), 5)
     matrix32 = matrix.astype(np.float32)
-    record = Projection(matrix32, matrix32.T.copy(), energy.astype(np.float32), "lseg", {"n_pixels": 400})
-    with artifact.publish(path, Manifest(SCHEMA, KEY, "projection")) as tmp:
-        write_projection(tmp, record)
+    record = ChannelMap(matrix32, matrix32.T.copy(), energy.astype(np.float32), "lseg", {"n_pixels": 400})
+    with artifact.publish(path, Manifest(SCHEMA, KEY, "channels")) as tmp:
+        write_channels(tmp, record)
     return record
 
 
-def test_a_projection_reads_back_and_restores(tmp_path):
-    record, found = made(tmp_path / "p"), read_projection(tmp_path / "p")
+def test_a_channel_map_reads_back_and_restores(tmp_path):
+    record, found = made(tmp_path / "p"), read_channels(tmp_path / "p")
     assert (found.teacher, found.notes) == ("lseg", {"n_pixels": 400})
     assert all(np.array_equal(getattr(found, k), getattr(record, k)) for k in ("matrix", "inverse", "energy"))
     features = low_rank(8, 12).reshape(20, 20, 12)
@@ -141,11 +141,11 @@ def test_a_projection_reads_back_and_restores(tmp_path):
     assert found.embed(words(12)).shape == (40, 5)
 
 
-@pytest.mark.parametrize("name", ["projection.safetensors", "projection.json"])
-def test_a_damaged_projection_is_named_with_its_remedy(tmp_path, name):
+@pytest.mark.parametrize("name", ["channels.safetensors", "channels.json"])
+def test_a_damaged_channel_map_is_named_with_its_remedy(tmp_path, name):
     made(tmp_path / "p")
     file = tmp_path / "p" / name
     good = file.read_bytes()
     file.write_bytes(good[:-1] + bytes([good[-1] ^ 1]))
     with pytest.raises(InputError, match=rf"{name} does not match its sha256; delete .* run its stage again"):
-        read_projection(tmp_path / "p")
+        read_channels(tmp_path / "p")

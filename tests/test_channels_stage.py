@@ -1,4 +1,4 @@
-"""The projection is the teacher's: every scene of a teacher shares one, and nothing of a scene changes it."""
+"""The channels are the teacher's: every scene of a teacher shares them, and nothing of a scene changes them."""
 
 import hashlib
 
@@ -8,10 +8,10 @@ from shared import ROOT, run_stage
 from tiny_teachers import color_reference, color_teacher, write_settings, write_table
 
 from chebsplat.formats.artifact import read_manifest
+from chebsplat.formats.channels import SCHEMA, read_channels
 from chebsplat.formats.images import SUFFIXES
-from chebsplat.formats.projection import SCHEMA, read_projection
 from chebsplat.pipelines.plan import Planner
-from chebsplat.stages.projection import generated
+from chebsplat.stages.channels import generated
 from chebsplat.synthetic import seeds
 
 
@@ -28,14 +28,14 @@ def tiny(tmp_path, monkeypatch):
     return model, color_reference(tmp_path / "reference")
 
 
-def projected(tmp_path, model, reference, **settings):
+def reduced(tmp_path, model, reference, **settings):
     values = {"model": str(model), "reference": None if reference is None else str(reference)} | settings
-    code = run_stage("projection", tmp_path / "out", {}, {"projection": {k: v for k, v in values.items() if v}})
-    return code, read_projection(tmp_path / "out") if code == 0 else None
+    code = run_stage("channels", tmp_path / "out", {}, {"channels": {k: v for k, v in values.items() if v}})
+    return code, read_channels(tmp_path / "out") if code == 0 else None
 
 
-def test_a_teacher_is_projected_to_the_channels_that_its_features_span(tmp_path, tiny):
-    code, found = projected(tmp_path, *tiny)
+def test_a_teacher_is_reduced_to_the_channels_that_its_features_span(tmp_path, tiny):
+    code, found = reduced(tmp_path, *tiny)
     assert code == 0
     assert found.matrix.shape == (6, 3)
     assert found.energy[2] == pytest.approx(1)
@@ -46,7 +46,7 @@ def test_a_teacher_is_projected_to_the_channels_that_its_features_span(tmp_path,
 
 
 def test_fewer_channels_lose_what_the_facts_say(tmp_path, tiny):
-    _, found = projected(tmp_path, *tiny, n_channels=2)
+    _, found = reduced(tmp_path, *tiny, n_channels=2)
     facts = read_manifest(tmp_path / "out", SCHEMA).facts
     assert found.matrix.shape == (6, 2)
     assert facts["relative_error"] == pytest.approx((1 - found.energy[1]) ** 0.5, rel=1e-4)
@@ -54,12 +54,12 @@ def test_fewer_channels_lose_what_the_facts_say(tmp_path, tiny):
     assert facts["label_agreement"] > 0.95  # three words differ in two directions
 
 
-def test_a_teacher_without_a_table_is_projected_by_energy_alone(tmp_path, tiny):
+def test_a_teacher_without_a_table_is_reduced_by_energy_alone(tmp_path, tiny):
     model, reference = tiny
     tokens = model.with_name("tokenizer.json")
     tokens.write_text("{}")
     write_settings(model, multiple=4, labels=None, text=model.name, tokenizer=tokens.name)
-    code, _ = projected(tmp_path, model, reference)
+    code, _ = reduced(tmp_path, model, reference)
     assert code == 0
     facts = read_manifest(tmp_path / "out", SCHEMA).facts
     assert "vocabulary" in facts["left_out"]
@@ -67,7 +67,7 @@ def test_a_teacher_without_a_table_is_projected_by_energy_alone(tmp_path, tiny):
 
 
 @pytest.mark.parametrize("bad", ["empty folder", "not an image", "other channels", "zero word", "closed set"])
-def test_what_cannot_be_projected_is_named(tmp_path, tiny, bad, capsys):
+def test_what_cannot_be_reduced_is_named(tmp_path, tiny, bad, capsys):
     model, reference = tiny
     named = reference
     if bad == "empty folder":
@@ -82,7 +82,7 @@ def test_what_cannot_be_projected_is_named(tmp_path, tiny, bad, capsys):
     else:
         write_settings(model, output="logits")
         named = model.with_suffix(".toml")
-    code, _ = projected(tmp_path, model, reference)
+    code, _ = reduced(tmp_path, model, reference)
     assert code == (2 if bad == "closed set" else 3)
     assert str(named) in capsys.readouterr().err
     assert not (tmp_path / "out").exists()
@@ -96,31 +96,31 @@ def test_the_reference_rooms_are_the_same_every_time_and_serve_nothing_else():
     assert sum(map(len, ranges)) == len(set().union(*ranges))
 
 
-def key(planner, scene, settings, stage="projection"):
+def key(planner, scene, settings, stage="channels"):
     return next(step.key for step in planner.plan(scene, settings).steps if step.stage == stage)
 
 
-def test_scenes_share_one_projection_which_only_its_teacher_changes(tmp_path, tiny):
+def test_scenes_share_channels_which_only_their_teacher_changes(tmp_path, tiny):
     planner, (model, reference) = Planner(), tiny
     settings = f"teacher.kind=onnx,teacher.model={model}"
     shared = key(planner, "toy", settings)
     changes = ["source.seed=7", "ingest.test_every=5", "train.steps=9", "teacher.downscale=8", "teacher.flips=true"]
     assert {key(planner, scene, settings) for scene in ("office0", "room0")} == {shared}
     assert {key(planner, "toy", f"{settings},{change}") for change in changes} == {shared}
-    assert key(planner, "toy", f"{settings},projection.n_channels=2") != shared
-    of_photos = key(planner, "toy", f"{settings},projection.reference={reference}")
+    assert key(planner, "toy", f"{settings},channels.n_channels=2") != shared
+    of_photos = key(planner, "toy", f"{settings},channels.reference={reference}")
     (reference / f"again{SUFFIXES[-1]}").write_bytes((reference / "0.png").read_bytes())
-    assert len({shared, of_photos, key(planner, "toy", f"{settings},projection.reference={reference}")}) == 3
+    assert len({shared, of_photos, key(planner, "toy", f"{settings},channels.reference={reference}")}) == 3
     before = key(planner, "toy", settings, "teacher")
     write_table(tmp_path / "tiny.npz", embeddings=np.eye(3, 6))
     assert key(planner, "toy", settings) != shared
     assert key(planner, "toy", settings, "teacher") != before
 
 
-def test_a_closed_set_teacher_and_labels_need_no_projection(tiny):
+def test_a_closed_set_teacher_and_labels_keep_their_channels(tiny):
     model, _ = tiny
-    assert "projection" in Planner().plan("toy").left_out
+    assert "channels" in Planner().plan("toy").left_out
     write_settings(model, output="logits")
     plan = Planner().plan("toy", f"teacher.kind=onnx,teacher.model={model}")
-    assert "closed-set" in plan.left_out["projection"]
-    assert all("projection" not in step.inputs for step in plan.steps)
+    assert "closed-set" in plan.left_out["channels"]
+    assert all("channels" not in step.inputs for step in plan.steps)
