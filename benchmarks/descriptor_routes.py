@@ -10,6 +10,7 @@ from __future__ import annotations
 import warnings
 from collections.abc import Callable
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 import scipy.linalg
@@ -19,7 +20,7 @@ from descriptor_cases import ANISOTROPY, BANDWIDTH, D, J, K, Regions
 from torch import Tensor
 
 from chebsplat.shape.albo import canonicalize, metric_factors, rotations_about, tangent_axis
-from chebsplat.shape.descriptor import describe_compiled, describe_reference
+from chebsplat.shape.descriptor import describe
 
 
 @dataclass
@@ -51,7 +52,7 @@ def operators(given: Regions, dtype: torch.dtype) -> tuple[list[Tensor], list[Te
 
 
 def paired(angles: list[Tensor], certainty: Tensor) -> Tensor:
-    """The pairs of angles of docs/method.md, section 2, as `describe_reference` forms them."""
+    """The pairs of angles of docs/method.md, section 2, as `descriptor_reference.describe` forms them."""
     fade = certainty[:, None, None]
     rest = []
     for j in range(1, J):
@@ -145,15 +146,16 @@ def printed(dtype: torch.dtype) -> Callable[[Regions], Tensor]:
 
 def reference(dtype: torch.dtype, spectrum: str = "full") -> Callable[[Regions], Tensor]:
     def run(given: Regions) -> Tensor:
-        options = {"n_angles": J, "max_degree": D, "anisotropy": ANISOTROPY, "bandwidth": BANDWIDTH}
-        return describe_reference(*given, **options, spectrum=spectrum, n_eigs=K, dtype=dtype).values  # type: ignore[arg-type]
+        options: dict[str, Any] = {"n_angles": J, "max_degree": D, "anisotropy": ANISOTROPY, "bandwidth": BANDWIDTH}
+        options |= {"spectrum": spectrum, "n_eigs": K, "dtype": dtype, "backend": "reference"}
+        return describe(*given, **options).values
 
     return run
 
 
 def compiled(given: Regions) -> Tensor:
-    options = {"n_angles": J, "max_degree": D, "anisotropy": ANISOTROPY, "bandwidth": BANDWIDTH}
-    return describe_compiled(*given, **options).values  # type: ignore[arg-type]
+    sizes = {"n_angles": J, "max_degree": D}
+    return describe(*given, **sizes, anisotropy=ANISOTROPY, bandwidth=BANDWIDTH, backend="numba").values
 
 
 ROUTES = [

@@ -40,9 +40,9 @@ def descriptors(trainer: Trainer) -> torch.Tensor:
     """Of the regions as they were sampled last and the Gaussians as they are now."""
     shape, raw = trainer.model.shape, trainer.model.raw
     assert shape is not None
-    arguments = raw["means"].detach(), raw["quats"].detach(), raw["log_scales"].detach().exp(), shape.members
-    options = shape.describe.model_dump(exclude={"n_regions", "region_size", "seed"})
-    return describe_members(*arguments, **options).values
+    means, quats, log_scales = (raw[name].detach() for name in ("means", "quats", "log_scales"))
+    gaussians = means.numpy(), quats.numpy(), log_scales.exp().numpy()
+    return torch.from_numpy(describe_members(*gaussians, shape.members.numpy(), shape.describe).values)
 
 
 def staleness(old: torch.Tensor, new: torch.Tensor) -> tuple[float, float]:

@@ -12,7 +12,6 @@ log = logging.getLogger("chebsplat")
 
 def run(job: Job) -> None:
     import numpy as np
-    import torch
 
     from chebsplat.formats.descriptors import Descriptors, write_descriptors
     from chebsplat.formats.points import read_points
@@ -26,11 +25,11 @@ def run(job: Job) -> None:
         raise DataFailure("the points artifact holds no points; nothing can be described")
     raw = initial_gaussians(points.means, points.colors, points.covariances)
     regions = build_regions(points.means, settings.n_regions, settings.region_size, settings.seed)
-    parameters = settings.model_dump(exclude={"n_regions", "region_size", "seed"})
     # Centred in float64, and only then float32: far from the origin the fractions would be lost.
-    means = torch.as_tensor(points.means - points.means.mean(0), dtype=torch.float32)
-    described = describe_members(means, *activated(raw)[1:3], torch.as_tensor(regions.members), **parameters)
-    values = described.values.numpy()
+    means = (points.means - points.means.mean(0)).astype(np.float32)
+    _, quats, scales, _ = activated(raw)
+    described = describe_members(means, quats.numpy(), scales.numpy(), regions.members, settings)
+    values = described.values
     if not np.isfinite(values).all():
         bad = int(np.sum(~np.isfinite(values).all((1, 2, 3))))
         raise DataFailure(f"{bad} of {len(values)} regions have non-finite descriptors")

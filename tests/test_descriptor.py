@@ -4,12 +4,13 @@ import pytest
 import torch
 from shared_regions import region
 
-from chebsplat.shape.descriptor import chebyshev_diagonals, describe_regions
+from chebsplat.shape import descriptor
+from chebsplat.shape.descriptor_reference import chebyshev_diagonals
 from chebsplat.splats.rotations import rotation_matrices
 
 
 def describe(given, **options):
-    return describe_regions(*given, **({"dtype": torch.float64} | options))
+    return descriptor.describe(*given, **({"dtype": torch.float64} | options)).values
 
 
 def close(a, b, tolerance):

@@ -8,18 +8,19 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from shared_regions import CASES, region, turned
 
-from chebsplat.shape.descriptor import describe_compiled, describe_members, describe_reference
+from chebsplat.settings import DescribeSection
+from chebsplat.shape.descriptor import describe, describe_members
 from chebsplat.splats.rotations import rotation_matrices
 
 WORST, MEDIAN = 5e-6, 5e-7  # issue bars, relative to the region's maximum
 
 
 def compiled(given, **options):
-    return describe_compiled(*given, **options).values
+    return describe(*given, **options, backend="numba").values
 
 
 def exact(given, **options):
-    return describe_reference(*given, **options).values
+    return describe(*given, **options, dtype=torch.float64, backend="reference").values
 
 
 def errors(found, expected):
@@ -154,13 +155,24 @@ def test_gathered_members_are_described_like_their_regions():
     members = torch.randint(-1, 50, (9, 12), generator=g)
     index = members.clamp_min(0)
     options = {"n_angles": 4, "max_degree": 8, "anisotropy": 30.0, "bandwidth": 0.7}
-    found = describe_members(means, quats, scales.exp(), members, **options, chunk=4)
+    arrays = (v.numpy() for v in (means, quats, scales.exp(), members))
+    found = torch.from_numpy(describe_members(*arrays, DescribeSection(**options), chunk=4).values)
     rotmats = rotation_matrices(quats.double())[index]
     wanted = compiled((means[index], scales.exp()[index], rotmats, members >= 0), **options)
-    assert (found.values - wanted).abs().max() <= 1e-6 * wanted.abs().max()  # the rounding of the rotations
+    assert (found - wanted).abs().max() <= 1e-6 * wanted.abs().max()  # the rounding of the rotations
 
 
 @pytest.mark.parametrize("bad", [{"bandwidth": 0.0}, {"n_angles": 0}, {"max_degree": 1}, {"anisotropy": -1.0}])
 def test_senseless_parameters_are_refused(bad):
     with pytest.raises(ValueError, match="needed"):
-        describe_compiled(*region(), **bad)
+        describe(*region(), **bad, backend="numba")
+
+
+@pytest.mark.parametrize(
+    "beyond", [{"spectrum": "hard"}, {"dtype": torch.float64}, {"gradient": True}, {"backend": "cuda"}]
+)
+def test_a_backend_refuses_what_it_does_not_compute(beyond):
+    means, *rest = region(4)
+    means = means.clone().requires_grad_(beyond.pop("gradient", False))
+    with pytest.raises(ValueError, match="backend"):
+        describe(means, *rest, **({"backend": "numba"} | beyond))

@@ -4,13 +4,14 @@ import pytest
 import torch
 from shared_regions import CASES, region, turned
 
+from chebsplat.settings import DescribeSection
 from chebsplat.shape.albo import canonicalize, metric_factors, similarity
-from chebsplat.shape.descriptor import describe_members, describe_reference, n_degrees
+from chebsplat.shape.descriptor import describe, describe_members, n_degrees
 from chebsplat.shape.spectra import cut_spectrum
 
 
 def described(given, spectrum, **options):
-    return describe_reference(*given, spectrum=spectrum, **options)
+    return describe(*given, spectrum=spectrum, dtype=torch.float64, backend="reference", **options)
 
 
 def operator(given, bandwidth=0.7):
@@ -85,8 +86,8 @@ def test_members_are_described_with_the_spectrum_that_was_chosen(spectrum):
     g = torch.Generator().manual_seed(0)
     means, quats, scales = (torch.randn(40, k, generator=g) for k in (3, 4, 3))
     members = torch.randint(0, 40, (5, 12), generator=g)
-    sizes = {"n_angles": 4, "max_degree": 8, "anisotropy": 30.0, "bandwidth": 0.7}
-    found = describe_members(means, quats, scales.exp(), members, **sizes, spectrum=spectrum, n_eigs=4)
+    settings = DescribeSection(n_angles=4, max_degree=8, spectrum=spectrum, n_eigs=4)
+    found = describe_members(*(v.numpy() for v in (means, quats, scales.exp(), members)), settings)
     assert found.values.shape == (5, 12, 4, n_degrees(spectrum, 8))
     assert found.n_cuts == (20 if spectrum == "hard" else 0)
 

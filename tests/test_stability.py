@@ -75,8 +75,13 @@ def test_a_wrong_descriptor_fails(suite, tmp_path, monkeypatch):
     module, _ = suite
     from benchmarks.stability import descriptor
 
-    correct = descriptor.describe_regions
-    monkeypatch.setattr(descriptor, "describe_regions", lambda *a, **k: correct(*a, **k) * (1 + 1e-5))
+    correct = descriptor.describe
+
+    def wrong(*regions, **options):
+        described = correct(*regions, **options)
+        return described._replace(values=described.values * (1 + 1e-5))
+
+    monkeypatch.setattr(descriptor, "describe", wrong)
     assert module.main(["--only", "descriptor: needles 1e6", "--csv", str(tmp_path / "s.csv")]) == 1
 
 

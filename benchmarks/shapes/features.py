@@ -8,7 +8,7 @@ import numpy as np
 import torch
 
 from benchmarks.shapes.samples import Regions
-from chebsplat.shape.descriptor import describe_regions
+from chebsplat.shape.descriptor import describe
 
 NEIGHBORS = 16
 
@@ -37,7 +37,7 @@ def ours(regions: Regions, **options: float) -> np.ndarray:
     for rows in np.array_split(np.arange(len(regions.labels)), max(1, len(regions.labels) // 256)):
         given = [torch.from_numpy(v[rows]) for v in (regions.means, regions.scales, regions.rotmats)]
         mask = torch.ones(given[0].shape[:2], dtype=torch.bool)
-        parts.append(describe_regions(*given, mask, **options).flatten(2).numpy())  # type: ignore[arg-type]
+        parts.append(describe(*given, mask, **options).values.flatten(2).numpy())  # type: ignore[arg-type]
     return np.concatenate(parts)
 
 

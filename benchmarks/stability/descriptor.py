@@ -13,7 +13,7 @@ import torch
 
 from benchmarks.stability import oracle
 from benchmarks.stability.case import Outcome, case, naive, relative
-from chebsplat.shape.descriptor import describe_regions
+from chebsplat.shape.descriptor import describe
 from chebsplat.splats.rotations import rotation_matrices
 
 TOLERANCE = 5e-6  # the worst that any case may reach in float32
@@ -49,7 +49,7 @@ def ours(region: Region, dtype: torch.dtype = torch.float32, pad: int = 0, **opt
     n = len(region.means)
     padded = [torch.from_numpy(np.concatenate([v, np.full((pad, *v.shape[1:]), 7.0)]))[None] for v in region]
     mask = torch.arange(n + pad)[None] < n
-    found, again = (describe_regions(*padded, mask, dtype=dtype, **options)[0] for _ in range(2))
+    found, again = (describe(*padded, mask, dtype=dtype, **options).values[0] for _ in range(2))
     if not torch.equal(found, again):
         raise ValueError("a second run gives other bits, or NaN")
     if not (found[n:] == 0).all():
@@ -254,7 +254,7 @@ def one_broken(bad: float, field: str) -> Outcome:
     broken = Region(*(v.copy() for v in clean))
     getattr(broken, field)[5].flat[1] = bad
     both = [torch.from_numpy(np.stack(v)) for v in zip(broken, other, strict=True)]
-    found = describe_regions(*both, torch.ones(2, 16, dtype=torch.bool)).double().numpy()
+    found = describe(*both, torch.ones(2, 16, dtype=torch.bool)).values.double().numpy()
     if (found[0, 5] != 0).any() or not np.array_equal(found[1], ours(other)):
         raise ValueError("the broken row is not zero, or the region beside it has changed")
     error = relative(found[0, rest], oracle.describe(*(v[rest] for v in clean)))
@@ -284,7 +284,7 @@ def gradient(name: str) -> Outcome:
     region = FLAT[name]()
     values = [torch.from_numpy(v)[None] for v in region]
     means = values[0].requires_grad_(True)
-    found = describe_regions(means, *values[1:], torch.ones(1, len(region.means), dtype=torch.bool))
+    found = describe(means, *values[1:], torch.ones(1, len(region.means), dtype=torch.bool)).values
     bad = 0.0
     if found.requires_grad:
         (slope,) = torch.autograd.grad(found.square().sum(), means)

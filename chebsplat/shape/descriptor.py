@@ -1,29 +1,32 @@
-"""Chebyshev descriptors of regions of Gaussians (Eqs 4-6): the torch route, differentiable and of any precision, and
-the compiled one that stages and training use.
+"""Chebyshev descriptors of regions of Gaussians (Eqs 4-6).
+
+Two backends agree to float32: `numba` compiles the full spectrum, `reference` (torch) differentiates it, and knows cut
+spectra. Torch is imported where it is needed only: finished scenes are described without it.
 """
 
 from __future__ import annotations
 
-from typing import Any, Literal, NamedTuple
+from typing import TYPE_CHECKING, Any, Generic, Literal, NamedTuple, TypeVar
 
 import numpy as np
-import torch
-from torch import Tensor
 
-from chebsplat.shape import descriptor_arrays as arrays
-from chebsplat.shape.albo import canonicalize, metric_factors, rotations_about, similarity, tangent_axis
-from chebsplat.shape.spectra import cut_spectrum
-from chebsplat.splats.rotations import rotation_matrices
+from chebsplat.settings import DescribeSection
+from chebsplat.splats.rotations import rotation_matrices, rotation_matrices_f64
+
+if TYPE_CHECKING:
+    import torch
+    from torch import Tensor
 
 Spectrum = Literal["full", "taper", "hard"]
+Values = TypeVar("Values")  # Tensor or np.ndarray
 
 
-class Described(NamedTuple):
-    """values f32 [M, n, J, P]; of the n_cuts cuts of the spectrum (region and angle), n_clustered fell into a cluster
-    of eigenvalues; n_exact regions took the float64 operator. All counts are 0 where they do not apply.
+class Described(NamedTuple, Generic[Values]):
+    """values [M, n, J, P]; of the n_cuts cuts of the spectrum (region and angle), n_clustered fell into a cluster of
+    eigenvalues; n_exact regions took the float64 operator. All counts are 0 where they do not apply.
     """
 
-    values: Tensor
+    values: Values
     n_cuts: int = 0
     n_clustered: int = 0
     n_exact: int = 0
@@ -34,30 +37,7 @@ def n_degrees(spectrum: Spectrum, max_degree: int) -> int:
     return max_degree - 1 if spectrum == "full" else max_degree + 1
 
 
-def chebyshev_diagonals(S: Tensor, max_degree: int) -> Tensor:
-    """Diagonals of T_d(−S) − T_d(0) I for d = 2...max_degree.
-
-    Args: S [..., n, n] symmetric, spectrum within [-1, 1], zero diagonal.
-    Returns: [..., n, max_degree - 1].
-    Choices: E_m = T_m − T_m(0) I is carried, so nothing of size 1 is ever subtracted; the diagonals of T_2m and
-    T_2m+1 are row products of T_m and T_m+1, so max_degree 8 costs three matrix products.
-    """
-    x = -S
-    terms = [torch.zeros_like(x), x]
-    at_zero = [1.0, 0.0]
-    for m in range(1, (max_degree + 1) // 2):
-        terms.append(2 * (x @ terms[m]) + 2 * at_zero[m] * x - terms[m - 1])
-        at_zero.append(-at_zero[m - 1])
-    diagonals = [t.diagonal(dim1=-2, dim2=-1) for t in terms]
-    columns = []
-    for degree in range(2, max_degree + 1):
-        m, k = degree // 2, degree - degree // 2
-        rows = (terms[m] * terms[k]).sum(-1)
-        columns.append(2 * (rows + at_zero[m] * diagonals[k] + at_zero[k] * diagonals[m]))
-    return torch.stack(columns, -1)
-
-
-def describe_reference(
+def describe(
     means: Tensor,
     scales: Tensor,
     rotmats: Tensor,
@@ -69,112 +49,107 @@ def describe_reference(
     bandwidth: float = 0.7,
     spectrum: Spectrum = "full",
     n_eigs: int = 16,
-    dtype: torch.dtype = torch.float64,
-) -> Described:
-    """Descriptor of every Gaussian of every region, in torch: the oracle, and differentiable with the full spectrum.
+    dtype: torch.dtype | None = None,
+    backend: Literal["auto", "numba", "reference"] = "auto",
+) -> Described[Tensor]:
+    """Descriptor of every Gaussian of every region: g^d(i) = n ([T_d(−S)]_ii − T_d(0)), by angle and degree.
 
-    Args: as `albo.canonicalize`; `dtype` is that of the recurrence, all before it is float64; `n_eigs` is K of a cut
-      spectrum (see `spectra`).
-    Returns: values [M, n, J, P], zero where padded and in regions of fewer than two Gaussians, which have no edge;
-      g^d(i) = n ([T_d(−S)]_ii − T_d(0)), the printed formula with K = n and λ_max = 2; degrees 0 and 1 are
-      identically zero and left out.
-    Raises: ValueError on sizes or parameters that make no sense.
-    Choices: angles j and J − j are replaced by half their sum and half their absolute difference, so that the sign of
-    the axis does not matter; angles j > 0 fade to angle 0 where the axis is ill-defined; the axis has no gradient.
+    Args:
+      means, scales, rotmats, mask: [M, n, ...], as `albo.canonicalize`.
+      n_angles, max_degree, anisotropy, bandwidth: J, D, a and the width, as in `settings.DescribeSection`.
+      spectrum, n_eigs: `full`, or what `spectra.cut_spectrum` leaves of it, with K = n_eigs.
+      dtype:   of the result, float32 if None; float64 by the reference only.
+      backend: `numba` (full spectrum, float32, no gradient; the same bits for any number of threads), `reference`, or
+        `auto`: numba where it can.
+    Returns: values [M, n, J, P], zero where padded and in regions of fewer than two Gaussians, which have no edge. Of
+      the full spectrum it is the printed formula with K = n and λ_max = 2, without degrees 0 and 1, which vanish.
+    Raises: ValueError on sizes or parameters that make no sense, or that the backend does not take.
     """
-    arrays.check(means, scales, rotmats, mask, n_angles, max_degree, anisotropy, bandwidth, n_eigs)
-    region = canonicalize(means, scales, rotmats, mask)
-    factors = metric_factors(region, anisotropy)
-    axis, certainty = tangent_axis(region)
-    count = region.mask.sum(1)[:, None, None]
-    angles, n_cuts, n_clustered = [], 0, 0
-    for rotation in rotations_about(axis, n_angles):
-        S = similarity(region, factors, rotation, bandwidth)
-        if spectrum == "full":
-            angles.append(chebyshev_diagonals(S.to(dtype), max_degree) * count)
-        else:
-            cut = cut_spectrum(S, region.mask, n_eigs, max_degree, hard=spectrum == "hard")
-            angles.append(cut.values.to(dtype))
-            n_cuts, n_clustered = n_cuts + cut.n_cuts, n_clustered + cut.n_clustered
-    certainty = certainty.to(dtype)[:, None, None]
-    paired = [angles[0]]
-    for j in range(1, n_angles):
-        low, high = angles[min(j, n_angles - j)], angles[max(j, n_angles - j)]
-        if j <= n_angles - j:
-            paired.append(angles[0] + certainty * (0.5 * (low + high) - angles[0]))
-        else:
-            paired.append(certainty * 0.5 * (low - high).abs())
-    keep = region.mask[..., None, None] & (count[..., None] > 1)
-    return Described(torch.where(keep, torch.stack(paired, 2), 0.0), n_cuts, n_clustered)
+    import torch
 
-
-def describe_compiled(
-    means: Tensor,
-    scales: Tensor,
-    rotmats: Tensor,
-    mask: Tensor,
-    *,
-    n_angles: int = 8,
-    max_degree: int = 8,
-    anisotropy: float = 10.0,
-    bandwidth: float = 0.7,
-) -> Described:
-    """`describe_reference` of the full spectrum, compiled: `descriptor_arrays.describe_regions`, of tensors."""
-    given = [v.detach().numpy() for v in (means, scales, rotmats, mask)]
+    if n_angles < 1 or max_degree < 2 or n_eigs < 1 or not bandwidth > 0 or not anisotropy >= 0:
+        raise ValueError("n_angles >= 1, max_degree >= 2, n_eigs >= 1, bandwidth > 0 and anisotropy >= 0 are needed")
+    if means.shape != scales.shape or rotmats.shape != (*means.shape, 3) or mask.shape != means.shape[:2]:
+        raise ValueError(f"shapes disagree: {means.shape}, {scales.shape}, {rotmats.shape}, {mask.shape}")
+    regions, dtype = (means, scales, rotmats, mask), dtype or torch.float32
+    can_compile = spectrum == "full" and dtype == torch.float32 and not any(v.requires_grad for v in regions)
     sizes: dict[str, Any] = {"n_angles": n_angles, "max_degree": max_degree}
-    values, n_exact = arrays.describe_regions(*given, **sizes, anisotropy=anisotropy, bandwidth=bandwidth)
+    sizes |= {"anisotropy": anisotropy, "bandwidth": bandwidth}
+    if backend == "reference" or (backend == "auto" and not can_compile):
+        from chebsplat.shape import descriptor_reference
+
+        return descriptor_reference.describe(*regions, **sizes, spectrum=spectrum, n_eigs=n_eigs, dtype=dtype)
+    if backend not in ("auto", "numba"):
+        raise ValueError(f"backend {backend!r} is none of auto, numba, reference")
+    if not can_compile:
+        raise ValueError("the numba backend takes the full spectrum in float32 without gradients: use the reference")
+    values, n_exact = _compiled(means.numpy(), scales.numpy(), rotmats.numpy(), mask.numpy(), **sizes)
     return Described(torch.from_numpy(values), n_exact=n_exact)
 
 
-def describe_regions(
-    means: Tensor,
-    scales: Tensor,
-    rotmats: Tensor,
-    mask: Tensor,
-    *,
-    spectrum: Spectrum = "full",
-    n_eigs: int = 16,
-    dtype: torch.dtype = torch.float32,
-    **parameters: Any,
-) -> Tensor:
-    """Descriptors [M, n, J, P] by the fastest route: compiled for the full spectrum in float32 without a gradient,
-    else `describe_reference`, which documents the arguments.
-    """
-    given = (means, scales, rotmats, mask)
-    if spectrum == "full" and dtype == torch.float32 and not any(v.requires_grad for v in given):
-        return describe_compiled(*given, **parameters).values
-    return describe_reference(*given, spectrum=spectrum, n_eigs=n_eigs, dtype=dtype, **parameters).values
-
-
-@torch.no_grad()
 def describe_members(
-    means: Tensor,
-    quats: Tensor,
-    scales: Tensor,
-    members: Tensor,
+    means: np.ndarray,
+    quats: np.ndarray,
+    scales: np.ndarray,
+    members: np.ndarray,
+    settings: DescribeSection,
     *,
+    chunk: int = 2048,
+) -> Described[np.ndarray]:
+    """Descriptors f32 [M, n, J, P] of regions whose members are gathered from Gaussians; torch only if cut.
+
+    Args:
+      means:   [N, 3] scene units; quats [N, 4] wxyz, of any length; scales [N, 3] standard deviations, scene units.
+      members: i64 [M, n], -1 where padded.
+      chunk:   regions at a time, at most: bounds memory.
+    """
+    full, n = settings.spectrum == "full", n_degrees(settings.spectrum, settings.max_degree)
+    values, counts = np.zeros((*members.shape, settings.n_angles, n), np.float32), np.zeros(3, np.int64)
+    step = chunk if full else min(chunk, 256)
+    for start in range(0, len(members), step):
+        part = members[start : start + step]
+        index = np.maximum(part, 0)
+        described = (_full if full else _cut)(means[index], quats[index], scales[index], part >= 0, settings)
+        values[start : start + step] = described.values
+        counts += described[1:]
+    return Described(values, *counts.tolist())
+
+
+def _full(
+    means: np.ndarray, quats: np.ndarray, scales: np.ndarray, mask: np.ndarray, settings: DescribeSection
+) -> Described[np.ndarray]:
+    sizes = settings.n_angles, settings.max_degree, settings.anisotropy, settings.bandwidth
+    values, n_exact = _compiled(means, scales, rotation_matrices_f64(quats), mask, *sizes)
+    return Described(values, n_exact=n_exact)
+
+
+def _cut(
+    means: np.ndarray, quats: np.ndarray, scales: np.ndarray, mask: np.ndarray, settings: DescribeSection
+) -> Described[np.ndarray]:
+    import torch
+
+    rotmats = rotation_matrices(torch.from_numpy(quats).reshape(-1, 4)).reshape(*mask.shape, 3, 3)
+    regions = torch.from_numpy(means), torch.from_numpy(scales), rotmats, torch.from_numpy(mask)
+    parameters = settings.model_dump(exclude={"n_regions", "region_size", "seed"})
+    described = describe(*regions, **parameters, dtype=torch.float64, backend="reference")
+    return Described(described.values.float().numpy(), *described[1:])
+
+
+def _compiled(
+    means: np.ndarray,
+    scales: np.ndarray,
+    rotmats: np.ndarray,
+    mask: np.ndarray,
     n_angles: int,
     max_degree: int,
     anisotropy: float,
     bandwidth: float,
-    spectrum: Spectrum = "full",
-    n_eigs: int = 16,
-    chunk: int = 2048,
-) -> Described:
-    """Descriptors of Gaussians [N] gathered by `members` i64 [M, n], -1 where padded; `chunk` bounds memory."""
-    sizes: dict[str, Any] = {"n_angles": n_angles, "max_degree": max_degree}
-    sizes |= {"anisotropy": anisotropy, "bandwidth": bandwidth}
-    if spectrum == "full":
-        plain = (v.numpy() for v in (means, quats, scales, members))
-        full = arrays.describe_members(*plain, **sizes, chunk=chunk)
-        return Described(torch.from_numpy(full.values), n_exact=full.n_exact)
-    values = [torch.zeros(0, members.shape[1], n_angles, n_degrees(spectrum, max_degree))]
-    counts = np.zeros(3, np.int64)
-    for part in members.split(min(chunk, 256)):
-        index = part.clamp_min(0)
-        rotmats = rotation_matrices(quats[index].reshape(-1, 4)).reshape(*index.shape, 3, 3)
-        given = (means[index], scales[index], rotmats, part >= 0)
-        found = describe_reference(*given, **sizes, spectrum=spectrum, n_eigs=n_eigs)
-        values.append(found.values.float())
-        counts += found[1:]
-    return Described(torch.cat(values), *(int(count) for count in counts))
+) -> tuple[np.ndarray, int]:
+    """The kernel's values f32 [M, n, J, D - 1], and how many regions took the float64 operator."""
+    from chebsplat.shape import descriptor_kernel
+
+    out = np.zeros((*mask.shape, n_angles, max_degree - 1), np.float32)
+    exact = np.zeros(len(mask), np.bool_)
+    parts = [np.ascontiguousarray(v, np.float64) for v in (means, scales, rotmats)]
+    descriptor_kernel.describe(*parts, np.ascontiguousarray(mask), float(anisotropy), float(bandwidth), out, exact)
+    return out, int(exact.sum())

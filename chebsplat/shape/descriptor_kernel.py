@@ -1,5 +1,5 @@
 """Operator and centred Chebyshev recurrence of many regions in one compiled loop (Eqs 2-6): the fast twin of
-`descriptor.describe_reference`. Matrices are as in `albo_kernel`.
+`descriptor_reference.describe`. Matrices are as in `albo_kernel`.
 """
 
 from __future__ import annotations

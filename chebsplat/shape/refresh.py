@@ -106,22 +106,12 @@ class Descriptors:
         same = ((given[:n_before] - self.given[:n_before]).abs() <= limit).all(-1).all(-1)
         same &= (mask[:n_before] == self.mask[:n_before]).all(-1)
         changed = torch.cat([~same, torch.ones(len(members) - n_before, dtype=torch.bool)])
-        described = describe_members(
-            means,
-            quats,
-            log_scales.exp(),
-            members[changed],
-            n_angles=self.settings.n_angles,
-            max_degree=self.settings.max_degree,
-            anisotropy=self.settings.anisotropy,
-            bandwidth=self.settings.bandwidth,
-            spectrum=self.settings.spectrum,
-            n_eigs=self.settings.n_eigs,
-        )
-        values = described.values.new_zeros(len(members), members.shape[1], self.values.shape[2])
+        gaussians = means.numpy(), quats.numpy(), log_scales.exp().numpy()
+        described = torch.from_numpy(describe_members(*gaussians, members[changed].numpy(), self.settings).values)
+        values = described.new_zeros(len(members), members.shape[1], self.values.shape[2])
         before = values.new_zeros(len(members), *given.shape[1:])
         values[:n_before], before[:n_before] = self.values[:n_before], self.given[:n_before]
-        values[changed], before[changed] = described.values.flatten(2), given[changed]
+        values[changed], before[changed] = described.flatten(2), given[changed]
         self.values, self.given, self.mask = values, before, mask
         self.n_described += int(changed.sum())
         self.n_regions += len(members)

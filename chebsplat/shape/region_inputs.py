@@ -7,7 +7,7 @@ from typing import NamedTuple
 import numpy as np
 
 from chebsplat.settings import DescribeSection
-from chebsplat.shape.descriptor_arrays import describe_members
+from chebsplat.shape.descriptor import describe_members
 from chebsplat.shape.regions import Regions, build_regions, covering
 
 
@@ -61,17 +61,8 @@ def region_inputs(
     if described:
         if describe.spectrum != "full":
             raise ValueError(f"describe.spectrum = {describe.spectrum} is computed by torch only")
-        found = describe_members(
-            means,
-            quats,
-            np.exp(log_scales),
-            regions.members,
-            n_angles=describe.n_angles,
-            max_degree=describe.max_degree,
-            anisotropy=describe.anisotropy,
-            bandwidth=describe.bandwidth,
-        )
-        parts.append(found.values.reshape(*mask.shape, -1))
+        values = describe_members(means, quats, np.exp(log_scales), regions.members, describe).values
+        parts.append(values.reshape(*mask.shape, -1))
     if context:
         parts.append(features[np.maximum(regions.members, 0)])
     inputs = np.concatenate(parts, -1) if parts else np.zeros((*mask.shape, 0), np.float32)
