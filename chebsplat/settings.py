@@ -24,10 +24,13 @@ def number(default: float | None, meaning: str, low: float, high: float) -> Any:
 
 
 def seed(meaning: str) -> Any:
+    """A field for the seed of a random generator."""
     return number(0, meaning, 0, 2**31 - 1)  # what pycolmap takes
 
 
 class Section(BaseModel):
+    """Settings of one kind: frozen, strict about types, without unknown keys."""
+
     model_config = ConfigDict(extra="forbid", frozen=True, strict=True, allow_inf_nan=False)
 
 
@@ -57,6 +60,8 @@ class DescribeSection(Section):
 
 
 class TrainSection(Section):
+    """docs/method.md, sections 3 to 8."""
+
     steps: int = number(3000, "of training; the schedule's fractions are of these", 1, 1_000_000)
     seconds: float | None = number(None, "of training, instead of steps: the schedule follows the clock", 0.1, 604_800)
     seed: int = seed("of the order of views and of all that is drawn in training")

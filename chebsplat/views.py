@@ -68,6 +68,7 @@ class Views:
     features: Callable[[int], Tensor] | None = None
 
     def camera(self, index: int, factor: int) -> View:
+        """The view's camera at 1/factor of its resolution."""
         height, width = self.images.shape[1] // factor, self.images.shape[2] // factor
         scale = torch.tensor([[width / self.images.shape[2]], [height / self.images.shape[1]], [1.0]])
         return View(self.Ks[index] * scale, self.viewmats[index], width, height)

@@ -1,4 +1,8 @@
-"""Differentiable Gaussian rasterization behind one signature, in the words of gsplat."""
+"""Differentiable Gaussian rasterization behind one signature, in the words of gsplat.
+
+Means and scales are in scene units, cameras are OpenCV's (x right, y down, z forward) as viewmats [C, 4, 4] from the
+world, pixel (0, 0) has its centre at (0.5, 0.5), colours have any number of channels. May import kernels, splats.
+"""
 
 from __future__ import annotations
 

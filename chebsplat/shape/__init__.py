@@ -2,5 +2,5 @@
 Gaussians (Eqs 1-10), and the knowledge space of its attention (Eqs 14-15).
 
 Centres and standard deviations are in scene units, rotations are quaternions wxyz. M regions of n members are padded
-with -1, or a false mask.
+with -1, or a false mask. May import kernels, settings, splats.
 """

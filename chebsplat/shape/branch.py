@@ -125,6 +125,7 @@ class ShapeBranch(nn.Module):
         }
 
     def load_region_state(self, state: dict[str, Any]) -> None:
+        """Go on from what `region_state` returned."""
         for name in OF_REGIONS:
             setattr(self, name, state[name])
         centers, members, radius, share = state["regions"]

@@ -60,6 +60,7 @@ class Descriptors:
         return self.n_described / max(self.n_regions, 1)
 
     def forget(self, region_size: int = 0) -> None:
+        """Compare with nothing: the next `update` describes every region."""
         size = self.settings.n_angles * n_degrees(self.settings.spectrum, self.settings.max_degree)
         self.given = torch.zeros(0, region_size, 10)
         self.mask = torch.zeros(0, region_size, dtype=torch.bool)

@@ -13,9 +13,11 @@ class Laps:
         self.start()
 
     def start(self) -> None:
+        """Begin to measure, or go on after a pause that belongs to no part."""
         self.last = time.perf_counter()
 
     def mark(self, part: str) -> None:
+        """Book the seconds since the last mark or start under `part`."""
         now = time.perf_counter()
         self.seconds[part] = self.seconds.get(part, 0.0) + now - self.last
         self.last = now

@@ -105,6 +105,7 @@ class SceneModel:
 
     @property
     def modules(self) -> dict[str, nn.Module]:
+        """What is learned beside the raw parameters, by name: shape branch and semantic gate, where there are any."""
         parts = {"shape": self.shape, "semantic_gate": self.semantic_gate}
         return {name: module for name, module in parts.items() if module is not None}
 

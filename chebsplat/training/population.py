@@ -28,14 +28,17 @@ class Population:
         self.clear_gradients()
 
     def state_dict(self) -> dict[str, Any]:
+        """Counts, and the gradients gathered since growth: tensors, not copied, and plain values."""
         gradients = {"gradient_sum": self.gradient_sum, "gradient_count": self.gradient_count}
         return {name: getattr(self, name) for name in COUNTS} | gradients
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
+        """Go on as the population whose `state_dict()` this is."""
         for name, value in state.items():
             setattr(self, name, value)
 
     def clear_gradients(self) -> None:
+        """Begin to gather gradients anew, of as many Gaussians as there are."""
         self.gradient_sum, self.gradient_count = (torch.zeros(len(self.model)) for _ in range(2))
 
     def note_gradients(self, rendered: Rendered) -> None:

@@ -88,9 +88,11 @@ class Schedule:
         return sum(share >= at for at in self.growth)
 
     def encodes(self, share: float) -> bool:
+        """Are regions encoded?"""
         return share >= self.settings.encode_from
 
     def prunes(self, share: float) -> bool:
+        """Are Gaussians pruned?"""
         return share >= self.settings.prune_from
 
     def has_grown(self, share: float) -> bool:
@@ -98,4 +100,5 @@ class Schedule:
         return share >= self.settings.densify_until
 
     def freezes_bands(self, share: float) -> bool:
+        """Do SH bands stay as they are?"""
         return share >= self.settings.sh_freeze
