@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import difflib
 import unicodedata
 from collections import Counter
+from collections.abc import Iterable
 from typing import Any
 
 from chebsplat.errors import InputError
@@ -29,3 +31,8 @@ def check_names(names: Any, what: str, where: object, remedy: str) -> None:
     for name, count in Counter(names).most_common(1):
         if count > 1:
             raise InputError(f"{where}: {what}: {name!r} occurs {count} times; {remedy}")
+
+
+def suggest(word: str, known: Iterable[str], n: int = 3) -> list[str]:
+    """At most `n` of the known names that look most like a word, the most alike first; none if none is like it."""
+    return difflib.get_close_matches(word[:LONGEST], list(known), n)

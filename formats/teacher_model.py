@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-import difflib
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from chebsplat.errors import InputError
 from chebsplat.formats.files import parse_toml, read_text
-from chebsplat.formats.names import check_names, unprintable
+from chebsplat.formats.names import check_names, suggest, unprintable
 
 if TYPE_CHECKING:
     import numpy as np
@@ -120,7 +119,7 @@ RULES = {
 
 def _check(settings: Path, key: str, value: Any) -> None:
     if key not in RULES:
-        near = difflib.get_close_matches(key, RULES, 1)
+        near = suggest(key, RULES, 1)
         advice = f"did you mean {near[0]}?" if near else f"known are {', '.join(RULES)}"
         raise InputError(f"{settings}: no such key {key}; {advice}")
     wanted, fits = RULES[key]

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import difflib
 import io
 import shutil
 import sys
@@ -13,6 +12,7 @@ from pathlib import Path
 from chebsplat.errors import ConfigError
 from chebsplat.formats import artifact, heads
 from chebsplat.formats.basis import SCHEMA, read_lineage
+from chebsplat.formats.names import suggest
 from chebsplat.pipelines import job, store
 from chebsplat.pipelines.plan import Plan, Planner
 from chebsplat.pipelines.run import HERE, entry, git_state, write_plan
@@ -94,7 +94,7 @@ def revisions_of_head(name: str) -> list[Path]:
     found = heads.revisions(head_folder(name))
     if not found:
         known = [*head_names(), *names("sequences")]
-        near = difflib.get_close_matches(name, known, 3) or known
+        near = suggest(name, known) or known
         raise ConfigError(f"no basis is called {name}; did you mean {', '.join(near)}, or a folder (with a /)?")
     return found
 

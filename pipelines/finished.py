@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-import difflib
 import os
 from pathlib import Path
 
 from chebsplat.errors import ConfigError, InputError
+from chebsplat.formats.names import suggest
 from chebsplat.pipelines import folders, store
 from chebsplat.pipelines.scenes import names, shown
 from chebsplat.stages.registry import STAGES
@@ -75,7 +75,7 @@ def unknown(scene: str, name: str | None) -> ConfigError | InputError:
     if "/" in scene:
         return InputError(f"{shown(scene)} is missing: neither a scene, its folder nor an artifact; correct the path")
     known = titles()
-    near = difflib.get_close_matches(scene[:80], known, 3) or known[:8]
+    near = suggest(scene, known) or known[:8]
     if near and scene not in names("scenes"):
         return ConfigError(f"{shown(scene)} is {where}, and no folder of one; there is {', '.join(near)}")
     return ConfigError(f"{shown(scene)} is {where}, and no folder of one; run it first: make scene={shown(scene)}")

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import difflib
 import os
 import re
 import tomllib
@@ -10,6 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from chebsplat.errors import ConfigError, InputError
+from chebsplat.formats.names import suggest
 
 CONFIGS = Path(__file__).parent / "configs"
 ONE = {"scenes": "scene", "ablations": "ablation", "sequences": "sequence", "studies": "study"}
@@ -23,7 +23,7 @@ def names(kind: str) -> list[str]:
 def read_toml(kind: str, name: str) -> dict[str, Any]:
     """A config of ours. Raises ConfigError with the nearest names."""
     if name not in names(kind):
-        near = difflib.get_close_matches(name[:80], names(kind), 3) or names(kind)
+        near = suggest(name, names(kind)) or names(kind)
         raise ConfigError(f"no {ONE[kind]} is called {shown(name)}; did you mean {', '.join(near)}?")
     return tomllib.loads((CONFIGS / kind / f"{name}.toml").read_text())
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import difflib
 import re
 from pathlib import Path
 from typing import Any, TypeVar
@@ -11,6 +10,7 @@ from pydantic import BaseModel, ValidationError
 
 from chebsplat.errors import ChebsplatError, ConfigError
 from chebsplat.formats.files import parse_json, parse_toml
+from chebsplat.formats.names import suggest
 from chebsplat.settings import DescribeSection, Section, TrainSection
 from chebsplat.stages import settings as parts
 
@@ -89,11 +89,11 @@ def _advice(error: Any, first: list[str]) -> str:
         return f"{said} (got {got})"
     loc = [str(part) for part in error["loc"]]
     if len(loc) == 1:
-        near = difflib.get_close_matches(loc[0][:60], first, 1)
+        near = suggest(loc[0], first, 1)
         if not near and isinstance(error["input"], dict):  # a section of another name, perhaps an earlier one
             near = [key for wanted in error["input"] for key in known_keys() if key.endswith(f".{wanted}")]
     else:
         elsewhere = [key for key in known_keys() if key.endswith("." + loc[-1])]
         own = [key.split(".")[1] for key in known_keys() if key.startswith(loc[0] + ".")]
-        near = elsewhere or [f"{loc[0]}.{key}" for key in difflib.get_close_matches(loc[-1][:60], own, 1)]
+        near = elsewhere or [f"{loc[0]}.{key}" for key in suggest(loc[-1], own, 1)]
     return "no such key" + (f"; did you mean {near[0]}?" if near else "")

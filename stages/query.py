@@ -101,15 +101,14 @@ def embedded(words: list[str], features: Features, model: str | None) -> np.ndar
 
 def among_labels(features: Features, text: str, phrases: list[str]) -> Query:
     """A query of a scene whose teacher knows its labels and no other words."""
-    import difflib
-
+    from chebsplat.formats.names import suggest
     from chebsplat.stages.text import folded
 
     names = features.label_names
     row = {folded(name): k for k, name in enumerate(names)}
     for word in (text, *phrases):
         if folded(word) not in row:
-            near = difflib.get_close_matches(folded(word), row, 3)
+            near = suggest(folded(word), row)
             raise ConfigError(
                 f"{word!r} is no label of this scene, and its teacher (kind {features.convention['kind']}) knows no "
                 f"other words{'; near: ' + ', '.join(near) if near else ''}. Labels: {', '.join(names)}. For free text "

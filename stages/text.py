@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-import difflib
 import logging
 from collections.abc import Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 from chebsplat.errors import InputError
+from chebsplat.formats.names import suggest
 from chebsplat.stages.inference import Model
 
 if TYPE_CHECKING:
@@ -71,7 +71,7 @@ def forms(name: str) -> Iterator[str]:
 def _encoded(names: list[str], teacher: TeacherModel, known: dict[str, int]) -> np.ndarray:
     """Rows of what the table lacks, by the teacher's text encoder. Raises InputError where there is none."""
     words = ", ".join(repr(name) for name in names)
-    near = [match for name in names for match in difflib.get_close_matches(folded(name), known, 3)]
+    near = [match for name in names for match in suggest(folded(name), known)]
     hint = f" (near: {', '.join(dict.fromkeys(near))})" if near else ""
     lacking = f"{teacher.labels or teacher.settings} does not know {words}{hint}"
     if teacher.text is None:

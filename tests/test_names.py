@@ -8,7 +8,7 @@ from chebsplat.errors import InputError
 from chebsplat.formats import artifact
 from chebsplat.formats.cameras import Cameras
 from chebsplat.formats.manifest import Manifest
-from chebsplat.formats.names import check_names
+from chebsplat.formats.names import check_names, suggest
 from chebsplat.formats.ply import read_ply
 from chebsplat.formats.scene import SCHEMA, Scene, read_scene, write_scene
 from chebsplat.stages.extract import extract
@@ -62,3 +62,10 @@ def test_views_of_one_file_name_keep_their_pictures_apart():
     assert len({name.lower() for name in found}) == len(views)
     assert not any("/" in name or name.startswith(".") for name in found)
     assert found[-1] == "view_000" and found[0] == "a-img"
+
+
+def test_names_that_look_like_a_word_are_suggested_however_long_it_is():
+    known = {"chair": 0, "armchair": 1, "table": 2}
+    assert suggest("chiar", known, 1) == ["chair"]
+    assert suggest("charr", known) == ["chair", "armchair"]
+    assert suggest("x" * 10**7, known) == []

@@ -36,8 +36,7 @@ def scenes() -> None:
 @click.argument("section", required=False)
 def settings(section: str | None) -> None:
     """List every setting (of a SECTION, or one section.key): name, default, range, meaning."""
-    import difflib
-
+    from chebsplat.formats.names import suggest
     from chebsplat.pipelines.scenes import shown
     from chebsplat.pipelines.tables import show_rows
     from chebsplat.stages.config import Config, known_keys
@@ -45,7 +44,7 @@ def settings(section: str | None) -> None:
     asked = section or ""
     chosen = [key for key in known_keys() if not asked or asked in (key, key.partition(".")[0])]
     if not chosen:
-        near = difflib.get_close_matches(asked[:80], [*Config.model_fields, *known_keys()], 3)
+        near = suggest(asked, [*Config.model_fields, *known_keys()])
         raise ConfigError(f"no setting or section is called {shown(asked)}; did you mean "
                           f"{', '.join(near or Config.model_fields)}?")  # fmt: skip
     rows = []

@@ -9,6 +9,7 @@ from typing import Any
 import click
 
 from chebsplat.errors import ConfigError
+from chebsplat.formats.names import suggest
 from chebsplat.stages.device import DEVICES
 from chebsplat.stages.registry import STAGES
 
@@ -45,9 +46,7 @@ def checked_stage(stage: str | None, found: list[Any]) -> str | None:
     if stage is None:
         return None
     if stage not in STAGES:
-        import difflib
-
-        near = difflib.get_close_matches(stage, list(STAGES), 1)
+        near = suggest(stage, STAGES, 1)
         raise ConfigError(f"no stage is called {stage}" + (f"; did you mean {near[0]}?" if near else ""))
     for plan in found:
         if plan.asked and stage not in plan.targets:
