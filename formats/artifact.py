@@ -20,6 +20,7 @@ from typing import Any
 
 from chebsplat.errors import ConfigError, InputError
 from chebsplat.formats import disk
+from chebsplat.formats.files import sync
 from chebsplat.formats.manifest import MANIFEST, Manifest, parse_manifest, remedy_of
 
 
@@ -70,10 +71,10 @@ def publish(out: Path, manifest: Manifest, force: bool = False) -> Iterator[Path
             yield tmp
             if force or not is_whole(out, manifest.schema):
                 manifest.files = _file_table(tmp)
-                _write_synced(tmp / MANIFEST, json.dumps(asdict(manifest), indent=1, sort_keys=True) + "\n")
+                (tmp / MANIFEST).write_text(json.dumps(asdict(manifest), indent=1, sort_keys=True) + "\n")
                 _settle_tree(tmp)
                 _put(tmp, out, manifest, force)
-                sync_directory(out.parent)
+                sync(out.parent)
     except BaseException:
         if "zarr" in sys.modules:
             from chebsplat.formats.arrays import settle
@@ -209,13 +210,6 @@ def _file_table(root: Path) -> dict[str, dict[str, Any]]:
     return {name: {"sha256": sha256_file(p), "bytes": p.stat().st_size} for name, p in _members(root).items()}
 
 
-def _write_synced(path: Path, text: str) -> None:
-    with path.open("w") as handle:
-        handle.write(text)
-        handle.flush()
-        os.fsync(handle.fileno())
-
-
 def _settle_tree(root: Path) -> None:
     """Make files outlive a power cut, and as readable as the user's umask has made their folder: some writers give a
     file to its owner alone.
@@ -226,16 +220,7 @@ def _settle_tree(root: Path) -> None:
             with path.open("rb") as handle:
                 os.fchmod(handle.fileno(), mode)
                 os.fsync(handle.fileno())
-    sync_directory(root)
-
-
-def sync_directory(path: Path) -> None:
-    """Make its entries outlive a power cut."""
-    handle = os.open(path, os.O_RDONLY)
-    try:
-        os.fsync(handle)
-    finally:
-        os.close(handle)
+    sync(root)
 
 
 def digest(value: Mapping[str, Any]) -> str:

@@ -18,6 +18,7 @@ from chebsplat.formats.arrays import StoredArray, create_array, has_array, open_
 from chebsplat.formats.channels import SPECS, ChannelMap, from_parts, tensors
 from chebsplat.formats.channels import Document as ChannelsDocument
 from chebsplat.formats.documents import NotRequired, TypedDict, read_document, write_document
+from chebsplat.formats.files import atomic_write, sync
 from chebsplat.formats.manifest import remedy_of
 from chebsplat.formats.names import check_names
 from chebsplat.formats.tensors import read_tensors, write_tensors
@@ -84,7 +85,7 @@ class FeatureWriter:
         if not state.is_file() or state.read_text() != wanted:
             shutil.rmtree(self.folder, ignore_errors=True)
             (self.folder / "done").mkdir(parents=True)
-            _write_safely(state, wanted)
+            atomic_write(state, wanted)
         self._arrays: dict[str, Any] = {}
         self._holds: dict[int, list[str]] = {}  # view -> names of its arrays
         for mark in (self.folder / "done").iterdir():
@@ -121,8 +122,8 @@ class FeatureWriter:
                 raise ValueError(f"view {self.names[view]}: {name} hold {bad} non-finite values in float16")
             shutil.rmtree(self.folder / name / "c" / str(view), ignore_errors=True)  # what a kill left of it
             array[view] = stored
-            _sync(self._file(name, view))
-        _write_safely(self.folder / "done" / str(view), " ".join(values))
+            sync(self._file(name, view))
+        atomic_write(self.folder / "done" / str(view), " ".join(values))
         self._holds[view] = list(values)
 
     def finish(
@@ -176,23 +177,6 @@ class FeatureWriter:
     def _file(self, name: str, view: int) -> Path:
         """Where a view's values lie; every view is one file."""
         return self.folder / name / "c" / str(view) / ("0/0/0" if name == "features" else "0/0")
-
-
-def _write_safely(path: Path, text: str) -> None:
-    """A file that is there whole or not at all, whatever happens to the machine."""
-    part = path.with_name(f".{path.name}.part")
-    part.write_text(text)
-    _sync(part)
-    os.replace(part, path)
-    _sync(path.parent)
-
-
-def _sync(path: Path) -> None:
-    handle = os.open(path, os.O_RDONLY)
-    try:
-        os.fsync(handle)
-    finally:
-        os.close(handle)
 
 
 def _link(source: Path, target: Path) -> None:

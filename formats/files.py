@@ -1,4 +1,5 @@
-"""Files that people or other programs wrote: regular, of bounded size, UTF-8, and parsed or named in a clear error.
+"""Files one by one. Reading what people or other programs wrote: regular, of bounded size, UTF-8, and parsed or named
+in a clear error. Writing a file whole or not at all.
 
 Every reader of such a file goes through here, so that a pipe, a device, a folder, a file of gigabytes, bytes that are
 no text and a document nested a thousand levels deep are each refused at once, in the same words everywhere.
@@ -13,6 +14,8 @@ import re
 import stat
 import tomllib
 from collections import Counter
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any
 
@@ -97,3 +100,37 @@ def parse_toml(path: Path, remedy: str = RESTORE, error: type[ChebsplatError] = 
         raise error(f"{path} is nested too deeply; {remedy}") from None
     except ValueError as fault:
         raise error(f"{path} does not parse ({fault}); {remedy}") from None
+
+
+@contextmanager
+def atomic_path(path: Path) -> Iterator[Path]:
+    """A temporary path beside `path`, which a block fills; it becomes `path` when the block ends without an error.
+
+    The file is there whole or not at all, whatever happens to the machine. A block that fails leaves what stood there
+    before. The temporary name keeps the ending, by which some libraries choose a format.
+    """
+    path.parent.mkdir(parents=True, exist_ok=True)
+    temporary = path.with_name(f".tmp-{os.getpid()}-{path.name}")
+    try:
+        yield temporary
+        sync(temporary)
+        os.replace(temporary, path)
+    finally:
+        with suppress(OSError):  # of the disk that has just failed
+            temporary.unlink(missing_ok=True)
+    sync(path.parent)
+
+
+def atomic_write(path: Path, content: str | bytes) -> None:
+    """Write a file whole or not at all; text as UTF-8."""
+    with atomic_path(path) as temporary:
+        temporary.write_bytes(content.encode() if isinstance(content, str) else content)
+
+
+def sync(path: Path) -> None:
+    """Make a file's bytes, or a folder's entries, outlive a power cut."""
+    handle = os.open(path, os.O_RDONLY)
+    try:
+        os.fsync(handle)
+    finally:
+        os.close(handle)

@@ -13,6 +13,7 @@ from pathlib import Path
 
 from chebsplat.errors import InputError
 from chebsplat.formats import artifact
+from chebsplat.formats.files import sync
 
 NUMBER = re.compile(r"[1-9][0-9]{0,8}")  # of a revision
 
@@ -48,7 +49,7 @@ def advance(folder: Path, count: int, target: Path) -> bool:
         os.symlink(os.path.relpath(target, folder.resolve()), folder / str(count + 1))
     except FileExistsError:
         return False
-    artifact.sync_directory(folder)
+    sync(folder)
     return True
 
 

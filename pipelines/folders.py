@@ -14,7 +14,7 @@ import os
 from pathlib import Path
 
 from chebsplat.errors import ConfigError, InputError
-from chebsplat.formats.files import parse_json
+from chebsplat.formats.files import atomic_write, parse_json
 from chebsplat.pipelines import store
 from chebsplat.pipelines.scenes import folder_name, names
 
@@ -82,9 +82,7 @@ def claim(folder: Path) -> str:
         fcntl.flock(lock, fcntl.LOCK_EX)
         name = name_of(folder)
         if not place(name).exists():
-            part = place(name).with_suffix(".part")
-            part.write_text(json.dumps({"source": str(folder)}) + "\n")
-            os.replace(part, place(name))
+            atomic_write(place(name), json.dumps({"source": str(folder)}) + "\n")
     return name
 
 

@@ -16,6 +16,7 @@ from pathlib import Path
 from typing import Any
 
 from chebsplat.formats import disk
+from chebsplat.formats.files import atomic_write
 from chebsplat.pipelines import children, job, store, summary
 from chebsplat.pipelines.plan import Plan, Step
 from chebsplat.pipelines.store import say
@@ -129,8 +130,7 @@ def write_plan(entries: list[dict[str, Any]]) -> Path:
     for name, hashes in raw.items():
         (folder / name).write_text(json.dumps(hashes))
     plan = folder / "plan.json"
-    plan.with_suffix(".part").write_text(text)
-    os.replace(plan.with_suffix(".part"), plan)
+    atomic_write(plan, text)
     return plan
 
 

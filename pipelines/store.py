@@ -8,12 +8,12 @@ import shutil
 import sys
 import time
 from collections.abc import Container
-from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
 from chebsplat.errors import ConfigError, InputError
 from chebsplat.formats import artifact
+from chebsplat.formats.files import atomic_write
 from chebsplat.formats.manifest import parse_manifest
 
 
@@ -64,14 +64,9 @@ class Memo:
         """Nothing where there is no work folder: a run makes one, planning does not."""
         text = json.dumps(self.values, sort_keys=True)
         if text != self._before and work().is_dir():
-            tmp = self.path.with_suffix(f".{os.getpid()}")
             try:
-                self.path.parent.mkdir(parents=True, exist_ok=True)
-                tmp.write_text(text)
-                os.replace(tmp, self.path)
+                atomic_write(self.path, text)
             except OSError as error:
-                with suppress(OSError):
-                    tmp.unlink(missing_ok=True)
                 say(f"{self.path} cannot be written ({error.strerror}): what it would spare is done again next time")
 
 

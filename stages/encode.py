@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-import os
 import time
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from chebsplat.errors import ConfigError, InputError
+from chebsplat.formats.files import atomic_path
 from chebsplat.formats.manifest import remedy_of
 from chebsplat.stages.inference import Model
 
@@ -168,10 +168,5 @@ def write(out: Path, arrays: dict[str, Any]) -> None:
     """A .npz that is there whole or not at all."""
     import numpy as np
 
-    out.parent.mkdir(parents=True, exist_ok=True)
-    tmp = out.with_name(f".tmp-{os.getpid()}-{out.name}")
-    try:
-        np.savez(tmp, **arrays)
-        os.replace(tmp, out)
-    finally:
-        tmp.unlink(missing_ok=True)
+    with atomic_path(out) as temporary:
+        np.savez(temporary, **arrays)

@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
-import os
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from chebsplat.errors import ConfigError, DataFailure
+from chebsplat.formats.files import atomic_path
+from chebsplat.formats.names import suggest
 
 if TYPE_CHECKING:
     import numpy as np
@@ -56,20 +57,13 @@ def extract(
         raise DataFailure(f"no Gaussian of {n} is left ({why}); choose wider filters")
     part = {name: values[kept] for name, values in scene.parameters.items()}
     held = None if scene.labels is None else scene.labels[kept]
-    out.parent.mkdir(parents=True, exist_ok=True)
-    tmp = out.with_name(f".tmp-{os.getpid()}-{out.name}")
-    try:
-        write_ply(tmp, part, int(part["degrees"].max()), held, scene.label_names)
-        os.replace(tmp, out)
-    finally:
-        tmp.unlink(missing_ok=True)
+    with atomic_path(out) as temporary:
+        write_ply(temporary, part, int(part["degrees"].max()), held, scene.label_names)
     return {"kept": int(kept.sum()), "of": n} | {f"left out by {name}": number for name, number in left_out.items()}
 
 
 def has_label(scene: Scene, path: Path, names: tuple[str, ...]) -> np.ndarray:
     """Which Gaussians bear one of the names. Raises ConfigError, with the nearest name, for one that is unknown."""
-    import difflib
-
     import numpy as np
 
     if scene.labels is None or scene.label_names is None:
@@ -77,7 +71,7 @@ def has_label(scene: Scene, path: Path, names: tuple[str, ...]) -> np.ndarray:
         raise ConfigError(f"{path} has no labels: {why}")
     for name in names:
         if name not in scene.label_names:
-            near = difflib.get_close_matches(name, scene.label_names, 1)
+            near = suggest(name, scene.label_names, 1)
             advice = f"did you mean {near[0]}?" if near else f"there are: {', '.join(scene.label_names)}"
             raise ConfigError(f"no label is called {name}; {advice}")
     return np.isin(scene.labels, [scene.label_names.index(name) for name in names])

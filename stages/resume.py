@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 import logging
-import os
 import time
 from typing import Any
 
 from chebsplat.formats import disk
 from chebsplat.formats.artifact import digest, read_manifest
+from chebsplat.formats.files import atomic_path
 from chebsplat.stages.command import Job, n_threads
 
 log = logging.getLogger("chebsplat")
@@ -55,16 +55,16 @@ class Saves:
         import torch
 
         self.saved = time.monotonic()
-        part = self.file.with_suffix(".part")
+        fault = None
         try:
-            self.file.parent.mkdir(parents=True, exist_ok=True)
-            with part.open("wb") as handle:
-                torch.save({"identity": self.identity, "state": state()}, handle)
-                handle.flush()
-                os.fsync(handle.fileno())
-            os.replace(part, self.file)
-        except (OSError, RuntimeError):  # torch has its own word for a full disk
-            if (fault := disk.refusal(part.parent)) is None:
+            with atomic_path(self.file) as temporary:
+                try:
+                    with temporary.open("wb") as handle:
+                        torch.save({"identity": self.identity, "state": state()}, handle)
+                except (OSError, RuntimeError):  # torch has its own word for a full disk
+                    fault = disk.refusal(temporary.parent)  # while the half file still takes its room
+                    raise
+        except (OSError, RuntimeError):
+            if (fault := fault or disk.refusal(self.file.parent)) is None:
                 raise
-            part.unlink(missing_ok=True)
             log.warning("%s cannot be saved (%s): the training goes on without", self.file, fault.strerror)

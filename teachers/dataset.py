@@ -8,6 +8,7 @@ from pathlib import Path
 
 import numpy as np
 
+from chebsplat.formats.files import atomic_path
 from chebsplat.stages.progress import Progress
 from chebsplat.teachers.rooms import generator_digest, training_views
 
@@ -30,9 +31,8 @@ def rendered(folder: Path, seeds: range, n_views: int, workers: int) -> tuple[np
 
 def _render(place: Path, seed: int, n_views: int) -> None:
     images, labels = training_views(seed, n_views)
-    part = place / f"{seed}.part.npz"
-    np.savez(part, images=images, labels=labels)
-    part.rename(place / f"{seed}.npz")
+    with atomic_path(place / f"{seed}.npz") as temporary:
+        np.savez(temporary, images=images, labels=labels)
 
 
 def _load(path: Path) -> tuple[np.ndarray, np.ndarray]:

@@ -16,6 +16,7 @@ from chebsplat.errors import DiskFailure, InputError
 from chebsplat.formats import artifact, disk
 from chebsplat.formats.arrays import write_array
 from chebsplat.formats.manifest import Manifest
+from chebsplat.stages.resume import Saves
 
 MOUNT = 'mount -t tmpfs -o "$0" tmpfs "$1" && shift && exec "$@"'
 
@@ -110,3 +111,18 @@ def test_a_file_that_may_not_be_read_is_an_input_s_fault(tmp_path, monkeypatch):
     (tmp_path / "photo.jpg").touch()
     with pytest.raises(InputError, match=r"photo\.jpg cannot be read"), disk.explained(tmp_path):
         raise PermissionError(errno.EACCES, os.strerror(errno.EACCES), str(tmp_path / "photo.jpg"))
+
+
+def test_a_training_goes_on_where_a_full_disk_takes_no_state(tmp_path, monkeypatch, caplog):
+    """The disk is asked while the half file still takes its room: once that is removed, a little more would fit."""
+    full = OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+    monkeypatch.setattr(disk, "refusal", lambda folder: full if list(folder.iterdir()) else None)
+    saves = Saves.__new__(Saves)
+    saves.file, saves.identity, saves.saved = tmp_path / "training.pt", "i", 0.0
+
+    def state():
+        raise RuntimeError("unexpected pos")  # torch's word
+
+    saves.offer(state, now=True)
+    assert "the training goes on without" in caplog.text
+    assert not list(tmp_path.iterdir())

@@ -5,7 +5,7 @@ import os
 import pytest
 
 from chebsplat.errors import ConfigError, InputError
-from chebsplat.formats.files import parse_json, parse_toml, read_text, regular
+from chebsplat.formats.files import atomic_path, atomic_write, parse_json, parse_toml, read_text, regular
 
 
 def write(path, content):
@@ -55,3 +55,27 @@ def test_a_file_of_gigabytes_is_refused_unread(tmp_path):
 def test_names_in_any_language_and_a_byte_order_mark_are_read(tmp_path):
     assert parse_json(write(tmp_path / "a.json", "\ufeff" + '{"é": "\\ud83d\\ude00"}')) == {"é": "😀"}
     assert parse_toml(write(tmp_path / "a.toml", "\ufeffa.b.c = '沙'")) == {"a": {"b": {"c": "沙"}}}
+
+
+def test_a_file_is_written_whole_or_stays_as_it_was(tmp_path):
+    file = tmp_path / "new" / "notes.json"
+    atomic_write(file, "é\n")
+    assert file.read_bytes() == "é\n".encode()
+    with pytest.raises(RuntimeError), atomic_path(file) as temporary:
+        assert temporary.suffix == file.suffix
+        temporary.write_bytes(b"half")
+        raise RuntimeError
+    assert file.read_bytes() == "é\n".encode()
+    atomic_write(file, b"\xff")
+    assert file.read_bytes() == b"\xff"
+    assert list(file.parent.iterdir()) == [file]
+
+
+@pytest.mark.parametrize(("umask", "mode"), [(0o022, 0o644), (0o077, 0o600)])
+def test_a_file_written_whole_is_as_readable_as_the_umask_says(tmp_path, umask, mode):
+    before = os.umask(umask)
+    try:
+        atomic_write(tmp_path / "x", "1")
+    finally:
+        os.umask(before)
+    assert (tmp_path / "x").stat().st_mode & 0o777 == mode
