@@ -125,10 +125,10 @@ def generated(seeds: range) -> Iterator[tuple[str, np.ndarray]]:
     from concurrent.futures import ThreadPoolExecutor
     from functools import partial
 
-    from chebsplat.formats.meshes import RayCaster
     from chebsplat.stages.sources.generated import SIZES, photograph
     from chebsplat.synthetic.layout import build
     from chebsplat.synthetic.path import intrinsics, walk
+    from chebsplat.synthetic.rays import RayCaster
 
     for seed in seeds:
         preset = ("office", "room")[seed % 2]

@@ -43,10 +43,10 @@ def labelled(vectors: np.ndarray, texts: np.ndarray, height: int, width: int) ->
 
 def held_out_room(seed: int, n_views: int = VIEWS, width: int = WIDTH, height: int = HEIGHT) -> list[View]:
     """Views of a held-out room along its path, as the named scenes are photographed."""
-    from chebsplat.formats.meshes import RayCaster
     from chebsplat.stages.sources.generated import photograph
     from chebsplat.synthetic.layout import build
     from chebsplat.synthetic.path import intrinsics, walk
+    from chebsplat.synthetic.rays import RayCaster
 
     room = build("office" if seed < HELD_OUT[len(HELD_OUT) // 2] else "room", seed)
     caster, K = RayCaster(room.soup.vertices, room.soup.triangles), intrinsics(width, height)

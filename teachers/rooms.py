@@ -29,8 +29,8 @@ def training_views(seed: int, n_views: int) -> tuple[np.ndarray, np.ndarray]:
 
     Raises: ValueError if the seed is not one of TRAINING.
     """
-    from chebsplat.formats.meshes import RayCaster
     from chebsplat.stages.sources.generated import photograph
+    from chebsplat.synthetic.rays import RayCaster
 
     if seed not in TRAINING:
         raise ValueError(f"seed {seed} is not one for training: {TRAINING}")

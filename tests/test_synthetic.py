@@ -4,11 +4,11 @@ import numpy as np
 import pytest
 
 from chebsplat.cameras import centers, unproject
-from chebsplat.formats.meshes import RayCaster
 from chebsplat.stages.sources import generated
 from chebsplat.synthetic import CLASS_NAMES
 from chebsplat.synthetic.layout import build
 from chebsplat.synthetic.path import intrinsics, walk
+from chebsplat.synthetic.rays import RayCaster
 
 SCENES = [*(("office", seed) for seed in range(100, 105)), *(("room", seed) for seed in range(200, 203)), ("toy", 1)]
 

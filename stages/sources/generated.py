@@ -7,8 +7,8 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 if TYPE_CHECKING:
-    from chebsplat.formats.meshes import Hits, RayCaster
     from chebsplat.synthetic.layout import Room
+    from chebsplat.synthetic.rays import Hits, RayCaster
 
 SIZES = {"office": (80, 320, 240), "room": (80, 320, 240), "toy": (16, 96, 72)}  # views, width, height
 EDGE_SAMPLES = 3  # rays along each side of a pixel on an edge
@@ -18,10 +18,10 @@ def capture(name: str, seed: int, preset: str) -> dict[str, Any]:
     """The fields of a capture; see `formats.capture`."""
     from concurrent.futures import ThreadPoolExecutor
 
-    from chebsplat.formats.meshes import RayCaster
     from chebsplat.synthetic import CLASS_NAMES
     from chebsplat.synthetic.layout import build
     from chebsplat.synthetic.path import intrinsics, walk
+    from chebsplat.synthetic.rays import RayCaster
 
     n_views, width, height = SIZES[preset]
     room = build(preset, seed)

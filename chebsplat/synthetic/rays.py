@@ -1,4 +1,4 @@
-"""Triangle meshes: the one door to open3d."""
+"""Rays cast at triangles: the one door to open3d."""
 
 from __future__ import annotations
 
@@ -28,12 +28,12 @@ class RayCaster:
 
     def cast(self, origins: np.ndarray, directions: np.ndarray) -> Hits:
         """First hits of rays [N, 3] + t [N, 3]; distance is in units of the direction's length."""
-        found = self._scene.cast_rays(self._rays(origins, directions))
-        triangle = found["primitive_ids"].numpy().astype(np.int64)
-        normals = found["primitive_normals"].numpy()
+        answer = self._scene.cast_rays(self._rays(origins, directions))
+        triangle = answer["primitive_ids"].numpy().astype(np.int64)
+        normals = answer["primitive_normals"].numpy()
         triangle[triangle == self._none] = -1
         lengths = np.linalg.norm(normals, axis=-1, keepdims=True)
-        return Hits(found["t_hit"].numpy(), triangle, normals / np.maximum(lengths, 1e-20))
+        return Hits(answer["t_hit"].numpy(), triangle, normals / np.maximum(lengths, 1e-20))
 
     def is_blocked(self, origins: np.ndarray, directions: np.ndarray) -> np.ndarray:
         """Bool [N]: something lies within one length of the direction."""
