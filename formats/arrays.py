@@ -105,7 +105,10 @@ class StoredArray:
     """
 
     def __init__(self, root: Path, manifest: Manifest, name: str, within: tuple[float, float] | None = None):
-        """Raises: InputError if metadata is damaged, or its chunks are not those that the manifest lists."""
+        """Open the array `name` of the artifact at `root`; no value is read yet.
+
+        Raises: InputError if metadata is damaged, or its chunks are not those that the manifest lists.
+        """
         import zarr
 
         self.root, self.path, self.within = root, root / name, within
@@ -207,20 +210,20 @@ def _check_metadata(file: Path, manifest: Manifest, name: str, remedy: str) -> N
 
     Choices: zstd stores 128 KB of one value in 4 bytes, its best; what claims to be packed more tightly lies.
     """
-    found = conform(parse_json(file, remedy), _Metadata, file, remedy)
-    shape, part = found["shape"], found["chunk_grid"]["configuration"]["chunk_shape"]
-    for codec in found["codecs"]:
+    metadata = conform(parse_json(file, remedy), _Metadata, file, remedy)
+    shape, part = metadata["shape"], metadata["chunk_grid"]["configuration"]["chunk_shape"]
+    for codec in metadata["codecs"]:
         inner = codec.get("configuration", {})
         conform([*inner.get("codecs", []), *inner.get("index_codecs", [])], list[_Codec], file, remedy)
-    held = {path: entry["bytes"] for path, entry in manifest.files.items() if path.startswith(f"{name}/c/")}
+    sizes = {path: entry["bytes"] for path, entry in manifest.files.items() if path.startswith(f"{name}/c/")}
     if len(part) != len(shape):
         raise InputError(f"{file} declares chunks {part} of an array {shape}; {remedy}")
     grid = [-(-n // c) for n, c in zip(shape, part, strict=True)]
-    for k in range(min(math.prod(grid), len(held) + 1)):
-        if (chunk := "/".join([name, "c", *map(str, _unravelled(k, grid))])) not in held:
+    for k in range(min(math.prod(grid), len(sizes) + 1)):
+        if (chunk := "/".join([name, "c", *map(str, _unravelled(k, grid))])) not in sizes:
             raise InputError(f"{file.parents[name.count('/') + 1] / chunk} is missing; {remedy}")
-    size, least = math.prod(part) * np.dtype(found["data_type"]).itemsize, min(held.values(), default=0)
-    if held and size > TIGHTEST * max(least, 64):
+    size, least = math.prod(part) * np.dtype(metadata["data_type"]).itemsize, min(sizes.values(), default=0)
+    if sizes and size > TIGHTEST * max(least, 64):
         raise InputError(f"{file} declares {size:,} bytes of a file of {least}; {remedy}")
 
 
@@ -234,4 +237,5 @@ def _unravelled(k: int, grid: list[int]) -> list[int]:
 
 
 def has_array(manifest: Manifest, name: str) -> bool:
+    """Whether an artifact lists an array of that name."""
     return f"{name}/zarr.json" in manifest.files

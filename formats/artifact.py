@@ -25,11 +25,13 @@ from chebsplat.formats.manifest import MANIFEST, Manifest, parse_manifest, remed
 
 
 def sha256_file(path: Path) -> str:
+    """sha256 of a file's bytes, 64 hexadecimal digits."""
     with path.open("rb") as handle:
         return hashlib.file_digest(handle, "sha256").hexdigest()
 
 
 def is_published(path: Path) -> bool:
+    """Whether a folder holds a manifest: `publish` has ended there."""
     return os.path.isfile(path / MANIFEST)
 
 
@@ -97,22 +99,22 @@ def _make(tmp: Path, out: Path) -> None:
 
 
 def _put(tmp: Path, out: Path, manifest: Manifest, force: bool) -> None:
-    """Rename `tmp` to `out`; what `check_place` lets go stands aside for it: no one ever sees half of either."""
-    aside = tmp.with_name(f".tmp-{out.name}-old-{os.getpid()}")
+    """Rename `tmp` to `out`; what `check_place` lets be replaced is renamed before: no one sees half of either."""
+    replaced = tmp.with_name(f".tmp-{out.name}-old-{os.getpid()}")
     try:
         os.rename(tmp, out)
     except OSError:
         if not force and is_whole(out, manifest.schema):
             return  # a twin was faster
         check_place(out, manifest.schema, manifest.key, force)
-        os.rename(out, aside)
+        os.rename(out, replaced)
         try:
             os.rename(tmp, out)
         except OSError:
             if not is_whole(out, manifest.schema):
                 raise
     finally:
-        shutil.rmtree(aside, ignore_errors=True)
+        shutil.rmtree(replaced, ignore_errors=True)
 
 
 def check_place(out: Path, schema: str, key: str, force: bool = False) -> None:
@@ -129,12 +131,12 @@ def check_place(out: Path, schema: str, key: str, force: bool = False) -> None:
     if not is_published(out):
         raise InputError(f"{out} exists and is not an artifact: nothing was replaced; choose another --out")
     try:
-        found = parse_manifest(out)
+        standing = parse_manifest(out)
     except InputError:  # it may be anyone's: nobody is told to delete it
         raise InputError(f"{out / MANIFEST} is no manifest: nothing was replaced; choose another --out") from None
-    if found.schema != schema:
-        raise InputError(f"{out} holds {found.schema}, not {schema}: nothing was replaced; choose another --out")
-    if extra := _unlisted(out, found):
+    if standing.schema != schema:
+        raise InputError(f"{out} holds {standing.schema}, not {schema}: nothing was replaced; choose another --out")
+    if extra := _unlisted(out, standing):
         raise InputError(f"{out / extra[0]} is no part of the artifact: nothing was replaced; move it away")
     if not force:
         read_manifest(out, schema)

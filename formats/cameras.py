@@ -35,13 +35,14 @@ class Document(TypedDict):
 
 
 def write_cameras(out: Path, cameras: Cameras) -> None:
+    """Write cameras beside what else an artifact holds. Raises ValueError on a non-finite value."""
     write_tensors(out / "cameras.safetensors", {"Ks": cameras.Ks, "cam_from_world": cameras.cam_from_world})
     document = {"names": cameras.names, "width": cameras.width, "height": cameras.height}
     write_document(out / "cameras.json", document)
 
 
 def read_cameras(path: Path, manifest: Manifest) -> Cameras:
-    """Raises: InputError naming the damaged file and the remedy."""
+    """The cameras of an artifact. Raises InputError naming the damaged file and the remedy."""
     document, file = read_document(path, manifest, "cameras.json", Document), path / "cameras.safetensors"
     names = document["names"]
     check_names(names, "names", path / "cameras.json", remedy_of(path))

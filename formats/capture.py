@@ -98,7 +98,10 @@ def write_capture(out: Path, capture: Capture) -> None:
 
 
 def read_capture(path: Path) -> Capture:
-    """Images, depth, labels and masks stay on disk until indexed. Raises InputError naming file and remedy."""
+    """The capture at `path`; images, depth, labels and masks stay on disk until indexed.
+
+    Raises: InputError naming the damaged file and the remedy.
+    """
     path = Path(path)
     manifest = artifact.read_manifest(path, SCHEMA)
     document = read_document(path, manifest, "capture.json", Document)

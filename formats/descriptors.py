@@ -48,7 +48,7 @@ def write_descriptors(out: Path, descriptors: Descriptors) -> None:
 
 
 def read_descriptors(path: Path) -> Descriptors:
-    """Raises: InputError naming the damaged file and the remedy."""
+    """Regions and descriptors at `path`, all in memory. Raises InputError naming the damaged file and the remedy."""
     path = Path(path)
     manifest = artifact.read_manifest(path, SCHEMA)
     arrays = read_tensors(path, manifest, "descriptors.safetensors", SPECS)

@@ -1,4 +1,4 @@
-"""Disks that are full, over quota, read-only or not ours to write: said in one line, with the file and the bytes."""
+"""Disks that are full, over quota, read-only or not ours to write: one line, with the file and the bytes."""
 
 from __future__ import annotations
 
@@ -39,9 +39,9 @@ def explained(folder: Path, passed: tuple[type[Exception], ...] = ()) -> Iterato
         raise _failure(fault, folder) from error
 
 
-def check(folder: Path, said: str) -> None:
-    """Raises DiskFailure if a disk takes no more, or a program `said` so before it ended."""
-    if fault := _of_disk(RuntimeError(said)) or refusal(folder):
+def check(folder: Path, words: str) -> None:
+    """Raise DiskFailure if a disk takes no more, or if the last `words` of a program say so."""
+    if fault := _of_disk(RuntimeError(words)) or refusal(folder):
         raise _failure(fault, folder)
 
 
@@ -74,15 +74,15 @@ def refusal(folder: Path) -> OSError | None:
 
 
 def _failure(fault: OSError, folder: Path) -> ChebsplatError:
-    place = Path(os.fsdecode(fault.filename)) if isinstance(fault.filename, str | bytes) else folder
+    file = Path(os.fsdecode(fault.filename)) if isinstance(fault.filename, str | bytes) else folder
     if fault.errno in CLOSED:
-        if place.exists() and not os.access(place, os.R_OK):
-            return InputError(f"{place} cannot be read ({fault.strerror}); allow it, or name another")
-        return DiskFailure(f"{place} cannot be written ({fault.strerror}); make it writable, or choose another folder")
+        if file.exists() and not os.access(file, os.R_OK):
+            return InputError(f"{file} cannot be read ({fault.strerror}); allow it, or name another")
+        return DiskFailure(f"{file} cannot be written ({fault.strerror}); make it writable, or choose another folder")
     there = next(parent for parent in (folder, *folder.parents) if parent.is_dir())
     written = sum(path.stat().st_size for path in folder.rglob("*") if path.is_file()) if folder == there else 0
     free = shutil.disk_usage(there).free
     return DiskFailure(
-        f"{place} cannot be written ({fault.strerror}): more than {written:,} bytes are needed in {folder.parent}, "
+        f"{file} cannot be written ({fault.strerror}): more than {written:,} bytes are needed in {folder.parent}, "
         f"{free:,} are free beside those; make room and give the same command again"
     )

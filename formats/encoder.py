@@ -50,7 +50,10 @@ def write_encoder(out: Path, contract: dict[str, Any], parity: dict[str, list[di
 
 
 def read_encoder(path: Path) -> Encoder:
-    """Raises: InputError naming the damaged file and the remedy."""
+    """Paths of the models at `path`, their contract and their parity with torch.
+
+    Raises: InputError naming the damaged file and the remedy.
+    """
     path = Path(path)
     manifest = artifact.read_manifest(path, SCHEMA)
     models = {name: artifact.checked(path, manifest, name) for name in (FLOAT, DYNAMIC, FUSED)}

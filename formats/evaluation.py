@@ -81,7 +81,10 @@ def write_evaluation(out: Path, evaluation: Evaluation) -> None:
 
 
 def read_evaluation(path: Path) -> Evaluation:
-    """Raises: InputError naming the damaged file and the remedy."""
+    """Figures at `path`; pictures stay on disk until indexed.
+
+    Raises: InputError naming the damaged file and the remedy.
+    """
     path = Path(path)
     manifest = artifact.read_manifest(path, SCHEMA)
     pictures: dict[str, np.ndarray | StoredArray] = {}

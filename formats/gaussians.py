@@ -106,12 +106,15 @@ def write_gaussians(out: Path, gaussians: Gaussians) -> None:
 
 
 def read_gaussians(path: Path) -> Gaussians:
-    """Raises: InputError naming the damaged file and the remedy."""
+    """The checkpoint at `path`; SH bands that it leaves out are zeros.
+
+    Raises: InputError naming the damaged file and the remedy.
+    """
     manifest = artifact.read_manifest(path, SCHEMA)
     file, remedy = path / "parameters.safetensors", remedy_of(path)
     parameters = read_tensors(path, manifest, file.name, SPECS)
-    if held := {name: spec for name, spec in SEMANTIC.items() if name in parameters}:
-        parameters = read_tensors(path, manifest, file.name, SPECS | held)
+    if semantic := {name: spec for name, spec in SEMANTIC.items() if name in parameters}:
+        parameters = read_tensors(path, manifest, file.name, SPECS | semantic)
     n, shN = len(parameters["means"]), parameters["shN"]
     if parameters["degrees"].max(initial=0) > 3 or shN.shape[1] not in REST.values():
         raise InputError(f"{file}: SH {shN.shape} or a degree beyond 3 make no scene; {remedy}")

@@ -24,18 +24,18 @@ def revisions(folder: Path) -> list[Path]:
     Raises: InputError naming a revision that is missing or whose artifact is, or a link that is out of order.
     """
     numbers = [name for name in (os.listdir(folder) if folder.is_dir() else []) if NUMBER.fullmatch(name)]
-    found = [folder / str(number) for number in range(1, len(numbers) + 1)]
+    links = [folder / str(number) for number in range(1, len(numbers) + 1)]
     for name in numbers:
-        if folder / name not in found:
+        if folder / name not in links:
             raise InputError(
                 f"{folder / name} follows no finished revision {int(name) - 1}: restore that, or delete the link"
             )
-    for link in found:
+    for link in links:
         if not artifact.is_published(link):
             raise InputError(f"{link} is no finished revision: restore its artifact, or delete {folder} and begin anew")
         if link.resolve().name != (key := artifact.read_manifest(link).key):
             raise InputError(f"{link} leads to no folder that is called {key}, as its artifact is; link that")
-    return [link.resolve() for link in found]
+    return [link.resolve() for link in links]
 
 
 def advance(folder: Path, count: int, target: Path) -> bool:
@@ -61,7 +61,7 @@ def extend(folder: Path, build: Callable[[Path | None], Path | None]) -> list[Pa
     Raises: InputError, and what `build` raises.
     """
     while True:
-        found = revisions(folder)
-        made = build(found[-1] if found else None)
-        if made is None or advance(folder, len(found), made):
-            return found if made is None else [*found, made]
+        chain = revisions(folder)
+        made = build(chain[-1] if chain else None)
+        if made is None or advance(folder, len(chain), made):
+            return chain if made is None else [*chain, made]

@@ -1,4 +1,4 @@
-"""Images from outside: the one door to Pillow's readers. PNG and JPEG, told by content, of bounded size.
+"""Images from outside: the one door to Pillow's readers. PNG and JPEG, recognised by content, of bounded size.
 
 Pillow would read forty more formats, whatever a file is called; one of its readers starts Ghostscript.
 """
@@ -35,6 +35,7 @@ ON_ITS_SIDE = (5, 6, 7, 8)  # orientations that swap width and height
 
 
 def is_image(name: str) -> bool:
+    """Whether a file's name is that of a PNG or JPEG image; hidden files are none."""
     return os.path.splitext(name)[1].lower() in SUFFIXES and not name.startswith(".")
 
 
@@ -46,15 +47,15 @@ def opened(path: Path, remedy: str = INCOMPLETE, check: Callable[[Any], None] | 
       that blocks must not be nested.
     Raises:  InputError if it is missing (with that remedy), damaged, too large or of another format.
     """
-    with ExitStack() as held:
+    with ExitStack() as pixels:
 
-        def look(image: Any) -> None:
+        def inspect(image: Any) -> None:
             if check is not None:
                 check(image)
-            held.enter_context(_BUDGET.hold(image.width * image.height))
+            pixels.enter_context(_BUDGET.hold(image.width * image.height))
             image.load()
 
-        yield _opened(path, look, remedy)
+        yield _opened(path, inspect, remedy)
 
 
 def read_rgb(path: Path, remedy: str = INCOMPLETE) -> np.ndarray:
@@ -68,14 +69,16 @@ def read_rgb(path: Path, remedy: str = INCOMPLETE) -> np.ndarray:
 def header(path: Path, remedy: str = INCOMPLETE) -> tuple[tuple[int, int], float | None]:
     """(width, height) as the photo is meant to be seen, and its 35 mm focal length if it says so; decodes no pixel."""
 
-    def look(image: Any) -> None:
+    def inspect(image: Any) -> None:
         focal = _exif(image).get_ifd(SUBSECTION).get(FOCAL_35)
         usable = isinstance(focal, (int, float)) and math.isfinite(focal) and focal > 0
-        found.update(size=seen_size(image), focal=float(focal) if usable else None)
+        sizes.append(seen_size(image))
+        focals.append(float(focal) if usable else None)
 
-    found: dict[str, Any] = {}
-    _opened(path, look, remedy)
-    return found["size"], found["focal"]
+    sizes: list[tuple[int, int]] = []
+    focals: list[float | None] = []
+    _opened(path, inspect, remedy)
+    return sizes[0], focals[0]
 
 
 def seen_size(image: Any) -> tuple[int, int]:
@@ -97,7 +100,7 @@ def _exif(image: Any) -> Any:
     return Image.Image.getexif(image)
 
 
-def _opened(path: Path, look: Callable[[Any], None], remedy: str) -> Any:
+def _opened(path: Path, inspect: Callable[[Any], None], remedy: str) -> Any:
     from PIL import Image, UnidentifiedImageError
 
     regular(path, remedy)
@@ -107,7 +110,7 @@ def _opened(path: Path, look: Callable[[Any], None], remedy: str) -> Any:
             image = Image.open(handle, formats=FORMATS)
             if image.width * image.height > MAX_PIXELS or max(image.size) > MAX_SIDE:
                 raise Image.DecompressionBombError(f"{image.width}x{image.height}")
-            look(image)
+            inspect(image)
     except (Image.DecompressionBombError, Image.DecompressionBombWarning) as error:
         raise InputError(
             f"{path} is too large ({error}; {MAX_PIXELS // 10**6} megapixels and {MAX_SIDE} pixels a side are read); "

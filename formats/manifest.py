@@ -99,6 +99,7 @@ NEEDED = {"schema", "key", "stage"}
 
 
 def remedy_of(path: Path) -> str:
+    """What a message advises about a damaged artifact."""
     return f"delete {path} and run its stage again"
 
 

@@ -34,15 +34,15 @@ def read_npy(path: Path, remedy: str, largest: int = LARGEST) -> np.ndarray:
 
 def read_npz(path: Path, wanted: Sequence[str], remedy: str, largest: int = LARGEST) -> dict[str, np.ndarray]:
     """Those of the wanted arrays that an .npz file holds; the others stay packed. Raises as `read_npy`."""
-    found: dict[str, np.ndarray] = {}
+    arrays: dict[str, np.ndarray] = {}
     with _readable(path, ".npz", remedy), zipfile.ZipFile(path) as archive:
         members = {entry.filename.removesuffix(".npy"): entry for entry in archive.infolist()}
         for name in wanted:
             if name in members:
                 with archive.open(members[name]) as handle:
-                    found[name] = _array(handle, members[name].file_size, largest)
-                largest -= found[name].nbytes
-    return found
+                    arrays[name] = _array(handle, members[name].file_size, largest)
+                largest -= arrays[name].nbytes
+    return arrays
 
 
 def finite32(values: np.ndarray) -> np.ndarray | None:

@@ -70,7 +70,10 @@ def write_points(out: Path, points: Points) -> None:
 
 
 def read_points(path: Path) -> Points:
-    """Raises: InputError naming the damaged file and the remedy."""
+    """Registered views and points at `path`, all in memory.
+
+    Raises: InputError naming the damaged file and the remedy.
+    """
     path = Path(path)
     manifest = artifact.read_manifest(path, SCHEMA)
     document, file = read_document(path, manifest, "points.json", Document), path / "points.safetensors"

@@ -39,7 +39,7 @@ class Scene:
                 Gaussian's degree), `degrees` u8 [N] ascending; where there are semantics `features` [N,C], fused if
                 the scene has an encoder; where it has one, `raw_features` [N,C] that encoder and gate see.
     cameras:    of the views it can be evaluated on.
-    order:      i64 [N], place of each Gaussian in the checkpoint, on which the regions depend.
+    order:      i64 [N], row of each Gaussian in the checkpoint, on which the regions depend.
     labels:     i32 [N] class index, -1 none; None without semantics. label_names, label_embeddings f32 [L, C].
     summary:    counts, bytes, and what was left out and why.
     """
@@ -102,7 +102,7 @@ def write_scene(out: Path, scene: Scene, split_by_degree: bool = True) -> dict[s
 
 
 def read_scene(path: Path) -> Scene:
-    """Raises: InputError naming the damaged file and the remedy."""
+    """The exported scene at `path`, all in memory. Raises InputError naming the damaged file and the remedy."""
     path = Path(path)
     manifest = artifact.read_manifest(path, SCHEMA)
     unsorted = read_tensors(path, manifest, "degrees.safetensors", {"degrees": ("uint8", "n")})["degrees"]
@@ -134,21 +134,21 @@ def read_scene(path: Path) -> Scene:
         return Scene(parameters, cameras, order, summary=summary)
     names = read_label_names(path, manifest)
     specs = {"labels": ("int32", n), "embeddings": ("float32", len(names), parameters["features"].shape[1])}
-    found = read_tensors(path, manifest, "labels.safetensors", specs)
-    labels = found["labels"]
+    tensors = read_tensors(path, manifest, "labels.safetensors", specs)
+    labels = tensors["labels"]
     if not -1 <= labels.min() <= labels.max() < len(names):
         raise InputError(
             f"{path / 'labels.safetensors'}: labels {labels.min()} to {labels.max()} of {len(names)}; "
             + remedy_of(path)
         )
-    return Scene(parameters, cameras, order, found["labels"], names, found["embeddings"], summary)
+    return Scene(parameters, cameras, order, labels, names, tensors["embeddings"], summary)
 
 
 def read_label_names(path: Path, manifest: Manifest) -> list[str]:
     """The label dictionary alone, in order of ids. Raises InputError naming file and remedy."""
-    held = read_document(path, manifest, "labels.json", dict[str, str])
-    names, file = list(held.values()), path / "labels.json"
-    if list(held) != [str(k) for k in range(len(names))]:
+    names_by_id = read_document(path, manifest, "labels.json", dict[str, str])
+    names, file = list(names_by_id.values()), path / "labels.json"
+    if list(names_by_id) != [str(k) for k in range(len(names))]:
         raise InputError(f"{file}: the ids are not 0, 1, ... in order; {remedy_of(path)}")
     check_names(names, "labels", file, remedy_of(path))
     return names

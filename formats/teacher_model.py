@@ -21,7 +21,7 @@ TEXT_PACKAGE = "minilm"  # `text` may name the optional extra instead of a file
 
 @dataclass(frozen=True)
 class TeacherModel:
-    """What `read_teacher` found; docs/teachers.md says what each key means to a user.
+    """What `read_teacher` returns; docs/teachers.md says what each key means to a user.
 
     path:      the image encoder, `[1, 3, H, W]` float32 -> `[1, C, h, w]`.
     output:    "features", or "logits" of a closed-set segmenter: channel = index into the label list.
@@ -77,16 +77,16 @@ def read_teacher(path: Path) -> TeacherModel:
             values[key] = settings.parent / values[key]
             if not values[key].is_file():
                 raise InputError(f"{values[key]} is missing; correct `{key}` in {settings}")
-    found = TeacherModel(path, **({"name": path.stem} | values))
-    if found.output == "features" and found.labels is None and found.text is None:
+    teacher = TeacherModel(path, **({"name": path.stem} | values))
+    if teacher.output == "features" and teacher.labels is None and teacher.text is None:
         raise InputError(f"{settings} has neither `labels` nor `text`: no label could be told; add one of them")
-    if found.output == "logits" and found.labels is None:
+    if teacher.output == "logits" and teacher.labels is None:
         raise InputError(f"{settings} has no `labels`: the names of the channels are needed; add them")
-    if isinstance(found.text, Path) and found.tokenizer is None:
+    if isinstance(teacher.text, Path) and teacher.tokenizer is None:
         raise InputError(f"{settings} has `text` without `tokenizer`; add the tokenizer.json of the text encoder")
-    if found.size is not None and any(side % found.multiple for side in found.size):
-        raise InputError(f"{settings}: size {list(found.size)} is not a multiple of {found.multiple}; correct one")
-    return found
+    if teacher.size is not None and any(side % teacher.multiple for side in teacher.size):
+        raise InputError(f"{settings}: size {list(teacher.size)} is not a multiple of {teacher.multiple}; correct one")
+    return teacher
 
 
 def _is_list(value: Any, kinds: tuple[type, ...], length: int, low: float, high: float) -> bool:
@@ -161,16 +161,16 @@ def read_label_set(path: Path) -> dict[str, list[str]]:
     Raises: InputError naming the file, the line and the remedy.
     """
     lines = read_text(path, "labels are plain text, one name a line").splitlines()
-    found: dict[str, list[str]] = {}
+    words_of: dict[str, list[str]] = {}
     for number, line in enumerate(lines, start=1):
         name, _, others = (part.strip() for part in line.partition("#")[0].partition(":"))
         if not name and not others:
             continue
-        if not name or name in found:
+        if not name or name in words_of:
             raise InputError(f"{path}, line {number}: a name is {'given twice' if name else 'missing'}; correct it")
         words = [name, *(word.strip() for word in others.split(",") if word.strip())]
-        found[name] = list(dict.fromkeys(words))
-        check_names(found[name], f"line {number}", path, "correct it")
-    if not 0 < len(found) <= MAX_LABELS:
-        raise InputError(f"{path} holds {len(found)} labels; 1 to {MAX_LABELS} are possible, one name a line")
-    return found
+        words_of[name] = list(dict.fromkeys(words))
+        check_names(words_of[name], f"line {number}", path, "correct it")
+    if not 0 < len(words_of) <= MAX_LABELS:
+        raise InputError(f"{path} holds {len(words_of)} labels; 1 to {MAX_LABELS} are possible, one name a line")
+    return words_of

@@ -44,15 +44,15 @@ def read_tensors(
     for key, (dtype, *shape) in (specs or {}).items():
         if key not in arrays:
             raise InputError(f"{path} has no array {key}; {remedy_of(root)}")
-        found = arrays[key].shape
+        stored = arrays[key].shape
         if arrays[key].dtype.name not in dtype.split(" or "):
             raise InputError(f"{path}: {key} is {arrays[key].dtype}, expected {dtype}; {remedy_of(root)}")
-        fits = len(found) == len(shape) and all(
+        fits = len(stored) == len(shape) and all(
             n == (sizes.setdefault(want, n) if isinstance(want, str) else want)
-            for n, want in zip(found, shape, strict=True)
+            for n, want in zip(stored, shape, strict=True)
         )
         if not fits:
-            raise InputError(f"{path}: {key} has shape {found}, expected {tuple(shape)}; {remedy_of(root)}")
+            raise InputError(f"{path}: {key} has shape {stored}, expected {tuple(shape)}; {remedy_of(root)}")
     for key, array in arrays.items():
         if np.issubdtype(array.dtype, np.floating) and not np.isfinite(array).all():
             raise InputError(f"{path}: {key} holds non-finite values; {remedy_of(root)}")
