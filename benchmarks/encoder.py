@@ -2,22 +2,19 @@
 
 All regions of the scene are encoded, 256 at a time, on the threads that OMP_NUM_THREADS names. Errors are against torch
 in float64: of the encodings, of the fused features, and of the labels that these decode to.
-
-Usage: python benchmarks/encoder.py --work work/office0 [--repeats 15] [--out build/bench]
-The folder holds the links `export`, `train` and `onnx`, from `make scene=office0 stage=...`.
 """
 
 from __future__ import annotations
 
-import argparse
-import csv
 import time
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import torch
 
+from benchmarks import shared
 from chebsplat.formats.encoder import DYNAMIC, FLOAT, read_encoder
 from chebsplat.formats.gaussians import read_gaussians
 from chebsplat.formats.scene import read_scene
@@ -63,18 +60,16 @@ def milliseconds(routes: dict[str, Any], repeats: int) -> dict[str, list[float]]
     return taken
 
 
-def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--work", type=Path, default=Path("work/office0"))
+def main(arguments: Sequence[str]) -> None:
+    parser = shared.parser("encoder", __doc__, work=True)
     parser.add_argument("--repeats", type=int, default=15)
-    parser.add_argument("--out", type=Path, default=Path("build/bench"))
-    arguments = parser.parse_args()
+    options = parser.parse_args(arguments)
     torch.set_num_threads(n_threads())
-    scene, held = read_scene(arguments.work / "export"), read_encoder(arguments.work / "onnx")
+    scene, held = read_scene(options.work / "export"), read_encoder(options.work / "onnx")
     settings = held.contract["settings"]
-    p, order = gaussians(arguments.work / "export", None, settings["n_channels"])
+    p, order = gaussians(options.work / "export", None, settings["n_channels"])
     inputs = inputs_of(p, DescribeSection.model_validate(settings["describe"]), settings)
-    checkpoint, parts = read_gaussians(arguments.work / "train"), chunks(inputs)
+    checkpoint, parts = read_gaussians(options.work / "train"), chunks(inputs)
     single, double = (RegionEncoder.restored(*checkpoint.encoder()) for _ in range(2))
     double, fusion = double.double(), restored_fusion(checkpoint, settings["n_channels"])
     exact = torch_route(double, parts, torch.float64)()
@@ -95,7 +90,7 @@ def main() -> None:
     wanted = fused(exact)
     assert scene.label_embeddings is not None
     labels = decode_labels(wanted, scene.label_embeddings)
-    taken = milliseconds(routes, arguments.repeats)
+    taken = milliseconds(routes, options.repeats)
     rows = []
     for name, route in routes.items():
         encodings = route()
@@ -110,11 +105,7 @@ def main() -> None:
                 "labels_changed": f"{np.mean(decode_labels(found, scene.label_embeddings) != labels):.4%}",
             }
         )
-    arguments.out.mkdir(parents=True, exist_ok=True)
-    with (arguments.out / "encoder.csv").open("w", newline="") as handle:
-        writer = csv.DictWriter(handle, list(rows[0]))
-        writer.writeheader()
-        writer.writerows(rows)
+    shared.write_csv(options.out / "encoder.csv", rows)
     m, n = inputs.mask.shape
     print(f"{m} regions of up to {n} Gaussians, {len(order)} Gaussians, {n_threads()} threads; largest encoding "
           f"{np.abs(exact).max():.2f}")  # fmt: skip
@@ -123,7 +114,3 @@ def main() -> None:
         print("  ".join(row[key].ljust(width) for key, width in widths.items()))
     slower = float(rows[1]["milliseconds"]) > float(rows[0]["milliseconds"])
     print(f"bar: onnxruntime at least as fast as torch: {'MISSED' if slower else 'met'}")
-
-
-if __name__ == "__main__":
-    main()

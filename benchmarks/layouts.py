@@ -3,24 +3,21 @@
 Each layout is read back (the compressed ones through npm's splat-transform, which also writes them) and rendered in
 every test view, all bands, in float32. Bars: split and ragged take at most 40 % of the unpruned PLY, and
 no pixel of ours is off by more than 1e-4.
-
-Usage: python benchmarks/layouts.py --work work/office0 [--out build/bench]
-The folder holds the links `ingest`, `train` and `export`, from `make scene=office0 stage=export`.
 """
 
 from __future__ import annotations
 
-import argparse
 import csv
 import shutil
 import subprocess
 import sys
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 
 import numpy as np
 import torch
 
+from benchmarks import shared
 from chebsplat.formats.artifact import read_manifest
 from chebsplat.formats.capture import read_capture
 from chebsplat.formats.gaussians import read_gaussians
@@ -69,12 +66,10 @@ def compressed(ply: Path, folder: Path) -> Iterator[tuple[str, int, Parameters]]
         yield name, file.stat().st_size, read_ply(back)[0]
 
 
-def main() -> int:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--work", type=Path, required=True)
-    parser.add_argument("--out", type=Path, default=Path("build/bench"))
-    arguments = parser.parse_args()
-    work, out = arguments.work, arguments.out
+def main(arguments: Sequence[str]) -> int:
+    parser = shared.parser("layouts", __doc__, work=True)
+    options = parser.parse_args(arguments)
+    work, out = options.work, options.out
     out.mkdir(parents=True, exist_ok=True)
     checkpoint, scene, capture = (
         read(work / stage)
@@ -103,7 +98,3 @@ def main() -> int:
     key = read_manifest(work / "export").key
     print(f"export {key}: {'within' if good else 'NOT within'} the bars ({len(views)} test views)")
     return 0 if good else 1
-
-
-if __name__ == "__main__":
-    sys.exit(main())

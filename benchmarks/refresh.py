@@ -1,39 +1,28 @@
 """What refreshing regions and descriptors costs in training, and how stale descriptors are between two refreshes.
 
-Usage: python benchmarks/refresh.py --capture DIR --points DIR --features DIR [--out FOLDER]
-The artifacts of one scene, from `make scene=NAME stage=describe`. Trains with the default schedule, without growth, to
-the end of its half-resolution part; from there on descriptors are left as they are, and compared with fresh ones.
+Trains with the default schedule, without growth, to the end of its half-resolution part; from there on descriptors are
+left as they are, and compared with fresh ones.
 """
 
 from __future__ import annotations
 
-import argparse
-import csv
 import os
 import statistics
 import time
-from pathlib import Path
+from collections.abc import Sequence
 from typing import Any
 
-import chebsplat  # isort: skip  # before torch: a busy machine punishes OpenMP threads that wait actively
 import numba
 import torch
 
-from chebsplat.formats.capture import read_capture
-from chebsplat.formats.features import read_features
-from chebsplat.formats.points import read_points
+import chebsplat
+from benchmarks import shared
+from benchmarks.scene import trainer_from
 from chebsplat.shape.descriptor import describe_members
 from chebsplat.stages.config import Config
-from chebsplat.stages.train_inputs import trainer_of
 from chebsplat.training.trainer import Trainer
 
 INTERVALS = (25, 50, 100, 200, 400)
-
-
-def prepared(options: argparse.Namespace) -> Trainer:
-    config = Config.model_validate({"train": {"n_densify": 0, "refresh_every": 1_000_000}})
-    capture, points = read_capture(options.capture), read_points(options.points)
-    return trainer_of(capture, points, read_features(options.features), config.train, config.describe)
 
 
 def descriptors(trainer: Trainer) -> torch.Tensor:
@@ -51,13 +40,11 @@ def staleness(old: torch.Tensor, new: torch.Tensor) -> tuple[float, float]:
     return float(error.median()), float(error.quantile(0.95))
 
 
-def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    for name in ("capture", "points", "features"):
-        parser.add_argument(f"--{name}", type=Path, required=True)
-    parser.add_argument("--out", type=Path, default=Path("build/bench"))
-    options = parser.parse_args()
-    trainer = prepared(options)
+def main(arguments: Sequence[str]) -> None:
+    parser = shared.parser("refresh", __doc__, work=True)
+    options = parser.parse_args(arguments)
+    train = {"n_densify": 0, "refresh_every": 1_000_000}
+    trainer = trainer_from(options.work, Config.model_validate({"train": train}))
     begin = round(trainer.settings.encode_from * trainer.settings.steps)
     before, spent, began = torch.zeros(0), 0.0, 0.0
     rows: list[dict[str, Any]] = []
@@ -91,12 +78,4 @@ def main() -> None:
     for row in rows:
         row["share"] = refresh / (refresh + row["interval"] * row["step_seconds"])
         print(f"{row['interval']:8d} {row['share']:24.1%} {row['median']:19.2e} {row['p95']:9.2e}")
-    options.out.mkdir(parents=True, exist_ok=True)
-    with (options.out / "refresh.csv").open("w", newline="") as handle:
-        writer = csv.DictWriter(handle, list(rows[0]))
-        writer.writeheader()
-        writer.writerows(rows)
-
-
-if __name__ == "__main__":
-    main()
+    shared.write_csv(options.out / "refresh.csv", rows)

@@ -6,26 +6,25 @@ mixed with their nearest words by smooth maps, blurred over boundaries, with smo
 falls as k^-a too. How steep LSeg's own spectrum is, is not known: a = 3 and a = 1 are both measured. The embedded
 teacher's features are its own, on rooms that it was not trained on.
 
-Usage: python benchmarks/store.py [--views 3]  -> a table, build/bench/store.csv; fails if a bar does
+Fails if a bar does.
 """
 
 from __future__ import annotations
 
-import csv
 import json
 import os
 import subprocess
 import sys
 import tempfile
 import time
-from collections.abc import Callable, Iterator
+from argparse import SUPPRESS
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 
-import chebsplat  # isort: skip  # noqa: F401  # before torch
-import click
 import numpy as np
 from scipy.ndimage import gaussian_filter
 
+from benchmarks import shared
 from chebsplat.formats.artifact import publish
 from chebsplat.formats.features import PATCH, SCHEMA, FeatureWriter, read_features
 from chebsplat.formats.manifest import Manifest
@@ -101,20 +100,22 @@ def embedded(n_views: int) -> tuple[np.ndarray, Iterator[np.ndarray], Iterator[n
     return unit(words), features(REFERENCE[: REFERENCES // VIEWS]), features(HELD_OUT[:n_rooms])
 
 
-def measured(name: str, words: np.ndarray, references: Iterator, views: list[np.ndarray]) -> list[dict]:
+def measured(name: str, words: np.ndarray, references: Iterator, views: list[np.ndarray], out: Path) -> list[dict]:
     """A row for each width, and one for the width of a scene by energy alone: what the vocabulary's weight is for."""
     moments = Moments(words.shape[1])
     for features in references:
         moments.add(features)
     cases = [(width, 1.0) for width in WIDTHS] + [(WIDTH, 0.0)]
-    return [row(name, words, views, *channel_map(moments, words, *case)) | {"weight": case[1]} for case in cases]
+    return [row(name, words, views, out, *channel_map(moments, words, *case)) | {"weight": case[1]} for case in cases]
 
 
-def row(name: str, words: np.ndarray, views: list[np.ndarray], matrix: np.ndarray, energy: np.ndarray) -> dict:
+def row(
+    name: str, words: np.ndarray, views: list[np.ndarray], scratch: Path, matrix: np.ndarray, energy: np.ndarray
+) -> dict:
     """What one width costs and keeps, on views that the channels were not computed from."""
     few = [(view @ matrix.astype(np.float32)) for view in views]
     lost, whole, same = 0.0, 0.0, []
-    with tempfile.TemporaryDirectory(dir=bench()) as folder:
+    with tempfile.TemporaryDirectory(dir=scratch) as folder:
         out = Path(folder) / "features"
         names = [str(k) for k in range(len(few))]
         seconds = {"write": clock(lambda: write(out, names, iter(few), few[0].shape))}
@@ -180,7 +181,7 @@ def memory(what: str, folder: Path, n_views: int) -> int:
     return int(next(line for line in status.splitlines() if line.startswith("VmHWM")).split()[1]) * 1024
 
 
-def memories() -> list[dict]:
+def memories(scratch: Path) -> list[dict]:
     """Peak megabytes of writing and of reading, for 20 and 200 views, each in a process of its own.
 
     Large blocks go back to the system as soon as they are freed: otherwise the peak is, now and then, that of what the
@@ -188,22 +189,17 @@ def memories() -> list[dict]:
     """
     rows, environment = [], os.environ | {"MALLOC_MMAP_THRESHOLD_": str(1 << 20)}
     for n_views in (20, 200):
-        with tempfile.TemporaryDirectory(dir=bench()) as folder:
+        with tempfile.TemporaryDirectory(dir=scratch) as folder:
             for what in ("write", "read"):
-                command = [sys.executable, __file__, "--memory", what, "--folder", folder, "--views", str(n_views)]
+                command = [sys.executable, "-m", "benchmarks", "store", "--memory", what, "--out", folder]
+                command += ["--views", str(n_views)]
                 done = subprocess.run(command, stdout=subprocess.PIPE, text=True, check=True, env=environment)
                 peak = json.loads(done.stdout)
                 rows.append({"features": f"{what} {n_views} views", "shape": f"360x480x{WIDTH}", "peak_mb": peak / 1e6})
     return rows
 
 
-def bench() -> Path:
-    folder = Path("build/bench")
-    folder.mkdir(parents=True, exist_ok=True)
-    return folder
-
-
-def failed(rows: list[dict]) -> list[str]:
+def bars_missed(rows: list[dict]) -> list[str]:
     """Bars that are not held. The stand-in of the shallow spectrum is measured, not judged."""
     best = [r for r in rows if r["features"] == "LSeg-like, a = 3" and r["relative_error"] <= MAX_ERROR]
     found = [] if best and best[0]["mb_a_view"] * 1e6 <= MAX_BYTES else ["20 MB a view at 1 % error"]
@@ -215,36 +211,30 @@ def failed(rows: list[dict]) -> list[str]:
     return found
 
 
-@click.command()
-@click.option("--views", default=3, show_default=True, help="that error and bandwidth are measured on")
-@click.option("--memory", "what", type=click.Choice(["write", "read"]), hidden=True)
-@click.option("--folder", type=click.Path(path_type=Path), hidden=True)
-def main(views: int, what: str | None, folder: Path) -> None:
-    """Measure the store; writes build/bench/store.csv."""
-    if what:
-        print(json.dumps(memory(what, folder, views)))
-        return
+def main(arguments: Sequence[str]) -> int:
+    parser = shared.parser("store", __doc__)
+    parser.add_argument("--views", type=int, default=3, help="that error and bandwidth are measured on")
+    parser.add_argument("--memory", choices=["write", "read"], help=SUPPRESS)  # of a process of its own, in --out
+    options = parser.parse_args(arguments)
+    if options.memory:
+        print(json.dumps(memory(options.memory, options.out, options.views)))
+        return 0
+    options.out.mkdir(parents=True, exist_ok=True)
     rows: list[dict] = []
     if EMBEDDED.is_file():
-        words, references, held_out = embedded(views)
-        rows += measured("embedded teacher", words, references, list(held_out))
+        words, references, held_out = embedded(options.views)
+        rows += measured("embedded teacher", words, references, list(held_out), options.out)
     for steepness in (3, 1):
         words, view = stand_in(steepness)
         references = (view(1000 + k, (90, 120)) for k in range(REFERENCES))
-        rows += measured(f"LSeg-like, a = {steepness}", words, references, [view(k, SIZE) for k in range(views)])
-    rows += memories()
+        views = [view(k, SIZE) for k in range(options.views)]
+        rows += measured(f"LSeg-like, a = {steepness}", words, references, views, options.out)
+    rows += memories(options.out)
     columns = list(dict.fromkeys(column for r in rows for column in r))
     print(" | ".join(columns))
     for r in rows:
         print(" | ".join(str(round(r[c], 1) if c == "peak_mb" and c in r else r.get(c, "")) for c in columns))
-    with (bench() / "store.csv").open("w", newline="") as handle:
-        writer = csv.DictWriter(handle, columns)
-        writer.writeheader()
-        writer.writerows(rows)
-    bad = failed(rows)
-    print("bars: held" if not bad else "bars missed: " + "; ".join(bad))
-    sys.exit(bool(bad))
-
-
-if __name__ == "__main__":
-    main()
+    shared.write_csv(options.out / "store.csv", rows)
+    missed = bars_missed(rows)
+    print("bars: held" if not missed else "bars missed: " + "; ".join(missed))
+    return int(bool(missed))

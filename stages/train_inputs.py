@@ -17,7 +17,6 @@ if TYPE_CHECKING:
     from chebsplat.settings import DescribeSection, TrainSection
     from chebsplat.shape.regions import Regions
     from chebsplat.training.model import SceneModel
-    from chebsplat.training.trainer import Trainer
     from chebsplat.views import Views
 
 FEATURE_BYTES = 64 << 20  # of features that are kept in memory; what is beyond is read when its view is looked at
@@ -59,22 +58,6 @@ def training_views(capture: Capture, points: Points, features: Features | None) 
         None if masks is None else torch.from_numpy(masks[:][chosen]),
         of,
     )
-
-
-def trainer_of(
-    capture: Capture,
-    points: Points,
-    features: Features | None,
-    train: TrainSection,
-    describe: DescribeSection,
-    backend: str = "auto",
-) -> Trainer:
-    """A training before its first step, without earlier knowledge; backend: of the rasterizer."""
-    from chebsplat.cameras import extent
-    from chebsplat.training.trainer import Trainer
-
-    model = model_of(points, features, train, describe, backend)
-    return Trainer(model, training_views(capture, points, features), train, extent(points.cam_from_world))
 
 
 def model_of(

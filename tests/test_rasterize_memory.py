@@ -1,4 +1,4 @@
-"""The rasterizer's memory is bounded by what it draws, and does not grow with use; measured by `raster_memory.py`."""
+"""The rasterizer's memory is bounded by what it draws, and does not grow with use; `benchmarks/rasterizer/memory.py`."""
 
 import importlib.util
 import sys
@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-FILE = Path(__file__).parents[1] / "benchmarks/raster_memory.py"
+FILE = Path(__file__).parents[1] / "benchmarks/rasterizer/memory.py"
 BORDER = pytest.mark.xfail(reason="0.97 to 1.05 of the bar", strict=False)
 GAUSSIANS = pytest.mark.xfail(reason="two pairs a Gaussian: its splat and gradients, 8 (11 + D) bytes, outweigh them")
 

@@ -10,7 +10,7 @@ from shared import ROOT
 @pytest.fixture
 def shapes(monkeypatch):
     monkeypatch.syspath_prepend(str(ROOT))
-    import benchmarks.shapes.__main__ as module
+    import benchmarks.shapes.main as module
 
     return module
 

@@ -9,7 +9,7 @@ from shared import ROOT
 @pytest.fixture
 def suite(monkeypatch):
     monkeypatch.syspath_prepend(str(ROOT))
-    import benchmarks.stability.__main__ as module
+    import benchmarks.stability.main as module
     from benchmarks.stability import case
 
     monkeypatch.setattr(case, "CASES", dict(case.CASES))

@@ -4,7 +4,7 @@ The kernel keeps the peak of the resident set; writing 5 to /proc/self/clear_ref
 forward and backward pass raises it over what was resident before, after a warm-up on a scene a hundredth the size, so
 that neither compilation nor thread stacks count. `drift` is what is resident after 10,000 iterations over after 1,000.
 
-Usage: python benchmarks/raster_memory.py peak GAUSSIANS CHANNELS | drift  (prints JSON)
+Usage: python benchmarks/rasterizer/memory.py peak GAUSSIANS CHANNELS | drift  (prints JSON)
 """
 
 from __future__ import annotations

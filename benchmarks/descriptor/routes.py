@@ -1,4 +1,4 @@
-"""Routes to the descriptor that `benchmarks/descriptor.py` compares.
+"""Routes to the descriptor that `python -m benchmarks descriptor` compares.
 
 Every route takes regions (means, scales, rotmats [M, n, ...], mask) and gives descriptors [M, n, J, P]: those of the
 full spectrum, P = D - 1, or of the lowest K eigenpairs, P = D + 1. The routes other than ours share one batched torch
@@ -16,9 +16,9 @@ import numpy as np
 import scipy.linalg
 import scipy.sparse.linalg
 import torch
-from descriptor_cases import ANISOTROPY, BANDWIDTH, D, J, K, Regions
 from torch import Tensor
 
+from benchmarks.descriptor.cases import ANISOTROPY, BANDWIDTH, D, J, K, Regions
 from chebsplat.shape.albo import canonicalize, metric_factors, rotations_about, tangent_axis
 from chebsplat.shape.descriptor import describe
 

@@ -1,4 +1,4 @@
-"""Regions that `benchmarks/descriptor.py` compares routes on, and their descriptors in 50 digits."""
+"""Regions that `python -m benchmarks descriptor` compares routes on, and their descriptors in 50 digits."""
 
 from __future__ import annotations
 

@@ -1,7 +1,4 @@
-"""Every stiff and extreme case: condition, what the naive formula makes of it, our float32 error, pass or fail.
-
-Usage: python -m benchmarks.stability [--only TEXT] [--csv FILE]; exits 1 if any case fails.
-"""
+"""Every stiff and extreme case: condition, what the naive formula makes of it, our float32 error, pass or fail."""
 
 from __future__ import annotations
 
@@ -11,10 +8,10 @@ import sys
 from collections.abc import Sequence
 from pathlib import Path
 
-import chebsplat  # isort: skip  # before torch: a busy machine punishes OpenMP threads that wait actively
 import numpy as np
 import torch
 
+import chebsplat
 from benchmarks.stability import (  # noqa: F401  # importing a module registers its cases
     descriptor,
     fusion,
@@ -29,8 +26,8 @@ from benchmarks.stability.case import CASES, Row, run
 MEDIAN = 5e-7  # of the descriptor's float32 errors, in a whole run
 
 
-def main(arguments: Sequence[str] | None = None) -> int:
-    parser = argparse.ArgumentParser(prog="stability", description=__doc__)
+def main(arguments: Sequence[str]) -> int:
+    parser = argparse.ArgumentParser("python -m benchmarks stability", description=__doc__)
     parser.add_argument("--only", default="", help="run cases whose `module: name` holds this text")
     parser.add_argument("--csv", type=Path, default=Path("build/bench/stability.csv"))
     options = parser.parse_args(arguments)
@@ -61,7 +58,3 @@ def main(arguments: Sequence[str] | None = None) -> int:
 def line(row: Row) -> str:
     what = f"{row.module:<11} {row.case:<44} {row.condition:<24} {row.naive:<31}"
     return f"{what} {row.error:8.1e} <= {row.tolerance:7.1e}  {'pass' if row.passed else 'FAIL'}  {row.note}".rstrip()
-
-
-if __name__ == "__main__":
-    sys.exit(main())

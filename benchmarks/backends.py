@@ -2,28 +2,27 @@
 
 Trains once in full on the cpu backend, then again with few steps on both cpu and reference, which see the same views,
 seeds and schedules. Test views are looked at once, at the end of each training.
-
-Usage: python benchmarks/training.py --work work/office0 [--steps 3000] [--equal-steps 200] [--out build/bench]
-The folder holds the links `ingest`, `sfm` and `teacher`, from `make scene=office0 set=teacher.kind=labels stage=...`.
 """
 
 from __future__ import annotations
 
-import argparse
-import csv
 import os
 import time
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
 import numba
 import numpy as np
 import torch
-from prepared import prepared
 
+from benchmarks import shared
+from benchmarks.scene import trainer_from
+from chebsplat.evaluation.metrics import psnr
 from chebsplat.formats.capture import read_capture
 from chebsplat.formats.points import read_points
 from chebsplat.stages.config import Config
+from chebsplat.training.model import SceneModel
 from chebsplat.views import Views
 
 NEVER = 1_000_000  # steps
@@ -38,28 +37,34 @@ def test_views(work: Path) -> Views:
     return Views([points.names[k] for k in used], torch.from_numpy(images), *cameras)
 
 
+@torch.no_grad()
+def mean_psnr(model: SceneModel, views: Views, degree: int) -> float:
+    """Mean over views of the PSNR of 8-bit images, dB; degree: of the spherical harmonics."""
+    scores = []
+    for k in range(len(views.names)):
+        image = model.render(views.camera(k, 1), degree, semantic=False).rgb.clamp(0, 1)
+        scores.append(psnr((image * 255).round().byte().numpy(), views.images[k].numpy()))
+    return float(np.mean(scores))
+
+
 def train(work: Path, backend: str, steps: int, seed: int) -> dict[str, Any]:
     settings = {"steps": steps, "seed": seed, "encoder": "off", "max_gaussians": 20_000, "refresh_every": NEVER}
-    trainer = prepared(work, Config.model_validate({"train": settings}), backend)
+    trainer = trainer_from(work, Config.model_validate({"train": settings}), backend)
     began = time.perf_counter()
     for _ in trainer.steps():
         pass
     seconds = time.perf_counter() - began
-    trainer.views = test_views(work)
-    psnr = trainer.held_in_psnr(list(range(len(trainer.views.names))))
-    found = {"backend": backend, "steps": steps, "seed": seed, "seconds": seconds, "psnr": psnr}
-    return found | {"gaussians": len(trainer.model), "channels": trainer.model.raw["features"].shape[-1]}
+    row = {"backend": backend, "steps": steps, "seed": seed, "seconds": seconds}
+    row |= {"psnr": mean_psnr(trainer.model, test_views(work), trainer.schedule.degree(1.0))}
+    return row | {"gaussians": len(trainer.model), "channels": trainer.model.raw["features"].shape[-1]}
 
 
-def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--work", type=Path, required=True)
+def main(arguments: Sequence[str]) -> None:
+    parser = shared.parser("train", __doc__, work=True)
     parser.add_argument("--steps", type=int, default=3000)
     parser.add_argument("--equal-steps", type=int, default=200)
     parser.add_argument("--seeds", type=int, default=1)
-    parser.add_argument("--out", type=Path, default=Path("build/bench"))
-    options = parser.parse_args()
-    options.out.mkdir(parents=True, exist_ok=True)
+    options = parser.parse_args(arguments)
     print(f"{os.cpu_count()} cores, load {os.getloadavg()[0]:.1f}; torch {torch.__version__} on "
           f"{torch.get_num_threads()} threads, numba {numba.__version__} on {numba.get_num_threads()}")  # fmt: skip
     wanted = [("cpu", options.steps, 0)]
@@ -77,11 +82,4 @@ def main() -> None:
         print(
             f"PSNR of cpu against reference after {options.equal_steps} steps: {np.max(gaps):.3f} dB apart, bar <= 0.2"
         )
-    with open(options.out / "training.csv", "w", newline="") as handle:
-        writer = csv.DictWriter(handle, list(rows[0]))
-        writer.writeheader()
-        writer.writerows(rows)
-
-
-if __name__ == "__main__":
-    main()
+    shared.write_csv(options.out / "training.csv", rows)

@@ -1,26 +1,23 @@
 """How well a linear and a kNN classifier tell eight simple shapes from each descriptor, as trained and under shift.
 
-Usage: python -m benchmarks.shapes [--seeds N] [--pooling NAME] [--features NAME ...] [--out FOLDER]
 Trained on clean regions (noise .02), tested on those and on shifted ones; `mixed` is trained and tested on a mixture.
 Every seed draws new training and test regions; nothing is chosen by their test split. Mean ± deviation over seeds.
 """
 
 from __future__ import annotations
 
-import argparse
-import csv
 import os
 import platform
-import sys
 import time
 from collections.abc import Sequence
 from pathlib import Path
 
-import chebsplat  # isort: skip  # before torch: a busy machine punishes OpenMP threads that wait actively
 import numba
 import numpy as np
 import torch
 
+import chebsplat
+from benchmarks import shared
 from benchmarks.shapes import classifiers, samples
 from benchmarks.shapes.features import BOTH, FEATURES, POOLING, pooled
 
@@ -122,14 +119,13 @@ def draw(rows: list[dict[str, object]], names: Sequence[str], file: Path) -> Non
     plt.close(figure)
 
 
-def main(arguments: Sequence[str] | None = None) -> int:
-    parser = argparse.ArgumentParser(prog="shapes", description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
+def main(arguments: Sequence[str]) -> int:
+    parser = shared.parser("shapes", __doc__)
     parser.add_argument("--seeds", type=int, default=5)
     parser.add_argument("--train", type=int, default=60, help="training regions of each shape")
     parser.add_argument("--test", type=int, default=20, help="test regions of each shape and condition")
     parser.add_argument("--pooling", choices=list(POOLING), default="mean and deviation")
     parser.add_argument("--features", nargs="+", choices=[*FEATURES, BOTH], default=[*FEATURES, BOTH], metavar="NAME")
-    parser.add_argument("--out", type=Path, default=Path("build/bench"))
     options = parser.parse_args(arguments)
     torch.set_num_threads(1)  # matrices this small wait longer for threads than they compute
     print(f"{platform.machine()} CPU, {os.cpu_count()} cores; torch 1 thread, numba {numba.get_num_threads()}")
@@ -140,15 +136,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     for seed in range(options.seeds):
         rows += measure(seed, options.features, options.pooling, options.train, options.test)
     show(rows, options.features)
-    options.out.mkdir(parents=True, exist_ok=True)
-    with (options.out / "shapes.csv").open("w", newline="") as handle:
-        writer = csv.DictWriter(handle, list(rows[0]))
-        writer.writeheader()
-        writer.writerows(rows)
+    shared.write_csv(options.out / "shapes.csv", rows)
     draw(rows, options.features, options.out / "shapes.png")
     print(f"\n{time.perf_counter() - began:.0f} s; {options.out}/shapes.csv, {options.out}/shapes.png")
     return 0
-
-
-if __name__ == "__main__":
-    sys.exit(main())

@@ -1,6 +1,5 @@
 """Error against run time of every route to the descriptor, and the growth of sampling; into build/bench/.
 
-Usage: python benchmarks/descriptor.py [--out FOLDER] [--quick]
 Times are the best of several on one thread, except where threads are named. Errors are relative to a region's largest
 value: those of the full spectrum against the float64 polynomial, which is itself held against 50 digits, those of the
 lowest K eigenpairs against the float64 dense solver with whole eigenspaces.
@@ -12,28 +11,23 @@ import os
 
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # numpy's and scipy's solvers share small matrices out otherwise
 
-import argparse
-import csv
-import platform
 import time
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-import chebsplat  # isort: skip  # before torch: a busy machine punishes OpenMP threads that wait actively
 import numba
 import numpy as np
 import scipy
 import torch
-from descriptor_cases import Regions, mpmath_full, regions_of
-from descriptor_routes import ROUTES, compiled, dense, printed, reference
-from descriptor_sampling import best, sampling_rows, stage_rows
+
+import chebsplat
+from benchmarks import shared
+from benchmarks.descriptor.cases import Regions, mpmath_full, regions_of
+from benchmarks.descriptor.routes import ROUTES, compiled, dense, printed, reference
+from benchmarks.descriptor.sampling import best, sampling_rows, stage_rows
 
 KINDS, SIZES = ("random", "room", "degenerate"), (32, 64, 128)
-
-
-def cpu() -> str:
-    lines = Path("/proc/cpuinfo").read_text().splitlines() if Path("/proc/cpuinfo").exists() else []
-    return next((line.split(":")[1].strip() for line in lines if line.startswith("model name")), platform.machine())
 
 
 def others() -> float:
@@ -141,34 +135,27 @@ def figure(rows: list[dict[str, Any]], path: Path) -> None:
     canvas.savefig(path, dpi=130, bbox_inches="tight")
 
 
-def write(rows: list[dict[str, Any]], path: Path) -> None:
-    with path.open("w", newline="") as handle:
-        writer = csv.DictWriter(handle, list(rows[0]))
-        writer.writeheader()
-        writer.writerows(rows)
-
-
 def judged(what: str, value: float, bar: float, at_least: bool) -> None:
     passed = value >= bar if at_least else value <= bar
     print(f"  {what:<60} {value:9.3g}  bar {'>=' if at_least else '<='} {bar:g}  {'pass' if passed else 'FAIL'}")
 
 
-def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--out", type=Path, default=Path("build/bench"))
+def main(arguments: Sequence[str]) -> None:
+    parser = shared.parser("descriptor", __doc__)
     parser.add_argument("--quick", action="store_true", help="n = 32 alone, and no process of its own")
-    options = parser.parse_args()
+    options = parser.parse_args(arguments)
     options.out.mkdir(parents=True, exist_ok=True)
     torch.set_num_threads(1)
     numba.set_num_threads(1)
-    print(f"{cpu()}, {os.cpu_count()} cores, load {os.getloadavg()[0]:.1f}; one thread where nothing else is said")
+    machine = f"{shared.processor()}, {os.cpu_count()} cores, load {os.getloadavg()[0]:.1f}"
+    print(f"{machine}; one thread where nothing else is said")
     versions = {m.__name__: m.__version__ for m in (chebsplat, np, scipy, torch, numba)}
     print(", ".join(f"{name} {version}" for name, version in versions.items()))
     print("\nagainst 50 digits, n = 32, largest error of the region's maximum")
     for row in oracle_rows():
         print(f"  {row['kind']:<14} {row['route']:<26} {row['error']:.1e}")
     rows = route_rows(SIZES[:1] if options.quick else SIZES)
-    write(rows, options.out / "descriptor.csv")
+    shared.write_csv(options.out / "descriptor.csv", rows)
     figure(rows, options.out / "descriptor.png")
     print(f"\n{'regions':<11} {'n':>4} {'route':<36} {'ms/region':>10} {'median':>9} {'worst':>9}")
     for row in rows:
@@ -179,7 +166,7 @@ def main() -> None:
     for name, rate in rates.items():
         print(f"  {name:<60} {rate:9.{1 if 'cores' in name else 0}f}")
     sampling = sampling_rows() + ([] if options.quick else stage_rows())
-    write(sampling, options.out / "sampling.csv")
+    shared.write_csv(options.out / "sampling.csv", sampling)
     took = {(row["what"], row["n"]): row["ms"] for row in sampling}
     print(f"\n{'sampling, all cores':<34} {'n':>8} {'ms':>9} growth from a tenth")
     for (what, n), ms in took.items():
@@ -199,7 +186,3 @@ def main() -> None:
         if "stage" in what:
             judged(f"{what}, 1e5 points, seconds", took[what, 100_000] / 1e3, 8, False)
         judged(f"{what}, growth from 1e5 to 1e6", took[what, 1_000_000] / took[what, 100_000], 12, False)
-
-
-if __name__ == "__main__":
-    main()

@@ -1,0 +1,81 @@
+"""Run a benchmark, after the stages of the scene that it measures on: python -m benchmarks NAME [ARGUMENTS].
+
+With --work FOLDER among the arguments, a folder of a scene's links, that scene is measured as it is.
+"""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+from collections.abc import Sequence
+from dataclasses import dataclass
+from importlib import import_module
+from pathlib import Path
+
+SCENE = "office0"
+
+
+@dataclass(frozen=True)
+class Benchmark:
+    """module: in `benchmarks`; stages: what it needs of SCENE, under `settings` (as `set=` takes them)."""
+
+    module: str
+    measures: str
+    stages: tuple[str, ...] = ()
+    settings: str = ""
+
+
+LABELS = "teacher.kind=labels"
+BENCHMARKS = {
+    "raster": Benchmark("rasterizer.main", "the rasterizer against its bars: milliseconds, errors, memory"),
+    "train": Benchmark(
+        "backends", "a training without the shape branch: seconds, PSNR by backend", ("sfm", "teacher"), LABELS
+    ),
+    "cost": Benchmark("cost", "whole trainings beside plain 3DGS: what each part costs", ("sfm", "teacher")),
+    "knowledge": Benchmark(
+        "knowledge", "what the knowledge space costs a training: regulariser and update", ("sfm", "teacher"), LABELS
+    ),
+    "refresh": Benchmark("refresh", "what refreshing descriptors costs, and how stale they get", ("sfm", "teacher")),
+    "descriptor": Benchmark("descriptor.main", "routes to the descriptor: error against run time, growth of sampling"),
+    "shapes": Benchmark("shapes.main", "which shapes a classifier tells apart, ours beside FPFH and others"),
+    "encoder": Benchmark(
+        "encoder", "the region encoder: error against run time of torch and onnxruntime", ("export", "onnx")
+    ),
+    "layouts": Benchmark("layouts", "the exported layouts: bytes, and images beside the checkpoint's", ("export",)),
+    "store": Benchmark("store", "the feature store: bytes, error, label decisions, bandwidth, memory"),
+    "stability": Benchmark("stability.main", "every extreme case of the maths, naive and ours; fails if one does"),
+}
+
+
+def linked(benchmark: Benchmark) -> Path:
+    """The folder of SCENE's links, its `stages` brought up to date. Raises CalledProcessError if one fails."""
+    command = [sys.executable, "-P", "-m", "chebsplat.pipelines.cli", "run", "--scene", SCENE]
+    command += ["--set", benchmark.settings] if benchmark.settings else []
+    for stage in benchmark.stages:
+        subprocess.run([*command, "--stage", stage], check=True)
+    work = Path(os.environ.get("CHEBSPLAT_WORK") or "work")
+    return work / (f"{SCENE}@{benchmark.settings}" if benchmark.settings else SCENE)
+
+
+def main(arguments: Sequence[str]) -> int:
+    if not arguments:
+        for name, benchmark in BENCHMARKS.items():
+            needs = f" ({SCENE}: {', '.join(benchmark.stages)})" if benchmark.stages else ""
+            print(f"{name:<11} {benchmark.measures}{needs}")
+        return 0
+    name, *rest = arguments
+    if name not in BENCHMARKS:
+        print(f"no benchmark is called {name[:60]!a}; there are {', '.join(BENCHMARKS)}", file=sys.stderr)
+        return 2
+    benchmark = BENCHMARKS[name]
+    if benchmark.stages and not any(text in ("-h", "--help") or text.startswith("--work") for text in rest):
+        try:
+            rest = ["--work", str(linked(benchmark)), *rest]
+        except subprocess.CalledProcessError as error:
+            return error.returncode
+    return int(import_module(f"benchmarks.{benchmark.module}").main(rest) or 0)
+
+
+if __name__ == "__main__":
+    sys.exit(main(sys.argv[1:]))

@@ -1,0 +1,1 @@
+"""Routes to the descriptor: error against run time, and the growth of sampling."""

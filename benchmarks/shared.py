@@ -1,0 +1,36 @@
+"""What the benchmarks share: their arguments, rows as CSV, and the machine that they are measured on."""
+
+from __future__ import annotations
+
+import csv
+import platform
+from argparse import ArgumentParser, RawDescriptionHelpFormatter
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+
+def parser(name: str, description: str | None, work: bool = False) -> ArgumentParser:
+    """The arguments of benchmark `name`: --out, and --work where it measures on a scene; it adds its own."""
+    prog = f"python -m benchmarks {name}"
+    arguments = ArgumentParser(prog, description=description, formatter_class=RawDescriptionHelpFormatter)
+    if work:
+        arguments.add_argument("--work", type=Path, required=True, help="a scene's links, such as work/office0")
+    arguments.add_argument("--out", type=Path, default=Path("build/bench"), help="folder for tables and figures")
+    return arguments
+
+
+def write_csv(path: Path, rows: Sequence[dict[str, Any]]) -> None:
+    """Write rows under all their keys, in order of appearance."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    with path.open("w", newline="") as handle:
+        writer = csv.DictWriter(handle, list(dict.fromkeys(key for row in rows for key in row)))
+        writer.writeheader()
+        writer.writerows(rows)
+
+
+def processor() -> str:
+    """The processor's name, where the system tells it, otherwise its architecture."""
+    path = Path("/proc/cpuinfo")
+    lines = path.read_text().splitlines() if path.exists() else []
+    return next((line.split(":")[1].strip() for line in lines if line.startswith("model name")), platform.machine())

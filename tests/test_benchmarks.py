@@ -1,0 +1,82 @@
+"""`python -m benchmarks` lists what there is, and brings the scene that a benchmark measures on up to date first."""
+
+import ast
+import subprocess
+from types import SimpleNamespace
+
+import pytest
+from shared import ROOT
+
+from chebsplat.stages.registry import STAGES
+
+
+@pytest.fixture
+def bench(monkeypatch):
+    monkeypatch.syspath_prepend(str(ROOT))
+    import benchmarks.__main__ as module
+
+    return module
+
+
+def test_every_benchmark_has_a_main_and_needs_stages_that_exist(bench):
+    for benchmark in bench.BENCHMARKS.values():
+        file = ROOT / "benchmarks" / (benchmark.module.replace(".", "/") + ".py")
+        functions = {node.name: node for node in ast.parse(file.read_text()).body if isinstance(node, ast.FunctionDef)}
+        assert [a.arg for a in functions["main"].args.args] == ["arguments"], file
+        assert set(benchmark.stages) <= set(STAGES)
+
+
+def test_without_a_name_they_are_listed_and_a_wrong_one_is_refused(bench, capsys):
+    assert bench.main([]) == 0
+    listed = capsys.readouterr().out
+    assert all(f"{name} " in listed for name in bench.BENCHMARKS)
+    assert bench.main(["rasterr"]) == 2
+    assert "raster" in capsys.readouterr().err
+
+
+@pytest.fixture
+def ran(bench, monkeypatch):
+    """Stages that were run, and the arguments that the benchmark got."""
+    calls = {"stages": [], "arguments": None}
+
+    def stage(command, check):
+        assert "chebsplat.pipelines.cli" in command
+        assert check
+        calls["stages"].append(command[command.index("--stage") + 1])
+
+    monkeypatch.setattr(bench.subprocess, "run", stage)
+    main = SimpleNamespace(main=lambda arguments: calls.update(arguments=arguments))
+    monkeypatch.setattr(bench, "import_module", lambda name: main)
+    return calls
+
+
+def test_what_a_benchmark_needs_is_made_first(bench, ran, monkeypatch):
+    monkeypatch.setenv("CHEBSPLAT_WORK", "elsewhere")
+    assert bench.main(["train", "--steps", "3"]) == 0
+    assert ran == {
+        "stages": ["sfm", "teacher"],
+        "arguments": ["--work", "elsewhere/office0@teacher.kind=labels", "--steps", "3"],
+    }
+
+
+@pytest.mark.parametrize("arguments", [["--work", "there"], ["--work=there"], ["--help"]])
+def test_nothing_is_made_for_a_scene_of_the_user_s_or_for_help(bench, ran, arguments):
+    assert bench.main(["train", *arguments]) == 0
+    assert ran == {"stages": [], "arguments": arguments}
+
+
+def test_a_stage_that_fails_ends_the_benchmark_with_its_exit_code(bench, ran, monkeypatch):
+    def fails(command, check):
+        raise subprocess.CalledProcessError(3, command)
+
+    monkeypatch.setattr(bench.subprocess, "run", fails)
+    assert bench.main(["cost"]) == 3
+    assert ran["arguments"] is None
+
+
+@pytest.mark.parametrize("words", [["bench=cost"], ["bench-cost"]])
+def test_make_runs_one_by_name(words):
+    done = subprocess.run(
+        ["make", "-n", *words, "args=--steps 9"], cwd=ROOT, capture_output=True, text=True, check=True
+    )
+    assert done.stdout.splitlines()[-1].endswith("-m benchmarks cost --steps 9")
