@@ -2,10 +2,7 @@
 
 from __future__ import annotations
 
-import io
 import shutil
-import sys
-from contextlib import redirect_stdout
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -137,7 +134,7 @@ def extend(name: str, gaussians: Path, scene: str) -> list[Path]:
     """Add a trained scene's knowledge to a HEAD, which begins with it if there is none; returns its revisions.
 
     A scene that the HEAD knows already is not added again, so that a command that was killed may simply be repeated.
-    Raises: ConfigError, InputError; SystemExit with the stage's exit code if it fails.
+    Raises: ConfigError, and what the stage raises.
     """
     if is_sequence(name) or not store.is_name(name) or "@" in name:
         raise ConfigError(f"a HEAD cannot be called {name!r}: a sequence is, or it holds a / or @, or begins with a .")
@@ -155,10 +152,7 @@ def extend(name: str, gaussians: Path, scene: str) -> list[Path]:
         step = planner.step(STAGES["cks"], config, {"gaussians": gaussians} | earlier, keys)
         plan = write_plan([entry(step, git_state(HERE)) | {"threads": 1}])
         folders.append(plan.parent)  # until the revision is linked, its plan keeps `clean-stale` from it
-        with redirect_stdout(io.StringIO()):
-            code = job.run(plan, step.key)
-        if code:
-            sys.exit(code)
+        job.make(plan, step.key)
         return step.path
 
     try:

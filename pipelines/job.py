@@ -1,4 +1,4 @@
-"""One Snakemake job: a stage's own command, in this process, under its artifact's lock."""
+"""One Snakemake job: a stage in this process, under its artifact's lock."""
 
 from __future__ import annotations
 
@@ -7,6 +7,7 @@ import logging
 import os
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
+from importlib import import_module
 from pathlib import Path
 from typing import Any
 
@@ -15,21 +16,21 @@ from chebsplat.formats import disk
 from chebsplat.pipelines import store
 from chebsplat.pipelines.raw import unchanged
 from chebsplat.pipelines.store import say
+from chebsplat.stages.command import exit_code, publish
 
 CODE = "{:<4d}"  # of a job, written over in place: a full disk does not keep it from being told
 
 
 def run(plan: Path, key: str) -> int:
-    """One Snakemake job: the stage's own command, in this process; a twin in another run is waited for."""
+    """One Snakemake job; returns the exit code of its step, which is written beside the plan, and so is its log."""
     # Snakemake sets OMP_NUM_THREADS to the one thread that a rule declares; a stage may use all cores of the run.
     if threads := os.environ.get("CHEBSPLAT_THREADS"):
         os.environ |= {"OMP_NUM_THREADS": threads, "NUMBA_NUM_THREADS": threads}
-    step = next(s for s in json.loads(plan.read_text())["steps"] if s["key"] == key)
-    files = plan.parent / f"{step['stage']}-{key}"
+    step, files = read_step(plan, key)
     try:
-        with disk.explained(plan.parent):
-            code = in_stage(step, files)
-    except ChebsplatError as error:
+        with disk.explained(plan.parent), logged(Path(f"{files}.log")):
+            code = exit_code(lambda: make(plan, key))
+    except ChebsplatError as error:  # there cannot be a log
         say(f"{step['stage']}: {error}")
         code = error.exit_code
     with Path(f"{files}.exit").open("r+") as handle:
@@ -37,28 +38,39 @@ def run(plan: Path, key: str) -> int:
     return code
 
 
-def in_stage(step: dict[str, Any], files: Path) -> int:
-    """Run a step's stage under its artifact's lock, with a log beside its config; returns its exit code."""
-    from importlib import import_module
+def read_step(plan: Path, key: str) -> tuple[dict[str, Any], Path]:
+    """A step of a plan, and the path that the names of its files beside the plan begin with."""
+    step = next(s for s in json.loads(plan.read_text())["steps"] if s["key"] == key)
+    return step, plan.parent / f"{step['stage']}-{key}"
 
-    arguments = ["--config", f"{files}.json", "--out", step["path"], "--key", step["key"]]
-    arguments += ["--code", json.dumps(step["code"]), "--device", step["device"]]
-    for role, path in step["inputs"].items():
-        arguments += [f"--in-{role}", path]
-    log = _Log(f"{files}.log")
+
+def make(plan: Path, key: str) -> None:
+    """Run a step's stage in this process, under its artifact's lock; a twin in another run is waited for.
+
+    Raises: ChebsplatError, Stopped.
+    """
+    step, files = read_step(plan, key)
+    stage, out = step["stage"], Path(step["path"])
+    inputs = {role: Path(path) for role, path in step["inputs"].items()}
+    with disk.explained(plan.parent), alone(out):
+        store.remove_half(out)
+        config, hashes = Path(f"{files}.json"), json.loads(Path(f"{files}.raw.json").read_text())
+        module = import_module(f"chebsplat.stages.{stage}")
+        publish(stage, module.run, out, inputs, config, key=key, code=step["code"], device=step["device"],
+                within=unchanged(stage, step["config"], hashes))  # fmt: skip
+
+
+@contextmanager
+def logged(path: Path) -> Iterator[None]:
+    """What is logged within goes to a file as well."""
+    log = _Log(path)
     logging.getLogger("chebsplat").addHandler(log)
     try:
-        with alone(Path(step["path"])):
-            store.remove_half(Path(step["path"]))
-            watch = unchanged(step["stage"], step["config"], json.loads(Path(f"{files}.raw.json").read_text()))
-            import_module(f"chebsplat.stages.{step['stage']}").main(arguments, prog_name=step["stage"], obj=watch)
-    except SystemExit as stop:
-        return stop.code if isinstance(stop.code, int) else 1
+        yield
     finally:
         logging.getLogger("chebsplat").removeHandler(log)
         with suppress(OSError):
             log.close()
-    return 0
 
 
 class _Log(logging.FileHandler):

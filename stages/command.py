@@ -1,4 +1,4 @@
-"""The thin wrapper that turns `run(job)` into a command: inputs checked, one artifact published, exit codes."""
+"""From `run(job)` to an artifact: inputs checked, one artifact published; and to a command with exit codes."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ import os
 import sys
 import time
 from collections.abc import Callable
-from contextlib import nullcontext
+from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -50,15 +50,16 @@ class Job:
 
 
 def command(name: str, run: Callable[[Job], None]) -> click.Command:
-    """The click command of stage `name`: explicit inputs, one config, one output.
-
-    The context's object may be a context manager that the stage reads and computes within; what it raises at the end
-    keeps the artifact from being published.
-    """
+    """The click command of stage `name`: explicit inputs, one config, one output, whose path it prints."""
     stage = STAGES[name]
 
-    def invoke(**options: Any) -> None:
-        sys.exit(execute(name, run, options | {"within": click.get_current_context().obj or nullcontext()}))
+    def invoke(out: Path, code: str | None, **options: Any) -> None:
+        def action() -> None:
+            inputs = {role: path for role in stage.roles if (path := options.pop(f"in_{role}"))}
+            publish(name, run, out, inputs, code=json.loads(code or "{}"), **options)
+            print(out.absolute())
+
+        sys.exit(exit_code(action))
 
     params: list[click.Parameter] = [
         click.Option(
@@ -83,18 +84,10 @@ def command(name: str, run: Callable[[Job], None]) -> click.Command:
     return click.Command(name, params=params, callback=invoke, help=stage.help)
 
 
-def execute(name: str, run: Callable[[Job], None], options: dict[str, Any]) -> int:
-    """Run one stage; returns the exit code. stdout gets the artifact's path and nothing else."""
-    line = f"%(asctime)s {name}: %(message)s"
-    logging.basicConfig(stream=sys.stderr, format=line, datefmt="%H:%M:%S", level="WARNING", force=True)
-    log.setLevel(options["log_level"].upper())
-    out = Path(options["out"]).absolute()
+def exit_code(action: Callable[[], None]) -> int:
+    """Exit code of an action, 0 if it ends; what ends it early, a typed error, a stop or a crash, is logged."""
     try:
-        if not options["force"] and artifact.is_whole(out, STAGES[name].schema):
-            log.info("already there")
-        else:
-            with heeded(), disk.explained(out.parent):
-                _run(name, run, options, out)
+        action()
     except ChebsplatError as error:
         log.error("%s", error)
         return error.exit_code
@@ -104,38 +97,65 @@ def execute(name: str, run: Callable[[Job], None], options: dict[str, Any]) -> i
     except Exception:
         log.exception("crashed; nothing was published")
         return 1
-    print(out)
     return 0
 
 
-def _run(name: str, run: Callable[[Job], None], options: dict[str, Any], out: Path) -> None:
-    stage = STAGES[name]
-    config = configs.load(options["config"]) if options["config"] else configs.Config()
-    inputs = {role: Path(options[f"in_{role}"]).absolute() for role in stage.roles if options.get(f"in_{role}")}
-    schemas = {role: STAGES[of].schema for role, of in stage.roles.items()}
-    found = {role: artifact.read_manifest(path, schemas[role]) for role, path in inputs.items()}
-    settings = config.sections(stage.sections)
-    sources = {role: {"key": m.key, "schema": m.schema} for role, m in found.items()}
-    if options["key"] is not None and not is_key(options["key"]):
-        raise ConfigError(f"--key {options['key']}: a key is 16 hexadecimal digits; leave it away, or correct it")
-    key = options["key"] or artifact.digest({"stage": name, "config": settings, "inputs": sources})
-    artifact.check_place(out, stage.schema, key, options["force"])
-    seed = next((settings[s]["seed"] for s in reversed(stage.sections) if "seed" in settings[s]), None)
-    device, why = resolve(options["device"])
-    if why:
-        log.info("%s", why)
-    manifest = Manifest(stage.schema, key, name, sources, settings, seed, device=device, threads=n_threads(),
-                        code=json.loads(options["code"] or "{}"))  # fmt: skip
-    progress = Progress(options["progress"])
-    scratch = out.parent / f".part-{out.name}"
-    began = time.perf_counter()
-    with artifact.publish(out, manifest, options["force"]) as tmp, half_made(tmp), options["within"]:
-        job = Job(inputs, config, tmp, scratch, device, progress, manifest.facts)
-        with progress.log_to(tmp / "log.jsonl"):
-            run(job)
-        manifest.seconds = round(time.perf_counter() - began, 3)
-        manifest.versions = _versions()
-    artifact.discard(scratch)
+def publish(
+    name: str,
+    run: Callable[[Job], None],
+    out: Path,
+    inputs: dict[str, Path],
+    config: Path | None = None,
+    *,
+    key: str | None = None,
+    code: dict[str, Any] | None = None,
+    device: str = "auto",
+    force: bool = False,
+    progress: bool | None = None,
+    log_level: str = "info",
+    within: AbstractContextManager[Any] | None = None,
+) -> None:
+    """Run one stage in this process and publish its artifact; nothing if it is there, unless by `force`.
+
+    Args: inputs: artifacts by role; config: TOML or JSON, otherwise defaults; key, code: identities given by the
+          planner; progress: None: where stderr is a terminal; within: what the stage reads and computes within; what it
+          raises at its end keeps the artifact from being published.
+    Raises: ChebsplatError, Stopped.
+    """
+    line = f"%(asctime)s {name}: %(message)s"
+    logging.basicConfig(stream=sys.stderr, format=line, datefmt="%H:%M:%S", level="WARNING", force=True)
+    log.setLevel(log_level.upper())
+    out, stage = out.absolute(), STAGES[name]
+    if not force and artifact.is_whole(out, stage.schema):
+        log.info("already there")
+        return
+    inputs, shown = {role: path.absolute() for role, path in inputs.items()}, Progress(progress)
+    with heeded(), disk.explained(out.parent):
+        chosen = configs.load(config) if config else configs.Config()
+        schemas = {role: STAGES[of].schema for role, of in stage.roles.items()}
+        found = {role: artifact.read_manifest(path, schemas[role]) for role, path in inputs.items()}
+        settings = chosen.sections(stage.sections)
+        sources = {role: {"key": m.key, "schema": m.schema} for role, m in found.items()}
+        if key is not None and not is_key(key):
+            raise ConfigError(f"--key {key}: a key is 16 hexadecimal digits; leave it away, or correct it")
+        key = key or artifact.digest({"stage": name, "config": settings, "inputs": sources})
+        artifact.check_place(out, stage.schema, key, force)
+        seed = next((settings[s]["seed"] for s in reversed(stage.sections) if "seed" in settings[s]), None)
+        device, why = resolve(device)
+        if why:
+            log.info("%s", why)
+        manifest = Manifest(
+            stage.schema, key, name, sources, settings, seed, device=device, threads=n_threads(), code=code or {}
+        )
+        scratch = out.parent / f".part-{out.name}"
+        began = time.perf_counter()
+        with artifact.publish(out, manifest, force) as tmp, half_made(tmp), within or nullcontext():
+            job = Job(inputs, chosen, tmp, scratch, device, shown, manifest.facts)
+            with shown.log_to(tmp / "log.jsonl"):
+                run(job)
+            manifest.seconds = round(time.perf_counter() - began, 3)
+            manifest.versions = _versions()
+        artifact.discard(scratch)
     if (jit := sys.modules.get("chebsplat.kernels.jit")) and jit.compilation.kernels:
         log.info("compiled %d kernels in %.0f s, once", jit.compilation.kernels, jit.compilation.seconds)
     log.info("done in %.1f s", manifest.seconds)

@@ -7,10 +7,10 @@ import pytest
 from click.testing import CliRunner
 from shared import KEY
 
-from chebsplat.errors import DataFailure
+from chebsplat.errors import ConfigError, DataFailure
 from chebsplat.formats import artifact
 from chebsplat.formats.manifest import Manifest
-from chebsplat.stages.command import command
+from chebsplat.stages.command import command, publish
 from chebsplat.stages.registry import STAGES
 
 
@@ -35,6 +35,17 @@ def test_artifact_is_published_and_its_path_printed(tmp_path):
     manifest = artifact.verify(tmp_path / "x", "chebsplat.capture/1")
     assert (manifest.key, manifest.facts) == (KEY, {"left_out": {"depth": "none given"}})
     assert set(manifest.config) == {"scene", "source", "ingest"}
+
+
+def test_called_from_python_a_stage_prints_nothing_and_raises_typed_errors(tmp_path, capsys):
+    publish("ingest", good, tmp_path / "x", {}, key=KEY)
+    assert artifact.verify(tmp_path / "x", "chebsplat.capture/1").key == KEY
+    with pytest.raises(DataFailure):
+        publish("ingest", fail_data, tmp_path / "y", {})
+    with pytest.raises(ConfigError, match="16 hexadecimal digits"):
+        publish("ingest", good, tmp_path / "y", {}, key="short")
+    assert not (tmp_path / "y").exists()
+    assert capsys.readouterr().out == ""
 
 
 def test_finished_artifact_is_not_made_again_unless_forced(tmp_path):

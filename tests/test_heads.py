@@ -160,6 +160,21 @@ def test_a_head_grows_by_scenes_and_a_scene_it_knows_adds_nothing(work):
             bases.extend(name, work / "trained/0", "room0")
 
 
+def test_a_head_whose_stage_fails_raises_its_error_and_stays_as_it_is(work, monkeypatch):
+    from chebsplat.errors import DataFailure
+    from chebsplat.pipelines import bases
+    from chebsplat.stages import cks
+
+    def fail(job):
+        raise DataFailure("no column is left")
+
+    monkeypatch.setattr(cks, "run", fail)
+    with pytest.raises(DataFailure, match="no column is left"):
+        bases.extend("shared", trained(work / "trained/0", key_of(0), 0), "room0")
+    assert bases.head_names() == []
+    assert not list((work / ".plans").iterdir())
+
+
 def test_a_head_moves_only_from_the_revision_that_was_read(tmp_path):
     first, second = (tmp_path / key_of(name) for name in "ab")
     for path in (first, second):
