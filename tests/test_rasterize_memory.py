@@ -1,4 +1,4 @@
-"""The rasterizer's memory is bounded by what it draws, and does not grow with use; `benchmarks/rasterizer/memory.py`."""
+"""The rasterizer's memory is bounded by what it draws, and does not grow with use, as its benchmark measures it."""
 
 import importlib.util
 import sys
