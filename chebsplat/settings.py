@@ -72,6 +72,9 @@ class TrainSection(Section):
     )
     albo: bool = setting(True, 'tokens hold descriptors; false: the paper\'s "no AGCD"')
     prune: bool = setting(True, "remove Gaussians that add nothing")
+    prune_gate: Literal["product", "printed"] = setting(
+        "product", "of the logit of a Gaussian and one of its features; printed: the paper's two gates in a row"
+    )
     prune_semantic: bool = setting(True, 'features guard Gaussians from pruning; false: "no semantic guidance"')
     densify: Literal["mixed", "region", "classic", "off"] = setting(
         "mixed", "where Gaussians grow; mixed: region and classic by turns"
@@ -81,7 +84,12 @@ class TrainSection(Section):
         1e-4, "gradient to the 2D means that grows a Gaussian, half image widths", 1e-12, 1e3
     )
     sh_prune: bool = setting(True, "close SH bands that add nothing")
-    sh_guided: bool = setting(True, 'false: the paper\'s "no semantic guidance" of SH pruning')
+    sh_masks: Literal["logits", "printed"] = setting(
+        "logits", "of a Gaussian's SH bands, guided by colour; printed: the paper's network, guided by semantics too"
+    )
+    sh_guided: bool = setting(True, "false: nothing but a Gaussian's own logits closes its SH bands")
+    sh_bins: int = number(8, "of the histogram of a region's colours", 1, 64)
+    mask_threshold: float = number(0.1, "soft mask below which a Gaussian or an SH band is closed", 1e-3, 0.5)
     # sizes
     sh_degree: int = number(3, "of colour, at most", 0, 3)
     max_gaussians: int = number(40_000, "growing stops here; more initial points are thinned", 16, 5_000_000)
@@ -115,6 +123,7 @@ class TrainSection(Section):
         None, "of features; default: 10 / steps, at most 5e-2; more fits each view's errors", 0, 10
     )
     lr_encoder: float = number(3e-3, "learning rate of the encoder", 0, 10)
+    lr_gates: float = number(1e-2, "learning rate of the printed gates' weights", 0, 10)
     lr_masks: float = number(5e-2, "learning rate of pruning masks", 0, 10)
     lr_sh_masks: float = number(0.4, "learning rate of SH masks; fast, under a weak penalty: docs/results.md", 0, 10)
     # weights

@@ -30,10 +30,10 @@ def test_closed_bands_leave_parameters_and_moments_and_the_picture_stays(tiny_tr
     raw = made.model.raw
     with torch.no_grad():
         raw["sh_logits"].copy_(torch.randn(raw["sh_logits"].shape, generator=torch.Generator().manual_seed(3)) * 6)
-    degrees = (made.model.sh_mask(torch.arange(len(made.model))) > 0.5).sum(-1)
+    degrees = (made.model.final_band_masks(None) > 0.5).sum(-1)
     moments = {name: dict(made.optimizer.state[value]) for name, value in raw.items()}
     before, means = made.model.render(made.views.camera(0, 1), 3).rgb, raw["means"].detach().clone()
-    made.population.freeze_bands(made.optimizer)
+    made.population.freeze_bands(made.optimizer, None)
     after = made.model.render(made.views.camera(0, 1), 3).rgb
     assert (after - before).abs().max() < 2e-6  # the order of equal depths may change
     order = torch.argsort(degrees, descending=True, stable=True)
@@ -57,7 +57,7 @@ def test_a_band_that_nobody_keeps_is_gone(tiny_trainer):
     made = tiny_trainer(densify="off")
     with torch.no_grad():
         made.model.raw["sh_logits"].copy_(torch.tensor([8.0, -8.0, 8.0]).expand_as(made.model.raw["sh_logits"]))
-    made.population.freeze_bands(made.optimizer)
+    made.population.freeze_bands(made.optimizer, None)
     assert {"sh2", "sh3"}.isdisjoint(made.model.raw) and len(made.model.raw["sh1"]) == len(made.model)
     assert {"sh2", "sh3"}.isdisjoint(group["name"] for group in made.optimizer.param_groups)
 
@@ -69,7 +69,7 @@ def test_gaussians_removed_after_the_freeze_take_their_bands_along(tiny_trainer)
         raw["sh_logits"].copy_(torch.randn(raw["sh_logits"].shape) * 6)
         for band in (1, 2, 3):
             raw[f"sh{band}"].copy_(torch.randn(raw[f"sh{band}"].shape))
-    made.population.freeze_bands(made.optimizer)
+    made.population.freeze_bands(made.optimizer, None)
     before = made.finish()
     with torch.no_grad():
         raw["logit_opacities"][::3] = -20.0
@@ -95,10 +95,14 @@ def bits(made):
     return {name: value.clone() for name, value in parts.items()}
 
 
-@pytest.mark.parametrize("densify", ["mixed", "region", "classic"])
-def test_a_resumed_training_takes_the_same_steps_to_the_bit(tiny_trainer, tmp_path, densify):
+@pytest.mark.parametrize(
+    "chosen",
+    [{"densify": name} for name in ("mixed", "region", "classic")] + [{"prune_gate": "printed", "sh_masks": "printed"}],
+    ids=lambda chosen: next(iter(chosen.values())),
+)
+def test_a_resumed_training_takes_the_same_steps_to_the_bit(tiny_trainer, tmp_path, chosen):
     """Saved after every step, through a file; over growth, removal, refreshes and the freeze."""
-    settings = {"steps": 24, "refresh_every": 5, "densify": densify, "grow_threshold": 1e-6}
+    settings = {"steps": 24, "refresh_every": 5, "grow_threshold": 1e-6} | chosen
     whole, sizes = tiny_trainer(**settings), []
     for _ in whole.steps():
         torch.save(whole.state_dict(), tmp_path / f"{whole.step}.pt")

@@ -12,9 +12,13 @@ from torch import Tensor, nn
 from chebsplat.rasterize import CELL, rasterize
 from chebsplat.settings import DescribeSection, TrainSection
 from chebsplat.shape.branch import ShapeBranch
+from chebsplat.shape.regions import Regions, covering
 from chebsplat.splats.sh_kernels import colors_in_view
-from chebsplat.training import prune, sh_prune
+from chebsplat.training import prune, sh_mask_network, sh_prune
+from chebsplat.training.sh_mask_network import BandMaskNetwork
 from chebsplat.views import View, in_frustum
+
+GATES = {"product": prune.SemanticGate, "printed": prune.PrintedGate}
 
 
 class _Take(torch.autograd.Function):
@@ -42,12 +46,13 @@ def take(values: Tensor, index: Tensor) -> Tensor:
 class Auxiliary:
     """What losses need beside the picture; None where it was not wanted or does not exist.
 
-    soft_mask: m̂ [V] of the pruning gates; band_masks [V, 3]; shape_distance []: of encodings that were computed anew
-    to the features of their members.
+    soft_mask: m̂ [V] of the pruning gates; band_masks [V, 3]; delta: δ [V, 4] of the printed mask network;
+    shape_distance []: of encodings that were computed anew to the features of their members.
     """
 
     soft_mask: Tensor | None = None
     band_masks: Tensor | None = None
+    delta: Tensor | None = None
     shape_distance: Tensor | None = None
 
 
@@ -96,18 +101,30 @@ class SceneModel:
         for value in self.raw.values():
             value.requires_grad_(True)
         self.shape = ShapeBranch(n_channels, describe, train) if n_channels and train.encoder != "off" else None
-        self.semantic_gate = (
-            prune.SemanticGate(n_channels) if n_channels and train.prune and train.prune_semantic else None
-        )
+        self.threshold = train.mask_threshold
+        self.semantic_gate: prune.SemanticGate | prune.PrintedGate | None = None
+        if n_channels and train.prune and train.prune_semantic:
+            self.semantic_gate = GATES[train.prune_gate](n_channels)
+        self.band_network: BandMaskNetwork | None = None
+        if "sh_logits" in self.raw and train.sh_masks == "printed":
+            self.band_network = BandMaskNetwork(n_channels or 0, train.sh_bins, guided=train.sh_guided)
+        self.members = self.nearest = torch.zeros(0, dtype=torch.int64)  # of the regions whose colours guide SH masks
 
     def __len__(self) -> int:
         return len(self.raw["means"])
 
     @property
     def modules(self) -> dict[str, nn.Module]:
-        """What is learned beside the raw parameters, by name: shape branch and semantic gate, where there are any."""
-        parts = {"shape": self.shape, "semantic_gate": self.semantic_gate}
+        """What is learned beside the raw parameters, by name: shape branch and gates, where there are any."""
+        parts = {"shape": self.shape, "semantic_gate": self.semantic_gate, "band_network": self.band_network}
         return {name: module for name, module in parts.items() if module is not None}
+
+    def follow(self, regions: Regions) -> None:
+        """Printed SH masks are guided by the colours of these regions from now on; others need none."""
+        if self.band_network is not None:
+            means = self.raw["means"].detach().double().numpy()
+            nearest = covering(means, means[regions.centers], regions.radius, 1)[:, 0]
+            self.members, self.nearest = torch.as_tensor(regions.members), torch.from_numpy(nearest)
 
     def bands(self) -> list[Tensor]:
         """Coefficients [N_l, 2 l + 1, 3] of the SH bands, from 0 to the highest that any Gaussian has."""
@@ -117,7 +134,7 @@ class SceneModel:
         """Part of all SH coefficients up to degree 3 that the Gaussians keep."""
         counts = [len(band) for band in self.bands()[1:]]
         if "sh_logits" in self.raw:
-            open_bands = sh_prune.band_mask(self.raw["sh_logits"].detach()) > 0.5
+            open_bands = self.final_band_masks(self.raw.get("features")) > 0.5
             counts = open_bands.sum(0).tolist()[: len(counts)]
         kept = sum(count * (2 * band + 3) for band, count in enumerate(counts))
         return float((len(self) + kept) / (16 * max(len(self), 1)))
@@ -126,14 +143,56 @@ class SceneModel:
         """m̂ [V] in (0, 1) of the pruning gates, None where pruning is off."""
         if "prune_logits" not in self.raw:
             return None
-        semantic = None
-        if self.semantic_gate is not None and features is not None:
-            semantic = self.semantic_gate(features.detach())
-        return prune.soft_mask(take(self.raw["prune_logits"], index), semantic)
+        logits, gate = take(self.raw["prune_logits"], index), self.semantic_gate
+        if gate is None or features is None:
+            return prune.soft_mask(logits, None)
+        if isinstance(gate, prune.PrintedGate):
+            soft: Tensor = gate(features.detach(), logits)
+            return soft
+        return prune.soft_mask(logits, gate(features.detach()))
 
-    def sh_mask(self, index: Tensor) -> Tensor | None:
-        """Nested band masks [V, 3] with a straight-through gradient, None where SH pruning is off."""
-        return sh_prune.band_mask(take(self.raw["sh_logits"], index)) if "sh_logits" in self.raw else None
+    def band_masks(self, index: Tensor, features: Tensor | None, eye: Tensor) -> tuple[Tensor | None, Tensor | None]:
+        """Nested masks [V, 3] of SH bands 1 to 3 with a straight-through gradient, and the printed network's δ [V, 4].
+
+        Args: index [V] Gaussians; features [V, C] theirs; eye [3]: where their regions' colours are seen from.
+        Returns: None where SH pruning is off; no δ where logits alone decide.
+        """
+        if "sh_logits" not in self.raw:
+            return None, None
+        logits = take(self.raw["sh_logits"], index)
+        if self.band_network is None:
+            return sh_prune.band_mask(logits, self.threshold), None
+        directions = torch.nn.functional.normalize(self.raw["means"].detach() - eye, dim=-1)
+        delta = self._delta(logits, index, features, directions[None])
+        return sh_mask_network.nested(delta, self.threshold)[:, 1:], delta
+
+    def _delta(self, logits: Tensor, index: Tensor, features: Tensor | None, directions: Tensor) -> Tensor:
+        """δ [V, 4] of the printed network; histograms are means over `directions` [Q, N or 1, 3]."""
+        network = self.band_network
+        assert network is not None
+        nearest, histograms = torch.full_like(index, -1), None
+        if network.guided:
+            nearest = self.nearest[index]
+            wanted, rows = nearest[nearest >= 0].unique(return_inverse=True)
+            nearest = nearest.masked_scatter(nearest >= 0, rows)
+            coefficients, members = sh_mask_network.whole(self.bands()), self.members[wanted]
+            parts = [
+                sh_mask_network.region_histograms(coefficients, d.expand(len(self), 3), members, network.n_bins)
+                for d in directions
+            ]
+            histograms = torch.stack(parts).mean(0)
+        delta: Tensor = network(logits, None if features is None else features.detach(), histograms, nearest)
+        return delta
+
+    @torch.no_grad()
+    def final_band_masks(self, features: Tensor | None) -> Tensor:
+        """Masks [N, 3] as the freeze makes them final: of no view, but of ten directions alike; features [N, C]."""
+        logits = self.raw["sh_logits"]
+        if self.band_network is None:
+            return sh_prune.band_mask(logits, self.threshold)
+        directions = sh_prune.guidance_directions()[:, None]
+        delta = self._delta(logits, torch.arange(len(self)), features, directions)
+        return sh_mask_network.nested(delta, self.threshold)[:, 1:]
 
     def render(
         self,
@@ -169,12 +228,14 @@ class SceneModel:
             features = take(raw["features"], index)
         if masked and (soft := self.soft_mask(index, features)) is not None:
             auxiliary.soft_mask = soft
-            scales, opacities = prune.apply_mask(prune.hard_mask(soft), scales, opacities)
+            scales, opacities = prune.apply_mask(prune.hard_mask(soft, self.threshold), scales, opacities)
+        eye = -view.viewmat[:3, :3].T @ view.viewmat[:3, 3]
+        masks = None
+        if masked and degree > 0:
+            masks, auxiliary.delta = self.band_masks(index, features, eye)
+            auxiliary.band_masks = masks
         if not semantic:  # the masks have seen them
             features = None
-        masks = self.sh_mask(index) if masked and degree > 0 else None
-        auxiliary.band_masks = masks
-        eye = -view.viewmat[:3, :3].T @ view.viewmat[:3, 3]
         colors = colors_in_view(self.bands(), masks, index, raw["means"], eye, degree)
         gaussians, camera = (means, quats, scales, opacities), (view.viewmat[None], view.K[None])
         size = view.width, view.height

@@ -79,7 +79,7 @@ class Population:
         """Hard-prune what is faint or, of the first Gaussians, closed by their soft mask; `min_gaussians` stay."""
         strength = self.model.raw["logit_opacities"].sigmoid()
         if mask is not None:
-            strength[: len(mask)] *= prune.hard_mask(mask)
+            strength[: len(mask)] *= prune.hard_mask(mask, self.settings.mask_threshold)
         keep = strength >= FAINT
         if keep.sum() < self.settings.min_gaussians:
             keep[strength.topk(min(self.settings.min_gaussians, len(strength))).indices] = True
@@ -105,12 +105,13 @@ class Population:
         self.clear_gradients()
 
     @torch.no_grad()
-    def freeze_bands(self, optimizer: torch.optim.Optimizer) -> bool:
-        """Fix every Gaussian's SH degree: what is closed leaves parameters, moments and memory. Was it still open?"""
+    def freeze_bands(self, optimizer: torch.optim.Optimizer, features: Tensor | None) -> None:
+        """Fix every Gaussian's SH degree, once: what is closed leaves parameters, moments and memory.
+
+        features [N, C] of all Gaussians: they guide the printed masks.
+        """
         raw = self.model.raw
-        if "sh_logits" not in raw:
-            return False
-        degrees = sh_prune.degrees(sh_prune.band_mask(raw["sh_logits"])).clamp_max(self.settings.sh_degree)
+        degrees = sh_prune.degrees(self.model.final_band_masks(features)).clamp_max(self.settings.sh_degree)
         rows = sh_prune.ragged_rows(degrees)
         optimizer_rows.drop(optimizer, raw, "sh_logits")
         bands = {f"sh{band}": rows[band] for band in range(1, 4)}
@@ -118,7 +119,6 @@ class Population:
         if self.model.shape is not None:
             self.model.shape.reorder(rows[0])
         self.clear_gradients()
-        return True
 
 
 def finite_rows(value: Tensor) -> Tensor:

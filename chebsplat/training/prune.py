@@ -58,7 +58,8 @@ class PrintedGate(nn.Module):
         f = features.clamp(-MAX_FEATURE, MAX_FEATURE)
         gated = self.gate_features(f).sigmoid() * f
         u = torch.cat([gated, logits.clamp(-MAX_LOGIT, MAX_LOGIT)[:, None]], -1)
-        return self.output(self.gate_hidden(u).sigmoid() * u)[:, 0].sigmoid()
+        soft: Tensor = self.output(self.gate_hidden(u).sigmoid() * u)[:, 0].sigmoid()
+        return soft
 
 
 def soft_mask(render_logits: Tensor, semantic_logits: Tensor | None) -> Tensor:

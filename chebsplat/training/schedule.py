@@ -7,6 +7,7 @@ import torch
 from chebsplat.settings import TrainSection
 from chebsplat.splats.sh import MAX_DEGREE
 from chebsplat.training.model import SceneModel
+from chebsplat.training.prune import SemanticGate
 
 TRAVEL, MOST = 10.0, 5e-2  # a rate that is not given: less than TRAVEL over all steps does not arrive
 FASTER = {"means": 0.01, "features": 0.01, "modules": 0.01}  # what a rate has fallen to at the end; 0.1 elsewhere
@@ -40,9 +41,11 @@ def adam(model: SceneModel, settings: TrainSection, extent: float) -> torch.opti
     for name, value in model.raw.items():
         rate = base_rates[name] * (extent if name == "means" else 1)
         groups.append({"params": [value], "rate": rate, "name": name})
-    weights = [p for module in model.modules.values() for p in module.parameters()]
-    if weights:
-        groups.append({"params": weights, "rate": settings.lr_encoder, "name": "modules"})
+    printed = {part for part in (model.semantic_gate, model.band_network) if not isinstance(part, SemanticGate)}
+    for name, rate, own in (("modules", settings.lr_encoder, False), ("gates", settings.lr_gates, True)):
+        weights = [p for module in model.modules.values() if (module in printed) == own for p in module.parameters()]
+        if weights:
+            groups.append({"params": weights, "rate": rate, "name": name})
     return torch.optim.Adam(groups, eps=1e-15, fused=True)
 
 

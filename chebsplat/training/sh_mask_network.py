@@ -13,26 +13,27 @@ BANDS = ((0, 1), (1, 4), (4, 9), (9, 16))  # coefficients of bands 0 to 3
 WEIGHTS = (1.0, 3.0, 5.0, 7.0)  # 2 l + 1
 
 
-def region_histograms(
-    coefficients: Tensor, directions: Tensor, members: Tensor, n_bins: int, wanted: Tensor | None = None
-) -> Tensor:
+def whole(bands: list[Tensor]) -> Tensor:
+    """Coefficients [N, 16, 3] of bands [N, 2 l + 1, 3] from 0 on, zero for those that are not given."""
+    given = torch.cat(bands, 1)
+    return torch.cat([given, given.new_zeros(len(given), 16 - given.shape[1], 3)], 1)
+
+
+def region_histograms(coefficients: Tensor, directions: Tensor, members: Tensor, n_bins: int) -> Tensor:
     """H(R) of Eq 13: histogram [M, 4, n_bins] of what each SH band adds to the colours of a region's Gaussians.
 
     Args:
-      coefficients: [N, 16, 3] of bands 0 to 3, zero where a Gaussian has none; the histogram's gradient reaches them.
+      coefficients: [N, 16, 3] of bands 0 to 3; the histogram's gradient reaches them.
       directions:   [N, 3] unit, along which each Gaussian is seen.
-      members:      i64 [M, n] Gaussians, -1 where padded; wanted: rows [W] of it, all by default.
-    Returns: [M or W, 4, n_bins]; each band's bins sum to 1, or to 0 in a region without members.
+      members:      i64 [M, n] Gaussians, -1 where padded.
+    Returns: [M, 4, n_bins]; each band's bins sum to 1, or to 0 in a region without members.
     Choices: the three colour channels count alike. Bins reach from the region's smallest to its largest value of the
       band, and are 1e-6 wide at least; `soft_histogram` says what the printed histogram would do.
     """
-    if wanted is not None:
-        members = members[wanted]
-    present = members >= 0
-    values = basis(directions, 3)
-    parts = [torch.einsum("nk,nkc->nc", values[:, a:b], coefficients[:, a:b]) for a, b in BANDS]
-    index = members.clamp_min(0)
-    colors = torch.stack(parts, 1)[index].permute(0, 2, 1, 3).flatten(2)  # [M, 4, n * 3]
+    present, index = members >= 0, members.clamp_min(0)
+    values, inside = basis(directions[index], 3), coefficients[index]
+    parts = [torch.einsum("mnk,mnkc->mnc", values[..., a:b], inside[..., a:b, :]) for a, b in BANDS]
+    colors = torch.stack(parts, 1).flatten(2)  # [M, 4, n * 3]
     valid = present[:, None, :, None].expand(-1, 4, -1, 3).flatten(2)
     low = colors.masked_fill(~valid, torch.inf).amin(-1).nan_to_num(posinf=0.0)
     high = colors.masked_fill(~valid, -torch.inf).amax(-1).nan_to_num(neginf=0.0)
@@ -53,8 +54,8 @@ class BandMaskNetwork(nn.Module):
 
     def __init__(self, n_channels: int, n_bins: int = 8, width: int = 8, *, guided: bool = True):
         super().__init__()
-        self.guided, self.n_bins = guided, n_bins
-        n_channels = n_channels if guided else 0
+        self.guided, self.n_bins, self.n_channels = guided, n_bins, n_channels if guided else 0
+        n_channels = self.n_channels
         if guided:
             self.embed = nn.ModuleList(
                 nn.Sequential(nn.Linear(n_bins, width), nn.ReLU(), nn.Linear(width, width)) for _ in BANDS
@@ -68,15 +69,18 @@ class BandMaskNetwork(nn.Module):
             self.output.bias[0] = 3.0
 
     def forward(self, logits: Tensor, features: Tensor | None, histograms: Tensor | None, nearest: Tensor) -> Tensor:
-        """logits ψ [V, 3]; features [V, C]; histograms [M, 4, n_bins]; nearest i64 [V] of its rows, -1 for none."""
+        """logits ψ [V, 3]; features [V, C], None where C = 0; histograms [M, 4, n_bins], None without guidance; nearest
+        i64 [V] of their rows, -1 for none."""
         v = logits.clamp(-MAX_LOGIT, MAX_LOGIT)
         if self.guided:
-            if features is None or histograms is None:
+            if histograms is None or (features is None and self.n_channels):
                 raise ValueError("guided band masks need features and histograms")
             eta = torch.cat([part(histograms[:, band]) for band, part in enumerate(self.embed)], -1)
             eta = torch.where(nearest[:, None] >= 0, eta[nearest.clamp_min(0)], 0.0)
-            v = torch.cat([features.clamp(-MAX_FEATURE, MAX_FEATURE), v, eta], -1)
-        return self.output(v).sigmoid()
+            f = [features.clamp(-MAX_FEATURE, MAX_FEATURE)] if features is not None and self.n_channels else []
+            v = torch.cat([*f, v, eta], -1)
+        delta: Tensor = self.output(v).sigmoid()
+        return delta
 
 
 def nested(delta: Tensor, threshold: float) -> Tensor:

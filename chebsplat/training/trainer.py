@@ -15,7 +15,7 @@ from chebsplat.evaluation.metrics import psnr
 from chebsplat.settings import TrainSection
 from chebsplat.shape import cks
 from chebsplat.shape.regions import Regions, build_regions
-from chebsplat.training import sh_prune
+from chebsplat.training import sh_mask_network, sh_prune
 from chebsplat.training.laps import Laps
 from chebsplat.training.losses import feature_distance, photometric
 from chebsplat.training.model import SceneModel
@@ -100,7 +100,8 @@ class Trainer:
             self.population.remove(self.optimizer, mask)
         if removing or due:
             self.refresh()
-        if self.schedule.freezes_bands(share) and self.population.freeze_bands(self.optimizer):
+        if self.schedule.freezes_bands(share) and "sh_logits" in self.model.raw:
+            self.population.freeze_bands(self.optimizer, self._features(share))
             self.refresh()
 
     def _drop_broken(self) -> None:
@@ -111,13 +112,19 @@ class Trainer:
 
     @torch.no_grad()
     def _soft_mask(self, share: float) -> Tensor | None:
-        """Of all Gaussians, once pruning has begun; encodings are as the last refresh or step left them."""
+        """Of all Gaussians, once pruning has begun."""
         if not self.schedule.prunes(share):
             return None
-        everyone, features, shape = torch.arange(len(self.model)), self.model.raw.get("features"), self.model.shape
-        if shape is not None and features is not None and self._encodes(share) and self.model.semantic_gate is not None:
-            features = shape.fuse(features, everyone)
-        return self.model.soft_mask(everyone, features)
+        features = None if self.model.semantic_gate is None else self._features(share)
+        return self.model.soft_mask(torch.arange(len(self.model)), features)
+
+    @torch.no_grad()
+    def _features(self, share: float) -> Tensor | None:
+        """Of all Gaussians, fused where they are rendered so; encodings are as the last refresh or step left them."""
+        features, shape = self.model.raw.get("features"), self.model.shape
+        if shape is None or features is None or not self._encodes(share):
+            return features
+        return shape.fuse(features, torch.arange(len(self.model)))
 
     def state_dict(self) -> dict[str, Any]:
         """All that the steps to come depend on: tensors (shared, not copied) and plain values."""
@@ -125,6 +132,7 @@ class Trainer:
             "raw": {name: value.detach() for name, value in self.model.raw.items()},
             "modules": {name: module.state_dict() for name, module in self.model.modules.items()},
             "regions": None if self.model.shape is None else self.model.shape.region_state(),
+            "guides": [self.model.members, self.model.nearest],
             "optimizer": self.optimizer.state_dict(),
             "order_generator": self.order_generator.bit_generator.state,
             "generator": self.generator.get_state(),
@@ -140,6 +148,7 @@ class Trainer:
             module.load_state_dict(state["modules"][name])
         if model.shape is not None:
             model.shape.load_region_state(state["regions"])
+        model.members, model.nearest = state["guides"]
         self.optimizer = adam(self.model, self.settings, self.extent)
         self.optimizer.load_state_dict(state["optimizer"])
         self.order_generator.bit_generator.state = state["order_generator"]
@@ -164,6 +173,7 @@ class Trainer:
             regions = build_regions(means, describe.n_regions, describe.region_size, describe.seed)
         assert regions is not None
         self.members, self.guidance = torch.as_tensor(regions.members), None
+        self.model.follow(regions)
         self.laps.mark("refresh")
 
     def _guided(self, index: Tensor) -> Tensor | None:
@@ -200,7 +210,9 @@ class Trainer:
             losses["mask"] = settings.weight_mask * auxiliary.soft_mask.mean()
         if auxiliary.shape_distance is not None and settings.weight_shape > 0:
             losses["shape"] = settings.weight_shape * auxiliary.shape_distance
-        if auxiliary.band_masks is not None:
+        if auxiliary.delta is not None:
+            losses["sh"] = settings.weight_sh * sh_mask_network.sh_loss(auxiliary.delta)
+        elif auxiliary.band_masks is not None:
             losses["sh"] = settings.weight_sh * sh_prune.sh_loss(auxiliary.band_masks, self._guided(rendered.index))
         if self.basis and self.model.shape is not None:
             weights = self.model.shape.encoder.attention_weights()
@@ -241,7 +253,8 @@ class Trainer:
     def finish(self) -> dict[str, np.ndarray]:
         """Final raw parameters: degrees fixed, bands above them zero, fused features of every Gaussian."""
         self._drop_broken()
-        self.population.freeze_bands(self.optimizer)
+        if "sh_logits" in self.model.raw:
+            self.population.freeze_bands(self.optimizer, self._features(self.share))
         bands = [band.detach() for band in self.model.bands()][: self.schedule.degree(1.0) + 1]
         others = self.model.raw.keys() - {"sh1", "sh2", "sh3", "prune_logits"}
         parameters = {name: self.model.raw[name].detach().numpy() for name in sorted(others)}
