@@ -15,6 +15,7 @@ import chebsplat
 from benchmarks.stability import (  # noqa: F401  # importing a module registers its cases
     descriptor,
     fusion,
+    gates,
     knowledge,
     pruning,
     rasterizer,

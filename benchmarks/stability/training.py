@@ -72,9 +72,10 @@ def ended(trainer: Trainer) -> tuple[str, float]:
     return f"{len(trainer.model)} left{broken}, {psnr:.1f} dB", float(1 - np.isfinite([*values, psnr]).mean())
 
 
-def _with_views(**changes: Callable[[Views], Any]) -> Trainer:
+def _with_views(*, prune_gate: str = "product", sh_masks: str = "logits", **changes: Callable[[Views], Any]) -> Trainer:
     views = four_views()
-    return tiny_trainer(views=replace(views, **{name: change(views) for name, change in changes.items()}))
+    changed = replace(views, **{name: change(views) for name, change in changes.items()})
+    return tiny_trainer(views=changed, prune_gate=prune_gate, sh_masks=sh_masks)
 
 
 def _corrupt(value: float) -> Callable[[Views], Any]:
@@ -128,6 +129,20 @@ def _flat() -> np.ndarray:
 SCENES: dict[str, Callable[[], Trainer]] = {
     "all masks closing": lambda: tiny_trainer(weight_mask=1e4, lr_masks=10.0, prune_from=0.1),
     "all bands closing": lambda: tiny_trainer(weight_sh=1e4, lr_sh_masks=10.0),
+    "printed gates, all masks closing": lambda: tiny_trainer(
+        prune_gate="printed", weight_mask=1e4, lr_masks=10.0, lr_gates=10.0, prune_from=0.1
+    ),
+    "printed gates, all bands closing": lambda: tiny_trainer(
+        sh_masks="printed", weight_sh=1e4, lr_sh_masks=10.0, lr_gates=10.0
+    ),
+    "printed gates, one Gaussian": lambda: tiny_trainer(
+        sphere(1), min_gaussians=1, prune_gate="printed", sh_masks="printed"
+    ),
+    "printed gates, features of 1e6": lambda: _with_views(
+        features=lambda v: lambda k: 1e6 * v.features(k),  # type: ignore[misc]
+        prune_gate="printed",
+        sh_masks="printed",
+    ),
     "one Gaussian": lambda: tiny_trainer(sphere(1), min_gaussians=1),
     "two coincident Gaussians": lambda: tiny_trainer(np.zeros((2, 3), np.float32), min_gaussians=1),
     "one plane": lambda: tiny_trainer(_flat()),
