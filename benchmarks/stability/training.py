@@ -130,11 +130,9 @@ SCENES: dict[str, Callable[[], Trainer]] = {
     "all masks closing": lambda: tiny_trainer(weight_mask=1e4, lr_masks=10.0, prune_from=0.1),
     "all bands closing": lambda: tiny_trainer(weight_sh=1e4, lr_sh_masks=10.0),
     "printed gates, all masks closing": lambda: tiny_trainer(
-        prune_gate="printed", weight_mask=1e4, lr_masks=10.0, lr_gates=10.0, prune_from=0.1
+        prune_gate="printed", weight_mask=1e4, lr_masks=10.0, prune_from=0.1
     ),
-    "printed gates, all bands closing": lambda: tiny_trainer(
-        sh_masks="printed", weight_sh=1e4, lr_sh_masks=10.0, lr_gates=10.0
-    ),
+    "printed gates, all bands closing": lambda: tiny_trainer(sh_masks="printed", weight_sh=1e4, lr_sh_masks=10.0),
     "printed gates, one Gaussian": lambda: tiny_trainer(
         sphere(1), min_gaussians=1, prune_gate="printed", sh_masks="printed"
     ),
