@@ -15,31 +15,11 @@ from chebsplat.shape.branch import ShapeBranch
 from chebsplat.shape.regions import Regions, covering
 from chebsplat.splats.sh_kernels import colors_in_view
 from chebsplat.training import prune, sh_mask_network, sh_prune
+from chebsplat.training.rows import take
 from chebsplat.training.sh_mask_network import BandMaskNetwork
 from chebsplat.views import View, in_frustum
 
 GATES = {"product": prune.SemanticGate, "printed": prune.PrintedGate}
-
-
-class _Take(torch.autograd.Function):
-    """Rows by an index without repeats: the gradient is one scatter, where plain indexing has to accumulate."""
-
-    @staticmethod
-    def forward(ctx: Any, values: Tensor, index: Tensor) -> Tensor:
-        ctx.save_for_backward(index)
-        ctx.shape = values.shape
-        return values.index_select(0, index)
-
-    @staticmethod
-    def backward(ctx: Any, grad: Tensor) -> tuple[Tensor, None]:
-        (index,) = ctx.saved_tensors
-        return grad.new_zeros(ctx.shape).index_copy_(0, index, grad), None
-
-
-def take(values: Tensor, index: Tensor) -> Tensor:
-    """values[index] for an index [V] that holds no row twice."""
-    rows: Tensor = _Take.apply(values, index)
-    return rows
 
 
 @dataclass
