@@ -11,7 +11,7 @@ import numpy as np
 import torch
 
 from benchmarks.rasterizer.memory import camera, scene
-from chebsplat.rasterize import binning, ellipses, rasterize, reference, tiles
+from chebsplat.rasterize import binning, ellipses, rasterize, reference, tiles, tiles_adjoint
 from chebsplat.training.losses import feature_distance, photometric
 
 SIZE, N, CHANNELS = (320, 240), 20_000, 19
@@ -91,7 +91,7 @@ def stages() -> dict[str, Callable[[], object]]:
     _, _, _, *seen = forward()
 
     def backward() -> tuple[Any, ...]:
-        return tiles.backward(N, splats, *found, *seen, ceiling, *grad, False)
+        return tiles_adjoint.backward(N, splats, *found, *seen, ceiling, *grad, False)
 
     to_means2d, moments, *_ = backward()
     return {

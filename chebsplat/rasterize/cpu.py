@@ -8,7 +8,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from chebsplat.rasterize import binning, ellipses, tiles
+from chebsplat.rasterize import binning, ellipses, tiles, tiles_adjoint
 from chebsplat.rasterize.projection import compensated, is_antialiased
 
 NAMES = ("means", "quats", "scales", "opacities", "colors", "viewmats", "Ks", "cell_colors")
@@ -63,7 +63,7 @@ class _Composite(torch.autograd.Function):
     @staticmethod
     def backward(ctx: Any, *grads: Tensor) -> tuple[Tensor | None, ...]:
         slopes = [g.contiguous().numpy() for g in grads]
-        *gradients, finite = tiles.backward(*ctx.arrays, *slopes, ctx.absgrad is not None)
+        *gradients, finite = tiles_adjoint.backward(*ctx.arrays, *slopes, ctx.absgrad is not None)
         if not finite:
             raise ValueError(f"the gradient of the image of view {ctx.view} is not finite")
         to_means2d, moments, to_opacities, absolute, *to_channels = (torch.from_numpy(a) for a in gradients)

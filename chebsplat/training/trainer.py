@@ -177,7 +177,7 @@ class Trainer:
         self.laps.mark("refresh")
 
     def _guided(self, index: Tensor) -> Tensor | None:
-        """Weights [V, 3] of the bands' penalty, found when they are first wanted after a refresh; None: all alike."""
+        """Weights [V, 3] of the bands' penalty, computed when first wanted after a refresh; None: all alike."""
         if not self.settings.sh_guided:
             return None
         if self.guidance is None:

@@ -1,0 +1,149 @@
+"""The adjoint of compositing, tile by tile (see `tiles`): a tile fills the records of its pairs, and every Gaussian's
+records are summed in the order of its pairs, so that gradients are the same bits for any number of threads.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+
+from chebsplat.kernels.jit import kernel, prange, serial
+from chebsplat.rasterize import cell_adjoint, cells
+from chebsplat.rasterize.binning import TILE, band_start
+from chebsplat.rasterize.blocks import prefetch, to_lanes
+from chebsplat.rasterize.cells import AHEAD, BLOCK, LANES, N_GEOMETRY, SHAPE, SLACK, ZERO
+from chebsplat.rasterize.tiles import AHEAD_OF_CACHE, begin, cell_column, fill_shapes, n_pixels_inside, spread
+
+
+@serial
+def _backward_tile(
+    splats, ranks, pair, masks, start, n, left, top, channels, max_alpha, grad, grad_means, grad_alpha, absolute, base,
+    spare, records,
+):  # fmt: skip
+    """One tile of `backward`: adds to the records of its pairs. Returns whether the gradient is finite.
+
+    `base` is the first pair's number, `spare` a row of records that takes what fills up a block.
+    """
+    height, width = grad_alpha.shape
+    depth = channels + 1  # alpha is a channel in which every Gaussian is 1
+    states = np.empty((LANES, 2, LANES), np.float32)
+    begin(states, width - left, height - top)
+    row, finite = LANES * channels + LANES, True  # of tall_grads: a cell's pixels, and a margin
+    grads = np.empty((LANES, cells.padded(channels) + 4, LANES), np.float32)
+    tall_grads, column = np.empty(LANES * row, np.float32), cell_column(channels)
+    mean_grads = np.zeros((LANES, splats.shape[1] - column), np.float32)
+    for cell in range(LANES):
+        x, at = left + 4 * (cell & 3), cell * row
+        for y in range(top + 4 * (cell >> 2), top + 4 * (cell >> 2) + 4):
+            inside = max(min(4, width - x), 0) * channels if y < height else 0
+            cells.copy(grad, (y * width + x) * channels, inside, tall_grads, at)
+            tall_grads[at + inside : at + 4 * channels] = ZERO
+            at += 4 * channels
+        tall_grads[at : (cell + 1) * row] = ZERO
+        for c in range(0, channels, 4):
+            to_lanes(grads, LANES * (grads.shape[1] * cell + c), tall_grads, cell * row + c, channels)
+        for lane in range(LANES):
+            x, y = left + 4 * (cell & 3) + (lane & 3), top + 4 * (cell >> 2) + (lane >> 2)
+            grads[cell, channels, lane] = grad_alpha[y, x] if y < height and x < width else ZERO
+        finite &= cells.is_finite(tall_grads, cell * row, row)
+        finite &= cells.is_finite(grads, LANES * (grads.shape[1] * cell + channels), LANES)
+        n_inside = n_pixels_inside(cell, width - left, height - top)
+        if n_inside > 0:
+            x, y = left // 4 + (cell & 3), top // 4 + (cell >> 2)
+            for c in range(grad_means.shape[2]):
+                mean_grads[cell, c] = grad_means[y, x, c] / np.float32(n_inside)
+        finite &= cells.is_finite(mean_grads, cell * mean_grads.shape[1], mean_grads.shape[1])
+    room = (n + AHEAD + BLOCK) // BLOCK * BLOCK
+    shapes, chosen = np.empty((n, SHAPE), np.float32), np.zeros((room + SLACK, cells.padded(depth)), np.float32)
+    alphas, weights = np.empty((room, LANES), np.float32), np.empty((room, LANES), np.float32)
+    g, slots, shares = np.empty((room, LANES), np.float32), np.empty(room, np.int64), np.empty(n, np.float32)
+    hits, rows = np.empty(n + AHEAD + 1, np.int64), np.empty(n, np.int64)
+    fill_shapes(splats, ranks, start, n, left, top, shapes)
+    for cell in range(LANES):
+        count = cells.listed(masks, start, n, cell, hits)
+        count = cells.sweep(shapes, hits, count, cell, max_alpha, states, alphas, weights, rows)
+        if count == 0:
+            continue
+        for m in range(count):
+            slots[m] = pair[start + rows[m]] - base
+        for m in range(count, (count + BLOCK - 1) // BLOCK * BLOCK):
+            slots[m] = spare
+        cells.gather(splats, ranks, start, rows, count, chosen)
+        cell_adjoint.slopes(chosen, grads, count, cell, depth, g)
+        if grad_means.shape[2] > 0:
+            cell_adjoint.add_slopes_of_means(splats, column, ranks, start, rows, count, cell, mean_grads, g)
+            cells.sum_lanes(weights, count, shares)
+            cell_adjoint.record_means(
+                shares, mean_grads, count, cell, slots, N_GEOMETRY + cells.padded(channels), records
+            )
+        cell_adjoint.unwind(alphas, weights, g, count, max_alpha)
+        cell_adjoint.record_colors(weights, tall_grads, channels, count, cell, slots, records)
+        cell_adjoint.record_geometry(g, count, cell, slots, records)
+        if absolute:
+            cell_adjoint.record_absolute(g, count, cell, shapes, rows, slots, records)
+    for k in range(n):
+        cell_adjoint.whiten(records, pair[start + k] - base, shapes, k)
+    return finite
+
+
+@kernel
+def backward(
+    n, splats, order, tile_starts, ranks, pair, pair_starts, masks, used, max_alpha, grad, grad_means, grad_alpha,
+    absolute,
+):  # fmt: skip
+    """Gradients of n Gaussians, band by band, each Gaussian's records summed in the order of its pairs.
+
+    Args: masks, used as `forward` returned them; grad [H, W, D] of the render, grad_means [⌈H/4⌉, ⌈W/4⌉, E],
+      grad_alpha [H, W]; absolute: whether to gather the absolute gradient too.
+    Returns: gradients to means2d [n, 2]; moments [n, 3] for `ellipses.project_adjoint`; gradients to opacities [n],
+      the absolute gradient to means2d [n or 0, 2], to colors [n, D], to cell_colors [n, E]; whether the image's
+      gradient is finite.
+    """
+    height, width, channels = grad.shape
+    flat = grad.reshape(-1)
+    columns, rows = (width + TILE - 1) // TILE, (height + TILE - 1) // TILE
+    finite, bands, shown = np.ones(len(tile_starts) - 1, np.bool_), len(pair_starts), len(order)
+    room = 0
+    for band in range(bands):
+        n_tiles = (band_start(band + 1, rows) - band_start(band, rows)) * columns
+        room = max(room, pair_starts[band, shown] - pair_starts[band, 0] + n_tiles)
+    cell_channels, column = grad_means.shape[2], N_GEOMETRY + cells.padded(channels)
+    records = np.empty((room, column + cells.whole(cell_channels)), np.float32)
+    sums, to_colors = np.zeros((shown, N_GEOMETRY), np.float32), np.zeros((n, channels), np.float32)
+    to_cell_colors = np.zeros((n, cells.whole(cell_channels)), np.float32)
+    for band in range(bands):
+        first_tile = band_start(band, rows) * columns
+        n_tiles = band_start(band + 1, rows) * columns - first_tile
+        base, n_pairs = pair_starts[band, 0], pair_starts[band, shown] - pair_starts[band, 0]
+        for j in prange(16 * ((n_tiles + 15) // 16)):
+            if spread(j, n_tiles) < n_tiles:
+                tile = first_tile + spread(j, n_tiles)
+                for k in range(tile_starts[tile], tile_starts[tile + 1]):
+                    cell_adjoint.clear(records, pair[k] - base)
+                finite[tile] = _backward_tile(
+                    splats, ranks, pair, masks, tile_starts[tile], used[tile], (tile % columns) * TILE,
+                    (tile // columns) * TILE, channels, max_alpha, flat, grad_means, grad_alpha, absolute, base,
+                    n_pairs + tile - first_tile, records,
+                )  # fmt: skip
+        for m in prange(shown):
+            following = np.int64(order[min(m + AHEAD_OF_CACHE, shown - 1)]) * channels
+            prefetch(to_colors, following)
+            prefetch(to_colors, following + channels - 1)
+            for k in range(pair_starts[band, m] - base, pair_starts[band, m + 1] - base):
+                for d in range(N_GEOMETRY):
+                    sums[m, d] += records[k, d]
+                for d in range(channels):
+                    to_colors[order[m], d] += records[k, N_GEOMETRY + d]
+                cell_adjoint.add_means(records, k, column, to_cell_colors, order[m])
+    to_means2d, moments = np.zeros((n, 2), np.float32), np.zeros((n, 3), np.float32)
+    to_opacities, to_absolute = np.zeros(n, np.float32), np.zeros((n if absolute else 0, 2), np.float32)
+    for m in prange(shown):
+        i, p, q, r = order[m], splats[m, 2], splats[m, 3], splats[m, 4]
+        to_means2d[i, 0] = 2 * p * sums[m, 1]
+        to_means2d[i, 1] = 2 * (q * sums[m, 1] + r * sums[m, 2])
+        moments[i, 0], moments[i, 1], moments[i, 2] = sums[m, 3], sums[m, 4], sums[m, 5]
+        to_opacities[i] = sums[m, 0] * 2.0 ** (-splats[m, 5]) / math.log(2.0)
+        if absolute:
+            to_absolute[i, 0], to_absolute[i, 1] = sums[m, 6], sums[m, 7]
+    return to_means2d, moments, to_opacities, to_absolute, to_colors, to_cell_colors[:, :cell_channels], finite.all()
