@@ -81,19 +81,19 @@ def before(planner: Planner, text: str, settings: str, ablation: str) -> tuple[l
         if "cks" not in plans[-1].targets:
             raise ConfigError(f"{text} holds no knowledge: {plans[-1].left_out['cks']}")
         return plans, plans[-1].targets["cks"], f"{Path(reference.name).stem}@{number}"
-    found = revisions_of_head(reference.name)
-    number = chosen(reference, len(found))
-    return [], found[number - 1], f"{reference.name}@{number}"
+    made = revisions_of_head(reference.name)
+    number = chosen(reference, len(made))
+    return [], made[number - 1], f"{reference.name}@{number}"
 
 
 def revisions_of_head(name: str) -> list[Path]:
     """Raises ConfigError with the nearest names if there is no such HEAD."""
-    found = heads.revisions(head_folder(name))
-    if not found:
+    made = heads.revisions(head_folder(name))
+    if not made:
         known = [*head_names(), *names("sequences")]
         near = suggest(name, known) or known
         raise ConfigError(f"no basis is called {name}; did you mean {', '.join(near)}, or a folder (with a /)?")
-    return found
+    return made
 
 
 def revisions(text: str) -> list[Path]:

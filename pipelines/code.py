@@ -50,8 +50,8 @@ class Code:
         """
         if name not in self._stages:
             self._stages[name] = self._identity(name)
-        found = self._stages[name]
-        return found | {"packages": found["packages"] | self._versions_of(used)}
+        identity = self._stages[name]
+        return identity | {"packages": identity["packages"] | self._versions_of(used)}
 
     def _identity(self, name: str) -> dict[str, Any]:
         seen: dict[str, str] = {}
@@ -82,12 +82,12 @@ class Code:
         first = dotted.split(".")[0]
         base = [] if first in LAYERS else ["chebsplat"]
         parts = [p for p in dotted.split(".") if p]
-        found = []
+        modules = []
         for n in range(len(parts) + 1):
             module = ".".join(base + parts[:n])
             if module and self._path(module) is not None:
-                found.append(module)
-        return found
+                modules.append(module)
+        return modules
 
     def _path(self, module: str) -> Path | None:
         first, *rest = module.split(".")
@@ -100,11 +100,11 @@ class Code:
     def _read(self, path: Path) -> tuple[str, list[str]]:
         state, key = path.stat(), str(path)
         stamp = [state.st_mtime_ns, state.st_size]
-        held = self.memo.get(key)
-        if held is None or not _remembers(held, stamp):
+        entry = self.memo.get(key)
+        if entry is None or not _remembers(entry, stamp):
             self.read_now += 1
-            held = self.memo[key] = [stamp, *parsed(path.read_text(), key)]
-        return held[1], held[2]
+            entry = self.memo[key] = [stamp, *parsed(path.read_text(), key)]
+        return entry[1], entry[2]
 
     def _version(self, package: str) -> str | None:
         if package not in self._versions:

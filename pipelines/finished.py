@@ -19,12 +19,12 @@ def is_artifact(path: Path) -> bool:
 def links(folder: Path) -> dict[str, Path]:
     """Artifacts that a folder names, stages in their order; whatever else lies there is none of ours."""
     try:
-        found = [entry.name for entry in os.scandir(folder) if is_artifact(Path(entry.path))]
+        stages = [entry.name for entry in os.scandir(folder) if is_artifact(Path(entry.path))]
     except OSError:
         return {}
     order = list(STAGES)
-    found.sort(key=lambda name: (order.index(name) if name in order else len(order), name))
-    return {name: folder / name for name in found}
+    stages.sort(key=lambda name: (order.index(name) if name in order else len(order), name))
+    return {name: folder / name for name in stages}
 
 
 def titles() -> list[str]:
@@ -39,16 +39,16 @@ def scene_folder(scene: str) -> Path:
 
     Raises: ConfigError with the nearest names, or if several are meant; InputError for a path that leads to none.
     """
-    place = Path(os.path.expanduser(scene))
+    path = Path(os.path.expanduser(scene))
     if "/" not in scene and links(store.work() / scene):
         return store.work() / scene
-    if is_artifact(place):
-        if found := holder(place):
-            return found
-        raise InputError(f"{place} belongs to no scene in {store.work()}; name the scene")
-    if links(place):
-        return place
-    name = folders.known(Path(os.path.realpath(place))) if os.path.isdir(place) else scene
+    if is_artifact(path):
+        if folder := holder(path):
+            return folder
+        raise InputError(f"{path} belongs to no scene in {store.work()}; name the scene")
+    if links(path):
+        return path
+    name = folders.known(Path(os.path.realpath(path))) if os.path.isdir(path) else scene
     runs = [title for title in titles() if title.partition("@")[0] == name]
     if len(runs) == 1 or name in runs:
         return store.work() / (name if name in runs else runs[0])
@@ -86,9 +86,9 @@ def artifact_of(scene: str, stage: str) -> Path:
 
     Raises: as `scene_folder`; ConfigError if the scene has no such artifact.
     """
-    place = Path(os.path.expanduser(scene))
-    if ("/" in scene or not links(store.work() / scene)) and is_artifact(place):
-        return place
+    path = Path(os.path.expanduser(scene))
+    if ("/" in scene or not links(store.work() / scene)) and is_artifact(path):
+        return path
     folder = scene_folder(scene)
     if not is_artifact(folder / stage):
         run = f"run it to its end: make scene={shown(folder.name.partition('@')[0])}"
@@ -98,7 +98,7 @@ def artifact_of(scene: str, stage: str) -> Path:
 
 def artifacts(scene: str) -> list[Path]:
     """All that a scene's links name, or the artifact alone that is named."""
-    place = Path(os.path.expanduser(scene))
-    if ("/" in scene or not links(store.work() / scene)) and is_artifact(place):
-        return [place]
+    path = Path(os.path.expanduser(scene))
+    if ("/" in scene or not links(store.work() / scene)) and is_artifact(path):
+        return [path]
     return list(links(scene_folder(scene)).values())

@@ -22,7 +22,8 @@ UNKNOWN = ""  # the owner of a name whose links were made by something else
 LONGEST = 80  # bytes of a name; its settings follow in the folder's name
 
 
-def place(name: str) -> Path:
+def record(name: str) -> Path:
+    """The file that says which folder a name stands for."""
     return store.work() / ".names" / f"{name}.json"
 
 
@@ -30,18 +31,18 @@ def candidates(folder: Path) -> list[str]:
     """Names for a folder, the shortest first: its own, with its parent's, with a digest of its path."""
     short, longer = folder_name(folder)[:LONGEST], folder_name(folder, 1)
     mark = hashlib.sha256(os.fsencode(folder)).hexdigest()[:8]
-    found = [short, longer, f"{short[: LONGEST - 9]}-{mark}"]
+    forms = [short, longer, f"{short[: LONGEST - 9]}-{mark}"]
     reserved = set(names("scenes"))
     return [
         name
-        for name in found
+        for name in forms
         if name not in reserved and not name.startswith(("study-", "basis-")) and len(name.encode()) <= LONGEST
     ] or [f"folder-{mark}"]
 
 
 def owner(name: str) -> str | None:
     """The folder that a name stands for; None of a free one. Raises InputError if what says so is damaged."""
-    file = place(name)
+    file = record(name)
     if file.exists():
         remedy = "remove it: the next run of its folder writes it again"
         value = parse_json(file, remedy)
@@ -64,32 +65,32 @@ def recorded(folder: Path) -> str:
 
 def name_of(folder: Path) -> str:
     """The name that a folder has, or that it would be given. Raises ConfigError if none is free."""
-    found = candidates(folder)
-    owners = {name: owner(name) for name in found}
+    possible = candidates(folder)
+    owners = {name: owner(name) for name in possible}
     for wanted in (str(folder), None):
-        for name in found:
+        for name in possible:
             if owners[name] == wanted:
                 return name
-    taken = place(found[-1]).parent
-    raise ConfigError(f"{folder}: {', '.join(found)} stand for other folders ({taken}); chebsplat rm frees a name")
+    taken = record(possible[-1]).parent
+    raise ConfigError(f"{folder}: {', '.join(possible)} stand for other folders ({taken}); chebsplat rm frees a name")
 
 
 def claim(folder: Path) -> str:
     """The folder's name, from now on its own."""
-    file = place("any")
+    file = record("any")
     file.parent.mkdir(parents=True, exist_ok=True)
     with (file.parent / ".lock").open("w") as lock:
         fcntl.flock(lock, fcntl.LOCK_EX)
         name = name_of(folder)
-        if not place(name).exists():
-            atomic_write(place(name), json.dumps({"source": str(folder)}) + "\n")
+        if not record(name).exists():
+            atomic_write(record(name), json.dumps({"source": str(folder)}) + "\n")
     return name
 
 
 def release(name: str) -> None:
     """Free a name that no links bear any more."""
     if not (store.work() / name).exists() and not any(store.work().glob(f"{glob.escape(name)}@*")):
-        place(name).unlink(missing_ok=True)
+        record(name).unlink(missing_ok=True)
 
 
 def known(folder: Path) -> str | None:

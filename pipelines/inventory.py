@@ -38,17 +38,17 @@ class Scene:
 
 def scenes() -> list[Scene]:
     """Those in work, each as far as it can be read; what is damaged counts nothing."""
-    found = []
+    rows = []
     for title in titles():
-        held = {stage: path for stage, path in links(store.work() / title).items() if stage in STAGES}
-        if not held:
+        artifacts = {stage: path for stage, path in links(store.work() / title).items() if stage in STAGES}
+        if not artifacts:
             continue
-        manifests = {stage: _manifest(path) for stage, path in held.items()}
+        manifests = {stage: _manifest(path) for stage, path in artifacts.items()}
         size = sum(_size(manifest) for manifest in manifests.values())
-        when = max((path / "artifact.json").stat().st_mtime for path in held.values())
-        psnr, miou, _ = summary.quality(summary.figures(held["evaluate"]) if "evaluate" in held else None)
-        found.append(Scene(title, _source(title, manifests.get("ingest")), list(held), size, when, psnr, miou))
-    return found
+        when = max((path / "artifact.json").stat().st_mtime for path in artifacts.values())
+        psnr, miou, _ = summary.quality(summary.figures(artifacts["evaluate"]) if "evaluate" in artifacts else None)
+        rows.append(Scene(title, _source(title, manifests.get("ingest")), list(artifacts), size, when, psnr, miou))
+    return rows
 
 
 def _manifest(path: Path) -> Any:
@@ -68,7 +68,7 @@ def _size(manifest: Any) -> int:
 def _source(title: str, ingest: Any) -> str:
     """Where a scene comes from: the folder that its name stands for, or what its capture was made of."""
     try:
-        if folders.place(name := title.partition("@")[0]).exists():
+        if folders.record(name := title.partition("@")[0]).exists():
             return folders.owner(name) or ""
         source = ingest["config"]["source"]
         return source["path"] or f"generated {source['preset']}, seed {source['seed']}"

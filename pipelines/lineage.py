@@ -125,16 +125,16 @@ def verify(path: Path | None, earlier: Path | None) -> str:
         if columns.shape[1] > max(int(share * len(columns)), before):
             raise InputError(f"{path}: {name} has {columns.shape[1]} columns, above its ceiling of {share:g} q")
     error = max(map(off_orthonormal, basis.bases.values()), default=0.0)
-    said = f"digests, |BᵀB − I| ≤ {error:.0e}"
+    checks = f"digests, |BᵀB − I| ≤ {error:.0e}"
     if earlier is None:
-        return said + ("" if basis.revision == 1 else "; the revision before is not in this store")
+        return checks + ("" if basis.revision == 1 else "; the revision before is not in this store")
     before = read_basis(earlier)
     if before.lineage != basis.lineage[:-1]:
         raise InputError(f"{path}: its lineage does not continue that of {earlier}; delete it and run its stage again")
     for name, columns in before.bases.items():
         if not np.array_equal(basis.bases[name][:, : columns.shape[1]], columns):
             raise InputError(f"{path}: {name} does not begin with the columns of {earlier}; {remedy_of(path)}")
-    return said + f", continues revision {before.revision}"
+    return checks + f", continues revision {before.revision}"
 
 
 def draw(path: Path, basis: Basis, max_rank: float) -> None:

@@ -90,8 +90,8 @@ def text_packages(model: TeacherModel | None, labels: str | None) -> tuple[str, 
 def source_sentence(name: str, asked: Any, source: Any) -> str:
     """Which of the possible sources it is, for the console."""
     if source.kind != "generated":
-        said = unread(Path(source.path))
-        return f"{source.kind} source at {source.path}{said and f' ({said})'}"
+        caution = unread(Path(source.path))
+        return f"{source.kind} source at {source.path}{caution and f' ({caution})'}"
     note = ""
     if asked.kind == "named":
         note = " (REPLICA_ROOT has no such scene)" if os.environ.get("REPLICA_ROOT") else " (REPLICA_ROOT is not set)"

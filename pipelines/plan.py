@@ -71,11 +71,11 @@ class Plan:
 def placed(config: Config) -> Config:
     """A config whose paths are absolute: stages run in another folder than the one that the user means."""
     for section, key in PLACES:
-        held = getattr(config, section)
-        path = getattr(held, key)
+        values = getattr(config, section)
+        path = getattr(values, key)
         if path is not None:
-            place = os.path.realpath(os.path.expanduser(expanded(path)))
-            config = config.model_copy(update={section: held.model_copy(update={key: place})})
+            absolute = os.path.realpath(os.path.expanduser(expanded(path)))
+            config = config.model_copy(update={section: values.model_copy(update={key: absolute})})
     return config
 
 

@@ -67,25 +67,25 @@ def hashes(files: Iterable[Path], memo: dict[str, Any]) -> Hashes:
       of modification. A file that has changed just now could change again within the same tick of that clock: it is not
       remembered.
     """
-    found: Hashes = {}
+    entries: Hashes = {}
     for path in files:
         now, state = time.time_ns(), regular(path)
         stamp = [state.st_ino, state.st_size, state.st_mtime_ns, state.st_ctime_ns]
-        held = memo.get(str(path))
-        if not (isinstance(held, list) and len(held) == 3 and held[0] == stamp and isinstance(held[1], str)):
-            held = [stamp, sha256_file(path), now - state.st_ctime_ns > SETTLED]
-            if held[2]:
-                memo[str(path)] = held
-        found[str(path)] = held
-    return found
+        entry = memo.get(str(path))
+        if not (isinstance(entry, list) and len(entry) == 3 and entry[0] == stamp and isinstance(entry[1], str)):
+            entry = [stamp, sha256_file(path), now - state.st_ctime_ns > SETTLED]
+            if entry[2]:
+                memo[str(path)] = entry
+        entries[str(path)] = entry
+    return entries
 
 
-def content_hash(found: Hashes, root: Path | None) -> str:
+def content_hash(entries: Hashes, root: Path | None) -> str:
     """One hash of files: their contents, and their paths below `root`, which tell a label from a depth image."""
     total = hashlib.sha256()
-    for path, (_, digest, _) in found.items():
-        place = os.path.basename(path) if root is None else os.path.relpath(path, root).replace(os.sep, "/")
-        total.update(os.fsencode(f"{place} {digest}\n"))
+    for path, (_, digest, _) in entries.items():
+        name = os.path.basename(path) if root is None else os.path.relpath(path, root).replace(os.sep, "/")
+        total.update(os.fsencode(f"{name} {digest}\n"))
     return total.hexdigest()[:16]
 
 
@@ -95,18 +95,18 @@ def unchanged(stage: str, sections: dict[str, Any], planned: Hashes) -> Iterator
 
     Raises: InputError naming the file that is another now, or was touched meanwhile, is new or gone.
     """
-    memo = {path: held for path, held in planned.items() if held[2]}
+    memo = {path: entry for path, entry in planned.items() if entry[2]}
 
     def check() -> Hashes:
-        found = hashes(raw_files(stage, sections)[1], memo)
-        for path in (*planned, *found):
-            if path not in found or path not in planned or found[path][1] != planned[path][1]:
-                what = "is gone" if path not in found else "is new" if path not in planned else "has changed"
+        now = hashes(raw_files(stage, sections)[1], memo)
+        for path in (*planned, *now):
+            if path not in now or path not in planned or now[path][1] != planned[path][1]:
+                what = "is gone" if path not in now else "is new" if path not in planned else "has changed"
                 raise InputError(f"{path} {what} since the run was planned; run again")
-        return found
+        return now
 
     before = check()
     yield
-    for path, held in check().items():
-        if held[0] != before[path][0]:
+    for path, entry in check().items():
+        if entry[0] != before[path][0]:
             raise InputError(f"{path} was touched while it was read; run again")

@@ -65,18 +65,18 @@ def execute(plans: list[Plan], stage: str | None, cores: int, device: str = "cpu
     if stale:
         seconds(list(steps.values()), {step.key for step in stale})
     for plan in asked:
-        tell(plan, stage)
+        say_result(plan, stage)
     return 0
 
 
-def tell(plan: Plan, stage: str | None) -> None:
+def say_result(plan: Plan, stage: str | None) -> None:
     """What a scene has come to, and where it lies: the report's page, or what was asked for last."""
     last = next(step for step in reversed(plan.steps) if stage in (None, step.stage))
     if last.stage == "report":
         for line in aligned(summary.table(plan.targets["evaluate"])):
             say(f"  {line}")
-    place = store.work() / plan.title / last.stage
-    print(summary.readable(place / "report.html" if last.stage == "report" else place))
+    link = store.work() / plan.title / last.stage
+    print(summary.readable(link / "report.html" if last.stage == "report" else link))
 
 
 def wanted_steps(plan: Plan, stage: str | None, others: Iterable[Plan] = ()) -> list[Step]:

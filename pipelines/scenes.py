@@ -87,5 +87,5 @@ def absent(scene: str, folder: Path) -> InputError:
     needed = data_of(scene)
     if needed is None or needed[1] != folder:
         return InputError(f"{folder} is not a folder; correct source.path")
-    told = f"{scene} needs data that is no part of chebsplat: {folder} is not a folder"
-    return InputError(f"{told}; set {needed[0]} to the folder that holds {folder.name}")
+    lack = f"{scene} needs data that is no part of chebsplat: {folder} is not a folder"
+    return InputError(f"{lack}; set {needed[0]} to the folder that holds {folder.name}")

@@ -1,4 +1,4 @@
-"""The work folder: artifacts by key, links for people, remembered hashes, and the collection of what nothing names."""
+"""The work folder: artifacts by key, links by scene, remembered hashes, and the collection of what nothing names."""
 
 from __future__ import annotations
 
@@ -87,13 +87,13 @@ def link(scene: str, targets: dict[str, Path]) -> Path:
         if not is_fresh(target):
             continue
         relative = os.path.relpath(target, folder)
-        place = folder / stage
-        if place.is_symlink() and os.readlink(place) == relative:
+        current = folder / stage
+        if current.is_symlink() and os.readlink(current) == relative:
             continue
         fresh = folder / f".{stage}-{os.getpid()}"
         fresh.unlink(missing_ok=True)
         fresh.symlink_to(relative)
-        os.replace(fresh, place)
+        os.replace(fresh, current)
     return folder
 
 
@@ -118,9 +118,9 @@ def unnamed(without: Container[Path] = ()) -> list[tuple[Path, int]]:
         named.add(path)
         keys = [entry["key"] for entry in parse_manifest(path).inputs.values()]
         waiting += [by_key[key] for key in keys if key in by_key]
-    found = [p for p in sorted(base.glob("store/*/*")) if _real(p) not in named and not _in_use(p, running)]
-    found += [p for p in sorted(base.glob(".plans/*")) if not _owner_lives(p)]
-    return [(p, sum(f.stat().st_size for f in p.rglob("*") if f.is_file())) for p in found]
+    leftovers = [p for p in sorted(base.glob("store/*/*")) if _real(p) not in named and not _in_use(p, running)]
+    leftovers += [p for p in sorted(base.glob(".plans/*")) if not _owner_lives(p)]
+    return [(p, sum(f.stat().st_size for f in p.rglob("*") if f.is_file())) for p in leftovers]
 
 
 def sweep() -> None:

@@ -20,36 +20,36 @@ def figures(evaluation: Path) -> Any:
         return None
 
 
-def number(found: Any, *keys: str) -> float | None:
+def number(figures: Any, *keys: str) -> float | None:
     """A figure by its keys; None if it was not measured."""
     for key in keys:
-        found = found.get(key) if isinstance(found, dict) else None
-    return found if isinstance(found, int | float) and math.isfinite(found) else None
+        figures = figures.get(key) if isinstance(figures, dict) else None
+    return figures if isinstance(figures, int | float) and math.isfinite(figures) else None
 
 
 def text(form: str, value: float | None) -> str:
     return "" if value is None else form.format(value)
 
 
-def quality(found: Any) -> tuple[str, str, str]:
+def quality(figures: Any) -> tuple[str, str, str]:
     """(test PSNR, mIoU, its 2D teacher's mIoU); empty where they were not measured."""
-    shares = (number(found, "segmentation", whose, "miou") for whose in ("scene", "teacher"))
+    shares = (number(figures, "segmentation", whose, "miou") for whose in ("scene", "teacher"))
     miou, teacher = (text("{:.1%}", share) for share in shares)
-    return text("{:.1f} dB", number(found, "image", "psnr")), miou, teacher
+    return text("{:.1f} dB", number(figures, "image", "psnr")), miou, teacher
 
 
 def table(evaluation: Path) -> list[tuple[str, str, str]]:
     """(what, value, beside it) of a scene that was evaluated; what was not measured is not there."""
-    found = figures(evaluation)
-    psnr, miou, teacher = quality(found)
-    size = {name: text("{:.1f} MB", scaled(number(found, "bytes", name))) for name in ("ply", "split", "ragged")}
+    measured = figures(evaluation)
+    psnr, miou, teacher = quality(measured)
+    size = {name: text("{:.1f} MB", scaled(number(measured, "bytes", name))) for name in ("ply", "split", "ragged")}
     others = ", ".join(f"{name} {shown}" for name, shown in size.items() if shown and name != "ply")
     rows = [
-        ("test PSNR", psnr, text("SSIM {:.3f}", number(found, "image", "ssim"))),
+        ("test PSNR", psnr, text("SSIM {:.3f}", number(measured, "image", "ssim"))),
         ("mIoU", miou, f"its 2D teacher {teacher}" if teacher else ""),
-        ("Gaussians", text("{:,}", number(found, "n_gaussians")), ""),
+        ("Gaussians", text("{:,}", number(measured, "n_gaussians")), ""),
         ("PLY", size["ply"], others),
-        ("frames/s", text("{:.0f}", number(found, "frames_per_second", "color")), "colour alone"),
+        ("frames/s", text("{:.0f}", number(measured, "frames_per_second", "color")), "colour alone"),
     ]
     return [row for row in rows if row[1]]
 

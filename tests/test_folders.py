@@ -64,11 +64,11 @@ def test_planning_names_a_folder_and_keeps_nothing(tmp_path, work):
 
 def test_a_damaged_or_exhausted_register_is_an_error_that_says_where(tmp_path, work):
     run(photo_folder(tmp_path / "a/images"))
-    folders.place("images").write_text("{")
+    folders.record("images").write_text("{")
     with pytest.raises(InputError, match=r"images\.json"):
         Planner().plan(f"{tmp_path}/a/images/")
     for name in folders.candidates(tmp_path / "a/images"):
-        folders.place(name).write_text(json.dumps({"source": "/elsewhere"}))
+        folders.record(name).write_text(json.dumps({"source": "/elsewhere"}))
     with pytest.raises(ConfigError, match="stand for other folders"):
         Planner().plan(f"{tmp_path}/a/images/")
 

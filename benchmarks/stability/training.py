@@ -64,8 +64,8 @@ def ended(trainer: Trainer) -> tuple[str, float]:
             pass
         parameters = trainer.finish()
     except DataFailure as failure:
-        told = str(failure)
-        return f"stopped: {told[:20]}...", float(not told.startswith("step "))
+        message = str(failure)
+        return f"stopped: {message[:20]}...", float(not message.startswith("step "))
     values = np.concatenate([value.ravel().astype(np.float64) for value in parameters.values()])
     psnr = trainer.held_in_psnr(list(range(4)))
     broken = f", {trainer.population.n_broken} removed" if trainer.population.n_broken else ""

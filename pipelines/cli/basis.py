@@ -23,7 +23,7 @@ def basis() -> None:
     """Knowledge bases: NAME[@REVISION] of a sequence or of a HEAD, or FOLDER/ of an artifact."""
 
 
-def found(name: str) -> tuple[Path, Basis]:
+def newest(name: str) -> tuple[Path, Basis]:
     from chebsplat.formats.basis import read_basis
     from chebsplat.pipelines.bases import revisions
 
@@ -39,7 +39,7 @@ def log(name: str, out: Path | None) -> None:
     from chebsplat.formats import artifact
     from chebsplat.pipelines import lineage
 
-    path, one = found(name)
+    path, one = newest(name)
     show_rows(lineage.log_table(one))
     if out is not None:
         out.mkdir(parents=True, exist_ok=True)
@@ -59,7 +59,7 @@ def show(name: str) -> None:
     """One revision: each attention weight, and which scene added which of its columns."""
     from chebsplat.pipelines import lineage
 
-    path, one = found(name)
+    path, one = newest(name)
     print(f"{path}: revision {one.revision}, {len(one.weights)} arrays of weights")
     show_rows(lineage.show_table(one))
 
@@ -71,7 +71,7 @@ def diff(first: str, second: str) -> None:
     """What two revisions share, and how far their spans and weights lie apart."""
     from chebsplat.pipelines import lineage
 
-    (_, one), (_, other) = found(first), found(second)
+    (_, one), (_, other) = newest(first), newest(second)
     count = lineage.common(one, other)
     print(f"{count} revisions in common")
     for name, which in ((first, one), (second, other)):
@@ -87,7 +87,7 @@ def verify(name: str) -> None:
     """Every revision: digests, BᵀB = I, ranks below their ceiling, each the continuation of the one before."""
     from chebsplat.pipelines import lineage
 
-    path, one = found(name)
+    path, one = newest(name)
     chain = lineage.ancestors(path)
     for number, (revision, earlier) in enumerate(zip(chain, [None, *chain], strict=False), start=1):
         print(f"{number} {one.lineage[number - 1]['scene']}: {lineage.verify(revision, earlier)}")
@@ -100,7 +100,7 @@ def export(name: str, out: Path) -> None:
     """Copy a revision, to start scenes from it elsewhere (basis=FOLDER/)."""
     from chebsplat.formats import artifact
 
-    path, _ = found(name)
+    path, _ = newest(name)
     if os.path.lexists(out):
         raise ConfigError(f"{out} exists; choose another --out")
     artifact.copy(path, out, artifact.verify(path))

@@ -34,21 +34,21 @@ def plans(
         earlier, path, name = bases.before(planner, basis, settings, ablation)
         plan = planner.plan(str(scene), settings, ablation, path)
         plan.title += ("+" if ablation or settings else "@") + f"basis={name}"
-        for found in earlier:
-            found.asked = False
+        for one in earlier:
+            one.asked = False
         return [*earlier, plan]
     finally:
         planner.save()
 
 
-def checked_stage(stage: str | None, found: list[Any]) -> str | None:
+def checked_stage(stage: str | None, chosen: list[Any]) -> str | None:
     """Raises ConfigError for a stage that does not exist or that this scene leaves out."""
     if stage is None:
         return None
     if stage not in STAGES:
         near = suggest(stage, STAGES, 1)
         raise ConfigError(f"no stage is called {stage}" + (f"; did you mean {near[0]}?" if near else ""))
-    for plan in found:
+    for plan in chosen:
         if plan.asked and stage not in plan.targets:
             raise ConfigError(f"{plan.title} leaves out {stage}: {plan.left_out.get(stage, 'not needed')}")
     return stage
@@ -83,8 +83,8 @@ def run(stage: str | None, cores: int, device: str, **choice: Any) -> int:
     """Bring a scene up to date; recompute only what is stale."""
     from chebsplat.pipelines.run import device_of, execute
 
-    used, found = device_of(device), plans(**choice, running=True)
-    return execute(found, checked_stage(stage or None, found), cores, used)
+    used, chosen = device_of(device), plans(**choice, running=True)
+    return execute(chosen, checked_stage(stage or None, chosen), cores, used)
 
 
 @click.command()
@@ -94,12 +94,12 @@ def plan(**choice: Any) -> None:
     from chebsplat.pipelines.run import wanted_steps
 
     chosen = plans(**choice)
-    keys = {step.key for found in chosen if found.asked for step in wanted_steps(found, None, chosen)}
-    for found in chosen:
-        print(f"{found.title}: {found.source}")
-        for step in (step for step in found.steps if step.key in keys):
+    keys = {step.key for one in chosen if one.asked for step in wanted_steps(one, None, chosen)}
+    for one in chosen:
+        print(f"{one.title}: {one.source}")
+        for step in (step for step in one.steps if step.key in keys):
             print(f"  {'fresh' if step.fresh else 'would run':9s} {step.stage:9s} {step.key}")
-        for what, why in found.left_out.items():
+        for what, why in one.left_out.items():
             print(f"  left out  {what}: {why}")
 
 

@@ -15,12 +15,12 @@ def list_scenes() -> None:
     from chebsplat.pipelines import inventory, store
     from chebsplat.pipelines.tables import show_rows
 
-    found = inventory.scenes()
-    if not found:
+    scenes = inventory.scenes()
+    if not scenes:
         print(f"no scene in {store.work()}", file=sys.stderr)
         return
     heading = ("scene", "source", "done", "MB", "when", "PSNR", "mIoU")
-    show_rows([heading, *(scene.row() for scene in found)])
+    show_rows([heading, *(scene.row() for scene in scenes)])
     print(f"{store.work()}: artifacts that several scenes share count in each", file=sys.stderr)
 
 
@@ -32,25 +32,25 @@ def rm(scenes: tuple[str, ...], yes: bool) -> None:
     from chebsplat.pipelines import folders, inventory, store
 
     chosen = list(dict.fromkeys(inventory.in_work(scene) for scene in scenes))
-    found = inventory.only_of(chosen)
+    artifacts = inventory.only_of(chosen)
     for folder in chosen:
         kept = inventory.others(folder)
         print(f"           {folder}" + (f" (stays, for what is not ours: {', '.join(kept)})" if kept else ""))
-    show_sizes(found, yes, "--yes removes them")
+    show_sizes(artifacts, yes, "--yes removes them")
     if not yes:
         return
     for folder in chosen:
         inventory.unlink(folder)
         folders.release(folder.name.partition("@")[0])
-    for path, _ in found:
+    for path, _ in artifacts:
         store.remove(path)
 
 
-def show_sizes(found: list, done: bool, advice: str) -> None:
-    for path, size in found:
+def show_sizes(sizes: list, done: bool, advice: str) -> None:
+    for path, size in sizes:
         print(f"{size / 2**20:9.1f} MB  {path}")
-    total = sum(size for _, size in found) / 2**20
-    print(f"{total:9.1f} MB  in {len(found)} folders" + ("" if done else f"; {advice}"))
+    total = sum(size for _, size in sizes) / 2**20
+    print(f"{total:9.1f} MB  in {len(sizes)} folders" + ("" if done else f"; {advice}"))
 
 
 @click.command()
@@ -77,10 +77,10 @@ def clean_stale(yes: bool) -> None:
     """List the artifacts that no scene names any more, and leftovers of killed runs."""
     from chebsplat.pipelines import store
 
-    found = store.unnamed()
-    show_sizes(found, yes or not found, "yes=1 (--yes) removes them")
+    leftovers = store.unnamed()
+    show_sizes(leftovers, yes or not leftovers, "yes=1 (--yes) removes them")
     if yes:
-        for path, _ in found:
+        for path, _ in leftovers:
             store.remove(path)
         store.sweep()
 

@@ -29,9 +29,9 @@ def query(scene: str, text: str, against: str, out: Path | None, top: int) -> No
     folder = scene_folder(scene)
     if not text.strip():
         raise ConfigError("the query is empty; say what to look for")
-    place = (out or folder / "query" / suffix(text.strip())).absolute()
-    answer(folder, text.strip(), [word.strip() for word in against.split(",") if word.strip()], place, top)
-    print(place)
+    target = (out or folder / "query" / suffix(text.strip())).absolute()
+    answer(folder, text.strip(), [word.strip() for word in against.split(",") if word.strip()], target, top)
+    print(target)
 
 
 @click.command("check-teacher")
@@ -76,12 +76,12 @@ def encode(scene: str, encoder: str | None, features: Path | None, out: Path) ->
     if scene.endswith(".ply"):
         if encoder is None:
             raise ConfigError(f"{scene} is a PLY, which has no encoder of its own; add --encoder")
-        held = Path(scene)
+        source = Path(scene)
     else:
-        held = artifact_of(scene, "export")
+        source = artifact_of(scene, "export")
         encoder = encoder or str(scene_folder(scene) / "onnx")
     model = Path(encoder) if encoder.endswith(".onnx") else artifact_of(encoder, "onnx")
-    figures = write(held, model, features, out)
+    figures = write(source, model, features, out)
     print(", ".join(f"{name} {value}" for name, value in figures.items()), file=sys.stderr)
     print(out)
 

@@ -119,7 +119,7 @@ def facts(runs: list[Run], rows: list[Row], command: str) -> list[tuple[str, str
         for m in manifests
         if "commit" in m.code
     }
-    found = [
+    lines = [
         ("command", command),
         ("protocol", ", ".join(sorted({row["protocol"] for row in rows}))),
         ("runs", f"{len(done)} of {len(rows)} done; {len({m.key for m in manifests})} different trainings"),
@@ -129,8 +129,8 @@ def facts(runs: list[Run], rows: list[Row], command: str) -> list[tuple[str, str
         ("commit", ", ".join(sorted(commits)) or "not in a checkout"),
     ]
     if len(threads) > 1:
-        found.append(("beware", "seconds and frames/s of runs with different numbers of threads do not compare"))
-    return found
+        lines.append(("beware", "seconds and frames/s of runs with different numbers of threads do not compare"))
+    return lines
 
 
 def processor() -> str:

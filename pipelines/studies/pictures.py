@@ -39,9 +39,9 @@ def gallery(study: Study, runs: list[Run], rows: list[Row]) -> dict[str, Any]:
     for where, some in scenes.items():
         table = np.array([*(union.index(name) for name in names[where]), -1])
         evaluations = {variant: read_evaluation(run.plan.targets["evaluate"]) for variant, run in some.items()}
-        images, found = _images(evaluations, table, len(union))
+        images, counts = _images(evaluations, table, len(union))
         pictures.append({"name": " ".join(part for part in where if part), "images": images})
-        pixels.update(found)
+        pixels.update(counts)
     variants = [v for v in study.variants if v != study.baseline]
     compared = variants[0] if variants else study.baseline
     there = {key for row in pictures for key, _, _ in row["images"]}
@@ -77,9 +77,9 @@ def _images(
     images = [("truth", draw.data_uri(_small(first.pictures["truth"][view]), photo=True), "photo")]
 
     def labels(key: str, stack: Any, caption: str) -> None:
-        found = table[_small(stack[view])]
-        pixels.update(counted(found))
-        images.append((key, draw.data_uri(draw.colored(found, n)), caption))
+        shown = table[_small(stack[view])]
+        pixels.update(counted(shown))
+        images.append((key, draw.data_uri(draw.colored(shown, n)), caption))
 
     if "labels" in first.pictures:
         labels("labels", first.pictures["labels"], "true labels")
@@ -107,13 +107,13 @@ def _modes(baseline: str, variants: list[str]) -> list[list[Any]]:
         return side(variant, f"render of {variant}", f"labels of {variant}" if what else None)
 
     first = (variants or [baseline])[0]
-    found = [[f"photo | {first}", side("photo", "truth"), of(first, False)]]
-    found.append([f"true labels | {first}", side("true labels", "truth", "labels"), of(first, True)])
+    modes = [[f"photo | {first}", side("photo", "truth"), of(first, False)]]
+    modes.append([f"true labels | {first}", side("true labels", "truth", "labels"), of(first, True)])
     if variants:
-        found.append([f"photo | {baseline}", side("photo", "truth"), of(baseline, False)])
-    for what, said in ((False, ""), (True, ", labels")):
-        found += [[f"{baseline} | {v}{said}", of(baseline, what), of(v, what)] for v in variants]
-    return found
+        modes.append([f"photo | {baseline}", side("photo", "truth"), of(baseline, False)])
+    for what, suffix in ((False, ""), (True, ", labels")):
+        modes += [[f"{baseline} | {v}{suffix}", of(baseline, what), of(v, what)] for v in variants]
+    return modes
 
 
 def _keys(mode: list[Any]) -> set[str]:
@@ -124,12 +124,12 @@ def _classes(of_interest: list[tuple[Run, Row]], variant: str, baseline: str, co
     """(class, colour, the variant's mean IoU over scenes and seeds, the baseline's), best first."""
 
     def means(wanted: str) -> dict[str, float]:
-        found: dict[str, list[float]] = {}
+        values_of: dict[str, list[float]] = {}
         for run, row in of_interest:
             for name, value in row["segmentation"].get("scene", {}).get("iou", {}).items():
                 if run.variant == wanted and run.place != 1 and value is not None:
-                    found.setdefault(name, []).append(value)
-        return {name: float(np.mean(values)) for name, values in found.items()}
+                    values_of.setdefault(name, []).append(value)
+        return {name: float(np.mean(values)) for name, values in values_of.items()}
 
     other = means(baseline) if baseline != variant else {}
     sides = {"scene": {"iou": means(variant)}, "teacher": {"iou": other}}

@@ -117,23 +117,23 @@ def over_scenes(rows: list[Row]) -> list[Row]:
     rule = getattr(protocols.ALL[rows[0]["protocol"]], "over_scenes", None) if rows else None
     if rule is None:
         return rows
-    found = []
+    pooled = []
     for members in groups([row for row in rows if row["segmentation"]], "sequence", "seed").values():
         sides = [[row["segmentation"].get(side) for row in members] for side in ("scene", "teacher")]
         scene, teacher = ({} if None in of_side else rule(of_side) for of_side in sides)
         name = "+".join(sorted(row["scene"] for row in members))
-        found.append(dict.fromkeys(POOLED) | members[0] | {"scene": name, "place": 0} | segmented(scene, teacher))
-    return found
+        pooled.append(dict.fromkeys(POOLED) | members[0] | {"scene": name, "place": 0} | segmented(scene, teacher))
+    return pooled
 
 
 def traces(runs: list[Run], rows: list[Row]) -> list[tuple[Row, list[dict[str, float]]]]:
     """The trace of every finished run, with its row."""
-    found = []
+    pairs = []
     for run, row in zip(runs, rows, strict=True):
         if row["state"] == "done":
             path = run.plan.targets["train"]
-            found.append((row, read_trace(path, artifact.read_manifest(path))))
-    return found
+            pairs.append((row, read_trace(path, artifact.read_manifest(path))))
+    return pairs
 
 
 @dataclass(frozen=True)
@@ -151,10 +151,10 @@ class Line:
 
 def groups(rows: list[Row], *names: str) -> dict[tuple, list[Row]]:
     """Rows by the values of these columns, in order of appearance."""
-    found: dict[tuple, list[Row]] = {}
+    members: dict[tuple, list[Row]] = {}
     for row in rows:
-        found.setdefault(tuple(row[name] for name in names), []).append(row)
-    return found
+        members.setdefault(tuple(row[name] for name in names), []).append(row)
+    return members
 
 
 def counted(rows: list[Row]) -> list[Row]:
@@ -185,8 +185,8 @@ def compare(rows: list[Row], baseline: str) -> list[Line]:
             pairs = _pairs(mine, theirs, figure.key) if variant != baseline else []
             if pairs:
                 scenes, own, other = zip(*pairs, strict=True)
-                found = paired_difference(own, other, list(scenes), figure.ratio)
-                differences[figure.key] = found
+                difference = paired_difference(own, other, list(scenes), figure.ratio)
+                differences[figure.key] = difference
         lines.append(Line(condition, budget, variant, len(done), len(members), summaries, differences))
     return lines
 

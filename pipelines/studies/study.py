@@ -37,9 +37,9 @@ class Budgets(Section):
 
     def settings(self) -> dict[str, dict[str, Any]]:
         """train settings by the budget's name; one unnamed budget, the scene's own, where none is given."""
-        found: dict[str, dict[str, Any]] = {f"{n} steps": {"steps": n} for n in self.steps}
-        found |= {f"{s:g} s": {"seconds": s} for s in self.seconds}
-        return found or {"": {}}
+        settings: dict[str, dict[str, Any]] = {f"{n} steps": {"steps": n} for n in self.steps}
+        settings |= {f"{s:g} s": {"seconds": s} for s in self.seconds}
+        return settings or {"": {}}
 
 
 class Study(Section):
@@ -104,7 +104,7 @@ class Run:
 
     @property
     def name(self) -> str:
-        """For its link, and for people."""
+        """The name of its link, which a reader can tell the run by."""
         parts = (self.condition, self.variant, self.budget, self.sequence, self.place or "", self.scene)
         return suffix("-".join(str(p) for p in parts if p).replace(" ", "")) + f"-seed{self.seed}"
 
@@ -137,21 +137,21 @@ def expand(study: Study, running: bool = False) -> list[Run]:
     chains = [("", [scene]) for scene in study.scenes]
     chains += [(Path(name).stem, scenes_of(name)) for name in study.sequences]
     order = list(study.budgets.settings())
-    found: list[Run] = []
+    runs: list[Run] = []
     try:
         for sequence, chain in chains:
             for seed, condition in itertools.product(study.seeds, study.conditions):
                 some: list[Run] = []
                 for variant in study.variants:
                     some += _chain(planner, study, condition, variant, seed, sequence, chain)
-                found += sorted(some, key=lambda run: (order.index(run.budget), run.place))
+                runs += sorted(some, key=lambda run: (order.index(run.budget), run.place))
     finally:
         planner.save()
     for condition in study.conditions:
-        used = sorted({run.protocol for run in found if run.condition == condition})
+        used = sorted({run.protocol for run in runs if run.condition == condition})
         if len(used) > 1:
             raise ConfigError(f"scenes measured as {' and as '.join(used)} do not compare; set ingest.protocol")
-    return found
+    return runs
 
 
 def _chain(
@@ -172,10 +172,10 @@ def _chain(
             settings = merged(values, {"train": spent})
             settings = merged(settings, seeded(scene, settings, seed))
             keep = knowledge and budget == list(budgets)[-1]
-            found = planner.plan(scene, basis=earlier, keep_knowledge=keep, values=settings)
-            basis = found.targets.get("cks", basis)
+            plan = planner.plan(scene, basis=earlier, keep_knowledge=keep, values=settings)
+            basis = plan.targets.get("cks", basis)
             where = (place, chain[:place].count(scene)) if sequence else (0, 1)
-            yield Run(condition, variant, budget, found.title, seed, sequence, *where, found)
+            yield Run(condition, variant, budget, plan.title, seed, sequence, *where, plan)
 
 
 def seeded(scene: str, values: dict[str, Any], seed: int) -> dict[str, Any]:
@@ -211,8 +211,8 @@ def execute(name: str, runs: list[Run], cores: int, threads: int, device: str = 
             if waiting:
                 say(f"  {scene}, seed {seed}: {describe(waiting)}; {cores // threads} at once, {threads} threads each")
                 with reported(runs, cores // threads, say):
-                    found = snakemake(waiting, cores, threads, device)
-                outcome = Outcome(max(outcome.code, found.code), outcome.failed | found.failed)
+                    part_outcome = snakemake(waiting, cores, threads, device)
+                outcome = Outcome(max(outcome.code, part_outcome.code), outcome.failed | part_outcome.failed)
         finally:  # a study that is stopped names what it has finished
             store.link(f"study-{name}", {run.name: run.plan.targets[LAST] for run in runs})
     return outcome

@@ -34,15 +34,15 @@ def mean_text(summary: Summary, figure: Figure) -> str:
     return number(summary.mean, figure) + spread
 
 
-def difference_text(found: Difference, figure: Figure) -> str:
+def difference_text(difference: Difference, figure: Figure) -> str:
     """`+2.1 [1.0, 3.2]`, or `×0.48 [0.40, 0.55]`; no interval where there is one unit."""
 
     def shown(value: float) -> str:
         return f"{value:.2f}" if figure.ratio else number(value, figure)
 
-    interval = "" if math.isnan(found.low) else f" [{shown(found.low)}, {shown(found.high)}]"
-    sign = "×" if figure.ratio else "+" if found.mean >= 0 else ""
-    return sign + shown(found.mean) + interval
+    interval = "" if math.isnan(difference.low) else f" [{shown(difference.low)}, {shown(difference.high)}]"
+    sign = "×" if figure.ratio else "+" if difference.mean >= 0 else ""
+    return sign + shown(difference.mean) + interval
 
 
 def shown_figures(lines: list[Line]) -> list[Figure]:
@@ -74,12 +74,12 @@ def tables(lines: list[Line], baseline: str) -> list[tuple[list[str], list[tuple
     """
     fixed, figures = [*labels(lines), "runs"], shown_figures(lines)
     parts = [[k for k, figure in enumerate(figures) if (figure.key in COSTS) == costs] for costs in (False, True)]
-    found = []
+    halves = []
     for part in filter(None, parts):
         columns = [*range(len(fixed)), *(len(fixed) + k for k in part)]
         rows = [(line.variant == baseline, [table_row(line, lines)[k] for k in columns]) for line in lines]
-        found.append(([*fixed, *(figures[k].heading for k in part)], rows))
-    return found
+        halves.append(([*fixed, *(figures[k].heading for k in part)], rows))
+    return halves
 
 
 def scene_table(rows: list[Row]) -> list[list[str]]:
@@ -113,11 +113,11 @@ def left_out(rows: list[Row]) -> list[tuple[str, str, str]]:
     """(what, why, by which variants) of all that finished runs left out."""
     done = [row for row in rows if row["state"] == "done"]
     every = list(dict.fromkeys(row["variant"] for row in done))
-    found: dict[tuple[str, str], dict[str, None]] = {}
+    variants: dict[tuple[str, str], dict[str, None]] = {}
     for row in done:
         for entry in row["left_out"].items():
-            found.setdefault(entry, {})[row["variant"]] = None
-    return sorted((*entry, "all" if len(by) == len(every) else ", ".join(by)) for entry, by in found.items())
+            variants.setdefault(entry, {})[row["variant"]] = None
+    return sorted((*entry, "all" if len(by) == len(every) else ", ".join(by)) for entry, by in variants.items())
 
 
 def stability(path: Path) -> list[tuple[str, int, int, float]]:

@@ -45,14 +45,14 @@ def reach(points: Sequence[tuple[float, float]], target: float) -> Reach:
 def complete(rows: list[Row], study: Study, condition: str) -> dict[str, dict[tuple, dict[str, Row]]]:
     """Rows by variant, place and budget, of the places where every variant has done every budget."""
     done = [row for row in counted(rows) if row["condition"] == condition and row["miou"] is not None]
-    found: dict[str, dict[tuple, dict[str, Row]]] = {
+    curves: dict[str, dict[tuple, dict[str, Row]]] = {
         name: {place: {row["budget"]: row for row in some} for place, some in groups(of, *PLACE).items()}
         for (name,), of in groups(done, "variant").items()
     }
     n_budgets = len(study.budgets.settings())
-    whole = [{p for p, by in found.get(name, {}).items() if len(by) == n_budgets} for name in study.variants]
+    whole = [{p for p, by in curves.get(name, {}).items() if len(by) == n_budgets} for name in study.variants]
     kept = set.intersection(*whole)
-    return {name: {p: by for p, by in found.get(name, {}).items() if p in kept} for name in study.variants}
+    return {name: {p: by for p, by in curves.get(name, {}).items() if p in kept} for name in study.variants}
 
 
 def mean_curve(places: dict[tuple, dict[str, Row]], x: str, y: str) -> list[tuple[float, float]]:
@@ -69,7 +69,7 @@ def sections(out: Path, study: Study, rows: list[Row]) -> list[Section]:
         return []
     out.mkdir(parents=True, exist_ok=True)
     draw(out / PICTURE, study, curves)
-    found = [
+    parts = [
         Section(
             f"Steps to reach what {study.baseline} ends with",
             f"Where the line through the budgets' mean mIoU first reaches the mean with which {study.baseline} ends, "
@@ -85,12 +85,12 @@ def sections(out: Path, study: Study, rows: list[Row]) -> list[Section]:
             f"mIoU with the last budget of scenes that come again at the end of their sequence, and so start from "
             f"knowledge of all scenes, themselves among them: against {study.baseline}, and against their first visit."
         )
-        found.append(Section("The first scenes again, with the last basis", note, again))
+        parts.append(Section("The first scenes again, with the last basis", note, again))
     if pairs := pair_table(study, rows):
-        found.append(
+        parts.append(
             Section("Variants against each other", "Paired differences, the first from the second variant.", pairs)
         )
-    return found
+    return parts
 
 
 def reach_table(study: Study, condition: str, curves: dict[str, dict[tuple, dict[str, Row]]]) -> list[list[str]]:
@@ -127,8 +127,8 @@ def runs_that_reach(mine: dict[tuple, dict[str, Row]], base: dict[tuple, dict[st
     shares = []
     for place, by in mine.items():
         end = base[place][last]
-        found = reach([(row["steps"], row["miou"]) for row in by.values()], end["miou"])
-        shares.append(np.inf if found.bound == ">" else found.x / end["steps"])
+        reached = reach([(row["steps"], row["miou"]) for row in by.values()], end["miou"])
+        shares.append(np.inf if reached.bound == ">" else reached.x / end["steps"])
     middle = float(np.median(shares))
     return [
         f"{sum(np.isfinite(shares))} of {len(shares)}",
