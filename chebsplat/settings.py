@@ -70,7 +70,7 @@ class TrainSection(Section):
     encoder: Literal["transformer", "mlp", "off"] = setting(
         "transformer", 'of regions; mlp: the paper\'s "no TLE"; off: no shape branch'
     )
-    albo: bool = setting(True, 'tokens hold descriptors; false: the paper\'s "no AGCD"')
+    albo: bool = setting(True, "tokens hold descriptors")
     prune: bool = setting(True, "remove Gaussians that add nothing")
     prune_gate: Literal["product", "printed"] = setting(
         "product", "of the logit of a Gaussian and one of its features; printed: the paper's two gates in a row"
@@ -101,6 +101,9 @@ class TrainSection(Section):
     regions_per_step: int = number(32, "encoded anew in such a step; the others come from the cache", 1, 4096)
     n_covers: int = number(4, "regions that reach a Gaussian, at most", 1, 64)
     context: Literal["features", "none"] = setting("features", "what tokens hold beside the descriptor")
+    position: Literal["region", "center", "both"] = setting(
+        "region", "of a token: from the region's centre in radii, or (printed) the Gaussian's own in the scene"
+    )
     # schedule, as fractions of the budget
     coarse_until: float = number(0.1, "fraction of the training at half resolution", 0, 1)
     encode_from: float = number(0.1, "fraction after which regions are encoded", 0, 1)

@@ -4,12 +4,12 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated, Any, Literal
 
 from annotated_types import Ge, Le
 
 from chebsplat.formats import artifact
-from chebsplat.formats.documents import Count, TypedDict, read_document, write_document
+from chebsplat.formats.documents import Count, NotRequired, TypedDict, read_document, write_document
 
 SCHEMA = "chebsplat.encoder/2"
 FLOAT, DYNAMIC, FUSED = "encoder.onnx", "encoder.int8.onnx", "fusion.onnx"
@@ -20,6 +20,7 @@ class Settings(TypedDict):
     n_covers: Annotated[int, Ge(1), Le(64)]
     described: bool
     context: bool
+    position: NotRequired[Literal["region", "center", "both"]]  # region before there was a choice
     n_inputs: Count
     n_channels: Count
 

@@ -6,7 +6,7 @@ import csv
 import math
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated, Any, Literal
 
 import numpy as np
 from annotated_types import Ge, Le
@@ -39,6 +39,7 @@ class EncoderSettings(TypedDict):
     width: Annotated[int, Ge(1), Le(1024)]
     n_layers: Annotated[int, Ge(0), Le(64)]
     n_heads: Annotated[int, Ge(1), Le(64)]
+    n_positions: NotRequired[Literal[3, 6]]  # 3 before there was a choice
 
 
 class Notes(TypedDict):

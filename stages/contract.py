@@ -4,6 +4,12 @@ from __future__ import annotations
 
 from typing import Any
 
+POSITIONS = {  # units and meaning
+    "region": ("region radii", "(mean - centre) / radius"),
+    "center": ("scene extents", "(mean - median) / extent, the 0.95 quantile of largest distances along an axis"),
+    "both": ("region radii, scene extents", "(mean - centre) / radius, then (mean - median) / extent"),
+}
+
 
 def contract(encoder: Any, config: dict[str, Any]) -> dict[str, Any]:
     """Inputs, outputs and settings of the graphs that the onnx stage writes, as JSON-able values.
@@ -25,7 +31,7 @@ def contract(encoder: Any, config: dict[str, Any]) -> dict[str, Any]:
             "none",
             ", then ".join(first) or "nothing: the encoder sees positions alone",
         ),
-        "positions": array("float32", ["regions", "members", 3], "region radii", "(mean - centre) / radius"),
+        "positions": array("float32", ["regions", "members", encoder.n_positions], *POSITIONS[train["position"]]),
         "mask": array(
             "bool", ["regions", "members"], "", "true where a member exists; what stands elsewhere is unread"
         ),
@@ -62,6 +68,7 @@ def contract(encoder: Any, config: dict[str, Any]) -> dict[str, Any]:
             "n_covers": train["n_covers"],
             "described": described,
             "context": context,
+            "position": train["position"],
             "n_inputs": encoder.n_inputs,
             "n_channels": c,
         }

@@ -97,6 +97,7 @@ def inputs_of(p: dict[str, np.ndarray], describe: DescribeSection, settings: dic
         n_covers=settings["n_covers"],
         described=settings["described"],
         context=settings["context"],
+        position=settings.get("position", "region"),
     )
 
 

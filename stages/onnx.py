@@ -93,7 +93,7 @@ def example(encoder: Any, n_regions: int, n_members: int, seed: int = 0) -> dict
         mask[::2, -1] = False
     return {
         "inputs": torch.randn(n_regions, n_members, encoder.n_inputs, generator=generator),
-        "positions": 2 * torch.rand(n_regions, n_members, 3, generator=generator) - 1,
+        "positions": 2 * torch.rand(n_regions, n_members, encoder.n_positions, generator=generator) - 1,
         "mask": mask,
     }
 

@@ -93,12 +93,12 @@ def encoder_model(encoder: RegionEncoder, opset: int) -> ModelProto:
     region: list[int | str] = ["regions", "members"]
     graph = Graph(
         inputs=(TensorProto.FLOAT, [*region, encoder.n_inputs]),
-        positions=(TensorProto.FLOAT, [*region, 3]),
+        positions=(TensorProto.FLOAT, [*region, encoder.n_positions]),
         mask=(TensorProto.BOOL, region),
     )
     octaves = np.array([[math.pi * 2.0**k] for k in range(N_FREQUENCIES)], np.float32)
     angles = graph.add("Mul", graph.add("Unsqueeze", "positions", whole(2)), octaves)
-    angles = graph.add("Reshape", angles, whole(0, 0, 3 * N_FREQUENCIES))
+    angles = graph.add("Reshape", angles, whole(0, 0, encoder.n_positions * N_FREQUENCIES))
     waves = graph.add("Concat", "positions", graph.add("Sin", angles), graph.add("Cos", angles), axis=-1)
     tokens = graph.linear(waves, encoder.embed_position)
     if encoder.n_inputs:

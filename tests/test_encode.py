@@ -195,8 +195,11 @@ def test_a_cut_spectrum_and_an_empty_scene_are_refused_by_name():
         region_inputs(*(row[:0] for row in rows), describe, **tokens)
 
 
+VARIANTS = [{"n_layers": 0}, {"n_inputs": 0}, {"n_inputs": 5, "n_layers": 1}, {"n_positions": 6}]
+
+
 @pytest.mark.slow
-@pytest.mark.parametrize("variant", [{"n_layers": 0}, {"n_inputs": 0}, {"n_inputs": 5, "n_layers": 1}])
+@pytest.mark.parametrize("variant", VARIANTS)
 def test_every_kind_of_encoder_exports_and_keeps_its_contract(tmp_path, variant):
     import onnx
     import torch
@@ -211,9 +214,11 @@ def test_every_kind_of_encoder_exports_and_keeps_its_contract(tmp_path, variant)
     encoder = RegionEncoder(**({"n_inputs": 9, "n_channels": 4} | variant)).eval()
     onnx.save(encoder_model(encoder, 18), tmp_path / "a.onnx")
     quantize(tmp_path / "a.onnx", tmp_path / "b.onnx")
-    config = Config().sections(("describe", "train"))
+    position = "both" if encoder.n_positions == 6 else "center"
+    config = Config.model_validate({"train": {"position": position}}).sections(("describe", "train"))
     said = contract(encoder, config)["encoder"]["inputs"]
-    assert [entry.name for entry in opened(tmp_path / "a.onnx").get_inputs()] == list(said)
+    found = {entry.name: entry.shape for entry in opened(tmp_path / "a.onnx").get_inputs()}
+    assert found == {name: entry["shape"] for name, entry in said.items()}
     for shape in SHAPES[:10]:
         given = example(encoder, *shape)
         assert compare(encoder, tmp_path / "a.onnx", given) < 1e-5

@@ -108,3 +108,32 @@ def test_removal_that_was_not_announced_is_an_error():
     shape.refresh(raw)
     with pytest.raises(ValueError, match="not announced"):
         shape.refresh({name: value[:-1] for name, value in raw.items()})
+
+
+def test_a_position_is_an_offset_in_the_region_the_place_in_the_scene_or_both():
+    raw = scene()
+    region, center, both = (shape_of(position=position) for position in ("region", "center", "both"))
+    for shape in (region, center, both):
+        shape.refresh(raw)
+    assert torch.equal(both.positions, torch.cat([region.positions, center.positions], -1))
+    assert region.positions[region.members >= 0].norm(dim=-1).max() <= 1 + 1e-5
+    away = raw["means"] - raw["means"].quantile(0.5, dim=0, interpolation="midpoint")
+    place = away / away.abs().amax(1).quantile(0.95)
+    assert torch.allclose(center.positions, place[center.members.clamp_min(0)], atol=1e-5)
+    moved = raw | {"means": 7 * raw["means"] + 100}
+    again = shape_of(position="center")
+    again.refresh(moved | {"log_scales": raw["log_scales"] + 7**0.5}, center.regions._replace(radius=7.0))
+    assert torch.allclose(again.positions, center.positions, atol=1e-4)  # of no unit and no origin
+    assert both.encode(raw["features"], torch.arange(3)).shape == (3, 6)
+
+
+def test_the_paper_s_no_agcd_sees_positions_alone():
+    shape, raw = shape_of(encoder="mlp", albo=False, context="none"), scene()
+    shape.refresh(raw)
+    assert shape.encoder.n_inputs == 0
+    assert len(shape.encoder.blocks) == 0
+    assert not torch.equal(shape.cache[0], shape.cache[1])
+    other = {"features": -raw["features"], "log_scales": raw["log_scales"] - 1, "quats": raw["quats"].flip(1)}
+    again = shape_of(encoder="mlp", albo=False, context="none")
+    again.refresh(raw | other)
+    assert torch.equal(shape.cache, again.cache)

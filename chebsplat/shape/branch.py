@@ -38,7 +38,7 @@ class ShapeBranch(nn.Module):
     members: Tensor  # i64 [M, n], -1 where padded
     centers: Tensor  # i64 [M] Gaussians
     descriptors: Tensor  # [M, n, J P]
-    positions: Tensor  # [M, n, 3] in radii
+    positions: Tensor  # [M, n, 3 or 6], see `placed`
     cover: Tensor  # i64 [N, k] regions, -1 where fewer reach a Gaussian
     weights: Tensor  # [N, k] of Eq 8
     cache: Tensor  # [M, C] encodings, as last computed
@@ -50,7 +50,9 @@ class ShapeBranch(nn.Module):
         self.n_described = describe.n_angles * per_angle if train.albo else 0
         n_context = n_channels if train.context == "features" else 0
         n_layers = train.n_layers if train.encoder == "transformer" else 0
-        self.encoder = RegionEncoder(self.n_described + n_context, n_channels, train.width, n_layers, train.n_heads)
+        n_positions = 6 if train.position == "both" else 3
+        sizes = n_channels, train.width, n_layers, train.n_heads, n_positions
+        self.encoder = RegionEncoder(self.n_described + n_context, *sizes)
         if n_context:  # unit vectors
             rms = torch.full((n_context,), n_context**-0.5)
             self.encoder.norm_input.set(self.n_described, torch.zeros(n_context), rms)
@@ -107,7 +109,7 @@ class ShapeBranch(nn.Module):
         rows = self.descriptors[self.members >= 0]
         if self.n_described and len(rows) and not self.keeps_norm:
             self.encoder.norm_input.set(0, rows.mean(0), rows.std(0, unbiased=False))
-        positions, cover = placed(means.numpy(), regions, self.train_settings.n_covers)
+        positions, cover = placed(means.numpy(), regions, self.train_settings.n_covers, self.train_settings.position)
         self.positions, self.cover = torch.from_numpy(positions), torch.from_numpy(cover)
         frames, scales = rotation_matrices(quats[self.centers]), log_scales.exp()[self.centers]
         self.weights = propagation_weights(means, self.cover, means[self.centers], frames, scales, regions.radius)

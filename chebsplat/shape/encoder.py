@@ -12,7 +12,7 @@ N_FREQUENCIES = 4
 
 
 def positional_encoding(positions: Tensor) -> Tensor:
-    """Positions and their sines and cosines at octaves, [..., 3] -> [..., 3 + 6 * N_FREQUENCIES]."""
+    """Positions and their sines and cosines at octaves, [..., p] -> [..., p + 2 p N_FREQUENCIES]."""
     angles = torch.cat([positions * (math.pi * 2.0**k) for k in range(N_FREQUENCIES)], -1)
     return torch.cat([positions, angles.sin(), angles.cos()], -1)
 
@@ -93,16 +93,25 @@ class RegionEncoder(nn.Module):
     Args:
       n_inputs:   width of a token's input: flattened descriptor, context, or both; 0 for positions alone.
       n_channels: width of the semantic features.
+      n_positions: numbers that say where a token lies: 3, or 6.
       n_layers:   0 replaces attention by a maximum over tokens (the paper's ablation without the transformer).
     Choices: pre-norm, with an output map and feed-forward; each input is standardised; a region without members
       gives a finite vector that nothing reads.
     """
 
-    def __init__(self, n_inputs: int, n_channels: int, width: int = 32, n_layers: int = 2, n_heads: int = 4):
+    def __init__(
+        self,
+        n_inputs: int,
+        n_channels: int,
+        width: int = 32,
+        n_layers: int = 2,
+        n_heads: int = 4,
+        n_positions: int = 3,
+    ):
         super().__init__()
-        self.n_inputs, self.n_channels = n_inputs, n_channels
-        self.settings = {"width": width, "n_layers": n_layers, "n_heads": n_heads}
-        self.embed_position = nn.Linear(3 + 6 * N_FREQUENCIES, width)
+        self.n_inputs, self.n_channels, self.n_positions = n_inputs, n_channels, n_positions
+        self.settings = {"width": width, "n_layers": n_layers, "n_heads": n_heads, "n_positions": n_positions}
+        self.embed_position = nn.Linear(n_positions * (1 + 2 * N_FREQUENCIES), width)
         if n_inputs:
             self.norm_input = Standardize(n_inputs)
             self.embed_input = nn.Linear(n_inputs, width)
@@ -117,7 +126,7 @@ class RegionEncoder(nn.Module):
 
         Args:
           inputs:    [M, n, n_inputs]; ignored where n_inputs is 0.
-          positions: [M, n, 3] relative to the region's centre, in units of its radius.
+          positions: [M, n, n_positions], see `region_inputs.placed`.
           mask:      [M, n] bool, true where a member exists.
         Returns: [M, n_channels].
         """
