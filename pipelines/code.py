@@ -1,8 +1,8 @@
 """Identity of the code behind a stage: what it computes with, not how it is written down.
 
 The hash covers the syntax trees, without comments and docstrings, of the stage's module and of every module of ours
-it imports, however deep, and the versions of the packages these import. Plumbing that cannot change a result is left
-out, so that a better progress bar makes nothing stale.
+it imports, however deep, the templates of pages beside them, and the versions of the packages these import. Plumbing
+that cannot change a result is left out, so that a better progress bar makes nothing stale.
 """
 
 from __future__ import annotations
@@ -28,6 +28,7 @@ def installed() -> dict[str, Path]:
 
 PLUMBING = {f"stages.{name}" for name in ("config", "settings", "registry", "command", "progress", "stopping")}
 PLUMBING |= {"chebsplat.settings"}
+TEMPLATES = {".html", ".css", ".js"}  # of a package: what its modules fill
 LAYERS = ("formats", "stages", "pipelines", "teachers")
 OPTIONAL = {"gsplat", "tokenizers", "transformers"}  # of extras: their versions count only where a scene uses them
 
@@ -64,6 +65,9 @@ class Code:
                 continue
             digest, imports = self._read(path)
             seen[module] = digest
+            if path.name == "__init__.py":
+                templates = (file for file in sorted(path.parent.iterdir()) if file.suffix in TEMPLATES)
+                seen |= {f"{module}/{file.name}": self._read(file)[0] for file in templates}
             for imported in imports:
                 first, _, rest = imported.partition(".")
                 if first == "chebsplat":
@@ -103,7 +107,7 @@ class Code:
         entry = self.memo.get(key)
         if entry is None or not _remembers(entry, stamp):
             self.read_now += 1
-            entry = self.memo[key] = [stamp, *parsed(path.read_text(), key)]
+            entry = self.memo[key] = [stamp, *parsed(path.read_text(encoding="utf-8"), key)]
         return entry[1], entry[2]
 
     def _version(self, package: str) -> str | None:
@@ -124,7 +128,9 @@ def _remembers(held: Any, stamp: list[int]) -> bool:
 
 
 def parsed(text: str, name: str) -> tuple[str, list[str]]:
-    """Digest of a module's syntax tree without docstrings, and the dotted names it imports."""
+    """Digest of a module's syntax tree without docstrings, and the dotted names it imports; of a template's text."""
+    if not name.endswith(".py"):
+        return hashlib.sha256(text.encode()).hexdigest()[:16], []
     tree = ast.parse(text, name)
     imports: set[str] = set()
     for node in ast.walk(tree):

@@ -154,7 +154,7 @@ def draw(scene: Scene, views: list[int], query: Query, out: Path) -> None:
     from chebsplat.labels.relevancy import relevancy
     from chebsplat.render import SceneRenderer
     from chebsplat.stages.evaluate import camera
-    from chebsplat.stages.figures import heat, heat_scale, png
+    from chebsplat.stages.pages.pictures import heat, heat_scale, png
 
     renderer, rows = SceneRenderer(scene.parameters), []
     shown = {views[round(k)] for k in np.linspace(0, len(views) - 1, min(N_SHEET, len(views)))}

@@ -45,11 +45,10 @@ def run(job: Job) -> None:
     from chebsplat.formats.evaluation import read_evaluation
     from chebsplat.formats.gaussians import read_gaussians
     from chebsplat.formats.manifest import remedy_of
-    from chebsplat.stages import figures as draw
-    from chebsplat.stages import report_parts as parts
-    from chebsplat.stages.page import PAGE
+    from chebsplat.stages.pages import parts
+    from chebsplat.stages.pages import pictures as draw
+    from chebsplat.stages.pages.template import REPORT, rendered
     from chebsplat.stages.report_facts import Reported, facts_of
-    from chebsplat.stages.viewer import rendered
 
     evaluation = read_evaluation(job.inputs["evaluation"])
     gaussians = read_gaussians(job.inputs["gaussians"])
@@ -76,7 +75,7 @@ def run(job: Job) -> None:
     colors = {name: "#" + bytes(color).hex() for name, color in zip(names, draw.palette(len(names)), strict=True)}
     pictures, pixels = parts.picture_rows(evaluation, names, job.config.report.n_pictures, job.out)
     text = rendered(
-        PAGE,
+        REPORT,
         name=figures["source"].get("name") or figures["source"].get("kind", "scene"),
         source=figures["source"],
         protocol=figures["protocol"],

@@ -35,6 +35,16 @@ def test_the_code_of_a_stage_is_the_same_in_a_checkout_and_in_a_wheel(wheel):
     assert {s for s in STAGES if edited.stage(s) != checkout.stage(s)} == {"teacher", "channels"}
 
 
+@pytest.mark.parametrize("name", ["report.html", "style.css", "viewer.js"])
+def test_a_template_is_code_of_the_report_and_of_no_other_stage(wheel, name):
+    before = Code(wheel, {})
+    digests = {stage: before.stage(stage) for stage in STAGES}
+    with (wheel["stages"] / "pages" / name).open("a") as file:
+        file.write("<!-- another -->\n")
+    after = Code(wheel, before.memo)
+    assert {stage for stage in STAGES if after.stage(stage) != digests[stage]} == {"report"}
+
+
 @pytest.fixture
 def extras(tmp_path, monkeypatch):
     """Installs the packages of every extra, as far as a key could see."""

@@ -16,8 +16,8 @@ from chebsplat.errors import InputError
 from chebsplat.formats.artifact import publish, read_manifest
 from chebsplat.formats.evaluation import read_evaluation
 from chebsplat.formats.manifest import Manifest
-from chebsplat.stages import figures as draw
-from chebsplat.stages.report_parts import class_rows, label_names, legend, picture_rows
+from chebsplat.stages.pages import pictures as draw
+from chebsplat.stages.pages.parts import class_rows, label_names, legend, picture_rows
 
 pytestmark = pytest.mark.xdist_group("toy")
 

@@ -63,15 +63,15 @@ def write(
     }
     (out / "results.md").write_text(markdown(parts))
     from chebsplat.pipelines.studies.pictures import gallery
+    from chebsplat.stages.pages.template import rendered
     from chebsplat.stages.report import LARGEST
-    from chebsplat.stages.viewer import rendered
 
     drawings = {
         name: "data:image/png;base64," + base64.b64encode((out / name).read_bytes()).decode()
         for name in (PICTURE, *(section.picture for section in more if section.picture))
     }
     page = rendered(
-        PAGE.read_text(encoding="utf-8"),
+        PAGE,
         narrow=NARROW,
         picture=drawings[PICTURE],
         drawings=drawings,

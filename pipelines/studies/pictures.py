@@ -10,8 +10,8 @@ import numpy as np
 from chebsplat.formats.evaluation import Evaluation, read_evaluation
 from chebsplat.pipelines.studies.results import Row
 from chebsplat.pipelines.studies.study import Run, Study
-from chebsplat.stages import figures as draw
-from chebsplat.stages.report_parts import class_rows, counted, label_names, legend, side
+from chebsplat.stages.pages import pictures as draw
+from chebsplat.stages.pages.parts import class_rows, counted, label_names, legend, side
 
 LONGEST = 480  # side of a picture, pixels
 

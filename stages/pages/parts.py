@@ -109,7 +109,7 @@ def picture_rows(
     """
     import numpy as np
 
-    from chebsplat.stages import figures as draw
+    from chebsplat.stages.pages import pictures as draw
 
     views, pictures = evaluation.figures["names"], evaluation.pictures
     if not views or not {"truth", "renders"} <= pictures.keys():

@@ -1,4 +1,4 @@
-"""Pictures of the report, as self-contained data URIs and inline SVG."""
+"""Pictures of pages and queries, as self-contained data URIs and inline SVG."""
 
 from __future__ import annotations
 
