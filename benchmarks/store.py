@@ -28,8 +28,8 @@ from benchmarks import shared
 from chebsplat.formats.artifact import publish
 from chebsplat.formats.features import PATCH, SCHEMA, FeatureWriter, read_features
 from chebsplat.formats.manifest import Manifest
+from chebsplat.formats.teacher_model import EMBEDDED
 from chebsplat.labels.channels import ROWS, Moments, channel_map
-from chebsplat.teachers import EMBEDDED
 
 SIZE, N_CHANNELS, N_WORDS = (360, 480), 512, 150
 WIDTH = 32  # the default of channels.n_channels

@@ -13,6 +13,7 @@ from chebsplat.formats.names import check_names, suggest, unprintable
 if TYPE_CHECKING:
     import numpy as np
 
+EMBEDDED = Path(__file__).parents[1] / "teachers/embedded.onnx"  # ships with the package
 MAX_LABELS = 2**15 - 1  # what maps of int16 can number
 MAX_SIDE = 4096  # pixels of what a model is fed
 FILES = ("labels", "text", "tokenizer")

@@ -20,7 +20,7 @@ def installed() -> dict[str, Path]:
     """Where the layers lie, in a checkout or in site-packages."""
     import chebsplat
     from chebsplat import formats, pipelines, stages
-    from chebsplat.teachers import EMBEDDED
+    from chebsplat.formats.teacher_model import EMBEDDED
 
     layers = {"chebsplat": chebsplat, "formats": formats, "stages": stages, "pipelines": pipelines}
     return {name: Path(module.__path__[0]) for name, module in layers.items()} | {"teachers": EMBEDDED.parent}

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any
 
 from chebsplat.errors import ConfigError
 from chebsplat.formats.names import unprintable
-from chebsplat.formats.teacher_model import read_teacher
+from chebsplat.formats.teacher_model import EMBEDDED, read_teacher
 from chebsplat.pipelines import folders, store
 from chebsplat.pipelines.code import Code, installed
 from chebsplat.pipelines.keys import PLACES, step_key
@@ -27,7 +27,6 @@ from chebsplat.pipelines.needs import (
 from chebsplat.pipelines.raw import Hashes, content_hash, hashes, raw_files
 from chebsplat.pipelines.scenes import absent, expanded, folder_of, read_toml, scene_values
 from chebsplat.stages.registry import STAGES, Stage
-from chebsplat.teachers import EMBEDDED
 
 if TYPE_CHECKING:
     from chebsplat.stages.config import Config

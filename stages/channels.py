@@ -28,13 +28,16 @@ CHECKED = 20_000  # pixels whose labels before and after are compared
 
 
 def run(job: Job) -> None:
+    """The directions of a teacher's features that scenes are trained in (docs/method.md, section 8).
+
+    Reads no artifact: a teacher, its words and reference images. Writes `channels`.
+    """
     import numpy as np
 
     from chebsplat.formats.channels import ChannelMap, write_channels
-    from chebsplat.formats.teacher_model import read_teacher
+    from chebsplat.formats.teacher_model import EMBEDDED, read_teacher
     from chebsplat.labels import channels as maths
     from chebsplat.stages.image_encoder import ImageEncoder
-    from chebsplat.teachers import EMBEDDED
 
     settings = job.config.channels
     teacher = read_teacher(Path(settings.model) if settings.model else EMBEDDED)

@@ -9,6 +9,10 @@ from chebsplat.stages.command import Job, command
 
 
 def run(job: Job) -> None:
+    """Extend the knowledge space by what it misses of a scene's encoder (Eq 15; docs/method.md, section 7).
+
+    Reads `gaussians` and, after the first scene of a sequence, the `basis` before. Writes `basis`.
+    """
     from chebsplat.formats.artifact import read_manifest
     from chebsplat.formats.basis import Basis, read_basis, write_basis
     from chebsplat.formats.gaussians import read_gaussians

@@ -11,6 +11,10 @@ log = logging.getLogger("chebsplat")
 
 
 def run(job: Job) -> None:
+    """Anisotropic Chebyshev descriptors of regions of the initial Gaussians (Eqs 1-6; docs/method.md, section 2).
+
+    Reads `points`. Writes `descriptors`.
+    """
     import numpy as np
 
     from chebsplat.formats.descriptors import Descriptors, write_descriptors

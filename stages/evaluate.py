@@ -20,6 +20,10 @@ if TYPE_CHECKING:
 
 
 def run(job: Job) -> None:
+    """Colour and semantics of the exported scene on its protocol's views (docs/method.md, section 10).
+
+    Reads `capture`, `scene` and, for the teacher's own figures, `features`. Writes `evaluation`.
+    """
     import numpy as np
 
     from chebsplat.evaluation import protocols

@@ -9,6 +9,10 @@ from chebsplat.stages.command import Job, command
 
 
 def run(job: Job) -> None:
+    """The trained Gaussians in order of SH degree, each with its label.
+
+    Reads `gaussians` and, for names of labels, `features`. Writes `scene`.
+    """
     import numpy as np
 
     from chebsplat.formats.features import read_features

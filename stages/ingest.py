@@ -90,6 +90,10 @@ def split(names: list[str], own: Any, settings: IngestSection) -> tuple[Any, dic
 
 
 def run(job: Job) -> None:
+    """Take a source's images, cameras, depth and labels as one capture, and choose the views that are tested.
+
+    Reads a source, of files or generated. Writes `capture`.
+    """
     import numpy as np
 
     from chebsplat.formats.capture import Capture, write_capture

@@ -22,6 +22,10 @@ FUSION = ("features", "encodings", "cover", "means", "centers", "quats", "scales
 
 
 def run(job: Job) -> None:
+    """The encoder and the fusion as ONNX graphs (Eqs 7-10), and how far they lie from torch.
+
+    Reads `gaussians`. Writes `encoder`.
+    """
     import onnx
 
     from chebsplat.formats.encoder import DYNAMIC, FLOAT, FUSED, write_encoder

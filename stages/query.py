@@ -84,9 +84,8 @@ def embedded(words: list[str], features: Features, model: str | None) -> np.ndar
     import numpy as np
 
     from chebsplat.formats.artifact import sha256_file
-    from chebsplat.formats.teacher_model import read_teacher
+    from chebsplat.formats.teacher_model import EMBEDDED, read_teacher
     from chebsplat.stages.text import text_embeddings
-    from chebsplat.teachers import EMBEDDED
 
     teacher = read_teacher(Path(model) if model else EMBEDDED)
     if sha256_file(teacher.path) != features.convention["sha256"]:

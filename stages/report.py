@@ -38,6 +38,11 @@ FRAMES = {"color": "colour", "color_and_features": "colour and features"}
 
 
 def run(job: Job) -> None:
+    """One HTML page, and the figures as CSV, of what was measured and where it comes from.
+
+    Reads `evaluation` and `gaussians`, and of `capture`, `points`, `channels`, `features`, `descriptors`, `scene`, `encoder`
+    and `basis` what there is. Writes `report`.
+    """
     import json
 
     from chebsplat.formats.artifact import read_manifest

@@ -15,6 +15,11 @@ if TYPE_CHECKING:
 
 
 def run(job: Job) -> None:
+    """Cameras, and points with the covariance and normal of their neighbours (docs/method.md, section 1).
+
+    Reads `capture`. Writes `points`. Poses, points and depth that the capture holds are taken; what it lacks is computed by
+    feature matching and triangulation.
+    """
     import numpy as np
 
     from chebsplat.cameras import centers

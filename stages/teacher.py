@@ -18,6 +18,10 @@ log = logging.getLogger("chebsplat")
 
 
 def run(job: Job) -> None:
+    """Features, labels and their confidence of every view, as a 2D teacher sees it (docs/method.md, section 9).
+
+    Reads `capture` and, where an ONNX teacher's channels are reduced, `channels`. Writes `features`.
+    """
     from chebsplat.formats.capture import read_capture
     from chebsplat.formats.features import write_features
 
@@ -42,11 +46,10 @@ def from_encoder(job: Job, capture: Capture, settings: TeacherSection) -> None:
 
     from chebsplat.formats.channels import read_channels
     from chebsplat.formats.features import FeatureWriter
-    from chebsplat.formats.teacher_model import read_teacher
+    from chebsplat.formats.teacher_model import EMBEDDED, read_teacher
     from chebsplat.stages.command import n_threads
     from chebsplat.stages.image_encoder import ImageEncoder
     from chebsplat.stages.label_space import MAX_CHANNELS, closed_set, label_set, open_vocabulary
-    from chebsplat.teachers import EMBEDDED
 
     teacher = read_teacher(Path(settings.model) if settings.model else EMBEDDED)
     encoder = ImageEncoder(teacher, n_threads())

@@ -23,6 +23,11 @@ log = logging.getLogger("chebsplat")
 
 
 def run(job: Job) -> None:
+    """Optimise Gaussians, their semantics and the shape encoder (Eqs 7-13; docs/method.md, sections 3 to 8).
+
+    Reads `capture`, `points` and, with semantics, `features`, `descriptors` and the `basis` of earlier scenes. Writes
+    `gaussians`.
+    """
     from chebsplat.cameras import extent
     from chebsplat.formats.cameras import Cameras
     from chebsplat.formats.capture import read_capture

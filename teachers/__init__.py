@@ -1,5 +1,1 @@
 """The embedded 2D teacher: a small dense image encoder that ships with the package, and what it was trained by."""
-
-from pathlib import Path
-
-EMBEDDED = Path(__file__).parent / "embedded.onnx"

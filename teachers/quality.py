@@ -18,12 +18,11 @@ import click
 import numpy as np
 
 from chebsplat.evaluation.metrics import IGNORE, confusion, segmentation
-from chebsplat.formats.teacher_model import read_teacher
+from chebsplat.formats.teacher_model import EMBEDDED, read_teacher
 from chebsplat.stages.image_encoder import ImageEncoder
 from chebsplat.stages.text import text_embeddings
 from chebsplat.synthetic import CLASS_NAMES
 from chebsplat.synthetic.seeds import HELD_OUT
-from chebsplat.teachers import EMBEDDED
 from chebsplat.teachers.words import words
 
 VIEWS, WIDTH, HEIGHT = 8, 320, 240  # of each held-out room, along its path

@@ -21,10 +21,10 @@ from torch import Tensor
 from torch.nn import functional as F
 
 from chebsplat.evaluation.metrics import confusion, segmentation
+from chebsplat.formats.teacher_model import EMBEDDED
 from chebsplat.stages.progress import Progress
 from chebsplat.synthetic import CLASS_NAMES
 from chebsplat.synthetic.seeds import TRAINING
-from chebsplat.teachers import EMBEDDED
 from chebsplat.teachers.augment import crops, recolored
 from chebsplat.teachers.dataset import rendered
 from chebsplat.teachers.network import Encoder, Trunk, span

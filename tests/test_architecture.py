@@ -48,8 +48,6 @@ def test_imports_run_one_way(path):
         first, _, rest = name.partition(".")
         assert first not in LAYERS[1:], f"{path}: bare import of {name}"
         if first == "chebsplat" and not rest.startswith("errors"):
-            if rest == "teachers.EMBEDDED" and layer in ("stages", "pipelines"):
-                continue  # the shipped model's path: all that the product knows of how it was made
             target = rest.split(".")[0]
             target = target if target in LAYERS[1:] else "chebsplat"
             assert target in MAY_IMPORT[layer], f"{path}: {layer} must not import {name}"

@@ -32,7 +32,7 @@ def test_the_code_of_a_stage_is_the_same_in_a_checkout_and_in_a_wheel(wheel):
     with (wheel["teachers"] / "__init__.py").open("a") as file:
         file.write("ANOTHER = 1\n")
     edited = Code(wheel, installation.memo)
-    assert {s for s in STAGES if edited.stage(s) != checkout.stage(s)} == {"teacher", "channels"}
+    assert {s for s in STAGES if edited.stage(s) != checkout.stage(s)} == set()  # nothing runs what trained it
 
 
 @pytest.mark.parametrize("name", ["report.html", "style.css", "viewer.js"])

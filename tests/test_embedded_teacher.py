@@ -8,10 +8,9 @@ import numpy as np
 import pytest
 from shared import ROOT
 
-from chebsplat.formats.teacher_model import read_teacher
+from chebsplat.formats.teacher_model import EMBEDDED, read_teacher
 from chebsplat.stages.image_encoder import ImageEncoder
 from chebsplat.synthetic import CLASS_NAMES, seeds
-from chebsplat.teachers import EMBEDDED
 
 
 @pytest.fixture(scope="module")

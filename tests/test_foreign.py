@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from chebsplat.teachers import EMBEDDED
+from chebsplat.formats.teacher_model import EMBEDDED
 
 CHEBSPLAT = str(Path(sys.executable).with_name("chebsplat"))
 HOSTILE = ("humanfriendly", "click", "json", "yaml", "snakemake", "chebsplat", "formats", "numpy", "sitecustomize")

@@ -193,7 +193,7 @@ def teacher_of(*arguments):
 
 
 def test_the_embedded_teacher_is_used_unless_another_is_asked_for(tmp_path):
-    from chebsplat.teachers import EMBEDDED
+    from chebsplat.formats.teacher_model import EMBEDDED
 
     for scene in (("office0",), ("toy", "teacher.kind=auto"), (photo_folder(tmp_path / "photos"),)):
         teacher = teacher_of(*scene)

@@ -1,8 +1,11 @@
 """Every stage does its job on a toy scene and fails with the documented exit code."""
 
 import copy
+import importlib
+import inspect
 import json
 import os
+import re
 import shutil
 
 import numpy as np
@@ -48,6 +51,16 @@ def test_a_finished_artifact_is_whole_and_a_second_call_does_nothing(toy, stage,
     assert run_stage(stage, toy[stage], inputs_of(toy, stage)) == 0
     assert (toy[stage] / "artifact.json").stat().st_mtime_ns == before
     assert capsys.readouterr().out == f"{toy[stage]}\n"
+
+
+@pytest.mark.parametrize("stage", STAGES)
+def test_a_stage_says_what_it_computes_reads_and_writes(stage):
+    first, blank, *rest = inspect.getdoc(importlib.import_module(f"chebsplat.stages.{stage}").run).splitlines()
+    reads, writes = " ".join(rest).split("Writes ")
+    kinds = {name: row.schema.removeprefix("chebsplat.").partition("/")[0] for name, row in STAGES.items()}
+    assert first.endswith(".") and not blank
+    assert set(re.findall("`(.+?)`", reads)) == {kinds[of] for of in STAGES[stage].roles.values()}
+    assert writes.startswith(f"`{kinds[stage]}`.")
 
 
 @pytest.mark.parametrize("stage", STAGES)

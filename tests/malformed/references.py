@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator
 from pathlib import Path
 
-from chebsplat.teachers import EMBEDDED
+from chebsplat.formats.teacher_model import EMBEDDED
 from malformed.case import Asked, Case, stage
 from malformed.edits import NO_FILES, Edit, Row, cut, declared_png, no_files, picture, put, remove
 from malformed.photos import EPS
