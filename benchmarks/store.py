@@ -84,17 +84,17 @@ def embedded(n_views: int) -> tuple[np.ndarray, Iterator[np.ndarray], Iterator[n
     from chebsplat.formats.teacher_model import read_label_table, read_teacher
     from chebsplat.stages.channels import VIEWS, generated
     from chebsplat.stages.command import n_threads
-    from chebsplat.stages.image_encoder import ImageEncoder
+    from chebsplat.stages.teacher_inference import TeacherInference
     from chebsplat.synthetic.seeds import HELD_OUT, REFERENCE
 
     teacher = read_teacher(EMBEDDED)
-    encoder = ImageEncoder(teacher, n_threads())
+    encoder = TeacherInference(teacher, n_threads())
     words = read_label_table(teacher.labels)[1] if teacher.labels else None
     assert words is not None
 
     def features(seeds: range) -> Iterator[np.ndarray]:
         for name, image in generated(seeds):
-            yield encoder.encode(image, encoder.grid(image, 4)[0], (1.0,), False, name)
+            yield encoder.features(image, encoder.grid(image, 4)[0], (1.0,), False, name)
 
     n_rooms = -(-n_views // VIEWS)
     return unit(words), features(REFERENCE[: REFERENCES // VIEWS]), features(HELD_OUT[:n_rooms])

@@ -37,18 +37,18 @@ def run(job: Job) -> None:
     from chebsplat.formats.channels import ChannelMap, write_channels
     from chebsplat.formats.teacher_model import EMBEDDED, read_teacher
     from chebsplat.labels import channels as maths
-    from chebsplat.stages.image_encoder import ImageEncoder
+    from chebsplat.stages.teacher_inference import TeacherInference
 
     settings = job.config.channels
     teacher = read_teacher(Path(settings.model) if settings.model else EMBEDDED)
     if teacher.output != "features":
         raise ConfigError(f"{teacher.settings}: output is {teacher.output}; only channels of features are reduced")
     words = vocabulary(job, teacher)
-    encoder = ImageEncoder(teacher, n_threads())
+    network = TeacherInference(teacher, n_threads())
     images, count = reference(settings)
     moments, sample = None, []
     for (name, image), status in job.progress.track(images, count, "channels"):
-        grid, n_channels = encoder.grid(image, ENTRY)
+        grid, n_channels = network.grid(image, ENTRY)
         if moments is None:
             moments = maths.Moments(n_channels)
             if words is not None and words.shape[1] != n_channels:
@@ -56,7 +56,7 @@ def run(job: Job) -> None:
                     f"{teacher.path} has {n_channels} channels, {teacher.labels} embeds in {words.shape[1]}; export "
                     "them from one model"
                 )
-        features = encoder.encode(image, grid, (1.0,), False, name)
+        features = network.features(image, grid, (1.0,), False, name)
         moments.add(features)
         rows = features.reshape(-1, n_channels)
         sample.append(rows[:: -(-len(rows) * count // CHECKED)])

@@ -133,9 +133,9 @@ def publish(
     with heeded(), disk.explained(out.parent):
         chosen = configs.load(config) if config else configs.Config()
         schemas = {role: STAGES[of].schema for role, of in stage.roles.items()}
-        found = {role: artifact.read_manifest(path, schemas[role]) for role, path in inputs.items()}
+        manifests = {role: artifact.read_manifest(path, schemas[role]) for role, path in inputs.items()}
         settings = chosen.sections(stage.sections)
-        sources = {role: {"key": m.key, "schema": m.schema} for role, m in found.items()}
+        sources = {role: {"key": m.key, "schema": m.schema} for role, m in manifests.items()}
         if key is not None and not is_key(key):
             raise ConfigError(f"--key {key}: a key is 16 hexadecimal digits; leave it away, or correct it")
         key = key or artifact.digest({"stage": name, "config": settings, "inputs": sources})

@@ -83,10 +83,10 @@ def _advice(error: Any, first: list[str]) -> str:
     if error["type"] == "value_error":
         return str(error["ctx"]["error"])
     if error["type"] != "extra_forbidden":
-        said = WORDS.get(error["type"]) or error["msg"].replace("Input should be", "it must be")
+        needed = WORDS.get(error["type"]) or error["msg"].replace("Input should be", "it must be")
         held = error["input"]
         got = f"a {type(held).__name__}" if isinstance(held, (dict, list, tuple)) else f"{held!r:.60}"
-        return f"{said} (got {got})"
+        return f"{needed} (got {got})"
     loc = [str(part) for part in error["loc"]]
     if len(loc) == 1:
         near = suggest(loc[0], first, 1)

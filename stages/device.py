@@ -19,7 +19,7 @@ def resolve(wanted: str, driver: Path | None = None) -> tuple[str, str]:
     """
     present = (driver or DRIVER).exists()
     if wanted == "cuda":
-        found = "an NVIDIA driver was found, but" if present else "no NVIDIA driver was found, and"
-        raise ConfigError(f"--device cuda: {found} {NO_GPU}; use cpu, or auto")
-    said = wanted == "auto" and present
-    return "cpu", f"an NVIDIA driver was found, but {NO_GPU}: everything runs on the CPU" if said else ""
+        lead = "an NVIDIA driver was found, but" if present else "no NVIDIA driver was found, and"
+        raise ConfigError(f"--device cuda: {lead} {NO_GPU}; use cpu, or auto")
+    mention = wanted == "auto" and present
+    return "cpu", f"an NVIDIA driver was found, but {NO_GPU}: everything runs on the CPU" if mention else ""

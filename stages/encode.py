@@ -75,10 +75,10 @@ def encode(scene: Path, encoder: Path, features: Path | None, out: Path) -> dict
     if any(values.shape != p["raw_features"].shape for values in (fused, gate)):
         raise InputError(f"{held.models[FUSED]} is of another scene's encoder; {remedy_of(folder)}")
     finished = time.perf_counter()
-    place = np.argsort(order)  # of each Gaussian in the scene's files
+    row_in_file = np.argsort(order)  # of each Gaussian in the scene's files
     members = inputs.regions.members
-    result = {"fused": fused[order], "gate": gate[order], "encodings": encodings, "centers": place[centers]}
-    result |= {"members": np.where(members >= 0, place[members], -1), "radius": np.float64(inputs.regions.radius)}
+    result = {"fused": fused[order], "gate": gate[order], "encodings": encodings, "centers": row_in_file[centers]}
+    result |= {"members": np.where(members >= 0, row_in_file[members], -1), "radius": np.float64(inputs.regions.radius)}
     write(out, result)
     seconds = {"describing": described - began, "encoding": done - described, "fusing": finished - done}
     return {"gaussians": len(order), "regions": len(centers)} | {f"{k} s": round(v, 3) for k, v in seconds.items()}
@@ -102,7 +102,7 @@ def inputs_of(p: dict[str, np.ndarray], describe: DescribeSection, settings: dic
 
 
 def gaussians(scene: Path, features: Path | None, n_channels: int) -> tuple[dict[str, np.ndarray], np.ndarray]:
-    """Raw parameters and `raw_features` in the order of training, and each one's place there by place in the file."""
+    """Raw parameters and `raw_features` in the order of training, and each one's row there by row in the file."""
     import numpy as np
 
     from chebsplat.formats.ply import read_ply
@@ -122,9 +122,9 @@ def gaussians(scene: Path, features: Path | None, n_channels: int) -> tuple[dict
         if features is None:
             raise ConfigError(f"{scene} is a PLY, which holds no features; add --features FILE.npy, or pass a scene")
         p["raw_features"] = read_features(features, len(order))
-    found = p["raw_features"].shape[1]
-    if found != n_channels:
-        raise InputError(f"{features or scene} has {found} feature channels, the encoder {n_channels}; pass its own")
+    width = p["raw_features"].shape[1]
+    if width != n_channels:
+        raise InputError(f"{features or scene} has {width} feature channels, the encoder {n_channels}; pass its own")
     return p, order
 
 
@@ -159,10 +159,10 @@ def encoded(model: Path, inputs: RegionInputs) -> np.ndarray:
     runner = opened(model)
     feed = {"inputs": inputs.inputs, "positions": inputs.positions, "mask": inputs.mask}
     starts = range(0, len(inputs.mask), CHUNK)
-    found = np.concatenate([runner.run({k: v[s : s + CHUNK] for k, v in feed.items()})[0] for s in starts])
-    if found.ndim != 2 or len(found) != len(inputs.mask) or not np.isfinite(found).all():
-        raise InputError(f"{model} gives {found.shape} or values that are not finite; {remedy_of(model.parent)}")
-    return found
+    encodings = np.concatenate([runner.run({k: v[s : s + CHUNK] for k, v in feed.items()})[0] for s in starts])
+    if encodings.ndim != 2 or len(encodings) != len(inputs.mask) or not np.isfinite(encodings).all():
+        raise InputError(f"{model} gives {encodings.shape} or values that are not finite; {remedy_of(model.parent)}")
+    return encodings
 
 
 def write(out: Path, arrays: dict[str, Any]) -> None:

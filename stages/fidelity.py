@@ -87,8 +87,8 @@ def frame_split(renderer: SceneRenderer, cameras: list[View], repeats: int) -> d
 
     sweeps = []
     for _ in range(repeats):
-        found = [frame_parts(renderer, view)[0] for view in cameras]
-        sweeps.append({part: 1000 * sum(parts[part] for parts in found) / len(cameras) for part in PARTS})
+        frames = [frame_parts(renderer, view)[0] for view in cameras]
+        sweeps.append({part: 1000 * sum(parts[part] for parts in frames) / len(cameras) for part in PARTS})
     size = {"width": cameras[0].width, "height": cameras[0].height}
     return min(sweeps, key=lambda sweep: sum(sweep.values())) | size | {
         "threads": numba.get_num_threads(), "device": "cpu"}  # fmt: skip

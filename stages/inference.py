@@ -38,7 +38,7 @@ class Model:
         self.path, self.remedy = Path(path), remedy
         size = regular(self.path, remedy).st_size
         options = options or onnxruntime.SessionOptions()
-        options.log_severity_level = 4  # what fails is raised, and told once
+        options.log_severity_level = 4  # what fails is raised, and reported once
         try:
             self._session: Any = onnxruntime.InferenceSession(str(path), options, providers=["CPUExecutionProvider"])
         except Exception as error:  # onnxruntime's own exception types are not public
@@ -64,16 +64,16 @@ class Model:
         late.daemon = True
         late.start()
         try:
-            found = self._session.run(None, dict(feeds), options)
+            outputs = self._session.run(None, dict(feeds), options)
         except Exception as error:  # onnxruntime's own exception types are not public
             why = f"not done after {self.seconds:g} s" if options.terminate else _line(error)
             sizes = ", ".join(str(list(value.shape)) for value in feeds.values())
             raise InputError(f"{self.path} fails on {sizes} ({why}); {self.remedy}") from None
         finally:
             late.cancel()
-        if not all(isinstance(value, np.ndarray) and value.dtype.kind in "fiub" for value in found):
+        if not all(isinstance(value, np.ndarray) and value.dtype.kind in "fiub" for value in outputs):
             raise InputError(f"{self.path} gives more than tensors of numbers; {self.remedy}")
-        return found
+        return outputs
 
 
 def _loops(path: Path) -> bool:

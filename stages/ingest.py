@@ -22,8 +22,8 @@ def resolve(name: str, source: SourceSection) -> SourceSection:
     if source.kind == "named":
         root = os.environ.get("REPLICA_ROOT")
         spellings = (name, name.rstrip("0123456789") + "_" + name[len(name.rstrip("0123456789")) :])
-        found = [Path(root) / s for s in spellings if root and (Path(root) / s).is_dir()]
-        change = {"kind": "replica", "path": str(found[0])} if found else {"kind": "generated", "path": None}
+        existing = [Path(root) / s for s in spellings if root and (Path(root) / s).is_dir()]
+        change = {"kind": "replica", "path": str(existing[0])} if existing else {"kind": "generated", "path": None}
         source = source.model_copy(update=change)
     if source.kind != "generated" and source.path is None:
         raise ConfigError(f"source.kind = {source.kind} needs source.path")
@@ -50,8 +50,8 @@ def read(name: str, source: SourceSection, settings: IngestSection) -> dict[str,
         "seven_scenes": seven_scenes,
     }
     fields: dict[str, Any] = modules[source.kind].read(folder, settings)
-    if said := common.unread(folder):
-        fields["source"]["notes"].append(f"{said[0].upper()}{said[1:]}.")
+    if unread := common.unread(folder):
+        fields["source"]["notes"].append(f"{unread[0].upper()}{unread[1:]}.")
     return fields
 
 
@@ -79,14 +79,14 @@ def split(names: list[str], own: Any, settings: IngestSection) -> tuple[Any, dic
     if own is not None and rule.OWN_SPLIT:
         return own, record | {"split": "the source's own"}
     step, offset = used["test_every"], used["test_offset"] % used["test_every"]
-    said = {"split": f"view index % {step} == {offset} is test", "test_every": step, "test_offset": offset}
+    by_index = {"split": f"view index % {step} == {offset} is test", "test_every": step, "test_offset": offset}
     is_test = every(names, step, offset)
     if is_test.all() or not is_test.any():
         raise DataFailure(
             f"of {len(names)} views every one whose index % {step} is {offset} is a test view (ingest.test_every, "
             f"ingest.test_offset): that is {'all' if is_test.any() else 'none'} of them; add views or change the rule"
         )
-    return is_test, record | said
+    return is_test, record | by_index
 
 
 def run(job: Job) -> None:

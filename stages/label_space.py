@@ -46,7 +46,7 @@ def label_set(teacher: TeacherModel, file: str | None, class_names: list[str] | 
 def open_vocabulary(
     teacher: TeacherModel, labels: dict[str, list[str]], n_channels: int, channels: ChannelMap | None
 ) -> LabelSpace:
-    """The space of an encoder of `n_channels` features.
+    """The space of a teacher of `n_channels` features.
 
     Raises: InputError where embeddings or the channel map have other channels.
     Choices: a label's vector is the mean of the unit embeddings of its words, made unit again. Labels and confidence
@@ -55,7 +55,7 @@ def open_vocabulary(
     import numpy as np
 
     from chebsplat.labels.decode import decode
-    from chebsplat.stages.image_encoder import unit
+    from chebsplat.stages.teacher_inference import unit
     from chebsplat.stages.text import text_embeddings
 
     words = list(dict.fromkeys(word for group in labels.values() for word in group))
@@ -72,9 +72,9 @@ def open_vocabulary(
             f"{n_channels}; pass the one of this teacher"
         )
 
-    def split(found: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        kept = found if channels is None else channels.apply(found)
-        return kept, *decode(found, own)
+    def split(maps: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        kept = maps if channels is None else channels.apply(maps)
+        return kept, *decode(maps, own)
 
     return LabelSpace(list(labels), own if channels is None else channels.embed(own), split)
 
@@ -93,7 +93,7 @@ def closed_set(teacher: TeacherModel, labels: dict[str, list[str]] | None, n_cha
 
     from chebsplat.formats.teacher_model import read_label_table
     from chebsplat.labels.class_codes import class_codes
-    from chebsplat.stages.image_encoder import unit
+    from chebsplat.stages.teacher_inference import unit
 
     assert teacher.labels is not None  # `read_teacher` has seen to it
     classes = read_label_table(teacher.labels)[0]
@@ -111,8 +111,8 @@ def closed_set(teacher: TeacherModel, labels: dict[str, list[str]] | None, n_cha
     merge = np.array([[name == of for name in names] for of in named], np.float32)
     codes = class_codes(names, n_codes)
 
-    def split(found: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        shares = found @ merge
+    def split(maps: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        shares = maps @ merge
         return unit(shares @ codes, -1), shares.argmax(-1).astype(np.int16), shares.max(-1)
 
     return LabelSpace(names, codes, split)

@@ -152,10 +152,10 @@ def compare(module: Any, path: Path, given: dict[str, Any]) -> float:
     import torch
 
     runner = onnxruntime.InferenceSession(str(path), providers=["CPUExecutionProvider"])
-    found = runner.run(None, {name: value.numpy() for name, value in given.items()})
+    outputs = runner.run(None, {name: value.numpy() for name, value in given.items()})
     with torch.no_grad():
         wanted = module(*given.values())
-    pairs = zip(found, wanted if isinstance(wanted, tuple) else (wanted,), strict=True)
+    pairs = zip(outputs, wanted if isinstance(wanted, tuple) else (wanted,), strict=True)
     return max(float((torch.from_numpy(a) - b).abs().max()) for a, b in pairs)
 
 

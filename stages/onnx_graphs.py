@@ -107,10 +107,10 @@ def encoder_model(encoder: RegionEncoder, opset: int) -> ModelProto:
         inputs = graph.add("Clip", inputs, number(-5), number(5))
         tokens = graph.add("Add", tokens, graph.linear(inputs, encoder.embed_input))
     tokens = graph.linear(graph.gelu(tokens), encoder.hidden)
-    found = _attended(graph, encoder, tokens) if len(encoder.blocks) else _pooled(graph, tokens)
+    pooled = _attended(graph, encoder, tokens) if len(encoder.blocks) else _pooled(graph, tokens)
     first, _, second = encoder.decode
-    found = graph.linear(graph.gelu(graph.linear(graph.layer_norm(found, encoder.norm), first)), second)
-    return graph.model("encoder", opset, encodings=(found, ["regions", encoder.n_channels]))
+    pooled = graph.linear(graph.gelu(graph.linear(graph.layer_norm(pooled, encoder.norm), first)), second)
+    return graph.model("encoder", opset, encodings=(pooled, ["regions", encoder.n_channels]))
 
 
 def _attended(graph: Graph, encoder: RegionEncoder, tokens: str) -> str:

@@ -51,10 +51,10 @@ def run(folder: Path, text: str, phrases: list[str], out: Path, n_rows: int) -> 
     if scene.labels is None or scene.label_names is None:
         raise InputError(f"{folder / 'export'} has no semantics; train the scene with a teacher")
     query = understood(folder / "teacher", text, phrases)
-    found = relevancy(scene.parameters["features"], query.embedding, query.against)
+    scores = relevancy(scene.parameters["features"], query.embedding, query.against)
     out.mkdir(parents=True, exist_ok=True)
-    np.savez_compressed(out / "relevancy.npz", relevancy=found, query=np.array(text), against=np.array(query.phrases))
-    for line in table(found, scene.labels, scene.label_names, n_rows):
+    np.savez_compressed(out / "relevancy.npz", relevancy=scores, query=np.array(text), against=np.array(query.phrases))
+    for line in table(scores, scene.labels, scene.label_names, n_rows):
         log.info("%s", line)
     draw(scene, test_views(folder / "ingest", scene), query, out)
 
@@ -120,16 +120,16 @@ def among_labels(features: Features, text: str, phrases: list[str]) -> Query:
     return Query(text, features.label_embeddings[asked], [names[k] for k in others], features.label_embeddings[others])
 
 
-def table(found: np.ndarray, labels: np.ndarray, names: list[str], n_rows: int) -> list[str]:
+def table(scores: np.ndarray, labels: np.ndarray, names: list[str], n_rows: int) -> list[str]:
     """Lines: how many Gaussians are relevant, then the labels of the highest mean relevancy."""
     import numpy as np
 
-    lines = [f"{np.sum(found > 0.5)} of {len(found)} Gaussians have a relevancy above 0.5"]
-    rows = [(float(found[labels == k].mean()), k) for k in np.unique(labels) if k >= 0]
+    lines = [f"{np.sum(scores > 0.5)} of {len(scores)} Gaussians have a relevancy above 0.5"]
+    rows = [(float(scores[labels == k].mean()), k) for k in np.unique(labels) if k >= 0]
     width = max([len(name) for name in names] + [5])
     lines.append(f"{'label':{width}s}  mean relevancy  Gaussians  above 0.5")
     for mean, k in sorted(rows, reverse=True)[:n_rows]:
-        mine = found[labels == k]
+        mine = scores[labels == k]
         lines.append(f"{names[k]:{width}s}  {mean:14.3f}  {len(mine):9d}  {np.sum(mine > 0.5):9d}")
     return lines
 
@@ -140,10 +140,10 @@ def test_views(path: Path, scene: Scene) -> list[int]:
 
     capture = read_capture(path)
     tests = {name for name, is_test in zip(capture.names, capture.is_test, strict=True) if is_test}
-    found = [k for k, name in enumerate(scene.cameras.names) if name in tests]
-    if not found:
+    rows = [k for k, name in enumerate(scene.cameras.names) if name in tests]
+    if not rows:
         raise DataFailure("no test view has a camera; lower ingest.test_every")
-    return found
+    return rows
 
 
 def draw(scene: Scene, views: list[int], query: Query, out: Path) -> None:
@@ -172,12 +172,12 @@ def draw(scene: Scene, views: list[int], query: Query, out: Path) -> None:
 
 def file_names(views: list[str]) -> list[str]:
     """A file's name for each view: its path with every separator replaced, and a number where two would be alike."""
-    found: list[str] = []
+    names: list[str] = []
     for view in views:
         name = re.sub(r"[^\w.-]+", "-", view.removesuffix(Path(view).suffix)).strip(".-") or "view"
         name = name.encode()[:200].decode(errors="ignore")
-        taken = {held.lower() for held in found}  # some file systems fold case
-        found.append(
+        taken = {held.lower() for held in names}  # some file systems fold case
+        names.append(
             next(new for k in itertools.count(1) if (new := name if k == 1 else f"{name}-{k}").lower() not in taken)
         )
-    return found
+    return names

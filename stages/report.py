@@ -40,8 +40,8 @@ FRAMES = {"color": "colour", "color_and_features": "colour and features"}
 def run(job: Job) -> None:
     """One HTML page, and the figures as CSV, of what was measured and where it comes from.
 
-    Reads `evaluation` and `gaussians`, and of `capture`, `points`, `channels`, `features`, `descriptors`, `scene`, `encoder`
-    and `basis` what there is. Writes `report`.
+    Reads `evaluation` and `gaussians`, and of `capture`, `points`, `channels`, `features`, `descriptors`, `scene`,
+    `encoder` and `basis` what there is. Writes `report`.
     """
     import json
 
@@ -64,8 +64,8 @@ def run(job: Job) -> None:
     evaluated = job.inputs["evaluation"]
     figures = conform(evaluation.figures, Reported, evaluated / "figures.json", remedy_of(evaluated))
     left_out = absent_stages(job, gaussians) | figures["left_out"]
-    for said in facts.values():
-        left_out |= said.get("left_out", {})
+    for of_input in facts.values():
+        left_out |= of_input.get("left_out", {})
     stages = [(STAGE_OF[role], m.seconds, m.key, m.device, m.threads) for role, m in manifests.items()]
     versions: dict[str, str] = {}
     settings: dict[str, Any] = {}

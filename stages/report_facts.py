@@ -45,7 +45,7 @@ class Exported(Facts):
     by_degree: list[Count]
 
 
-class Told(TypedDict):
+class AnyManifest(TypedDict):
     """Of any manifest."""
 
     stage: str
@@ -100,5 +100,5 @@ FACTS: dict[str, Any] = {"features": Teacher, "gaussians": Trained, "scene": Exp
 def facts_of(role: str, path: Path, manifest: Manifest) -> dict[str, Any]:
     """The facts of an input's manifest. Raises InputError naming the file and what is wrong in it."""
     file = path / "artifact.json"
-    conform(asdict(manifest), Told, file, remedy_of(path))
+    conform(asdict(manifest), AnyManifest, file, remedy_of(path))
     return conform(manifest.facts, FACTS.get(role, Facts), file, remedy_of(path))

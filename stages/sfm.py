@@ -17,8 +17,8 @@ if TYPE_CHECKING:
 def run(job: Job) -> None:
     """Cameras, and points with the covariance and normal of their neighbours (docs/method.md, section 1).
 
-    Reads `capture`. Writes `points`. Poses, points and depth that the capture holds are taken; what it lacks is computed by
-    feature matching and triangulation.
+    Reads `capture`. Writes `points`. Poses, points and depth that the capture holds are taken; what it lacks is
+    computed by feature matching and triangulation.
     """
     import numpy as np
 
@@ -30,36 +30,36 @@ def run(job: Job) -> None:
     settings, capture = job.config.sfm, read_capture(job.inputs["capture"])
     if capture.cam_from_world is not None and capture.points is not None:
         job.left_out("feature matching", "poses are given, and points by the source")
-        found = from_source(capture, settings)
+        cloud = from_source(capture, settings)
     elif capture.cam_from_world is not None and capture.depth is not None:
         job.left_out("feature matching", "poses and depth are given: points come from depth")
-        found = from_depth(job, capture, settings)
+        cloud = from_depth(job, capture, settings)
     else:
         from chebsplat.stages import reconstruction
 
         if capture.cam_from_world is not None:
             job.left_out("pose estimation", "poses are given: points are triangulated")
-        found = reconstruction.reconstruct(job, capture, settings)
-    means = found["means"]
+        cloud = reconstruction.reconstruct(job, capture, settings)
+    means = cloud["means"]
     if len(means) < 16:
         raise DataFailure(f"only {len(means)} points were found, at least 16 are needed; add views with more overlap")
     covariances, normals = local_shape(means, settings.n_neighbors)
-    eye = centers(found["cam_from_world"])[found["seen_from"]]
+    eye = centers(cloud["cam_from_world"])[cloud["seen_from"]]
     away = np.einsum("ni,ni->n", normals, eye - means) < 0
     normals[away] *= -1
-    job.facts |= {"n_points": len(means), "n_views": len(found["names"])} | found["notes"]
+    job.facts |= {"n_points": len(means), "n_views": len(cloud["names"])} | cloud["notes"]
     write_points(
         job.out,
         Points(
-            found["names"],
-            found["Ks"],
-            found["cam_from_world"],
+            cloud["names"],
+            cloud["Ks"],
+            cloud["cam_from_world"],
             means,
-            found["colors"],
+            cloud["colors"],
             normals,
             covariances,
-            found["tracks"],
-            found["notes"],
+            cloud["tracks"],
+            cloud["notes"],
         ),
     )
 

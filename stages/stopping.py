@@ -73,11 +73,11 @@ class Asked:
     def ignored(self, hook: Callable[[Any], object]) -> Callable[[Any], None]:
         """A hook for what Python has to ignore: in a destructor a stop is none, and no fault either."""
 
-        def told(unraisable: Any) -> None:
+        def unless_stopped(unraisable: Any) -> None:
             if self.stop is None:
                 hook(unraisable)
 
-        return told
+        return unless_stopped
 
 
 _asked: Asked | None = None

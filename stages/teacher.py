@@ -34,10 +34,10 @@ def run(job: Job) -> None:
         job.facts |= {"kind": settings.kind, "n_labels": len(features.label_names), "convention": features.convention}
         write_features(job.out, features)
     else:
-        from_encoder(job, capture, settings)
+        from_onnx(job, capture, settings)
 
 
-def from_encoder(job: Job, capture: Capture, settings: TeacherSection) -> None:
+def from_onnx(job: Job, capture: Capture, settings: TeacherSection) -> None:
     """Features of every view by an ONNX model, the embedded one if none is given; of a killed run, finished views stay.
 
     Choices: test views are encoded too, because evaluate reports the teacher's own figures on them.
@@ -48,12 +48,12 @@ def from_encoder(job: Job, capture: Capture, settings: TeacherSection) -> None:
     from chebsplat.formats.features import FeatureWriter
     from chebsplat.formats.teacher_model import EMBEDDED, read_teacher
     from chebsplat.stages.command import n_threads
-    from chebsplat.stages.image_encoder import ImageEncoder
     from chebsplat.stages.label_space import MAX_CHANNELS, closed_set, label_set, open_vocabulary
+    from chebsplat.stages.teacher_inference import TeacherInference
 
     teacher = read_teacher(Path(settings.model) if settings.model else EMBEDDED)
-    encoder = ImageEncoder(teacher, n_threads())
-    grid, n_channels = encoder.grid(capture.images[0], settings.downscale)
+    network = TeacherInference(teacher, n_threads())
+    grid, n_channels = network.grid(capture.images[0], settings.downscale)
     channels = None
     if teacher.output == "logits":
         labels = label_set(teacher, settings.labels, None) if settings.labels else None
@@ -93,8 +93,8 @@ def from_encoder(job: Job, capture: Capture, settings: TeacherSection) -> None:
         log.info("%d of %d views are there from a run that was stopped", len(writer.done), len(capture.names))
     for view, _ in job.progress.track(waiting, len(capture.names), "teacher", len(writer.done)):
         name = capture.names[view]
-        found = encoder.encode(capture.images[view], grid, settings.scales, settings.flips, name)
-        writer.add(view, *space.split(found))
+        features = network.features(capture.images[view], grid, settings.scales, settings.flips, name)
+        writer.add(view, *space.split(features))
     writer.finish(job.out, space.names, space.embeddings, convention, channels)
     job.facts |= {"kind": "onnx", "n_labels": len(space.names), "convention": convention}
 

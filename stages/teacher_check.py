@@ -21,27 +21,27 @@ def check(model: Path, photo: Path | None = None, labels: str | None = None) -> 
 
     from chebsplat.formats.teacher_model import read_teacher
     from chebsplat.stages.command import n_threads
-    from chebsplat.stages.image_encoder import ImageEncoder
     from chebsplat.stages.label_space import MAX_CHANNELS, closed_set, label_set, open_vocabulary
     from chebsplat.stages.settings import TeacherSection
+    from chebsplat.stages.teacher_inference import TeacherInference
 
     settings = TeacherSection()
     teacher = read_teacher(model)
-    encoder = ImageEncoder(teacher, n_threads())
+    network = TeacherInference(teacher, n_threads())
     name, image = shown(photo)
-    grid, n_channels = encoder.grid(image, settings.downscale)
+    grid, n_channels = network.grid(image, settings.downscale)
     if teacher.output == "logits":
         asked = label_set(teacher, labels, None) if labels else None
         space = closed_set(teacher, asked, n_channels, settings.n_channels)
     else:
         space = open_vocabulary(teacher, label_set(teacher, labels, None), n_channels, None)
     began = time.perf_counter()
-    _, found, confidence = space.split(encoder.encode(image, grid, settings.scales, settings.flips, name))
+    _, pseudo_labels, confidence = space.split(network.features(image, grid, settings.scales, settings.flips, name))
     seconds = time.perf_counter() - began
-    size = encoder.scaled_size(image, 1.0)
-    window = encoder.window(size)
-    counts = np.bincount(found.ravel(), minlength=len(space.names))
-    seen = [f"{space.names[k]} {counts[k] / found.size:.0%}" for k in np.argsort(-counts, kind="stable")[:SHOWN] if counts[k]]  # fmt: skip  # noqa: E501
+    size = network.scaled_size(image, 1.0)
+    window = network.window(size)
+    counts = np.bincount(pseudo_labels.ravel(), minlength=len(space.names))
+    seen = [f"{space.names[k]} {counts[k] / pseudo_labels.size:.0%}" for k in np.argsort(-counts, kind="stable")[:SHOWN] if counts[k]]  # fmt: skip  # noqa: E501
     wide = teacher.output == "features" and n_channels > MAX_CHANNELS
     return [
         ("name", f"{teacher.name} ({model}, {model.stat().st_size / 2**20:.1f} MB)"),
@@ -49,7 +49,7 @@ def check(model: Path, photo: Path | None = None, labels: str | None = None) -> 
         ("image", f"{name}, {image.shape[1]} x {image.shape[0]}, seen at {size[1]} x {size[0]}"),
         (
             "windows",
-            f"{n_windows(size, window)} of {window[1]} x {window[0]}{'' if encoder.size else ' (any size)'}",
+            f"{n_windows(size, window)} of {window[1]} x {window[0]}{'' if network.size else ' (any size)'}",
         ),
         ("map", f"{grid[1]} x {grid[0]}: one feature every {image.shape[0] / grid[0]:.3g} pixels"),
         ("labels", f"{len(space.names)}, from {labels or teacher.labels}"),

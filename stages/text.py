@@ -38,19 +38,19 @@ def text_embeddings(names: list[str], teacher: TeacherModel) -> np.ndarray:
     if teacher.labels is not None:
         known, embeddings = read_label_table(teacher.labels)
     row = {} if embeddings is None else {folded(name): k for k, name in reversed(list(enumerate(known)))}
-    found: dict[str, np.ndarray] = {}
+    vectors: dict[str, np.ndarray] = {}
     unknown: list[str] = []
     for name in dict.fromkeys(names):
         key = next((form for form in forms(name) if form in row), None)
         if key is None or embeddings is None:
             unknown.append(name)
             continue
-        found[name] = embeddings[row[key]]
+        vectors[name] = embeddings[row[key]]
         if key != folded(name):
             log.info("%s is not in %s; its %s is taken", name, teacher.labels, known[row[key]])
     if unknown:
-        found |= zip(unknown, _encoded(unknown, teacher, row), strict=True)
-    rows = np.stack([found[name] for name in names]).astype(np.float32)
+        vectors |= zip(unknown, _encoded(unknown, teacher, row), strict=True)
+    rows = np.stack([vectors[name] for name in names]).astype(np.float32)
     return rows / np.linalg.norm(rows, axis=1, keepdims=True).clip(1e-12)
 
 
@@ -99,7 +99,7 @@ def sentence_embeddings(texts: list[str]) -> np.ndarray:
 def _by_model(texts: list[str], teacher: TeacherModel, lacking: str) -> np.ndarray:
     """Rows by the teacher's own text encoder.
 
-    Choices: inputs are told by name, as in ENTRIES; a graph with a single input of another name takes the ids.
+    Choices: inputs are known by name, as in ENTRIES; a graph with a single input of another name takes the ids.
       One text at a time, so that padding never counts.
     """
     import numpy as np

@@ -37,7 +37,7 @@ def run(job: Job) -> None:
 
     train = job.config.train
     capture, given = read_capture(job.inputs["capture"]), read_points(job.inputs["points"])
-    found, points = described(job, given), within_cap(job, given)
+    descriptors, points = described(job, given), within_cap(job, given)
     features = read_features(job.inputs["features"]) if "features" in job.inputs and train.semantics else None
     note_left_out(job, train, features is not None)
     import torch  # once its inputs are known to be usable
@@ -46,7 +46,7 @@ def run(job: Job) -> None:
 
     torch.set_num_threads(n_threads())  # sums of torch depend on it; the same bytes are promised for the same number
     model = model_of(points, features, train, job.config.describe)
-    regions, descriptors = first_regions(found if points is given else None)
+    regions, described_values = first_regions(descriptors if points is given else None)
     trainer = Trainer(
         model,
         training_views(capture, points, features),
@@ -54,7 +54,7 @@ def run(job: Job) -> None:
         extent(points.cam_from_world),
         basis=knowledge(job, model, train),
         regions=regions,
-        descriptors=descriptors,
+        descriptors=described_values,
     )
     trace = follow(job, trainer, train)
     parameters, population = trainer.finish(), trainer.population
@@ -89,8 +89,8 @@ def agreement(alone: np.ndarray, features: np.ndarray, embeddings: np.ndarray) -
 
     from chebsplat.labels.decode import decode_labels
 
-    found, wanted = decode_labels(alone, embeddings), decode_labels(features, embeddings)
-    return {"agreement": float((found == wanted).mean()), "commonest": float(np.bincount(wanted).max() / len(wanted))}
+    named, wanted = decode_labels(alone, embeddings), decode_labels(features, embeddings)
+    return {"agreement": float((named == wanted).mean()), "commonest": float(np.bincount(wanted).max() / len(wanted))}
 
 
 def note_left_out(job: Job, train: TrainSection, has_semantics: bool) -> None:
@@ -152,8 +152,8 @@ def measured(trainer: Trainer, since: list[dict[str, float]], watched: list[int]
     """A row of the trace, from the figures of steps since the row before and the PSNR of the training views watched."""
     row = {"step": trainer.step, "seconds": trainer.seconds, "n": since[-1]["n"]}
     for name in {name for entry in since for name in entry} - row.keys():
-        found = [entry[name] for entry in since if name in entry]  # encodings have a loss in some steps only
-        row[name] = sum(found) / len(found)
+        values = [entry[name] for entry in since if name in entry]  # encodings have a loss in some steps only
+        row[name] = sum(values) / len(values)
     row |= {"psnr": trainer.held_in_psnr(watched), "sh_kept": trainer.model.sh_kept()}
     return {k: float(v) for k, v in row.items()}
 

@@ -117,25 +117,25 @@ def described(job: Job, points: Points) -> Descriptors | None:
     if "descriptors" not in job.inputs:
         return None
     path = job.inputs["descriptors"]
-    found = read_descriptors(path)
-    if max(found.members.max(initial=-1), found.centers.max(initial=-1)) >= len(points.means):
+    stored = read_descriptors(path)
+    if max(stored.members.max(initial=-1), stored.centers.max(initial=-1)) >= len(points.means):
         raise InputError(f"{path} describes other points; run the describe stage on these points")
     describe = job.config.describe
-    wrong = [f"describe.{name}" for name, value in describe.model_dump().items() if found.settings.get(name) != value]
+    wrong = [f"describe.{name}" for name, value in describe.model_dump().items() if stored.settings.get(name) != value]
     if wrong:
         raise InputError(f"{path} has another {wrong[0]}; run the describe stage with this config")
-    if found.values.shape[1:3] != (found.members.shape[1], describe.n_angles):
+    if stored.values.shape[1:3] != (stored.members.shape[1], describe.n_angles):
         raise InputError(f"{path} has descriptors of another shape; run the describe stage again")
-    return found
+    return stored
 
 
-def first_regions(found: Descriptors | None) -> tuple[Regions | None, Tensor | None]:
+def first_regions(stored: Descriptors | None) -> tuple[Regions | None, Tensor | None]:
     """The describe stage's regions and descriptors for a training to start from; None: it makes its own."""
     import torch
 
     from chebsplat.shape.regions import Regions
 
-    if found is None:
+    if stored is None:
         return None, None
-    regions = Regions(found.centers, found.members, found.settings["radius"], found.settings["share"])
-    return regions, torch.from_numpy(found.values)
+    regions = Regions(stored.centers, stored.members, stored.settings["radius"], stored.settings["share"])
+    return regions, torch.from_numpy(stored.values)

@@ -19,7 +19,7 @@ import numpy as np
 
 from chebsplat.evaluation.metrics import IGNORE, confusion, segmentation
 from chebsplat.formats.teacher_model import EMBEDDED, read_teacher
-from chebsplat.stages.image_encoder import ImageEncoder
+from chebsplat.stages.teacher_inference import TeacherInference
 from chebsplat.stages.text import text_embeddings
 from chebsplat.synthetic import CLASS_NAMES
 from chebsplat.synthetic.seeds import HELD_OUT
@@ -77,7 +77,7 @@ def figures(matrix: np.ndarray, names: list[str]) -> dict[str, Any]:
 
 def runner(model: Path, threads: int) -> Callable[[np.ndarray], np.ndarray]:
     """From a view u8 [H, W, 3], sides multiples of the model's, to vectors f32 [C, h, w]."""
-    encoder = ImageEncoder(read_teacher(model), threads)
+    encoder = TeacherInference(read_teacher(model), threads)
     return lambda image: encoder.run(image, "a view")
 
 

@@ -9,13 +9,13 @@ import pytest
 from shared import ROOT
 
 from chebsplat.formats.teacher_model import EMBEDDED, read_teacher
-from chebsplat.stages.image_encoder import ImageEncoder
+from chebsplat.stages.teacher_inference import TeacherInference
 from chebsplat.synthetic import CLASS_NAMES, seeds
 
 
 @pytest.fixture(scope="module")
 def encoder():
-    return ImageEncoder(read_teacher(EMBEDDED), 1)
+    return TeacherInference(read_teacher(EMBEDDED), 1)
 
 
 @pytest.mark.parametrize("size", [(16, 32), (96, 64), (112, 176)])

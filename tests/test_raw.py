@@ -133,16 +133,16 @@ def test_a_teacher_that_is_exported_anew_meanwhile_is_noticed(tmp_path, stage, w
     if when == "before":
         exported_anew()
     else:
-        from chebsplat.stages.image_encoder import ImageEncoder
+        from chebsplat.stages.teacher_inference import TeacherInference
 
-        encode = ImageEncoder.encode
+        encode = TeacherInference.features
 
         def encoded(self, *arguments):
             if not swap.done:
                 exported_anew()
             return encode(self, *arguments)
 
-        monkeypatch.setattr(ImageEncoder, "encode", encoded)
+        monkeypatch.setattr(TeacherInference, "features", encoded)
     assert job.run(plan, step.key) == 3
     assert swap.done
     assert f"{model} has changed" in capfd.readouterr().err

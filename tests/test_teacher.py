@@ -22,7 +22,7 @@ from chebsplat.formats.channels import ChannelMap, write_channels
 from chebsplat.formats.features import read_features
 from chebsplat.formats.manifest import Manifest
 from chebsplat.formats.teacher_model import read_label_set, read_teacher
-from chebsplat.stages.image_encoder import ImageEncoder
+from chebsplat.stages.teacher_inference import TeacherInference
 
 SIZE = (48, 64)
 
@@ -117,18 +117,18 @@ def test_a_flip_is_undone_before_averaging(tmp_path, capture):
     node = helper.make_node("Add", ["image", "ramp"], ["features"])
     write_model(tmp_path / "tiny.onnx", [node], shape=(1, 3, 48, 64), constants={"ramp": ramp})
     write_settings(tmp_path / "tiny.onnx")
-    encoder, image = ImageEncoder(read_teacher(tmp_path / "tiny.onnx"), 1), image_of(capture)
-    straight = encoder.encode(image, SIZE, (1.0,), True, "view")
-    mirrored = encoder.encode(image[:, ::-1], SIZE, (1.0,), True, "view")
+    encoder, image = TeacherInference(read_teacher(tmp_path / "tiny.onnx"), 1), image_of(capture)
+    straight = encoder.features(image, SIZE, (1.0,), True, "view")
+    mirrored = encoder.features(image[:, ::-1], SIZE, (1.0,), True, "view")
     assert np.allclose(straight[:, ::-1], mirrored, atol=1e-6)
-    assert not np.allclose(straight, encoder.encode(image, SIZE, (1.0,), False, "view"), atol=1e-2)
+    assert not np.allclose(straight, encoder.features(image, SIZE, (1.0,), False, "view"), atol=1e-2)
 
 
 def test_scales_keep_the_aspect_ratio_and_count_the_same(tmp_path, capture):
-    encoder, image = ImageEncoder(read_teacher(color_teacher(tmp_path)), 1), image_of(capture)
+    encoder, image = TeacherInference(read_teacher(color_teacher(tmp_path)), 1), image_of(capture)
     assert [encoder.scaled_size(image, s) for s in (0.75, 1.0, 1.25)] == [(36, 48), (48, 64), (60, 80)]
-    both = encoder.encode(image, (12, 16), (0.5, 1.0), False, "view")
-    each = [encoder.encode(image, (12, 16), (s,), False, "view") for s in (0.5, 1.0)]
+    both = encoder.features(image, (12, 16), (0.5, 1.0), False, "view")
+    each = [encoder.features(image, (12, 16), (s,), False, "view") for s in (0.5, 1.0)]
     mean = each[0] + each[1]
     assert np.allclose(both, mean / np.linalg.norm(mean, axis=-1, keepdims=True), atol=1e-6)
 
@@ -384,7 +384,7 @@ def test_check_teacher_tells_what_a_teacher_is_and_sees(tmp_path):
 
 
 def test_views_that_a_stopped_run_finished_are_not_encoded_again(tmp_path, capture, monkeypatch):
-    model, seen, encode = color_teacher(tmp_path), [], ImageEncoder.encode
+    model, seen, encode = color_teacher(tmp_path), [], TeacherInference.features
 
     def counted(self, image, grid, scales, flips, name):
         if name == "view_002" and "view_002" not in seen:
@@ -393,7 +393,7 @@ def test_views_that_a_stopped_run_finished_are_not_encoded_again(tmp_path, captu
         seen.append(name)
         return encode(self, image, grid, scales, flips, name)
 
-    monkeypatch.setattr(ImageEncoder, "encode", counted)
+    monkeypatch.setattr(TeacherInference, "features", counted)
     assert encoded(tmp_path, capture, model)[0] == 1
     assert not (tmp_path / "out").exists()
     assert encoded(tmp_path, capture, model)[0] == 0

@@ -38,7 +38,7 @@ def modes(pictures: list[dict[str, Any]]) -> list[list[Any]]:
     there = {key for key, _, _ in pictures[0]["images"]}
     errors = side("colour error, 4 times", "error")
     wrong = side("render, wrong labels in red", "renders", "wrong")
-    found: list[list[Any]] = [
+    compared: list[list[Any]] = [
         ["photo | render", side("photo", "truth"), side("render", "renders")],
         ["true labels | scene", side("true labels", "truth", "labels"), side("scene's labels", "renders", "predicted")],
         [
@@ -48,7 +48,7 @@ def modes(pictures: list[dict[str, Any]]) -> list[list[Any]]:
         ],
         ["errors", errors, wrong if "wrong" in there else side("render", "renders")],
     ]
-    return [mode for mode in found if {s[key] for s in mode[1:] for key in ("base", "over")} <= there | {None}]
+    return [mode for mode in compared if {s[key] for s in mode[1:] for key in ("base", "over")} <= there | {None}]
 
 
 def label_names(inputs: dict[str, Path], figures: dict[str, Any]) -> list[str]:
@@ -66,20 +66,20 @@ def label_names(inputs: dict[str, Path], figures: dict[str, Any]) -> list[str]:
 
 
 def tiles(figures: dict[str, Any], gaussians: Gaussians) -> list[tuple[str, str, str]]:
-    """The headline: (value, what, aside)."""
+    """The headline: (value, what, detail)."""
     image, segmentation = figures["image"], figures.get("segmentation") or {}
-    found = [(f"{image['psnr']:.1f} dB", "PSNR", f"SSIM {image['ssim']:.3f}")]
+    tiles = [(f"{image['psnr']:.1f} dB", "PSNR", f"SSIM {image['ssim']:.3f}")]
     if segmentation and segmentation["scene"]["miou"] is not None:
         of_teacher = segmentation.get("teacher", {}).get("miou")
-        aside = "" if of_teacher is None else f"its 2D teacher: {of_teacher:.1%}"
-        found.append((f"{segmentation['scene']['miou']:.1%}", "mIoU", aside))
+        detail = "" if of_teacher is None else f"its 2D teacher: {of_teacher:.1%}"
+        tiles.append((f"{segmentation['scene']['miou']:.1%}", "mIoU", detail))
     if segmentation and segmentation["scene"].get("oa") is not None:
-        found.append((f"{segmentation['scene']['oa']:.1%}", "pixels right", "overall accuracy"))
-    found.append((f"{figures['n_gaussians']:,}", "Gaussians", f"PLY {figures['bytes']['ply'] / 1e6:.1f} MB"))
+        tiles.append((f"{segmentation['scene']['oa']:.1%}", "pixels right", "overall accuracy"))
+    tiles.append((f"{figures['n_gaussians']:,}", "Gaussians", f"PLY {figures['bytes']['ply'] / 1e6:.1f} MB"))
     for name, value in list(figures["frames_per_second"].items())[:1]:
-        found.append((f"{value:.0f}", "frames a second", "colour alone" if name == "color" else "colour and features"))
+        tiles.append((f"{value:.0f}", "frames a second", "colour alone" if name == "color" else "colour and features"))
     last = gaussians.trace[-1]
-    return [*found, (f"{last['seconds']:.0f} s", "training", f"{last['step']:.0f} steps")]
+    return [*tiles, (f"{last['seconds']:.0f} s", "training", f"{last['step']:.0f} steps")]
 
 
 def class_rows(figures: dict[str, Any], colors: dict[str, str]) -> list[tuple[str, str, float, float | None]]:
@@ -142,5 +142,5 @@ def counted(labels: np.ndarray) -> dict[int, int]:
     """Pixels of each label of a map; -1 is none."""
     import numpy as np
 
-    found, counts = np.unique(labels[labels >= 0], return_counts=True)
-    return dict(zip(found.tolist(), counts.tolist(), strict=True))
+    present, counts = np.unique(labels[labels >= 0], return_counts=True)
+    return dict(zip(present.tolist(), counts.tolist(), strict=True))

@@ -57,14 +57,14 @@ def assemble(listing: Listing, settings: IngestSection, class_names: tuple[str, 
         fields["depth"] = stacks["depth"]
     if "labels" in stacks:
         wanted = class_names or listing.class_names
-        fields["labels"], fields["class_names"], said = indexed(stacks["labels"], listing.label_names, wanted)
-        notes += said
+        fields["labels"], fields["class_names"], remarks = indexed(stacks["labels"], listing.label_names, wanted)
+        notes += remarks
     if "pseudo_labels" in stacks:
         wanted = fields.get("class_names") or class_names or listing.class_names
         found = indexed(stacks["pseudo_labels"], listing.pseudo_names, wanted and tuple(wanted))
-        fields["pseudo_labels"], fields["class_names"], said = found
+        fields["pseudo_labels"], fields["class_names"], remarks = found
         fields["confidence"] = stacks["confidence"]
-        notes += said
+        notes += remarks
     if not stacks["loss_mask"].any():
         raise DataFailure(f"{frames[0].mask or frames[0].image}: no pixel of any view counts; correct the masks")
     if not stacks["loss_mask"].all():

@@ -104,8 +104,8 @@ def detect(folder: Path) -> str:
         return "seven_scenes"
     if folder.is_dir() and any(is_image(name) for name in os.listdir(folder)):
         return "photos"
-    if said := unread(folder):
-        raise InputError(f"{folder} holds no .jpg or .png photo: {said}")
+    if others := unread(folder):
+        raise InputError(f"{folder} holds no .jpg or .png photo: {others}")
     hint = f"; {folder / 'images'} may be meant" if (folder / "images").is_dir() else ""
     raise InputError(
         f"{folder} is no source: it holds neither transforms.json, traj.txt, results/, Sequence_1/, "
@@ -115,15 +115,15 @@ def detect(folder: Path) -> str:
 
 
 def unread(folder: Path) -> str:
-    """What else a folder and its images/ hold that people take for photos, counted by suffix; nothing of none."""
+    """What else a folder and its images/ hold that may be taken for photos, counted by suffix; nothing of none."""
     places = [place for place in (folder, folder / "images") if place.is_dir()]
     ends = [os.path.splitext(name)[1].lower() for place in places for name in os.listdir(place) if name[0] != "."]
     counts = {end: n for end, n in sorted(Counter(ends).items()) if end in UNREAD}
     if not counts:
         return ""
     how = dict.fromkeys(UNREAD[end].format(end) for end in counts)
-    said = ", ".join(f"{n} {end}" for end, n in counts.items())
-    return f"{said} not read; convert to JPEG, for example with {' and '.join(f'`{line}`' for line in how)}"
+    others = ", ".join(f"{n} {end}" for end, n in counts.items())
+    return f"{others} not read; convert to JPEG, for example with {' and '.join(f'`{line}`' for line in how)}"
 
 
 def names_below(folder: Path) -> Iterator[str]:

@@ -79,8 +79,8 @@ def _trajectory(path: Path, names: list[str]) -> np.ndarray:
         try:
             matrices[k] = [float(v) for v in row]
         except ValueError as error:
-            said = str(error)[: texts.LONGEST]
-            raise InputError(f"{path}: row {k + 1} does not hold 16 numbers ({said}); restore the file") from None
+            reason = str(error)[: texts.LONGEST]
+            raise InputError(f"{path}: row {k + 1} does not hold 16 numbers ({reason}); restore the file") from None
     return cameras.cam_from_world(path, matrices[numbers].reshape(-1, 4, 4), names)
 
 

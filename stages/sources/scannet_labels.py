@@ -53,8 +53,8 @@ def _column(path: Path | None, name: str, column: str, n_values: int, empty: int
     try:
         found = {int(row["id"]): int(row[column]) if row[column] or empty is None else empty for row in rows}
     except (KeyError, TypeError, ValueError) as error:
-        said = str(error)[:LONGEST]
-        raise InputError(f"{path} has no usable columns id and {column} ({said}); take {name}") from None
+        reason = str(error)[:LONGEST]
+        raise InputError(f"{path} has no usable columns id and {column} ({reason}); take {name}") from None
     if not found or min(found) < 0 or not all(0 <= value < n_values for value in found.values()):
         raise InputError(
             f"{path}: ids must not be negative, and values of {column} must lie in 0...{n_values - 1}; take {name}"

@@ -19,7 +19,7 @@ MAX_WINDOWS = 4096  # of a view
 MAX_SHARE = 0.5  # of the image's side that an entry of the map may be wide
 
 
-class ImageEncoder:
+class TeacherInference:
     """Runs one teacher, one window at a time: on a CPU a batch gains nothing, and memory stays that of one window.
 
     Args: threads: that onnxruntime may use.
@@ -82,7 +82,7 @@ class ImageEncoder:
     def grid(self, image: np.ndarray, downscale: int) -> tuple[tuple[int, int], int]:
         """((h, w), C): entries of a view's map, and the encoder's channels.
 
-        Choices: an entry is `downscale` pixels of the view wide, or as wide as the encoder's own at scale 1 where
+        Choices: an entry is `downscale` pixels of the view wide, or as wide as the model's own at scale 1 where
           these are wider.
         """
         scaled = self.scaled_size(image, 1.0)
@@ -105,12 +105,12 @@ class ImageEncoder:
             sides.append(math.ceil(n / entry - 1e-9))
         return (sides[0], sides[1]), cells.shape[0]
 
-    def encode(
+    def features(
         self, image: np.ndarray, grid: tuple[int, int], scales: tuple[float, ...], flips: bool, name: str
     ) -> np.ndarray:
         """The map f32 [h, w, C] of a view, u8 [H, W, 3]: unit features, or probabilities of a closed set.
 
-        Choices: every window's codes are unit (or probabilities) before windows are blended; every scale's and flip's
+        Choices: every window's entries are unit (or probabilities) before windows are blended; every scale's and flip's
           map counts the same in the mean, which is made unit again. Padding repeats the image's edge.
         """
         import numpy as np
@@ -124,11 +124,11 @@ class ImageEncoder:
             for flip in (False, True) if flips else (False,):
                 padded = _padded(resized[:, ::-1] if flip else resized, side)
 
-                def codes(top: int, left: int, padded: Any = padded, side: Any = side) -> np.ndarray:
-                    found = self.run(padded[top : top + side[0], left : left + side[1]], name)
-                    return softmax(found) if self.teacher.output == "logits" else unit(found, 0)
+                def entries(top: int, left: int, padded: Any = padded, side: Any = side) -> np.ndarray:
+                    output = self.run(padded[top : top + side[0], left : left + side[1]], name)
+                    return softmax(output) if self.teacher.output == "logits" else unit(output, 0)
 
-                part = self._normal(blended(codes, size, side, grid))
+                part = self._normal(blended(entries, size, side, grid))
                 part = part[:, ::-1] if flip else part
                 total = total + part if total.size else part
         return self._normal(total)
@@ -146,15 +146,15 @@ class ImageEncoder:
         teacher = self.teacher
         mean, std = (np.array(v, np.float32)[:, None, None] for v in (teacher.mean, teacher.std))
         image = (window.transpose(2, 0, 1).astype(np.float32) / 255 - mean) / std
-        found = self.model.run({self.model.inputs[0].name: image[None]})[0]
-        if found.ndim != 4 or found.shape[0] != 1 or not found.size:
-            raise InputError(f"{teacher.path} gives {list(found.shape)}; [1, C, h, w] is needed: export it again")
-        if not np.isfinite(found).all():
+        output = self.model.run({self.model.inputs[0].name: image[None]})[0]
+        if output.ndim != 4 or output.shape[0] != 1 or not output.size:
+            raise InputError(f"{teacher.path} gives {list(output.shape)}; [1, C, h, w] is needed: export it again")
+        if not np.isfinite(output).all():
             raise DataFailure(
-                f"{teacher.path} gives {np.sum(~np.isfinite(found))} non-finite values for {name}; check mean and std "
+                f"{teacher.path} gives {np.sum(~np.isfinite(output))} non-finite values for {name}; check mean and std "
                 f"in {teacher.settings}, and export it in float32"
             )
-        return found[0].astype(np.float32)
+        return output[0].astype(np.float32)
 
 
 def unit(values: np.ndarray, axis: int) -> np.ndarray:
