@@ -14,4 +14,4 @@ if os.environ.get("OMP_NUM_THREADS", "").isdigit():
 # this is set before. ORT_DISABLE_TELEMETRY=0 is for who wants that.
 os.environ.setdefault("ORT_DISABLE_TELEMETRY", "1")
 
-__version__ = "0.1.0"
+__version__ = "0.2.0"
