@@ -75,6 +75,9 @@ def run(job: Job) -> None:
         job.facts["described_anew"] = model.shape.described.share_described
     if model.shape is not None and features is not None:
         job.facts["encoder"] = agreement(model.shape.alone().numpy(), parameters["features"], features.label_embeddings)
+    if features is not None:
+        mask = trainer.final_mask()
+        job.facts["guidance"] = guidance(parameters, None if mask is None else mask.numpy(), features.label_embeddings)
     timed = max(trainer.step - 1, 1)  # all but the first
     job.facts |= {"n_gaussians": left, "steps": trainer.step, "seconds_per_step": trace[-1]["seconds"] / timed}
     job.facts["milliseconds"] = {part: 1e3 * seconds / timed for part, seconds in trainer.laps.seconds.items()}
@@ -91,6 +94,37 @@ def agreement(alone: np.ndarray, features: np.ndarray, embeddings: np.ndarray) -
 
     named, wanted = decode_labels(alone, embeddings), decode_labels(features, embeddings)
     return {"agreement": float((named == wanted).mean()), "commonest": float(np.bincount(wanted).max() / len(wanted))}
+
+
+FEW = 20  # a class of fewer Gaussians has no mean worth comparing
+
+
+def guidance(
+    parameters: dict[str, np.ndarray], mask: np.ndarray | None, embeddings: np.ndarray
+) -> dict[str, float | None]:
+    """What shape and semantics changed: labels, and which Gaussians and SH bands go.
+
+    Args: parameters: of a finished training; mask [N]: m̂ of its Gaussians, None without pruning; embeddings [L, C].
+    Returns: `labels_changed`, the part of Gaussians whose label the fusion changed; `mask_spread` and `band_spread`,
+      standard deviations over classes of the mean m̂ and of the mean share of SH coefficients kept. None: not there.
+    """
+    import numpy as np
+
+    from chebsplat.labels.decode import decode_labels
+
+    own = decode_labels(parameters["features"], embeddings)
+    fused = decode_labels(parameters["fused"], embeddings) if "fused" in parameters else own
+
+    def spread(values: np.ndarray) -> float:
+        counts, sums = np.bincount(fused), np.bincount(fused, values)
+        return float((sums / np.maximum(counts, 1))[counts >= FEW].std()) if (counts >= FEW).any() else 0.0
+
+    kept = (parameters["degrees"].astype(np.float64) + 1) ** 2 / 16
+    return {
+        "labels_changed": float((own != fused).mean()) if "fused" in parameters else None,
+        "mask_spread": None if mask is None else spread(mask.astype(np.float64)),
+        "band_spread": spread(kept),
+    }
 
 
 def note_left_out(job: Job, train: TrainSection, has_semantics: bool) -> None:
@@ -177,7 +211,7 @@ def optimizer_state(trainer: Trainer) -> dict[str, np.ndarray]:
     arrays: dict[str, np.ndarray] = {}
     for group in trainer.optimizer.param_groups:
         state = trainer.optimizer.state.get(group["params"][0], {})
-        if group["name"] != "modules" and "exp_avg" in state:
+        if group["name"] not in ("modules", "gates") and "exp_avg" in state:
             arrays |= {f"{group['name']}.{k}": state[k].numpy() for k in ("exp_avg", "exp_avg_sq")}
     return arrays
 

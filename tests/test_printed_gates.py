@@ -5,6 +5,7 @@ import pytest
 import torch
 
 from chebsplat.splats.sh import basis
+from chebsplat.stages.train import guidance
 from chebsplat.training import prune, sh_mask_network
 from chebsplat.training.sh_mask_network import BandMaskNetwork, nested, region_histograms
 
@@ -173,3 +174,18 @@ def test_regions_without_members_or_of_one_colour_have_finite_histograms(scene):
     assert coefficients.grad.isfinite().all()
     one_bin = region_histograms(scene["coefficients"], scene["directions"], scene["members"], 1)
     assert torch.allclose(one_bin, torch.ones_like(one_bin))
+
+
+def test_what_guidance_changed_is_read_off_a_finished_training():
+    features = np.repeat(np.eye(2, dtype=np.float32), 30, axis=0)
+    fused = features.copy()
+    fused[:6] = [0, 1]
+    degrees = np.r_[np.full(30, 3), np.zeros(30)].astype(np.uint8)
+    parameters = {"features": features, "fused": fused, "degrees": degrees}
+    mask = np.r_[np.full(30, 0.9), np.full(30, 0.5)].astype(np.float32)
+    found = guidance(parameters, mask, np.eye(2, dtype=np.float32))
+    assert found["labels_changed"] == 0.1
+    assert found["mask_spread"] == pytest.approx((0.9 - (30 * 0.5 + 6 * 0.9) / 36) / 2)
+    assert found["band_spread"] == pytest.approx((1 - (30 / 16 + 6) / 36) / 2)
+    alone = guidance({"features": features, "degrees": degrees}, None, np.eye(2, dtype=np.float32))
+    assert alone["labels_changed"] is None and alone["mask_spread"] is None

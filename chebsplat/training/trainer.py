@@ -119,6 +119,11 @@ class Trainer:
         return self.model.soft_mask(torch.arange(len(self.model)), features)
 
     @torch.no_grad()
+    def final_mask(self) -> Tensor | None:
+        """m̂ [N] of all Gaussians as they are, None without pruning."""
+        return self._soft_mask(self.share)
+
+    @torch.no_grad()
     def _features(self, share: float) -> Tensor | None:
         """Of all Gaussians, fused where they are rendered so; encodings are as the last refresh or step left them."""
         features, shape = self.model.raw.get("features"), self.model.shape

@@ -41,6 +41,9 @@ FIGURES = (
     Figure("ssim", "SSIM", 4),
     Figure("n_gaussians", "Gaussians", 0, 1, True),
     Figure("sh_kept", "SH coefficients kept, %", 1, 100),
+    Figure("labels_changed", "labels that shape changed, %", 2, 100),
+    Figure("mask_spread", "spread of m̂ between classes", 3),
+    Figure("band_spread", "spread of SH kept between classes", 3),
     Figure("bytes_ply", "PLY, MB", 2, 1e-6, True),
     Figure("bytes_ragged", "ragged, MB", 2, 1e-6, True),
     Figure("frames_per_second", "frames/s", 1, 1, True),
@@ -80,7 +83,7 @@ def row_of(run: Run, failed: dict[str, tuple[int, str, Path]]) -> Row:
     trace = read_trace(targets["train"], train)
     segmentation = figures.get("segmentation") or {}
     row |= segmented(segmentation.get("scene", {}), segmentation.get("teacher", {}))
-    counts = summary["by_degree"]
+    counts, guidance = summary["by_degree"], train.facts.get("guidance", {})
     kept = sum(n * (degree + 1) ** 2 for degree, n in enumerate(counts))
     return row | {
         "state": "done",
@@ -90,6 +93,7 @@ def row_of(run: Run, failed: dict[str, tuple[int, str, Path]]) -> Row:
         "ssim": figures["image"]["ssim"],
         "n_gaussians": figures["n_gaussians"],
         "sh_kept": kept / (16 * sum(counts)),
+        **{key: guidance.get(key) for key in ("labels_changed", "mask_spread", "band_spread")},
         "bytes_ply": figures["bytes"]["ply"],
         "bytes_ragged": figures["bytes"]["ragged"],
         "frames_per_second": figures["frames_per_second"].get("color"),
