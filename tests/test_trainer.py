@@ -53,6 +53,14 @@ def test_closed_bands_leave_parameters_and_moments_and_the_picture_stays(tiny_tr
     assert not parameters["shN"][absent].any()
 
 
+@pytest.mark.parametrize("steps", [1, 3, 6])
+def test_a_training_of_few_steps_does_not_grow_after_the_freeze(tiny_trainer, steps):
+    made = tiny_trainer(steps=steps, n_densify=12, grow_threshold=1e-12)
+    for _ in made.steps():
+        pass
+    assert made.population.n_grown < 12 and len(made.finish()["degrees"]) == len(made.model)
+
+
 def test_a_band_that_nobody_keeps_is_gone(tiny_trainer):
     made = tiny_trainer(densify="off")
     with torch.no_grad():
