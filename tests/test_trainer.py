@@ -53,9 +53,11 @@ def test_closed_bands_leave_parameters_and_moments_and_the_picture_stays(tiny_tr
     assert not parameters["shN"][absent].any()
 
 
-@pytest.mark.parametrize("steps", [1, 3, 6])
+@pytest.mark.parametrize("steps", [1, 6])
 def test_a_training_of_few_steps_does_not_grow_after_the_freeze(tiny_trainer, steps):
-    made = tiny_trainer(steps=steps, n_densify=12, grow_threshold=1e-12)
+    made = tiny_trainer(steps=steps, n_densify=12, grow_threshold=1e-12, lr_sh_masks=0.0, densify="classic")
+    with torch.no_grad():
+        made.model.raw["sh_logits"][::2] = -8.0
     for _ in made.steps():
         pass
     assert made.population.n_grown < 12 and len(made.finish()["degrees"]) == len(made.model)

@@ -89,8 +89,8 @@ class Trainer:
     def _adapt(self, share: float) -> None:
         """Growth, pruning, the freeze and refreshes that are due after a step."""
         due = self.step % self.settings.refresh_every == 0
-        open_bands = not self.schedule.freezes_bands(share)  # a training of few steps does not catch up after the freeze
-        growing = open_bands and self.schedule.grown(share) > self.population.n_grown
+        frozen = self.schedule.freezes_bands(share)  # a training of few steps does not catch up on growth
+        growing = not frozen and self.schedule.grown(share) > self.population.n_grown
         removing = growing or (self.schedule.has_grown(share) and self.step % 200 == 0)
         if growing or due:
             self._drop_broken()
@@ -101,7 +101,7 @@ class Trainer:
             self.population.remove(self.optimizer, mask)
         if removing or due:
             self.refresh()
-        if self.schedule.freezes_bands(share) and "sh_logits" in self.model.raw:
+        if frozen and "sh_logits" in self.model.raw:
             self.population.freeze_bands(self.optimizer, self._features(share))
             self.refresh()
 
