@@ -55,7 +55,7 @@ def test_closed_bands_leave_parameters_and_moments_and_the_picture_stays(tiny_tr
 
 @pytest.mark.parametrize("steps", [1, 6])
 def test_a_training_of_few_steps_does_not_grow_after_the_freeze(tiny_trainer, steps):
-    made = tiny_trainer(steps=steps, n_densify=12, grow_threshold=1e-12, lr_sh_masks=0.0, densify="classic")
+    made = tiny_trainer(steps=steps, n_densify=12, max_gaussians=3000, lr_sh_masks=0.0, densify="classic")
     with torch.no_grad():
         made.model.raw["sh_logits"][::2] = -8.0
     for _ in made.steps():
