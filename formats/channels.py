@@ -60,10 +60,12 @@ class ChannelMap:
 
 
 def tensors(channels: ChannelMap) -> dict[str, np.ndarray]:
+    """The arrays of a channel map by name, float32."""
     return {name: getattr(channels, name).astype(np.float32) for name in SPECS}
 
 
 def from_parts(arrays: Mapping[str, np.ndarray], document: Mapping[str, Any]) -> ChannelMap:
+    """The channel map whose arrays and document these are, read elsewhere."""
     return ChannelMap(**{name: arrays[name] for name in SPECS}, teacher=document["teacher"], notes=document["notes"])
 
 

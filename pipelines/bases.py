@@ -46,14 +46,17 @@ def head_folder(name: str) -> Path:
 
 
 def head_names() -> list[str]:
+    """HEADs in the work folder, sorted."""
     return sorted(path.name.removeprefix(PREFIX) for path in store.work().glob(f"{PREFIX}*") if path.is_dir())
 
 
 def is_folder(text: str) -> bool:
+    """Whether a reference names an exported folder: it has a slash, and is one."""
     return "/" in text and Path(text).expanduser().is_dir()
 
 
 def is_sequence(name: str) -> bool:
+    """Whether a reference names a sequence, of ours or by a .toml file."""
     return name in names("sequences") or name.endswith(".toml")
 
 

@@ -13,6 +13,7 @@ from chebsplat.stages.registry import STAGES
 
 
 def is_artifact(path: Path) -> bool:
+    """Whether a folder is an artifact: it has a manifest."""
     return os.path.isfile(path / "artifact.json")
 
 
@@ -69,6 +70,7 @@ def holder(artifact: Path) -> Path | None:
 
 
 def unknown(scene: str, name: str | None) -> ConfigError | InputError:
+    """The error for a scene that is not there, with the nearest names."""
     where = f"no finished scene in {store.work()}"
     if os.path.isdir(os.path.expanduser(scene)):
         return InputError(f"{shown(scene)} is {where}, nor the folder of one; run it first: make scene={shown(scene)}")

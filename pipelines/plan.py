@@ -85,6 +85,7 @@ def suffix(settings: str) -> str:
 
 
 def merged(base: dict[str, Any], over: dict[str, Any]) -> dict[str, Any]:
+    """Settings by section, `over` winning key by key."""
     return base | {s: base.get(s, {}) | v if isinstance(v, dict) else v for s, v in over.items()}
 
 

@@ -117,7 +117,8 @@ def snakemake(steps: list[Step], cores: int, threads: int | None = None, device:
 
 def write_plan(entries: list[dict[str, Any]]) -> Path:
     """The plan of a run, in a folder of its own with each job's config; as long as this process lives, `clean-stale`
-    spares what it names."""
+    spares what it names.
+    """
     raw = {f"{item['stage']}-{item['key']}.raw.json": item.pop("raw") for item in entries}
     text = json.dumps({"steps": entries}, indent=1)
     folder = store.work() / ".plans" / f"{hashlib.sha256(text.encode()).hexdigest()[:16]}-{os.getpid()}"
@@ -153,6 +154,7 @@ def failures(steps: list[Step], folder: Path, words: Path) -> Outcome:
 
 
 def last_word(log: Path) -> str:
+    """The last line of a log."""
     lines = log.read_text().strip().splitlines() if log.is_file() else []
     return lines[-1] if lines else "no message"
 

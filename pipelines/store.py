@@ -31,10 +31,12 @@ def make_work() -> None:
 
 
 def artifact_path(stage: str, key: str) -> Path:
+    """Where the artifact of a stage and key lies, or will."""
     return work() / "store" / stage / key
 
 
 def say(text: str) -> None:
+    """Print a line to stderr at once."""
     print(text, file=sys.stderr, flush=True)
 
 

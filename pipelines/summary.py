@@ -28,6 +28,7 @@ def number(figures: Any, *keys: str) -> float | None:
 
 
 def text(form: str, value: float | None) -> str:
+    """A value in a format, empty for None."""
     return "" if value is None else form.format(value)
 
 
@@ -55,6 +56,7 @@ def table(evaluation: Path) -> list[tuple[str, str, str]]:
 
 
 def scaled(size: float | None) -> float | None:
+    """Bytes as MB."""
     return None if size is None else size / 1e6
 
 

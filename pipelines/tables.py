@@ -14,5 +14,6 @@ def aligned(rows: Sequence[Sequence[str]]) -> list[str]:
 
 
 def show_rows(rows: Sequence[Sequence[str]]) -> None:
+    """Print rows in aligned columns."""
     for line in aligned(rows):
         print(line)

@@ -119,6 +119,7 @@ def reference(settings: ChannelsSection) -> tuple[Iterator[tuple[str, np.ndarray
 
 
 def photos(files: list[Path]) -> Iterator[tuple[str, np.ndarray]]:
+    """Names and u8 images [H, W, 3] of files. Raises InputError on one that cannot be read."""
     for file in files:
         yield str(file), read_rgb(file, "correct channels.reference")
 

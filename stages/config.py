@@ -71,6 +71,7 @@ def checked(model: type[Model], values: Any, origin: str, error: type[ChebsplatE
 
 
 def known_keys() -> list[str]:
+    """Every setting as `section.key`."""
     return [f"{s}.{k}" for s, f in Config.model_fields.items() for k in f.annotation.model_fields]  # type: ignore[union-attr]
 
 

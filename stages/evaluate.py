@@ -93,6 +93,7 @@ def run(job: Job) -> None:
 
 
 def camera(scene: Scene, index: int) -> View:
+    """The view of a scene's camera `index`."""
     import torch
 
     from chebsplat.views import View
@@ -114,6 +115,7 @@ def placed(depth: np.ndarray, view: View) -> np.ndarray:
 
 
 def task(job: Job, capture: Capture, scene: Scene, renderer: SceneRenderer) -> Any:
+    """What a protocol needs beside the views: classes, and features at points of surfaces."""
     from chebsplat.evaluation.protocols.task import Task
     from chebsplat.evaluation.surface import features_at
 

@@ -79,10 +79,12 @@ class Graph:
 
 
 def number(value: float) -> np.ndarray:
+    """A float32 constant []."""
     return np.array(value, np.float32)
 
 
 def whole(*values: int) -> np.ndarray:
+    """An int64 constant [n]."""
     return np.array(values, np.int64)
 
 

@@ -180,6 +180,7 @@ def summary_rows(figures: dict[str, Any], by_degree: list[int] | None, trained: 
 
 
 def write_table(path: Path, rows: list[list[Any]]) -> None:
+    """Write rows as CSV."""
     with path.open("w", newline="") as handle:
         csv.writer(handle).writerows(rows)
 

@@ -15,6 +15,7 @@ from chebsplat.stages.label_space import MAX_CHANNELS
 
 
 def printable(text: str) -> str:
+    """The text itself. Raises ValueError if it holds characters that cannot be printed."""
     if unprintable(text):
         raise ValueError(f"{text[:60]!r} holds characters that cannot be printed")
     return text
@@ -59,7 +60,8 @@ class SfmSection(Section):
 
 class TeacherSection(Section):
     """`auto`: the ONNX model if one is given, otherwise the embedded teacher; `labels`: the noisy-labels teacher;
-    `given`: pseudo labels with a confidence that the source brings (Panoptic Lifting's ScanNet)."""
+    `given`: pseudo labels with a confidence that the source brings (Panoptic Lifting's ScanNet).
+    """
 
     kind: Literal["auto", "labels", "given", "onnx", "none"] = setting("auto", "the 2D teacher; none: colour only")
     downscale: int = number(4, "pixels of a view that an entry of its map is wide; a coarser model's own", 1, 32)

@@ -52,7 +52,8 @@ class Asked:
     def insist(self, wakened: int, over: threading.Event) -> None:
         """A thread's work: once asked, leave in time, whether the main thread has come to hear of it or not.
 
-        wakened: file descriptor where signals arrive."""
+        wakened: file descriptor where signals arrive.
+        """
         while (data := os.read(wakened, 1)) and data[0] not in SIGNALS:
             pass
         until = time.monotonic() + self.seconds

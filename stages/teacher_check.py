@@ -59,6 +59,7 @@ def check(model: Path, photo: Path | None = None, labels: str | None = None) -> 
 
 
 def n_windows(size: tuple[int, int], window: tuple[int, int]) -> int:
+    """How many windows (H, W) cover an image (H, W)."""
     from chebsplat.labels.tiling import window_starts
 
     rows, columns = (window_starts(n, side) for n, side in zip(size, window, strict=True))

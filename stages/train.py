@@ -198,10 +198,12 @@ def shown(trace: list[dict[str, float]]) -> dict[str, str]:
 
 
 def expected(trainer: Trainer) -> int:
+    """How many steps there will be, for the progress line."""
     return trainer.schedule.last_step(trainer.step, trainer.seconds)
 
 
 def state(trainer: Trainer, trace: list[dict[str, float]], since: list[dict[str, float]], job: Job) -> dict[str, Any]:
+    """All that a resumed training goes on from."""
     resumed = job.facts.get("resumed_at", [])
     return {"trainer": trainer.state_dict(), "trace": trace, "since": since, "resumed_at": resumed}
 

@@ -21,6 +21,7 @@ def table() -> tuple[list[str], np.ndarray]:
 
 
 def main() -> None:
+    """Write the table of nouns and their embeddings."""
     try:
         names, embeddings = table()
     except ModuleNotFoundError as error:

@@ -70,6 +70,7 @@ def house(folder: Path, names: list[str]) -> Iterator[View]:
 
 
 def figures(matrix: np.ndarray, names: list[str]) -> dict[str, Any]:
+    """mIoU, mAcc, OA and IoU by class of a confusion matrix [L, L], to four digits."""
     found = segmentation(matrix)
     iou = {name: round(float(v), 4) for name, v in zip(names, found.iou, strict=True) if not np.isnan(v)}
     return {"miou": round(found.miou, 4), "macc": round(found.macc, 4), "oa": round(found.oa, 4), "iou": iou}
@@ -115,6 +116,7 @@ def measured(model: Path, data: Path, threads: int) -> dict[str, Any]:
 
 
 def house_figures(encode: Callable, folder: Path, asked: list[str], texts: np.ndarray) -> dict[str, Any]:
+    """Figures of an encoder over the views of a modelled house, and the share of pixels that count."""
     matrix, counted, total, views = np.zeros((len(asked),) * 2, np.int64), 0, 0, 0
     for image, truth in house(folder, asked):
         matrix += confusion(labelled(encode(image), texts, *truth.shape), truth, len(asked))

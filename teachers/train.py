@@ -56,6 +56,7 @@ def normalized(images: Tensor) -> Tensor:
 
 
 def rate(step: int, steps: int) -> float:
+    """Factor of the learning rate at a step: a short warm-up, then half a cosine."""
     return min(1.0, (step + 1) / WARM_UP) * 0.5 * (1 + float(np.cos(np.pi * step / steps)))
 
 

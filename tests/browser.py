@@ -1,5 +1,6 @@
 """What a real browser makes of a page: errors, requests, width, what is cut off or scrolls sideways, and what its
-slider shows in every mode."""
+slider shows in every mode.
+"""
 
 import json
 import shutil

@@ -41,7 +41,8 @@ Timed = dict[str, float]  # milliseconds by name
 
 def take_turns(variants: dict[str, tuple[int, Callable[[], object]]], rounds: int) -> Timed:
     """Fastest of `rounds` by name; variants are (threads, action). Each turn begins with a run that does not count:
-    it fills the caches, and starts as many threads."""
+    it fills the caches, and starts as many threads.
+    """
     best = dict.fromkeys(variants, np.inf)
     for _ in range(rounds):
         for name, (n, action) in variants.items():

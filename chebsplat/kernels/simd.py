@@ -52,6 +52,7 @@ def address(context: Any, builder: Any, kind: Any, value: Any, index: Any, to: i
 
 
 def broadcast(builder: Any, scalar: Any, width: int = 16) -> Any:
+    """A vector of `width` lanes that all hold `scalar`."""
     vector = ir.VectorType(FLOAT, width)
     one = builder.insert_element(ir.Constant(vector, ir.Undefined), scalar, ir.Constant(INT, 0))
     zeros = ir.Constant(ir.VectorType(INT, width), [0] * width)
@@ -125,7 +126,6 @@ def fnma(_typing, a, b, c):
 @intrinsic
 def magnitude(_typing, value):
     """|value|."""
-
     return signature(F16, F16), lambda context, builder, sig, args: _call(builder, "fabs", args[0])
 
 

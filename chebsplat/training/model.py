@@ -39,7 +39,8 @@ class Auxiliary:
 @dataclass
 class Rendered:
     """rgb [H, W, 3], alpha [H, W, 1], features [H, W, C], [h, w, C] by cell of the rasterizer, or None; `index` [V]
-    the Gaussians in the frustum, with `means2d` [1, V, 2] and `radii` [1, V, 2] in `meta`."""
+    the Gaussians in the frustum, with `means2d` [1, V, 2] and `radii` [1, V, 2] in `meta`.
+    """
 
     rgb: Tensor
     alpha: Tensor

@@ -70,7 +70,8 @@ class BandMaskNetwork(nn.Module):
 
     def forward(self, logits: Tensor, features: Tensor | None, histograms: Tensor | None, nearest: Tensor) -> Tensor:
         """logits ψ [V, 3]; features [V, C], None where C = 0; histograms [M, 4, n_bins], None without guidance; nearest
-        i64 [V] of their rows, -1 for none."""
+        i64 [V] of their rows, -1 for none.
+        """
         v = logits.clamp(-MAX_LOGIT, MAX_LOGIT)
         if self.guided:
             if histograms is None or (features is None and self.n_channels):

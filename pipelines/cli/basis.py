@@ -24,6 +24,7 @@ def basis() -> None:
 
 
 def newest(name: str) -> tuple[Path, Basis]:
+    """Path and content of a basis' newest revision. Raises ConfigError on an unknown name."""
     from chebsplat.formats.basis import read_basis
     from chebsplat.pipelines.bases import revisions
 

@@ -19,6 +19,7 @@ CLICK = (click.ClickException, click.Abort, click.exceptions.Exit)
 
 
 def say(text: str) -> None:
+    """Print a line of ours to stderr, where that is possible."""
     with suppress(OSError):  # the terminal may be gone, and the disk of a log full
         print(f"chebsplat: {text}", file=sys.stderr)
 

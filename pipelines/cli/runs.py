@@ -69,6 +69,7 @@ ON_DEVICE = click.option("--device", type=click.Choice(DEVICES), default="auto",
 
 
 def with_scene(command: Any) -> Any:
+    """Give a command the options that choose a scene and its settings."""
     for option in reversed(OPTIONS):
         command = option(command)
     return command

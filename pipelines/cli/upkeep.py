@@ -47,6 +47,7 @@ def rm(scenes: tuple[str, ...], yes: bool) -> None:
 
 
 def show_sizes(sizes: list, done: bool, advice: str) -> None:
+    """Print folders with their sizes in MB, and the total; `advice` says what to do, unless it is done."""
     for path, size in sizes:
         print(f"{size / 2**20:9.1f} MB  {path}")
     total = sum(size for _, size in sizes) / 2**20

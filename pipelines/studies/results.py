@@ -163,7 +163,8 @@ def groups(rows: list[Row], *names: str) -> dict[tuple, list[Row]]:
 
 def counted(rows: list[Row]) -> list[Row]:
     """Without the first scene of a sequence, which has no earlier knowledge, and scenes that come again, which know
-    themselves."""
+    themselves.
+    """
     return [row for row in rows if row["place"] != 1 and row["visit"] == 1]
 
 

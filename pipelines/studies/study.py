@@ -82,7 +82,8 @@ class Study(Section):
 @dataclass(frozen=True)
 class Run:
     """One point of a study. `place` counts from 1 within a sequence, and `visit` how often its scene has come; 0 and 1
-    outside one."""
+    outside one.
+    """
 
     condition: str
     variant: str
@@ -122,6 +123,7 @@ def read_study(name: str) -> Study:
 
 
 def checked_study(values: dict[str, Any], origin: str) -> Study:
+    """The study that a .toml's values describe. Raises ConfigError naming `origin` and the key."""
     return checked(Study, values, origin)
 
 

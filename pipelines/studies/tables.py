@@ -25,6 +25,7 @@ class Section:
 
 
 def number(value: float, figure: Figure) -> str:
+    """A value in its figure's scale and digits."""
     return f"{value * figure.scale:,.{figure.digits}f}"
 
 

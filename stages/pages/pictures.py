@@ -88,6 +88,7 @@ def data_uri(image: np.ndarray, photo: bool = False) -> str:
 
 
 def png(image: np.ndarray, path: Any) -> None:
+    """Write an image u8 [H, W, 3] to a path or a file as PNG."""
     from PIL import Image
 
     Image.fromarray(image).save(path, "PNG")

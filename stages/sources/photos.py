@@ -21,6 +21,7 @@ def read(folder: Path, settings: Any, class_names: tuple[str, ...] | None = None
 
 
 def probe(folder: Path) -> dict[str, bool]:
+    """What a folder of photos brings beside them: nothing."""
     return {"poses": False, "depth": False, "labels": False}
 
 
