@@ -24,7 +24,7 @@ from chebsplat.shape.encoder import RegionEncoder
 from chebsplat.shape.region_inputs import RegionInputs
 from chebsplat.stages.command import n_threads
 from chebsplat.stages.encode import CHUNK, gaussians, inputs_of, opened
-from chebsplat.stages.onnx import restored_fusion
+from chebsplat.stages.onnx import restored_fusion, trained_with
 
 
 def chunks(inputs: RegionInputs) -> list[dict[str, np.ndarray]]:
@@ -71,7 +71,8 @@ def main(arguments: Sequence[str]) -> None:
     inputs = inputs_of(p, DescribeSection.model_validate(settings["describe"]), settings)
     checkpoint, parts = read_gaussians(options.work / "train"), chunks(inputs)
     single, double = (RegionEncoder.restored(*checkpoint.encoder()) for _ in range(2))
-    double, fusion = double.double(), restored_fusion(checkpoint, settings["n_channels"])
+    train = trained_with(arguments.work / "train")["train"]
+    double, fusion = double.double(), restored_fusion(checkpoint, settings["n_channels"], train)
     exact = torch_route(double, parts, torch.float64)()
     routes = {
         "torch, float32": torch_route(single, parts, torch.float32),

@@ -41,11 +41,21 @@ class DescribeSection(Section):
     n_angles: int = number(8, "rotations of the anisotropic metric (J)", 1, 64)
     max_degree: int = number(8, "degree of the Chebyshev descriptor (D)", 2, 64)
     anisotropy: float = number(10.0, "of the metric (a); 0: isotropic", 0, 1e4)
+    metric: Literal["relative", "printed"] = setting(
+        "relative", "scales relative to the region's median; printed: in scene units"
+    )
+    axis: Literal["tangent", "world"] = setting(
+        "tangent", "that metrics turn about: the region's own; world: z for all (printed)"
+    )
     bandwidth: float = number(0.7, "of the edge weights, relative to a region's radius", 1e-3, 1e3)
     spectrum: Literal["full", "taper", "hard"] = setting("full", "eigenvalues that count; hard: the paper's cut")
     n_eigs: int = number(16, "eigenvalues kept by taper and hard (K)", 1, 64)
+    from_degree: int | None = number(None, "first degree; default: 2 (0 and 1 are constant), 0 of a cut spectrum", 0, 2)
     region_size: int = number(32, "Gaussians in a region, at most", 4, 64)
     n_regions: int = number(768, "regions that cover the scene", 1, 200_000)
+    radius: float | None = number(None, "of regions, scene units; default: such that they cover the scene", 1e-9, 1e9)
+    overlap: float = number(1.5, "radius of regions over the least that covers the scene", 1, 10)
+    thinning: bool = setting(True, "members from a thinned set, to fill a region; false: the nearest to its centre")
     seed: int = seed("of the choice of regions")
 
     @model_validator(mode="after")
@@ -90,6 +100,15 @@ class TrainSection(Section):
     sh_guided: bool = setting(True, "false: nothing but a Gaussian's own logits closes its SH bands")
     sh_bins: int = number(8, "of the histogram of a region's colours", 1, 64)
     mask_threshold: float = number(0.1, "soft mask below which a Gaussian or an SH band is closed", 1e-3, 0.5)
+    grow_rule: Literal["spacing", "printed"] = setting(
+        "spacing", "candidates by a region's volume in local spacings; printed: in scene units"
+    )
+    grow_density: float = number(0.05, "candidates per unit of that volume (α of Eq 12)", 1e-9, 1e9)
+    grow_candidates: int = number(32, "of a region, at most", 1, 10_000)
+    grow_nearest: float = number(
+        0.5, "least distance of a new Gaussian to the nearest one, in local spacings", 1e-6, 1e3
+    )
+    grow_farthest: float = number(1.5, "largest one", 1e-6, 1e6)
     # sizes
     sh_degree: int = number(3, "of colour, at most", 0, 3)
     max_gaussians: int = number(40_000, "growing stops here; more initial points are thinned", 16, 5_000_000)
@@ -101,6 +120,9 @@ class TrainSection(Section):
     regions_per_step: int = number(32, "encoded anew in such a step; the others come from the cache", 1, 4096)
     n_covers: int = number(4, "regions that reach a Gaussian, at most", 1, 64)
     context: Literal["features", "none"] = setting("features", "what tokens hold beside the descriptor")
+    inflation: float = number(0.25, "of a region's scales where it reaches Gaussians, in radii; 0: printed", 0, 10)
+    temperature: float = number(1.0, "of a region's weight at a Gaussian (τ of Eq 8)", 1e-6, 1e6)
+    gate_start: float = number(3.0, "bias of the fusion's gate at the start; 0: shape and features alike", -10, 10)
     position: Literal["region", "center", "both"] = setting(
         "region", "of a token: from the region's centre in radii, or (printed) the Gaussian's own in the scene"
     )
@@ -111,6 +133,7 @@ class TrainSection(Section):
     densify_until: float = number(0.6, "fraction after which they no longer do", 0, 1)
     n_densify: int = number(12, "how often they grow between the two", 0, 1000)
     prune_from: float = number(0.4, "fraction after which Gaussians are pruned", 0, 1)
+    remove_every: int = number(200, "steps from one pruning to the next, once growth is over", 1, 1_000_000)
     sh_freeze: float = number(0.8, "fraction after which SH bands stay as they are", 0, 1)
     refresh_every: int = number(200, "steps between refreshes of regions and descriptors", 1, 1_000_000)
     refresh_tolerance: float = number(0.0, "change, in radii, that leaves a region's descriptors as they are", 0, 1e3)
@@ -143,6 +166,8 @@ class TrainSection(Section):
     def _fits_together(self) -> TrainSection:
         if self.sh_prune and self.densify != "off" and self.densify_until > self.sh_freeze:
             raise ValueError("densify_until must not lie after sh_freeze, when SH bands are closed for good")
+        if self.grow_nearest >= self.grow_farthest:
+            raise ValueError(f"grow_nearest {self.grow_nearest} must lie below grow_farthest {self.grow_farthest}")
         if self.encoder == "transformer" and self.width % self.n_heads:
             raise ValueError(f"width {self.width} must be a multiple of n_heads {self.n_heads}")
         return self

@@ -20,7 +20,7 @@ def run(job: Job) -> None:
     from chebsplat.formats.descriptors import Descriptors, write_descriptors
     from chebsplat.formats.points import read_points
     from chebsplat.shape.descriptor import describe_members
-    from chebsplat.shape.regions import build_regions
+    from chebsplat.shape.regions import regions_of
     from chebsplat.splats.gaussians import activated, initial_gaussians
 
     settings = job.config.describe
@@ -28,7 +28,7 @@ def run(job: Job) -> None:
     if len(points.means) == 0:
         raise DataFailure("the points artifact holds no points; nothing can be described")
     raw = initial_gaussians(points.means, points.colors, points.covariances)
-    regions = build_regions(points.means, settings.n_regions, settings.region_size, settings.seed)
+    regions = regions_of(points.means, settings)
     # Centred in float64, and only then float32: far from the origin the fractions would be lost.
     means = (points.means - points.means.mean(0)).astype(np.float32)
     _, quats, scales, _ = activated(raw)
@@ -42,6 +42,7 @@ def run(job: Job) -> None:
     job.facts |= {"spectrum": settings.spectrum, "n_in_float64": described.n_exact}
     if settings.spectrum == "hard":
         job.facts |= {"n_cuts": described.n_cuts, "n_cuts_in_clusters": described.n_clustered}
+        job.facts["n_guarded"] = described.n_guarded
     if described.n_clustered:
         where = f"{described.n_clustered} of {described.n_cuts} cuts fell into a cluster of eigenvalues"
         log.warning("%s: values there depend on round-off; describe.spectrum = 'taper' does not cut", where)

@@ -36,11 +36,12 @@ def run(job: Job) -> None:
     path = job.inputs["gaussians"]
     gaussians = read_gaussians(path)
     encoder = restored_encoder(path, gaussians)
-    fusion = fitting(path, lambda: restored_fusion(gaussians, encoder.n_channels))
-    agreed = contract(encoder, trained_with(path))
+    config = trained_with(path)
+    fusion = fitting(path, lambda: restored_fusion(gaussians, encoder.n_channels, config["train"]))
+    agreed = contract(encoder, config)
     opset = job.config.onnx.opset
     onnx.save(encoder_model(encoder, opset), job.out / FLOAT)
-    onnx.save(fusion_model(fusion.gate, opset), job.out / FUSED)
+    onnx.save(fusion_model(fusion, opset), job.out / FUSED)
     quantize(job.out / FLOAT, job.out / DYNAMIC)
     for name in (FLOAT, FUSED, DYNAMIC):
         annotate(job.out / name, agreed)
@@ -74,8 +75,8 @@ def trained_with(path: Path) -> dict[str, Any]:
     }
 
 
-def restored_fusion(gaussians: Any, n_channels: int) -> Any:
-    """`fusion.Fusion` with the checkpoint's gate."""
+def restored_fusion(gaussians: Any, n_channels: int, train: dict[str, Any]) -> Any:
+    """`fusion.Fusion` with the checkpoint's gate; train: the section that it was trained with."""
     import torch
 
     from chebsplat.shape.fusion import Fusion, Gate
@@ -84,7 +85,7 @@ def restored_fusion(gaussians: Any, n_channels: int) -> Any:
     gate.load_state_dict(
         {k.removeprefix(prefix): torch.from_numpy(v) for k, v in gaussians.modules.items() if k.startswith(prefix)}
     )
-    return Fusion(gate).eval()
+    return Fusion(gate, train["inflation"], train["temperature"]).eval()
 
 
 def example(encoder: Any, n_regions: int, n_members: int, seed: int = 0) -> dict[str, Any]:

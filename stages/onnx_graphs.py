@@ -16,7 +16,7 @@ if TYPE_CHECKING:
     from torch import nn
 
     from chebsplat.shape.encoder import Attention, Block, RegionEncoder
-    from chebsplat.shape.fusion import Gate
+    from chebsplat.shape.fusion import Fusion
 
 Value = Any  # the name of what a node makes, a torch tensor, or a NumPy constant
 
@@ -158,9 +158,10 @@ def _pooled(graph: Graph, tokens: str) -> str:
     return graph.add("Where", graph.add("Cast", members, to=TensorProto.BOOL), highest, number(0))
 
 
-def fusion_model(gate: Gate, opset: int) -> ModelProto:
+def fusion_model(fusion: Fusion, opset: int) -> ModelProto:
     """`Fusion.forward`: features, encodings and where regions lie -> fused, gate [gaussians, C]."""
-    n_channels, kind = gate.linear.out_features, TensorProto.FLOAT
+    linear, kind = fusion.gate.linear, TensorProto.FLOAT
+    n_channels = linear.out_features
     graph = Graph(
         features=(kind, ["gaussians", n_channels]),
         encodings=(kind, ["regions", n_channels]),
@@ -172,11 +173,11 @@ def fusion_model(gate: Gate, opset: int) -> ModelProto:
         radius=(kind, []),
     )
     index = graph.add("Max", "cover", whole(0))
-    weights = graph.add("Unsqueeze", _propagation_weights(graph, index), whole(2))
+    weights = graph.add("Unsqueeze", _propagation_weights(graph, index, fusion), whole(2))
     carried = graph.add("Mul", graph.add("Gather", "encodings", index), weights)
     shape = graph.add("ReduceSum", carried, whole(1), keepdims=0)
     nearest = graph.add("Slice", "cover", whole(0), whole(1), whole(1))
-    logits = graph.linear(graph.add("Concat", shape, "features", axis=-1), gate.linear)
+    logits = graph.linear(graph.add("Concat", shape, "features", axis=-1), linear)
     covered = graph.add("GreaterOrEqual", nearest, whole(0))
     share = graph.add("Where", covered, graph.add("Sigmoid", logits), number(1))
     rest = graph.add("Mul", graph.add("Sub", number(1), share), shape)
@@ -185,22 +186,20 @@ def fusion_model(gate: Gate, opset: int) -> ModelProto:
     return graph.model("fusion", opset, fused=(fused, size), gate=(share, size))
 
 
-def _propagation_weights(graph: Graph, index: str) -> str:
-    """`fusion.propagation_weights` [gaussians, covers] (Eq 8), with its default inflation and temperature."""
-    from inspect import signature
+def _propagation_weights(graph: Graph, index: str, fusion: Fusion) -> str:
+    """`fusion.propagation_weights` [gaussians, covers] (Eq 8)."""
+    from chebsplat.shape.fusion import LEAST
 
-    from chebsplat.shape.fusion import propagation_weights
-
-    settings = {name: entry.default for name, entry in signature(propagation_weights).parameters.items()}
     away = graph.add("Sub", graph.add("Unsqueeze", "means", whole(1)), graph.add("Gather", "centers", index))
     away = graph.add("Unsqueeze", graph.add("Div", away, "radius"), whole(3))
     turned = graph.add("Mul", graph.add("Gather", _rotations(graph), index), away)
     local = graph.add("ReduceSum", turned, whole(2), keepdims=0)
     spread = graph.add("Div", graph.add("Gather", "scales", index), "radius")
-    variances = graph.add("Add", graph.add("Mul", spread, spread), number(settings["inflation"] ** 2))
+    variances = graph.add("Add", graph.add("Mul", spread, spread), number(fusion.inflation**2))
+    variances = graph.add("Max", variances, number(LEAST))
     distances = graph.add("Div", graph.add("Mul", local, local), variances)
     logits = graph.add("Neg", graph.add("ReduceSum", distances, whole(2), keepdims=0))
-    logits = graph.add("Div", logits, number(settings["temperature"]))
+    logits = graph.add("Div", logits, number(fusion.temperature))
     present = graph.add("GreaterOrEqual", "cover", whole(0))
     count = graph.add("ReduceMax", graph.add("Cast", present, to=TensorProto.INT32), whole(1), keepdims=1)
     covered = graph.add("Cast", count, to=TensorProto.BOOL)

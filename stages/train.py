@@ -73,6 +73,8 @@ def run(job: Job) -> None:
         encoder = model.shape.encoder
         notes["encoder"] = {"n_inputs": encoder.n_inputs, "n_channels": encoder.n_channels} | encoder.settings
         job.facts["described_anew"] = model.shape.described.share_described
+        if train.inflation == 0:
+            job.facts["guarded"] = model.shape.share_undefined
     if model.shape is not None and features is not None:
         job.facts["encoder"] = agreement(model.shape.alone().numpy(), parameters["features"], features.label_embeddings)
     if features is not None:

@@ -15,6 +15,7 @@ class Region(NamedTuple):
     scales: Tensor  # [M, n, 3]
     rotmats: Tensor  # [M, n, 3, 3]
     mask: Tensor  # [M, n] bool, false where padded or not finite
+    unit: Tensor  # [M, 1, 1], scene units
 
 
 def canonicalize(means: Tensor, scales: Tensor, rotmats: Tensor, mask: Tensor) -> Region:
@@ -43,16 +44,20 @@ def canonicalize(means: Tensor, scales: Tensor, rotmats: Tensor, mask: Tensor) -
     radius = torch.where(square > 0, square, 1.0).sqrt()  # the root of 0 has no gradient
     scales = torch.where(keep, scales.double() / extent / radius, 0.0)
     rotmats = torch.where(keep[..., None], rotmats.double(), torch.eye(3, dtype=torch.float64))
-    return Region(means / radius, scales, rotmats, mask)
+    return Region(means / radius, scales, rotmats, mask, extent * radius)
 
 
-def metric_factors(region: Region, anisotropy: float) -> Tensor:
+def metric_factors(region: Region, anisotropy: float, *, printed: bool = False) -> Tensor:
     """Y_i = diag(sqrt(m_i)) R_iᵀ with m_ik = 1 / (1 + a (s_ik / s̃)²) (Eq 1); |Y_i Δ|² is the squared length of Δ.
 
+    Args: printed: m_ik = 1 / (1 + a s_ik²) in scene units.
     Returns: [M, n, 3, 3].
     Choices: s̃ is the region's median largest scale, so that anisotropy does not fade with the scene's units; a region
     whose s̃ is 0 is isotropic wherever its scales are 0.
     """
+    if printed:
+        lengths = anisotropy**0.5 * region.scales * region.unit
+        return (1 / torch.hypot(torch.ones_like(lengths), lengths))[..., None] * region.rotmats.transpose(-1, -2)
     largest = region.scales.amax(-1)
     typical = torch.where(region.mask, largest, torch.nan).nanmedian(1).values.nan_to_num(0.0)[:, None, None]
     ratio = torch.where(

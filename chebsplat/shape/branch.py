@@ -11,11 +11,11 @@ from torch import Tensor, nn
 from chebsplat.settings import DescribeSection, TrainSection
 from chebsplat.shape.descriptor import n_degrees
 from chebsplat.shape.encoder import RegionEncoder
-from chebsplat.shape.fusion import Gate, propagate, propagation_weights
+from chebsplat.shape.fusion import Gate, propagate, propagation_weights, share_undefined
 from chebsplat.shape.fusion_kernels import fuse_in_view
 from chebsplat.shape.refresh import Descriptors, GaussianIds
 from chebsplat.shape.region_inputs import placed
-from chebsplat.shape.regions import Regions, build_regions
+from chebsplat.shape.regions import Regions, regions_of
 from chebsplat.splats.rotations import rotation_matrices
 
 CHUNK = 256  # regions that are encoded at once
@@ -46,7 +46,7 @@ class ShapeBranch(nn.Module):
     def __init__(self, n_channels: int, describe: DescribeSection, train: TrainSection):
         super().__init__()
         self.describe, self.train_settings = describe, train
-        per_angle = n_degrees(describe.spectrum, describe.max_degree)
+        per_angle = n_degrees(describe.spectrum, describe.max_degree, describe.from_degree)
         self.n_described = describe.n_angles * per_angle if train.albo else 0
         n_context = n_channels if train.context == "features" else 0
         n_layers = train.n_layers if train.encoder == "transformer" else 0
@@ -57,10 +57,11 @@ class ShapeBranch(nn.Module):
             rms = torch.full((n_context,), n_context**-0.5)
             self.encoder.norm_input.set(self.n_described, torch.zeros(n_context), rms)
         self.keeps_norm = False  # an earlier scene's constants are kept, with its weights
-        self.gate = Gate(n_channels)
+        self.gate = Gate(n_channels, train.gate_start)
         self.regions: Regions | None = None
         self.described = Descriptors(describe, train.refresh_tolerance)
         self.ids = GaussianIds()
+        self.share_undefined = 0.0  # of covered Gaussians, where Eq 8 as printed is 0 / 0
 
     def keep(self, rows: Tensor) -> None:
         """Gaussians were removed, all but `rows` [N] bool; those that are added go behind the others unannounced."""
@@ -97,8 +98,8 @@ class ShapeBranch(nn.Module):
             self.regions, self.ids = None, GaussianIds()
             self.described.forget()
         if regions is None:
-            sizes = self.describe.n_regions, self.describe.region_size, self.describe.seed
-            regions = build_regions(means.double().numpy(), *sizes, ids=self.ids.of(len(means)), earlier=self.regions)
+            places, ids = means.double().numpy(), self.ids.of(len(means))
+            regions = regions_of(places, self.describe, ids=ids, earlier=self.regions)
         self.regions = regions
         self.members, self.centers = torch.as_tensor(regions.members), torch.as_tensor(regions.centers)
         if not self.n_described:
@@ -112,7 +113,11 @@ class ShapeBranch(nn.Module):
         positions, cover = placed(means.numpy(), regions, self.train_settings.n_covers, self.train_settings.position)
         self.positions, self.cover = torch.from_numpy(positions), torch.from_numpy(cover)
         frames, scales = rotation_matrices(quats[self.centers]), log_scales.exp()[self.centers]
-        self.weights = propagation_weights(means, self.cover, means[self.centers], frames, scales, regions.radius)
+        settings, covered = self.train_settings, (self.cover, means[self.centers], frames, scales, regions.radius)
+        inflation, temperature = settings.inflation, settings.temperature
+        self.weights = propagation_weights(means, *covered, inflation=inflation, temperature=temperature)
+        if inflation == 0:
+            self.share_undefined = share_undefined(means, *covered, temperature=temperature)
         parts = torch.arange(len(self.members)).split(CHUNK)
         self.cache = torch.cat([self.encode(raw["features"], part) for part in parts])
 

@@ -1,7 +1,8 @@
 """Chebyshev descriptors of regions of Gaussians (Eqs 4-6).
 
-Two backends agree to float32: `numba` compiles the full spectrum, `reference` (torch) differentiates it, and knows cut
-spectra. Torch is imported where it is needed only: finished scenes are described without it.
+Two backends agree to float32: `numba` compiles the full spectrum, `reference` (torch) differentiates it, and knows
+cut spectra and the printed metric and axis. Torch is imported where it is needed only: finished scenes are described
+without it.
 """
 
 from __future__ import annotations
@@ -18,23 +19,37 @@ if TYPE_CHECKING:
     from torch import Tensor
 
 Spectrum = Literal["full", "taper", "hard"]
+Metric = Literal["relative", "printed"]
+Axis = Literal["tangent", "world"]
+OF_REGIONS = {"n_regions", "region_size", "seed", "radius", "overlap", "thinning"}  # settings of these, not of values
 Values = TypeVar("Values")  # Tensor or np.ndarray
 
 
 class Described(NamedTuple, Generic[Values]):
     """values [M, n, J, P]; of the n_cuts cuts of the spectrum (region and angle), n_clustered fell into a cluster of
-    eigenvalues; n_exact regions took the float64 operator. All counts are 0 where they do not apply.
+    eigenvalues; n_exact regions took the float64 operator; of n_guarded (region and angle, too) the kept eigenvalues
+    are all but 0, where the print divides by them. All counts are 0 where they do not apply.
     """
 
     values: Values
     n_cuts: int = 0
     n_clustered: int = 0
     n_exact: int = 0
+    n_guarded: int = 0
 
 
-def n_degrees(spectrum: Spectrum, max_degree: int) -> int:
-    """P, values of one angle: degrees 2...D of the full spectrum, whose first two vanish, and 0...D of a cut one."""
-    return max_degree - 1 if spectrum == "full" else max_degree + 1
+def n_degrees(spectrum: Spectrum, max_degree: int, from_degree: int | None = None) -> int:
+    """P, values of one angle: degrees 2...D of the full spectrum, whose first two vanish, and 0...D of a cut one,
+    unless `from_degree` says where to begin.
+    """
+    if from_degree is None:
+        from_degree = 2 if spectrum == "full" else 0
+    return max_degree + 1 - from_degree
+
+
+def compiles(spectrum: Spectrum, metric: Metric, axis: Axis) -> bool:
+    """Does the numba backend, and so a machine without torch, know this descriptor?"""
+    return spectrum == "full" and metric == "relative" and axis == "tangent"
 
 
 def describe(
@@ -49,6 +64,9 @@ def describe(
     bandwidth: float = 0.7,
     spectrum: Spectrum = "full",
     n_eigs: int = 16,
+    metric: Metric = "relative",
+    axis: Axis = "tangent",
+    from_degree: int | None = None,
     dtype: torch.dtype | None = None,
     backend: Literal["auto", "numba", "reference"] = "auto",
 ) -> Described[Tensor]:
@@ -58,8 +76,9 @@ def describe(
       means, scales, rotmats, mask: [M, n, ...], as `albo.canonicalize`.
       n_angles, max_degree, anisotropy, bandwidth: J, D, a and the width, as in `settings.DescribeSection`.
       spectrum, n_eigs: `full`, or what `spectra.cut_spectrum` leaves of it, with K = n_eigs.
+      metric, axis, from_degree: the printed ones, as in `settings.DescribeSection`.
       dtype:   of the result, float32 if None; float64 by the reference only.
-      backend: `numba` (full spectrum, float32, no gradient; the same bits for any number of threads), `reference`, or
+      backend: `numba` (what `compiles`, float32, no gradient; the same bits for any number of threads), `reference`, or
         `auto`: numba where it can.
     Returns: values [M, n, J, P], zero where padded and in regions of fewer than two Gaussians, which have no edge. Of
       the full spectrum it is the printed formula with K = n and λ_max = 2, without degrees 0 and 1, which vanish.
@@ -72,19 +91,26 @@ def describe(
     if means.shape != scales.shape or rotmats.shape != (*means.shape, 3) or mask.shape != means.shape[:2]:
         raise ValueError(f"shapes disagree: {means.shape}, {scales.shape}, {rotmats.shape}, {mask.shape}")
     regions, dtype = (means, scales, rotmats, mask), dtype or torch.float32
-    can_compile = spectrum == "full" and dtype == torch.float32 and not any(v.requires_grad for v in regions)
+    differentiable = any(v.requires_grad for v in regions)
+    can_compile = compiles(spectrum, metric, axis) and dtype == torch.float32 and not differentiable
     sizes: dict[str, Any] = {"n_angles": n_angles, "max_degree": max_degree}
     sizes |= {"anisotropy": anisotropy, "bandwidth": bandwidth}
     if backend == "reference" or (backend == "auto" and not can_compile):
         from chebsplat.shape import descriptor_reference
 
-        return descriptor_reference.describe(*regions, **sizes, spectrum=spectrum, n_eigs=n_eigs, dtype=dtype)
-    if backend not in ("auto", "numba"):
+        sizes |= {"spectrum": spectrum, "n_eigs": n_eigs, "metric": metric, "axis": axis}
+        found = descriptor_reference.describe(*regions, **sizes, dtype=dtype)
+    elif backend not in ("auto", "numba"):
         raise ValueError(f"backend {backend!r} is none of auto, numba, reference")
-    if not can_compile:
-        raise ValueError("the numba backend takes the full spectrum in float32 without gradients: use the reference")
-    values, n_exact = _compiled(means.numpy(), scales.numpy(), rotmats.numpy(), mask.numpy(), **sizes)
-    return Described(torch.from_numpy(values), n_exact=n_exact)
+    elif not can_compile:
+        raise ValueError(
+            "the numba backend takes no cut spectrum, printed metric or axis, only float32 and no gradients"
+        )
+    else:
+        values, n_exact = _compiled(means.numpy(), scales.numpy(), rotmats.numpy(), mask.numpy(), **sizes)
+        found = Described(torch.from_numpy(values), n_exact=n_exact)
+    wanted = n_degrees(spectrum, max_degree, from_degree)  # what is missing in front vanishes identically
+    return found._replace(values=torch.nn.functional.pad(found.values, (wanted - found.values.shape[-1], 0)))
 
 
 def describe_members(
@@ -96,21 +122,22 @@ def describe_members(
     *,
     chunk: int = 2048,
 ) -> Described[np.ndarray]:
-    """Descriptors f32 [M, n, J, P] of regions whose members are gathered from Gaussians; torch only if cut.
+    """Descriptors f32 [M, n, J, P] of regions whose members are gathered from Gaussians; torch only if cut or printed.
 
     Args:
       means:   [N, 3] scene units; quats [N, 4] wxyz, of any length; scales [N, 3] standard deviations, scene units.
       members: i64 [M, n], -1 where padded.
       chunk:   regions at a time, at most: bounds memory.
     """
-    full, n = settings.spectrum == "full", n_degrees(settings.spectrum, settings.max_degree)
-    values, counts = np.zeros((*members.shape, settings.n_angles, n), np.float32), np.zeros(3, np.int64)
+    full = compiles(settings.spectrum, settings.metric, settings.axis)
+    n = n_degrees(settings.spectrum, settings.max_degree, settings.from_degree)
+    values, counts = np.zeros((*members.shape, settings.n_angles, n), np.float32), np.zeros(4, np.int64)
     step = chunk if full else min(chunk, 256)
     for start in range(0, len(members), step):
         part = members[start : start + step]
         index = np.maximum(part, 0)
-        described = (_full if full else _cut)(means[index], quats[index], scales[index], part >= 0, settings)
-        values[start : start + step] = described.values
+        described = (_full if full else _reference)(means[index], quats[index], scales[index], part >= 0, settings)
+        values[start : start + step, ..., n - described.values.shape[-1] :] = described.values
         counts += described[1:]
     return Described(values, *counts.tolist())
 
@@ -123,14 +150,14 @@ def _full(
     return Described(values, n_exact=n_exact)
 
 
-def _cut(
+def _reference(
     means: np.ndarray, quats: np.ndarray, scales: np.ndarray, mask: np.ndarray, settings: DescribeSection
 ) -> Described[np.ndarray]:
     import torch
 
     rotmats = rotation_matrices(torch.from_numpy(quats).reshape(-1, 4)).reshape(*mask.shape, 3, 3)
     regions = torch.from_numpy(means), torch.from_numpy(scales), rotmats, torch.from_numpy(mask)
-    parameters = settings.model_dump(exclude={"n_regions", "region_size", "seed"})
+    parameters = settings.model_dump(exclude=OF_REGIONS)
     described = describe(*regions, **parameters, dtype=torch.float64, backend="reference")
     return Described(described.values.float().numpy(), *described[1:])
 

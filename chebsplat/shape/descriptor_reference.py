@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
+import numpy as np
 import torch
 from torch import Tensor
 
 from chebsplat.shape.albo import canonicalize, metric_factors, rotations_about, similarity, tangent_axis
-from chebsplat.shape.descriptor import Described, Spectrum
+from chebsplat.shape.descriptor import Axis, Described, Metric, Spectrum
 from chebsplat.shape.spectra import cut_spectrum
 
 
@@ -45,33 +46,40 @@ def describe(
     bandwidth: float,
     spectrum: Spectrum,
     n_eigs: int,
+    metric: Metric,
+    axis: Axis,
     dtype: torch.dtype,
 ) -> Described[Tensor]:
     """As `descriptor.describe`; `dtype` is that of the recurrence, all before it is float64.
 
     Choices: angles j and J − j are replaced by half their sum and half their absolute difference, so that the sign of
-    the axis does not matter; angles j > 0 fade to angle 0 where the axis is ill-defined; the axis has no gradient.
+    the axis does not matter; angles j > 0 fade to angle 0 where the axis is ill-defined; the axis has no gradient. The
+    world's axis has a sign and is defined everywhere: its angles are as printed.
     """
     region = canonicalize(means, scales, rotmats, mask)
-    factors = metric_factors(region, anisotropy)
-    axis, certainty = tangent_axis(region)
+    factors = metric_factors(region, anisotropy, printed=metric == "printed")
+    around, certainty = tangent_axis(region)
+    if axis == "world":
+        around = around.new_tensor([0.0, 0.0, 1.0]).expand_as(around)
     count = region.mask.sum(1)[:, None, None]
-    angles, n_cuts, n_clustered = [], 0, 0
-    for rotation in rotations_about(axis, n_angles):
+    angles, counts = [], np.zeros(3, np.int64)
+    for rotation in rotations_about(around, n_angles):
         S = similarity(region, factors, rotation, bandwidth)
         if spectrum == "full":
             angles.append(chebyshev_diagonals(S.to(dtype), max_degree) * count)
         else:
             cut = cut_spectrum(S, region.mask, n_eigs, max_degree, hard=spectrum == "hard")
             angles.append(cut.values.to(dtype))
-            n_cuts, n_clustered = n_cuts + cut.n_cuts, n_clustered + cut.n_clustered
+            counts += cut[1:]
     certainty = certainty.to(dtype)[:, None, None]
-    paired = [angles[0]]
-    for j in range(1, n_angles):
+    keep = region.mask[..., None, None] & (count[..., None] > 1)
+    n_cuts, n_clustered, n_guarded = counts.tolist()
+    paired = angles if axis == "world" else angles[:1]
+    for j in range(len(paired), n_angles):
         low, high = angles[min(j, n_angles - j)], angles[max(j, n_angles - j)]
         if j <= n_angles - j:
             paired.append(angles[0] + certainty * (0.5 * (low + high) - angles[0]))
         else:
             paired.append(certainty * 0.5 * (low - high).abs())
-    keep = region.mask[..., None, None] & (count[..., None] > 1)
-    return Described(torch.where(keep, torch.stack(paired, 2), 0.0), n_cuts, n_clustered)
+    values = torch.where(keep, torch.stack(paired, 2), 0.0)
+    return Described(values, n_cuts, n_clustered, n_guarded=n_guarded)

@@ -7,6 +7,8 @@ from torch import Tensor, nn
 
 from chebsplat.splats.rotations import rotation_matrices
 
+LEAST = 1e-30  # of a squared scale in radii: where the print divides by 0
+
 
 def propagation_weights(
     means: Tensor,
@@ -29,16 +31,48 @@ def propagation_weights(
     Returns: [N, k], rows sum to 1, or to 0 for a point that nothing covers.
     Choices: logits −|S⁻¹RᵀΔ|²/temperature with s² + (inflation · radius)² for s², since the centre's own
       deviations give one region all the weight, or NaN; softmax over the regions that cover the point;
-      lengths in radii, so that no unit over- or underflows.
+      lengths in radii, so that no unit over- or underflows. An inflation of 0 is the print, held finite by what no
+      weight shows: the largest logit is subtracted before the exponential, and no variance is below `LEAST`.
     """
-    index = cover.clamp_min(0)
-    local = torch.einsum("nkji,nkj->nki", rotmats[index], (means[:, None] - centers[index]) / radius)
-    variances = (scales[index] / radius) ** 2 + inflation**2
-    logits = -(local**2 / variances).sum(-1) / temperature
+    logits = _logits(means, cover, centers, rotmats, scales, radius, inflation, temperature)
     present = cover >= 0
     absent = ~present & present.any(-1, keepdim=True)  # a point that nothing covers keeps finite logits
     weights = logits.masked_fill(absent, -torch.inf).softmax(-1)
     return torch.where(present, weights, torch.zeros_like(weights))
+
+
+def share_undefined(
+    means: Tensor,
+    cover: Tensor,
+    centers: Tensor,
+    rotmats: Tensor,
+    scales: Tensor,
+    radius: float,
+    *,
+    temperature: float = 1.0,
+) -> float:
+    """Of the points that a region covers, the part whose weights (Eq 8) are 0 / 0 in float32 if computed as printed."""
+    covered = cover[:, 0] >= 0
+    logits = _logits(means, cover, centers, rotmats, scales, radius, 0.0, temperature)
+    total = logits.float().exp().masked_fill(cover < 0, 0.0).sum(-1)
+    return float((total[covered] == 0).float().mean()) if covered.any() else 0.0
+
+
+def _logits(
+    means: Tensor,
+    cover: Tensor,
+    centers: Tensor,
+    rotmats: Tensor,
+    scales: Tensor,
+    radius: float | Tensor,
+    inflation: float,
+    temperature: float,
+) -> Tensor:
+    """Of Eq 8 [N, k], before the softmax."""
+    index = cover.clamp_min(0)
+    local = torch.einsum("nkji,nkj->nki", rotmats[index], (means[:, None] - centers[index]) / radius)
+    variances = ((scales[index] / radius) ** 2 + inflation**2).clamp_min(LEAST)
+    return -(local**2 / variances).sum(-1) / temperature
 
 
 def propagate(encodings: Tensor, cover: Tensor, weights: Tensor) -> Tensor:
@@ -69,9 +103,9 @@ class Gate(nn.Module):
 class Fusion(nn.Module):
     """Eqs 8-10 in one: from encodings of regions to fused features of Gaussians, with a trained gate."""
 
-    def __init__(self, gate: Gate):
+    def __init__(self, gate: Gate, inflation: float = 0.25, temperature: float = 1.0):
         super().__init__()
-        self.gate = gate
+        self.gate, self.inflation, self.temperature = gate, inflation, temperature
 
     def forward(
         self,
@@ -87,6 +121,7 @@ class Fusion(nn.Module):
         """features [N, C], encodings [M, C]; cover [N, k], means [N, 3], centers [M, 3], scales [M, 3] and radius [] as
         of `propagation_weights`; quats [M, 4] of the Gaussians at the centres -> fused [N, C], gate [N, C].
         """
-        weights = propagation_weights(means, cover, centers, rotation_matrices(quats), scales, radius)
+        around = means, cover, centers, rotation_matrices(quats), scales, radius
+        weights = propagation_weights(*around, inflation=self.inflation, temperature=self.temperature)
         fused: tuple[Tensor, Tensor] = self.gate(features, propagate(encodings, cover, weights), cover[:, 0] >= 0)
         return fused

@@ -61,7 +61,9 @@ class Descriptors:
 
     def forget(self, region_size: int = 0) -> None:
         """Compare with nothing: the next `update` describes every region."""
-        size = self.settings.n_angles * n_degrees(self.settings.spectrum, self.settings.max_degree)
+        size = self.settings.n_angles * n_degrees(
+            self.settings.spectrum, self.settings.max_degree, self.settings.from_degree
+        )
         self.given = torch.zeros(0, region_size, 10)
         self.mask = torch.zeros(0, region_size, dtype=torch.bool)
         self.values = torch.zeros(0, region_size, size)

@@ -7,8 +7,8 @@ from typing import Literal, NamedTuple
 import numpy as np
 
 from chebsplat.settings import DescribeSection
-from chebsplat.shape.descriptor import describe_members
-from chebsplat.shape.regions import Regions, build_regions, covering
+from chebsplat.shape.descriptor import compiles, describe_members
+from chebsplat.shape.regions import Regions, covering, regions_of
 
 Position = Literal["region", "center", "both"]
 
@@ -74,16 +74,17 @@ def region_inputs(
       means [N, 3] scene units, quats [N, 4] wxyz, log_scales [N, 3], features [N, C] before fusion: float32, in the
       order that the scene was trained in (the regions depend on it).
       described, context: whether tokens hold descriptors, and features; position: see `placed`.
-    Raises: ValueError if there are no Gaussians, or the spectrum is cut: that has no route without torch.
+    Raises: ValueError if there are no Gaussians, or its descriptor has no route without torch.
     """
     if len(means) == 0:
         raise ValueError("there are no Gaussians")
-    regions = build_regions(means.astype(np.float64), describe.n_regions, describe.region_size, describe.seed)
+    regions = regions_of(means.astype(np.float64), describe)
     mask = regions.members >= 0
     parts = []
     if described:
-        if describe.spectrum != "full":
-            raise ValueError(f"describe.spectrum = {describe.spectrum} is computed by torch only")
+        if not compiles(describe.spectrum, describe.metric, describe.axis):
+            asked = ", ".join(f"describe.{name} = {getattr(describe, name)}" for name in ("spectrum", "metric", "axis"))
+            raise ValueError(f"{asked} is computed by torch only")
         values = describe_members(means, quats, np.exp(log_scales), regions.members, describe).values
         parts.append(values.reshape(*mask.shape, -1))
     if context:

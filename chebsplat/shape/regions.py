@@ -6,6 +6,8 @@ from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
+from chebsplat.settings import DescribeSection
+
 if TYPE_CHECKING:
     from scipy.spatial import cKDTree
 
@@ -24,6 +26,23 @@ class Regions(NamedTuple):
     share: float = 1.0
 
 
+def regions_of(
+    means: np.ndarray, settings: DescribeSection, *, ids: np.ndarray | None = None, earlier: Regions | None = None
+) -> Regions:
+    """`build_regions` as the settings ask for."""
+    return build_regions(
+        means,
+        settings.n_regions,
+        settings.region_size,
+        settings.seed,
+        ids=ids,
+        earlier=earlier,
+        overlap=settings.overlap,
+        radius=settings.radius,
+        thinning=settings.thinning,
+    )
+
+
 def build_regions(
     means: np.ndarray,
     n_regions: int,
@@ -32,6 +51,9 @@ def build_regions(
     *,
     ids: np.ndarray | None = None,
     earlier: Regions | None = None,
+    overlap: float = 1.5,
+    radius: float | None = None,
+    thinning: bool = True,
 ) -> Regions:
     """Cover points with regions (docs/method.md, section 2).
 
@@ -41,9 +63,12 @@ def build_regions(
       seed:        of the first centre and of the thinning.
       ids:         i64 [N], what a point is called while others come and go; its index otherwise.
       earlier:     regions whose centres, radius and share are kept if they still fit (their members are not read).
+      overlap:     the radius over the covering radius; radius: scene units, instead: regions need not cover the
+        points then, and centres are found anew at every call.
+      thinning:    false: members are the nearest points, however many a ball holds (printed).
     Returns: regions; zero of them for N = 0, fewer than n_regions where points coincide.
     Raises:  ValueError on sizes below 1 or non-finite means.
-    Choices: centres by farthest-point sampling; the radius is 1.5 times the covering radius, so that regions
+    Choices: centres by farthest-point sampling; the radius is `overlap` times the covering radius, so that regions
       overlap. Neighbours come from a thinned set of about `region_size` points a ball, else a region of the nearest
       ones would shrink to a speck inside a dense ball; the centre itself is always a member. A point is thinned away
       by a hash of its id, so that a point that comes, goes or moves changes the regions around it and no others.
@@ -56,12 +81,14 @@ def build_regions(
     if n == 0:
         return Regions(np.zeros(0, np.int64), np.zeros((0, region_size), np.int64), 0.0)
     keys = _uniform(np.arange(n) if ids is None else ids, seed)
-    still_covering = None if earlier is None else _hold(means, earlier, min(n_regions, n))
+    still_covering = None
+    if earlier is not None and radius is None:
+        still_covering = _hold(means, earlier, min(n_regions, n), overlap)
     if still_covering is None:
         start = int(np.random.default_rng(seed).integers(n))
         centers, reach = farthest_points(means, min(n_regions, n), start)
-        radius = 1.5 * reach or 1.0
-        share = _share(means, centers, radius, region_size, keys)
+        radius = radius or overlap * reach or 1.0
+        share = _share(means, centers, radius, region_size, keys) if thinning else 1.0
     else:
         centers, radius, share = still_covering
     return Regions(centers, _neighbourhoods(means, centers, radius, share, region_size, keys), radius, share)
@@ -103,7 +130,7 @@ def covering(points: np.ndarray, centers: np.ndarray, radius: float, n_covers: i
     return np.where(np.isfinite(distance), index, -1)
 
 
-def _hold(means: np.ndarray, earlier: Regions, count: int) -> tuple[np.ndarray, float, float] | None:
+def _hold(means: np.ndarray, earlier: Regions, count: int, overlap: float) -> tuple[np.ndarray, float, float] | None:
     """Earlier centres, the few that are missing filled in where points are farthest; None if they no longer fit."""
     missing = count - len(earlier.centers)
     if not 0 <= missing <= count // 8:
@@ -114,7 +141,7 @@ def _hold(means: np.ndarray, earlier: Regions, count: int) -> tuple[np.ndarray, 
         centers.append(int(reach.argmax()))
         reach = np.minimum(reach, np.linalg.norm(means - means[centers[-1]], axis=1))
     farthest = float(reach.max())
-    if not earlier.radius / 3 <= farthest <= earlier.radius:  # sampled, it is radius / 1.5
+    if not earlier.radius / (2 * overlap) <= farthest <= earlier.radius:  # sampled, it is radius / overlap
         return None
     return np.array(centers, np.int64), earlier.radius, earlier.share
 

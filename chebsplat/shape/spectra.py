@@ -19,12 +19,13 @@ CLUSTER = 1e-4  # a gap below this leaves few digits of single eigenvectors in f
 
 class Cut(NamedTuple):
     """values f64 [M, n, D + 1]; n_cuts regions were cut below n; n_clustered of the cuts asked for fell into a
-    cluster, so that they were moved behind it or lie at a gap below `CLUSTER`.
+    cluster, so that they were moved behind it or lie at a gap below `CLUSTER`; n_guarded have a λ_max below `SMALLEST`.
     """
 
     values: Tensor
     n_cuts: int
     n_clustered: int
+    n_guarded: int
 
 
 def cut_spectrum(S: Tensor, mask: Tensor, n_eigs: int, max_degree: int, *, hard: bool) -> Cut:
@@ -47,7 +48,7 @@ def cut_spectrum(S: Tensor, mask: Tensor, n_eigs: int, max_degree: int, *, hard:
     index, rows = np.arange(n), np.arange(m)
     wanted = np.minimum(n_eigs, count)
     valid = index < count[:, None]
-    n_cuts = n_clustered = 0
+    n_cuts = n_clustered = n_guarded = 0
     if hard:
         gaps = np.diff(values, axis=1, append=np.inf)  # behind each eigenvalue
         gaps = np.where(index < count[:, None] - 1, gaps, np.inf)
@@ -58,7 +59,9 @@ def cut_spectrum(S: Tensor, mask: Tensor, n_eigs: int, max_degree: int, *, hard:
         n_cuts = int(cuts.sum())
         n_clustered = int((cuts & (gaps[rows, np.maximum(wanted, 1) - 1] <= CLUSTER)).sum())
         weights = (index < kept[:, None]).astype(np.float64)
-        largest = np.maximum(values[rows, np.maximum(kept, 1) - 1], SMALLEST)[:, None]
+        largest = values[rows, np.maximum(kept, 1) - 1]
+        n_guarded = int(((largest < SMALLEST) & (count > 1)).sum())
+        largest = np.maximum(largest, SMALLEST)[:, None]
         x = 2 * np.minimum(values / largest, 1.0) - 1
     else:
         behind = np.minimum(wanted, np.maximum(count, 1) - 1)
@@ -68,7 +71,7 @@ def cut_spectrum(S: Tensor, mask: Tensor, n_eigs: int, max_degree: int, *, hard:
         x = 2 * np.minimum(values / largest, 1.0) - 1
     polynomials = np.cos(np.arange(max_degree + 1) * np.arccos(np.clip(x, -1.0, 1.0))[..., None])
     out = count[:, None, None] * ((vectors**2) @ (weights[..., None] * polynomials))
-    return Cut(torch.from_numpy(np.where(mask.numpy()[..., None], out, 0.0)), n_cuts, n_clustered)
+    return Cut(torch.from_numpy(np.where(mask.numpy()[..., None], out, 0.0)), n_cuts, n_clustered, n_guarded)
 
 
 def _eigenpairs(matrices: Tensor) -> tuple[np.ndarray, np.ndarray]:

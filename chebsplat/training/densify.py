@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 import torch
 from torch import Tensor
 
+from chebsplat.settings import TrainSection
 from chebsplat.splats.rotations import rotation_matrices
 
 if TYPE_CHECKING:
@@ -35,6 +36,17 @@ def region_gradients(gradients: Tensor, members: Tensor) -> Tensor:
     return values.sum(1) / present.sum(1).clamp_min(1)
 
 
+def growth_rule(settings: TrainSection) -> dict[str, Any]:
+    """The keywords of `densify`."""
+    return {
+        "density": settings.grow_density,
+        "max_candidates": settings.grow_candidates,
+        "nearest": settings.grow_nearest,
+        "farthest": settings.grow_farthest,
+        "printed": settings.grow_rule == "printed",
+    }
+
+
 def densify(
     raw: dict[str, Tensor],
     members: Tensor,
@@ -47,20 +59,22 @@ def densify(
     max_candidates: int = 32,
     nearest: float = 0.5,
     farthest: float = 1.5,
+    printed: bool = False,
 ) -> Additions:
     """New Gaussians in the regions whose mean gradient exceeds the threshold (Eq 12).
 
     Args:
       raw:      raw parameters [N, ...] by name; members i64 [M, n]; gradient [M] of `region_gradients`.
       budget:   at most so many are added; the steepest regions come first.
-      density:  candidates per local spacing³; max_candidates: a region's most.
+      density:  candidates per local spacing³ (printed: per cubic scene unit); max_candidates: a region's most.
       nearest, farthest: bounds of a candidate's distance to the nearest Gaussian, in local spacings.
     Raises:  ValueError on a threshold or bounds that are not positive and in order.
     Choices: local spacing is the median over the members of the mean distance to the three nearest Gaussians, members
       or not. A region of radius ρ gets density · 4/3 π (ρ / spacing)³ · min(gradient / threshold − 1, 1) candidates,
-      rounded up, uniform in the ball about its members' mean; new ones also keep `nearest` spacings apart. Each
-      inherits from the nearest Gaussian, which is its parent once at most, and both change so that the two render
-      like the one (`shared_opacity`, `shared_scales`). Gaussians with non-finite means are left out.
+      rounded up (printed: density · 4/3 π ρ³ · (gradient / threshold − 1)), uniform in the ball about its members'
+      mean; new ones also keep `nearest` spacings apart. Each inherits from the nearest Gaussian, which is its parent
+      once at most, and both change so that the two render like the one (`shared_opacity`, `shared_scales`). Gaussians
+      with non-finite means are left out.
     """
     if not (threshold > 0 and 0 < nearest < farthest):
         raise ValueError(f"threshold {threshold} and 0 < nearest {nearest} < farthest {farthest} do not hold")
@@ -73,11 +87,11 @@ def densify(
     if budget > 0 and len(steep) and alive.sum() > 3:
         means, ids = raw["means"].detach().double().numpy()[alive], np.flatnonzero(alive)
         tree = cKDTree(means)
-        excess = (gradient[steep].double() / threshold - 1).clamp_max(1).numpy()
+        excess = (gradient[steep].double() / threshold - 1).clamp_max(np.inf if printed else 1).numpy()
         inside = np.where(alive, np.cumsum(alive) - 1, -1)[members[steep].clamp_min(0).numpy()]
         inside[members[steep].numpy() < 0] = -1
         centers, radii, spacings = _balls(tree, means, inside)
-        volume = 4 / 3 * np.pi * (radii / np.where(spacings > 0, spacings, np.inf)) ** 3
+        volume = 4 / 3 * np.pi * (radii if printed else radii / np.where(spacings > 0, spacings, np.inf)) ** 3
         counts = np.ceil(np.minimum(density * volume * excess, max_candidates)).astype(np.int64)
         counts[np.cumsum(counts) - counts >= 16 * budget] = 0
         region = np.repeat(np.arange(len(counts)), counts)

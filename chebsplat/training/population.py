@@ -70,7 +70,8 @@ class Population:
             additions = densify.clone_or_split(raw, gradient, threshold, 0.01 * self.extent, budget, generator)
         else:
             mean = densify.region_gradients(gradient, members)
-            additions = densify.densify(raw, members, mean, threshold, budget, generator)
+            rule = densify.growth_rule(settings)
+            additions = densify.densify(raw, members, mean, threshold, budget, generator, **rule)
         self.n_added += len(additions.parents)
         optimizer_rows.apply_additions(optimizer, self.model.raw, additions)
 

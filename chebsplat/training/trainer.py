@@ -14,7 +14,7 @@ from chebsplat.errors import DataFailure
 from chebsplat.evaluation.metrics import psnr
 from chebsplat.settings import TrainSection
 from chebsplat.shape import cks
-from chebsplat.shape.regions import Regions, build_regions
+from chebsplat.shape.regions import Regions, regions_of
 from chebsplat.training import sh_mask_network, sh_prune
 from chebsplat.training.laps import Laps
 from chebsplat.training.losses import feature_distance, photometric
@@ -91,7 +91,7 @@ class Trainer:
         due = self.step % self.settings.refresh_every == 0
         frozen = self.schedule.freezes_bands(share)  # a training of few steps does not catch up on growth
         growing = not frozen and self.schedule.grown(share) > self.population.n_grown
-        removing = growing or (self.schedule.has_grown(share) and self.step % 200 == 0)
+        removing = growing or (self.schedule.has_grown(share) and self.step % self.settings.remove_every == 0)
         if growing or due:
             self._drop_broken()
         mask = self._soft_mask(share) if removing else None
@@ -175,8 +175,7 @@ class Trainer:
             regions = shape.regions
         elif regions is None:
             means = self.model.raw["means"].detach().double().numpy()
-            describe = self.model.describe
-            regions = build_regions(means, describe.n_regions, describe.region_size, describe.seed)
+            regions = regions_of(means, self.model.describe)
         assert regions is not None
         self.members, self.guidance = torch.as_tensor(regions.members), None
         self.model.follow(regions)

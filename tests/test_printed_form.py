@@ -1,0 +1,240 @@
+"""What is printed can be chosen: each setting against the printed formula, and by default nothing changes."""
+
+import math
+
+import numpy as np
+import pytest
+import torch
+
+from chebsplat.settings import DescribeSection, TrainSection
+from chebsplat.shape.albo import canonicalize
+from chebsplat.shape.descriptor import describe, describe_members, n_degrees
+from chebsplat.shape.fusion import Fusion, Gate, propagation_weights, share_undefined
+from chebsplat.shape.regions import build_regions
+from chebsplat.splats.rotations import rotation_matrices
+from chebsplat.training.densify import densify
+
+SIZES = {"n_angles": 3, "max_degree": 5, "backend": "reference", "dtype": torch.float64}
+
+
+def regions(m=4, n=9, unit=1.0, seed=0):
+    """means, scales [M, n, 3], rotmats [M, n, 3, 3], mask [M, n] in float64."""
+    g = torch.Generator().manual_seed(seed)
+    means, scales = (
+        torch.rand(m, n, 3, generator=g, dtype=torch.float64),
+        torch.rand(m, n, 3, generator=g, dtype=torch.float64),
+    )
+    rotmats = rotation_matrices(torch.randn(m * n, 4, generator=g, dtype=torch.float64)).reshape(m, n, 3, 3)
+    return unit * means, unit * (0.01 + 0.5 * scales), rotmats, torch.ones(m, n, dtype=torch.bool)
+
+
+def printed(means, scales, rotmats, *, beta, bandwidth, n_angles, max_degree):
+    """The descriptor of one region, float64, member by member: Eqs 1-6 with M = R diag(1 / (1 + β s²)) Rᵀ, turned
+    about z, and all eigenpairs with λ_max = 2 (so that the operator's own spectrum is the only approximation left out).
+    """
+    n = len(means)
+    centred = means - means.mean(0)
+    radius = np.sqrt((centred**2).sum(1).mean())
+    out = np.zeros((n, n_angles, max_degree + 1))
+    for j in range(n_angles):
+        angle = 2 * math.pi * j / n_angles
+        turn = np.array([[math.cos(angle), -math.sin(angle), 0], [math.sin(angle), math.cos(angle), 0], [0, 0, 1]])
+        weights = np.zeros((n, n))
+        for a in range(n):
+            for b in range(n):
+                if a != b:
+                    delta = turn.T @ (centred[a] - centred[b]) / radius
+                    metrics = [rotmats[i] @ np.diag(1 / (1 + beta * scales[i] ** 2)) @ rotmats[i].T for i in (a, b)]
+                    q = 0.5 * sum(delta @ metric @ delta for metric in metrics)
+                    weights[a, b] = math.exp(-q / bandwidth**2)
+        degree = weights.sum(1)
+        laplacian = np.eye(n) - weights / np.sqrt(degree[:, None] * degree)
+        values, vectors = np.linalg.eigh(laplacian)
+        for d in range(max_degree + 1):
+            polynomial = np.cos(d * np.arccos(np.clip(values - 1, -1, 1)))
+            out[:, j, d] = n * ((vectors**2) @ polynomial - math.cos(d * math.pi / 2))
+    return out
+
+
+def test_the_printed_metric_and_axis_are_the_printed_formula():
+    means, scales, rotmats, mask = regions()
+    options = {"metric": "printed", "axis": "world", "from_degree": 0, "anisotropy": 10.0, "bandwidth": 0.7}
+    found = describe(means, scales, rotmats, mask, **SIZES, **options).values
+    for m in range(len(means)):
+        given = (v[m].numpy() for v in (means, scales, rotmats))
+        wanted = printed(*given, beta=10.0, bandwidth=0.7, n_angles=3, max_degree=5)
+        assert np.abs(found[m].numpy() - wanted).max() < 1e-12 * len(wanted) * 10
+    assert (found[..., :2].abs() < 1e-12).all()  # degrees 0 and 1 are identically constant
+
+
+def test_the_printed_metric_depends_on_the_unit_and_ours_does_not():
+    near, far = regions(), regions(unit=0.01)
+    for metric, same in (("relative", True), ("printed", False)):
+        a, b = (describe(*given, **SIZES, metric=metric).values for given in (near, far))
+        assert torch.allclose(a, b, atol=1e-9) == same
+
+
+def test_the_printed_metric_has_a_finite_gradient_that_finite_differences_confirm():
+    means, scales, rotmats, mask = regions(1, 5)
+    scales.requires_grad_(True)
+
+    def first(scales):
+        options = {"metric": "printed", "axis": "world"}
+        return describe(means, scales, rotmats, mask, **SIZES, **options).values
+
+    assert torch.autograd.gradcheck(first, scales, rtol=1e-5, atol=1e-7)
+
+
+@pytest.mark.parametrize("unit", [1e-30, 1.0, 1e30])
+def test_the_printed_metric_is_finite_in_any_unit(unit):
+    assert describe(*regions(unit=unit), **SIZES, metric="printed", axis="world").values.isfinite().all()
+
+
+@pytest.mark.parametrize("spectrum", ["full", "hard"])
+def test_the_first_degree_is_chosen_and_what_is_added_vanishes(spectrum):
+    given = regions()
+    options = SIZES | {"spectrum": spectrum, "n_eigs": 4}
+    every, rest = (describe(*given, **options, from_degree=first).values for first in (0, 2))
+    assert torch.equal(every[..., 2:], rest)
+    assert every.shape[-1] == n_degrees(spectrum, 5, 0) == 6
+    assert (every[..., :2] == 0).all() == (spectrum == "full")
+    default = describe(*given, **options).values
+    assert torch.equal(default, rest if spectrum == "full" else every)
+    compiled = describe(*(v.float() for v in given[:3]), given[3], n_angles=3, max_degree=5, from_degree=0)
+    assert compiled.values.shape[-1] == 6
+    assert (compiled.values[..., :2] == 0).all()
+
+
+def test_members_are_described_as_the_settings_say():
+    rng = np.random.default_rng(0)
+    means, quats, scales = (rng.random((20, k)).astype(np.float32) for k in (3, 4, 3))
+    members = np.stack([np.arange(8), np.arange(8, 16)])
+    settings = DescribeSection(metric="printed", axis="world", from_degree=0, n_angles=3, max_degree=4)
+    found = describe_members(means, quats, scales, members, settings)
+    given = (torch.from_numpy(v[members]) for v in (means, scales))
+    rotmats = rotation_matrices(torch.from_numpy(quats)[members.ravel()]).reshape(2, 8, 3, 3)
+    options = {"metric": "printed", "axis": "world", "from_degree": 0, "n_angles": 3, "max_degree": 4}
+    wanted = describe(*given, rotmats, torch.ones(2, 8, dtype=torch.bool), **options, dtype=torch.float64).values
+    assert np.array_equal(found.values, wanted.float().numpy())
+    plain = describe_members(means, quats, scales, members, DescribeSection(from_degree=0, n_angles=3, max_degree=4))
+    native = describe_members(means, quats, scales, members, DescribeSection(n_angles=3, max_degree=4))
+    assert np.array_equal(plain.values[..., 2:], native.values)
+    assert (plain.values[..., :2] == 0).all()
+
+
+def test_a_spectrum_of_zeros_is_guarded_and_counted():
+    far = torch.tensor([[[1e3 * k, 0.0, 0.0] for k in (0, 1e-3, 1, 1.001, 2, 2.001)]], dtype=torch.float64)
+    scales, rotmats = torch.full_like(far, 1e-3), torch.eye(3, dtype=torch.float64).expand(1, 6, 3, 3)
+    options = SIZES | {"spectrum": "hard", "n_eigs": 2, "bandwidth": 1e-3}
+    found = describe(far, scales, rotmats, torch.ones(1, 6, dtype=torch.bool), **options)
+    assert found.values.isfinite().all()
+    assert found.n_guarded == SIZES["n_angles"]
+    assert describe(*regions(), **(SIZES | {"spectrum": "hard", "n_eigs": 4})).n_guarded == 0
+
+
+def test_regions_of_a_given_radius_and_overlap_and_without_thinning():
+    points = np.random.default_rng(0).random((3000, 3))
+    ours = build_regions(points, 40, 16)
+    tight = build_regions(points, 40, 16, overlap=1.0)
+    assert tight.radius == pytest.approx(ours.radius / 1.5)
+    fixed = build_regions(points, 40, 16, radius=0.07)
+    assert fixed.radius == 0.07
+    assert np.array_equal(build_regions(points, 40, 16, radius=0.07, earlier=fixed).members, fixed.members)
+    nearest = build_regions(points, 40, 16, thinning=False)
+    assert nearest.share == 1.0
+    for center, members in zip(nearest.centers, nearest.members, strict=True):
+        wanted = np.argsort(np.linalg.norm(points - points[center], axis=1))[:16]
+        assert set(members) == set(wanted)
+    held = build_regions(points, 40, 16, overlap=1.0, earlier=tight)
+    assert np.array_equal(held.centers, tight.centers)
+    assert held.radius == tight.radius
+
+
+def test_propagation_without_inflation_is_the_printed_softmax_where_that_is_finite():
+    g = torch.Generator().manual_seed(0)
+    means, centers = (torch.rand(n, 3, generator=g, dtype=torch.float64) for n in (50, 6))
+    scales = 0.1 + torch.rand(6, 3, generator=g, dtype=torch.float64)
+    rotmats = rotation_matrices(torch.randn(6, 4, generator=g, dtype=torch.float64))
+    cover = torch.arange(6).expand(50, 6)
+    for temperature in (1.0, 3.0):
+        found = propagation_weights(means, cover, centers, rotmats, scales, 0.4, inflation=0.0, temperature=temperature)
+        wanted = torch.zeros(50, 6, dtype=torch.float64)
+        for i in range(50):
+            for r in range(6):
+                local = rotmats[r].T @ (means[i] - centers[r]) / scales[r]
+                wanted[i, r] = math.exp(-float(local @ local) / temperature)
+        wanted /= wanted.sum(1, keepdim=True)
+        assert (found - wanted).abs().max() < 1e-12
+
+
+def test_propagation_without_inflation_is_finite_and_says_where_the_print_is_not():
+    means = torch.tensor([[0.0, 0, 0], [0.5, 0, 0], [0.002, 0, 0], [9.0, 0, 0]])
+    centers, rotmats = torch.tensor([[0.0, 0, 0], [1.0, 0, 0]]), torch.eye(3).expand(2, 3, 3)
+    cover = torch.tensor([[0, 1], [0, 1], [0, -1], [-1, -1]])
+    for scale in (1e-2, 1e-12, 1e-25, 0.0):
+        scales = torch.full((2, 3), scale)
+        weights = propagation_weights(means, cover, centers, rotmats, scales, 1.0, inflation=0.0)
+        assert weights.isfinite().all()
+        assert torch.allclose(weights.sum(1), torch.tensor([1.0, 1.0, 1.0, 0.0]))
+    around = cover, centers, rotmats
+    assert share_undefined(means, *around, torch.full((2, 3), 1e-2), 1.0) == pytest.approx(1 / 3)  # halfway
+    assert share_undefined(means, *around, torch.full((2, 3), 1.0), 1.0) == 0
+
+
+def test_the_exported_fusion_has_the_trained_inflation_and_temperature(tmp_path):
+    import onnx
+
+    from chebsplat.stages.onnx import compare, fusion_example
+    from chebsplat.stages.onnx_graphs import fusion_model
+
+    torch.manual_seed(0)
+    differences = []
+    for inflation, temperature in ((0.25, 1.0), (0.0, 1.0), (0.1, 7.0)):
+        fusion = Fusion(Gate(4, 0.0), inflation, temperature).eval()
+        onnx.save(fusion_model(fusion, 18), tmp_path / "a.onnx")
+        given = fusion_example(4, 16, 64)
+        assert compare(fusion, tmp_path / "a.onnx", given) < 1e-5
+        differences.append(compare(Fusion(Gate(4, 0.0)), tmp_path / "a.onnx", given))
+    assert differences[0] < 1e-5 < min(differences[1:])
+
+
+def test_the_gate_starts_where_the_setting_says():
+    features, shape, covered = torch.ones(2, 3), torch.zeros(2, 3), torch.tensor([True, False])
+    fused, gate = Gate(3, TrainSection(gate_start=0.0).gate_start)(features, shape, covered)
+    assert torch.allclose(fused[0], torch.full((3,), 0.5))
+    assert (gate[1] == 1).all()
+
+
+def growing(n=200, unit=1.0):
+    g = torch.Generator().manual_seed(0)
+    raw = {"means": unit * torch.rand(n, 3, generator=g), "quats": torch.randn(n, 4, generator=g)}
+    raw |= {"log_scales": torch.full((n, 3), math.log(0.05 * unit)), "logit_opacities": torch.zeros(n)}
+    return raw, torch.arange(n).reshape(2, -1)
+
+
+def grown(raw, members, **options):
+    options = {"nearest": 1e-3, "farthest": 1e3, "max_candidates": 1000} | options
+    gradient = torch.tensor([2.5, 0.5])
+    return len(densify(raw, members, gradient, 1.0, 10_000, torch.Generator().manual_seed(1), **options).parents)
+
+
+def test_the_printed_count_is_by_volume_in_scene_units_and_by_excess():
+    raw, members = growing()
+    inside = raw["means"][members[0]]
+    radius = float((inside - inside.mean(0)).norm(dim=1).max())
+    wanted = math.ceil(10 * 4 / 3 * math.pi * radius**3 * 1.5)
+    assert grown(raw, members, density=10, printed=True) == pytest.approx(wanted, abs=2)  # a parent once at most
+    far, _ = growing(unit=100)
+    assert grown(far, members, density=0.05) == grown(raw, members, density=0.05)
+    assert grown(far, members, density=1e-5, printed=True) > grown(raw, members, density=1e-5, printed=True) == 1
+
+
+def test_growth_bounds_out_of_order_are_refused():
+    with pytest.raises(ValueError, match="grow_farthest"):
+        TrainSection(grow_nearest=2.0)
+
+
+def test_canonical_regions_know_their_unit():
+    means, scales, rotmats, mask = regions(unit=7.0)
+    region = canonicalize(means, scales, rotmats, mask)
+    assert torch.allclose(region.scales * region.unit, scales)
