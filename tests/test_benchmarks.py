@@ -77,6 +77,10 @@ def test_a_stage_that_fails_ends_the_benchmark_with_its_exit_code(bench, ran, mo
 @pytest.mark.parametrize("words", [["bench=cost"], ["bench-cost"]])
 def test_make_runs_one_by_name(words):
     done = subprocess.run(
-        ["make", "-n", *words, "args=--steps 9"], cwd=ROOT, capture_output=True, text=True, check=True
+        ["make", "-n", "--no-print-directory", *words, "args=--steps 9"],
+        cwd=ROOT,
+        capture_output=True,
+        text=True,
+        check=True,
     )
     assert done.stdout.splitlines()[-1].endswith("-m benchmarks cost --steps 9")

@@ -78,7 +78,7 @@ def deep_code(tree):
 
 
 def report_code(tree):
-    edit(tree["stages"] / "page.py", "<h2>Test views</h2>", "<h2>Views</h2>")
+    edit(tree["stages"] / "pages/report.html", "<h2>Test views</h2>", "<h2>Views</h2>")
 
 
 def descriptor_code(tree):
@@ -106,7 +106,10 @@ CODE_CHANGES = [
 def test_a_change_of_code_makes_exactly_these_stages_stale(source_tree, change, expected):
     finish(Planner(source_tree).plan("toy"))
     assert stale(source_tree) == []
-    before = {name: {p: p.read_bytes() for p in f.rglob("*.py")} for name, f in source_tree.items()}
+    before = {
+        name: {p: p.read_bytes() for p in f.rglob("*") if p.suffix in (".py", ".html")}
+        for name, f in source_tree.items()
+    }
     change(source_tree)
     assert stale(source_tree) == expected
     for files in before.values():
