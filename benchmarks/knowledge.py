@@ -1,4 +1,4 @@
-"""What the knowledge space costs a training: its regulariser in every step, its update after the last one.
+"""What the knowledge space costs a training: its regulariser where regions are encoded, its update after the last step.
 
 Two trainings at full resolution, with and without the regulariser, take turns, so that other load on the machine meets
 both alike; a turn lasts from one step that encodes regions anew to the next.
@@ -32,7 +32,7 @@ def main(arguments: Sequence[str]) -> None:
     config = Config.model_validate({"train": train})
     plain = trainer_from(options.work, config)
     assert plain.model.shape is not None
-    weights = plain.model.shape.encoder.attention_weights()
+    weights = plain.model.shape.encoder.linear_maps()
     began = time.perf_counter()
     bases = {name: cks.update(None, W.detach())[0] for name, W in weights.items()}
     update = time.perf_counter() - began
@@ -48,11 +48,11 @@ def main(arguments: Sequence[str]) -> None:
     alone = []
     for _ in range(200):
         began = time.perf_counter()
-        cks.basis_loss(plain.model.shape.encoder.attention_weights(), bases).backward()
+        cks.basis_loss(plain.model.shape.encoder.linear_maps(), bases).backward()
         alone.append(time.perf_counter() - began)
     without, with_it = (statistics.median(times[which]) for which in (False, True))
     n_steps = plain.settings.steps
-    share = 100 * (statistics.median(alone) * n_steps + update) / (without * n_steps)
+    share = 100 * (statistics.median(alone) * n_steps / period + update) / (without * n_steps)
     found = {
         "weights": len(bases),
         "step_ms": 1e3 * without,

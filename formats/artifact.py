@@ -152,7 +152,9 @@ def read_manifest(path: Path, schema: str | None = None) -> Manifest:
         raise InputError(f"{path / MANIFEST} is missing: not a finished artifact; run the stage that makes it again")
     manifest = parse_manifest(path)
     if schema is not None and manifest.schema != schema:
-        raise InputError(f"{path / MANIFEST} has schema {manifest.schema}, expected {schema}; pass the right artifact")
+        older = manifest.schema.rpartition("/")[0] == schema.rpartition("/")[0]
+        remedy = "another version of chebsplat made it: make it again" if older else "pass the right artifact"
+        raise InputError(f"{path / MANIFEST} has schema {manifest.schema}, expected {schema}; {remedy}")
     for name, entry in manifest.files.items():
         member = os.path.join(path, name)
         try:

@@ -1,4 +1,4 @@
-"""`basis/2`: one revision of the core knowledge space; revisions form an append-only chain."""
+"""`basis/3`: one revision of the core knowledge space; revisions form an append-only chain."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from chebsplat.formats.documents import Count, TypedDict, read_document, write_d
 from chebsplat.formats.manifest import remedy_of
 from chebsplat.formats.tensors import read_tensors, write_tensors
 
-SCHEMA = "chebsplat.basis/2"
+SCHEMA = "chebsplat.basis/3"
 ORTHONORMAL = 1e-6
 
 
@@ -26,22 +26,25 @@ class Report(TypedDict):
     added: Count
     rho: float
     rho_after: float
+    rho_printed: float
     energy: float
 
 
 class Entry(TypedDict):
     scene: str
     gaussians: str
-    projections: dict[str, Report]
+    spread: float
+    maps: dict[str, Report]
 
 
 @dataclass
 class Basis:
-    """`bases[name]` [q, r] has orthonormal columns; `weights[name]` [q, p] is the encoder's own matrix beside it.
+    """`bases[name]` [q, r] has orthonormal columns that span inputs of the encoder's linear map W [q, p].
 
-    `lineage` holds one entry a revision, the oldest first: `scene`, `gaussians` (the checkpoint's key), and
-    `projections`: by name of an attention weight the report of `cks.update`. The scene's columns are those from
-    `rank_before` to `rank_after`.
+    `weights` are the encoder's own arrays beside them (its `nn.Linear.weight` is Wᵀ). `lineage` holds one entry a
+    revision, the oldest first: `scene`, `gaussians` (the checkpoint's key), `spread` (its σ_f), and `maps`: by name the
+    report of `cks.update`. The scene's columns are those from `rank_before` to `rank_after`; a map that the scene's
+    encoder lacks, or has for other inputs, has no report.
     """
 
     bases: dict[str, np.ndarray]
@@ -72,10 +75,16 @@ def read_basis(path: Path) -> Basis:
             raise InputError(f"{file}: {name} is no float32 matrix; {remedy_of(path)}")
         if (error := off_orthonormal(columns)) > ORTHONORMAL:
             raise InputError(f"{file}: {name} is not orthonormal ({error:.1e}); {remedy_of(path)}")
-        rank = lineage[-1]["projections"].get(name, {}).get("rank_after") if lineage else 0
+        rank = last_report(lineage, name)["rank_after"]
         if rank != columns.shape[1]:
             raise InputError(f"{file}: {name} has {columns.shape[1]} columns, its lineage {rank}; {remedy_of(path)}")
     return Basis(bases, weights, lineage)
+
+
+def last_report(lineage: list[dict[str, Any]], name: str) -> dict[str, Any]:
+    """Of the last scene that had the linear map `name`; ranks are 0 where none had."""
+    reports = (entry["maps"][name] for entry in reversed(lineage) if name in entry["maps"])
+    return next(reports, {"rank_before": 0, "rank_after": 0, "added": 0})
 
 
 def off_orthonormal(columns: np.ndarray) -> float:

@@ -9,7 +9,7 @@ import numpy as np
 
 from chebsplat.errors import InputError
 from chebsplat.formats import artifact
-from chebsplat.formats.basis import SCHEMA, Basis, off_orthonormal, read_basis
+from chebsplat.formats.basis import SCHEMA, Basis, last_report, off_orthonormal, read_basis
 from chebsplat.formats.manifest import remedy_of
 from chebsplat.pipelines import store
 
@@ -28,31 +28,32 @@ def ancestors(path: Path) -> list[Path | None]:
 
 
 def records(basis: Basis) -> list[dict[str, Any]]:
-    """A row a revision and attention weight, for the CSV file."""
+    """A row a revision and linear map, for the CSV file."""
     return [
-        {"revision": number, "scene": entry["scene"], "gaussians": entry["gaussians"], "weight": name} | report
+        {"revision": number, "map": name} | {key: entry[key] for key in ("scene", "gaussians", "spread")} | report
         for number, entry in enumerate(basis.lineage, start=1)
-        for name, report in entry["projections"].items()
+        for name, report in entry["maps"].items()
     ]
 
 
 def log_table(basis: Basis) -> Table:
-    """A row a revision, means over attention weights; `rank` with the largest, ρ after in `rho_after`."""
-    table = [["revision", "scene", "rank", "added", "ρ before", "ρ after", "energy", "gaussians"]]
+    """A row a revision, means over its linear maps; `rank` with the largest."""
+    table = [["revision", "scene", "rank", "added", "ρ before", "σ_f", "ρ′", "ρ after", "energy", "gaussians"]]
     for number, entry in enumerate(basis.lineage, start=1):
-        reports = list(entry["projections"].values())
+        reports = list(entry["maps"].values())
         mean = {name: float(np.mean([report[name] for report in reports])) for name in reports[0]}
         rank = f"{mean['rank_after']:.1f} (≤ {max(report['rank_after'] for report in reports)})"
-        figures = [rank, f"{mean['added']:.1f}", *(f"{mean[name]:.3f}" for name in ("rho", "rho_after", "energy"))]
-        table.append([str(number), entry["scene"], *figures, entry["gaussians"]])
+        mean |= {"spread": entry["spread"]}
+        figures = [f"{mean[name]:.3f}" for name in ("rho", "spread", "rho_printed", "rho_after", "energy")]
+        table.append([str(number), entry["scene"], rank, f"{mean['added']:.1f}", *figures, entry["gaussians"]])
     return table
 
 
 def columns_by_scene(basis: Basis, name: str) -> str:
-    """`1-10 office0, 11-12 office1`: the columns of one weight's basis, counted from 1."""
+    """`1-10 office0, 11-12 office1`: the columns of one map's basis, counted from 1."""
     parts = []
     for entry in basis.lineage:
-        report = entry["projections"].get(name, {"rank_before": 0, "rank_after": 0})
+        report = entry["maps"].get(name, {"rank_before": 0, "rank_after": 0})
         first, last = report["rank_before"] + 1, report["rank_after"]
         if last >= first:
             parts.append(f"{first}-{last} {entry['scene']}" if last > first else f"{first} {entry['scene']}")
@@ -60,11 +61,11 @@ def columns_by_scene(basis: Basis, name: str) -> str:
 
 
 def show_table(basis: Basis) -> Table:
-    """A row an attention weight of one revision."""
-    table = [["weight", "r of q", "ρ before", "ρ after", "energy", "|BᵀB − I|", "columns"]]
-    reports = basis.lineage[-1]["projections"]
+    """A row a linear map of one revision."""
+    table = [["map", "r of q", "ρ before", "ρ after", "energy", "|BᵀB − I|", "columns"]]
     for name, columns in basis.bases.items():
-        figures = [f"{reports[name][key]:.3f}" for key in ("rho", "rho_after", "energy")]
+        report = last_report(basis.lineage, name)
+        figures = [f"{report[key]:.3f}" for key in ("rho", "rho_after", "energy")]
         shape = f"{columns.shape[1]} of {columns.shape[0]}"
         table.append([name, shape, *figures, f"{off_orthonormal(columns):.0e}", columns_by_scene(basis, name)])
     return table
@@ -77,11 +78,11 @@ def common(a: Basis, b: Basis) -> int:
 
 
 def diff_table(a: Basis, b: Basis) -> Table:
-    """A row an attention weight: ranks, columns that are the same, how far each span lies outside the other.
+    """A row a linear map: ranks, columns that are the same, how far each span lies outside the other.
 
     `outside` is the largest sine of an angle between a vector of the one span and the other span.
     """
-    table = [["weight", "r", "same columns", "first outside second", "second outside first"]]
+    table = [["map", "r", "same columns", "first outside second", "second outside first"]]
     for name in sorted(a.bases.keys() | b.bases.keys()):
         if name not in a.bases or name not in b.bases or len(a.bases[name]) != len(b.bases[name]):
             table.append([name, "of one alone, or of another width", "", "", ""])
@@ -121,7 +122,7 @@ def verify(path: Path | None, earlier: Path | None) -> str:
     basis, manifest = read_basis(path), artifact.read_manifest(path)
     share = artifact.stated(path, manifest, "config", "cks", "max_rank", kind=(int, float))
     for name, columns in basis.bases.items():
-        before = basis.lineage[-1]["projections"][name]["rank_before"]
+        before = last_report(basis.lineage, name)["rank_before"]
         if columns.shape[1] > max(int(share * len(columns)), before):
             raise InputError(f"{path}: {name} has {columns.shape[1]} columns, above its ceiling of {share:g} q")
     error = max(map(off_orthonormal, basis.bases.values()), default=0.0)
@@ -138,7 +139,7 @@ def verify(path: Path | None, earlier: Path | None) -> str:
 
 
 def draw(path: Path, basis: Basis, max_rank: float) -> None:
-    """Rank and residual over revisions, as PNG: a thin line a weight, the mean bold; max_rank: as a share of q."""
+    """Rank and residual over revisions, as PNG: a thin line a linear map, the mean bold; max_rank: as a share of q."""
     import matplotlib
 
     matplotlib.use("Agg")
@@ -147,19 +148,19 @@ def draw(path: Path, basis: Basis, max_rank: float) -> None:
     x = np.arange(1, basis.revision + 1)
 
     def values(key: str) -> np.ndarray:
-        return np.array([[r[key] for r in entry["projections"].values()] for entry in basis.lineage], float)
+        return np.array([[e["maps"].get(name, {}).get(key, np.nan) for name in basis.bases] for e in basis.lineage])
 
     figure, (left, right) = plt.subplots(1, 2, figsize=(11, 4), layout="constrained")
     rank, widths = values("rank_after"), sorted({len(columns) for columns in basis.bases.values()})
     left.plot(x, rank, color="C0", linewidth=0.6, alpha=0.5)
-    left.plot(x, rank.mean(1), color="C0", linewidth=2, marker="o", label="rank r: mean, and each weight")
-    left.bar(x, values("added").mean(1), color="C1", alpha=0.6, label="columns added, mean")
+    left.plot(x, np.nanmean(rank, 1), color="C0", linewidth=2, marker="o", label="rank r: mean, and each map")
+    left.bar(x, np.nanmean(values("added"), 1), color="C1", alpha=0.6, label="columns added, mean")
     for width in widths:
         left.axhline(int(max_rank * width), color="C0", linestyle="--", linewidth=0.8, label=f"ceiling, of q = {width}")
     left.set_title("rank", fontsize=10)
     for key, color, label in (("rho", "C3", "before the update"), ("rho_after", "C2", "after it")):
         right.plot(x, values(key), color=color, linewidth=0.6, alpha=0.4)
-        right.plot(x, values(key).mean(1), color=color, linewidth=2, marker="o", label=label)
+        right.plot(x, np.nanmean(values(key), 1), color=color, linewidth=2, marker="o", label=label)
     right.set_ylim(0, 1.02)
     right.set_title("ρ: the share of W's norm outside the basis", fontsize=10)
     for axis in (left, right):

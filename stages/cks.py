@@ -2,10 +2,15 @@
 
 from __future__ import annotations
 
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from chebsplat.errors import DataFailure
 from chebsplat.stages.command import Job, command
+
+if TYPE_CHECKING:
+    from chebsplat.formats.gaussians import Gaussians
+
+GEOMETRY = ("means", "quats", "log_scales")
 
 
 def run(job: Job) -> None:
@@ -16,7 +21,7 @@ def run(job: Job) -> None:
     from chebsplat.formats.artifact import read_manifest
     from chebsplat.formats.basis import Basis, read_basis, write_basis
     from chebsplat.formats.gaussians import read_gaussians
-    from chebsplat.stages.restored import restored_encoder
+    from chebsplat.stages.restored import restored_encoder, without_basis
 
     settings = job.config.cks
     old = read_basis(job.inputs["basis"]) if "basis" in job.inputs else Basis({}, {})
@@ -26,34 +31,60 @@ def run(job: Job) -> None:
     from chebsplat.shape.cks import update
 
     encoder = restored_encoder(job.inputs["gaussians"], checkpoint)
-    attention = encoder.attention_weights()
-    if not attention:
+    if not encoder.blocks:
         raise DataFailure("the encoder has no attention weights (train.encoder = mlp); there is no knowledge to carry")
-    if old.bases and set(old.bases) != set(attention):
-        raise DataFailure("the basis belongs to an encoder of another depth; start another sequence")
-    bases: dict[str, Any] = {}
+    maps = encoder.linear_maps()
+    unfit, wrong = without_basis(maps, old.bases) if old.bases else ([], [])
+    if wrong or any(name.startswith("blocks.") for name in old.bases.keys() - maps.keys()):
+        raise DataFailure("the basis belongs to an encoder of another depth or width; start another sequence")
+    if unfit := [name for name in unfit if name in old.bases]:
+        job.left_out(f"knowledge of {', '.join(unfit)}", "this scene's inputs are not those of the basis, which stays")
+    sigma = descriptor_spread(job, checkpoint)
+    bases: dict[str, Any] = dict(old.bases)
     reports: dict[str, Any] = {}
-    for name, weight in attention.items():
-        start = torch.from_numpy(old.bases[name]) if name in old.bases else None
-        if start is not None and len(start) != len(weight):
-            raise DataFailure(f"the basis has {len(start)} rows at {name}, the encoder {len(weight)}")
-        grown, report = update(
-            start,
-            weight.detach(),
+    for name, W in maps.items():
+        if name in unfit:
+            continue
+        grown, reports[name] = update(
+            torch.from_numpy(old.bases[name]) if name in old.bases else None,
+            W.detach(),
             energy=settings.energy,
             tolerance=settings.tolerance,
             max_rank=settings.max_rank,
+            max_added=settings.max_added,
             rule=settings.energy_rule,
+            novelty=1 + settings.kappa * sigma,
+            update_rule=settings.update_rule,
         )
         bases[name] = grown.numpy()
-        reports[name] = report
     weights = {name: value.numpy() for name, value in encoder.state_dict().items()}
     if not old.bases:
         job.left_out("earlier basis", "this is the first scene of its sequence")
     key = read_manifest(job.inputs["gaussians"]).key
-    entry = {"scene": job.config.scene.name, "gaussians": key, "projections": reports}
+    entry = {"scene": job.config.scene.name, "gaussians": key, "spread": sigma, "maps": reports}
     job.facts |= {"revision": old.revision + 1, "ranks": {name: b.shape[1] for name, b in bases.items()}}
     write_basis(job.out, Basis(bases, weights, [*old.lineage, entry]))
+
+
+def descriptor_spread(job: Job, gaussians: Gaussians) -> float:
+    """σ_f of the trained scene (Eq 15), by the regions and descriptors that its last refresh had."""
+    import torch
+
+    from chebsplat.settings import DescribeSection
+    from chebsplat.shape.cks import spread
+    from chebsplat.shape.refresh import Descriptors
+    from chebsplat.shape.regions import regions_of
+    from chebsplat.stages.restored import trained_with
+
+    trained = trained_with(job.inputs["gaussians"])
+    if not trained["train"]["albo"]:
+        job.left_out("spread of shape", "train.albo is false: the encoder sees no descriptors")
+        return 0.0
+    describe = DescribeSection(**trained["describe"])
+    means, quats, log_scales = (torch.from_numpy(gaussians.parameters[name]) for name in GEOMETRY)
+    regions = regions_of(means.double().numpy(), describe)
+    members = torch.from_numpy(regions.members)
+    return spread(Descriptors(describe).update(means, quats, log_scales, members, regions.radius), members >= 0)
 
 
 main = command("cks", run)

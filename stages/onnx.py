@@ -5,7 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any
 
-from chebsplat.errors import DataFailure, InputError
+from chebsplat.errors import DataFailure
 from chebsplat.stages.command import Job, command
 from chebsplat.stages.contract import contract
 
@@ -31,7 +31,7 @@ def run(job: Job) -> None:
     from chebsplat.formats.encoder import DYNAMIC, FLOAT, FUSED, write_encoder
     from chebsplat.formats.gaussians import read_gaussians
     from chebsplat.stages.onnx_graphs import encoder_model, fusion_model
-    from chebsplat.stages.restored import fitting, restored_encoder
+    from chebsplat.stages.restored import fitting, restored_encoder, trained_with
 
     path = job.inputs["gaussians"]
     gaussians = read_gaussians(path)
@@ -58,21 +58,6 @@ def run(job: Job) -> None:
         "largest_difference_int8": max(row["difference"] for row in parity[DYNAMIC]),
     }
     write_encoder(job.out, agreed, parity)
-
-
-def trained_with(path: Path) -> dict[str, Any]:
-    """The sections `describe` and `train` that the checkpoint was made with. Raises InputError if it names none."""
-    from chebsplat.formats.artifact import read_manifest
-    from chebsplat.settings import DescribeSection, TrainSection
-    from chebsplat.stages.config import checked
-
-    config, file = read_manifest(path).config, path / "artifact.json"
-    if not {"describe", "train"} <= set(config):
-        raise InputError(f"{file} does not say how the scene was trained; train it again")
-    return {
-        "describe": checked(DescribeSection, config["describe"], f"{file}: describe", InputError).model_dump(),
-        "train": checked(TrainSection, config["train"], f"{file}: train", InputError).model_dump(),
-    }
 
 
 def restored_fusion(gaussians: Any, n_channels: int, train: dict[str, Any]) -> Any:

@@ -42,7 +42,7 @@ STAGES: dict[str, Stage] = {
               help="Write PLY files, ragged zarr, the label dictionary and the summary."),
         Stage("onnx", "chebsplat.encoder/2", ("onnx",), (("gaussians", "train"),),
               help="Export the local encoder to ONNX and check it against torch."),
-        Stage("cks", "chebsplat.basis/2", ("scene", "cks"), (("gaussians", "train"),), (("basis", "cks"),),
+        Stage("cks", "chebsplat.basis/3", ("scene", "cks"), (("gaussians", "train"),), (("basis", "cks"),),
               help="Update the core knowledge space with a trained scene (Eqs 14-15)."),
         Stage("evaluate", "chebsplat.evaluation/1", ("evaluate",), (("capture", "ingest"), ("scene", "export")),
               (("features", "teacher"),), help="Measure the exported scene on the test views."),

@@ -107,11 +107,16 @@ class OnnxSection(Section):
 
 class CksSection(Section):
     energy: float = number(0.96, "share of the energy that the basis grows to hold", 1e-3, 1)
-    tolerance: float = number(0.2, "relative residual below which a scene adds nothing (ε)", 1e-6, 10)
-    max_rank: float = number(0.5, "columns, at most, as a fraction of the rows of an attention weight", 1e-3, 0.999)
+    tolerance: float = number(0.2, "ρ, or ρ′, below which a scene adds nothing (ε)", 1e-6, 10)
+    max_rank: float = number(0.875, "columns, at most, as a fraction of a linear map's inputs", 1e-3, 0.999)
     energy_rule: Literal["total", "residual"] = setting(
         "total", "of all a scene holds, or (the printed rule) of what the basis misses"
     )
+    max_added: float = number(0.5, "columns that a scene may add, as a fraction of those left", 1e-3, 1)
+    update_rule: Literal["residual", "printed"] = setting(
+        "residual", "what decides if a scene adds: its relative residual ρ; printed: ρ′ = ρ (1 + κ σ_f)"
+    )
+    kappa: float = number(1.0, "weight in ρ′ of the spread of shape within a scene's regions (κ)", 0, 1e6)
 
 
 class EvaluateSection(Section):

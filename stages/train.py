@@ -75,6 +75,8 @@ def run(job: Job) -> None:
         job.facts["described_anew"] = model.shape.described.share_described
         if train.inflation == 0:
             job.facts["guarded"] = model.shape.share_undefined
+        if model.shape.modulation is not None and trainer.basis:
+            job.facts["alpha"] = float(model.shape.modulation(model.shape.cache.mean(0)))
     if model.shape is not None and features is not None:
         job.facts["encoder"] = agreement(model.shape.alone().numpy(), parameters["features"], features.label_embeddings)
     if features is not None:

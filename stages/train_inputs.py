@@ -6,6 +6,7 @@ from typing import TYPE_CHECKING
 
 from chebsplat.errors import DataFailure, InputError
 from chebsplat.stages.command import Job
+from chebsplat.stages.restored import without_basis
 
 if TYPE_CHECKING:
     from torch import Tensor
@@ -82,10 +83,12 @@ def knowledge(job: Job, model: SceneModel, train: TrainSection) -> dict[str, Ten
 
     from chebsplat.formats.basis import read_basis
 
-    basis, attention = read_basis(job.inputs["basis"]), model.shape.encoder.attention_weights()
-    wrong = [n for n, w in attention.items() if n not in basis.bases or len(basis.bases[n]) != len(w)]
+    basis, maps = read_basis(job.inputs["basis"]), model.shape.encoder.linear_maps()
+    unfit, wrong = without_basis(maps, basis.bases)
     if wrong:
         raise InputError(f"{job.inputs['basis']} does not fit the encoder at {wrong[0]}; start another sequence")
+    if unfit:
+        job.left_out(f"knowledge of {', '.join(unfit)}", "the earlier encoder has none of this shape")
     if train.warm_start:
         state = model.shape.encoder.state_dict()
         fitting = {k: torch.from_numpy(v) for k, v in basis.weights.items() if k in state and state[k].shape == v.shape}
@@ -94,7 +97,8 @@ def knowledge(job: Job, model: SceneModel, train: TrainSection) -> dict[str, Ten
         job.facts["warm_started"] = len(fitting)
         if other := sorted(state.keys() - fitting.keys()):
             job.left_out(f"warm start of {', '.join(other)}", "the earlier encoder has none of this shape")
-    return {name: torch.from_numpy(basis.bases[name]) for name in attention} if train.weight_basis > 0 else {}
+    followed = maps.keys() - set(unfit) if train.weight_basis > 0 else set()
+    return {name: torch.from_numpy(basis.bases[name]) for name in maps if name in followed}
 
 
 def within_cap(job: Job, points: Points) -> Points:

@@ -81,6 +81,13 @@ def test_wrong_schema_is_an_input_error(tmp_path):
         artifact.read_manifest(make(tmp_path / "x"), "chebsplat.points/1")
 
 
+def test_an_artifact_of_another_version_of_its_schema_says_that_it_is_to_be_made_again(tmp_path):
+    path = make(tmp_path / "x")
+    name, _, version = artifact.read_manifest(path).schema.rpartition("/")
+    with pytest.raises(InputError, match="another version of chebsplat made it: make it again"):
+        artifact.read_manifest(path, f"{name}/{int(version) + 1}")
+
+
 @pytest.mark.parametrize(("umask", "mode"), [(0o022, 0o644), (0o002, 0o664), (0o077, 0o600)])
 def test_files_are_as_readable_as_the_umask_says_whoever_wrote_them(tmp_path, umask, mode):
     before = os.umask(umask)

@@ -49,7 +49,7 @@ def chain():
             W = torch.randn(16, 2, generator=g) @ torch.randn(2, 16, generator=g)
             held, reports[name] = update(torch.from_numpy(grown[name]) if name in grown else None, W, energy=0.9999)
             grown[name], weights[f"{name}.weight"] = held.numpy(), W.numpy()
-        lineage.append({"scene": scene, "gaussians": f"g{number}", "projections": reports})
+        lineage.append({"scene": scene, "gaussians": f"g{number}", "spread": 1.0, "maps": reports})
         earlier = key_of(number - 1) if number > 1 else None
         found.append(publish(key_of(number), Basis(dict(grown), weights, list(lineage)), earlier))
         assert heads.advance(bases.head_folder("shared"), number - 1, found[-1])
@@ -69,7 +69,7 @@ def test_log_says_which_scene_added_how_much_and_draws_it(chain, tmp_path):
     assert [line.split()[:2] for line in lines[1:]] == [[str(k), scene] for k, scene in enumerate(SCENES, start=1)]
     with (tmp_path / "log/lineage.csv").open() as handle:
         rows = list(csv.DictReader(handle))
-    assert [(row["scene"], row["weight"], row["rank_after"]) for row in rows[::2]] == [
+    assert [(row["scene"], row["map"], row["rank_after"]) for row in rows[::2]] == [
         ("office0", NAMES[0], "2"), ("room0", NAMES[0], "4"), ("office1", NAMES[0], "6")
     ]  # fmt: skip
     assert all(float(row["rho_after"]) < 0.02 < float(row["rho"]) for row in rows)
@@ -114,7 +114,7 @@ def another_history(basis):
 
 def too_wide(basis):
     basis.bases[NAMES[0]] = np.eye(16, 9, dtype=np.float32)
-    basis.lineage[-1]["projections"][NAMES[0]]["rank_after"] = 9
+    basis.lineage[-1]["maps"][NAMES[0]]["rank_after"] = 9
 
 
 @pytest.mark.parametrize(
@@ -180,4 +180,4 @@ def test_a_sequence_that_is_not_made_yet_says_how_to_make_it():
 def test_the_lineage_is_plain_json(chain):
     entries = json.loads((chain[2] / "lineage.json").read_text())
     assert [entry["gaussians"] for entry in entries] == ["g1", "g2", "g3"]
-    assert entries[1]["projections"][NAMES[1]]["rank_before"] == 2
+    assert entries[1]["maps"][NAMES[1]]["rank_before"] == 2

@@ -32,7 +32,7 @@ def publish_gaussians(path, gaussians):
 
 
 def publish_basis(path, basis):
-    with artifact.publish(path, Manifest("chebsplat.basis/2", KEY, "cks")) as tmp:
+    with artifact.publish(path, Manifest("chebsplat.basis/3", KEY, "cks")) as tmp:
         write_basis(tmp, basis)
     return path
 
@@ -96,8 +96,16 @@ def test_bit_flip_is_named_with_the_remedy(tmp_path, file):
 def test_basis_round_trip_and_refusal_of_what_its_columns_and_lineage_contradict(tmp_path):
     q, _ = np.linalg.qr(np.random.default_rng(0).normal(size=(8, 3)))
     weights = {"layer0.query": np.ones((8, 8), np.float32)}
-    report = {"rank_before": 0, "rank_after": 3, "added": 3, "rho": 1.0, "rho_after": 0.1, "energy": 0.99}
-    entry = {"scene": "toy", "gaussians": "k", "projections": {"layer0.query": report}}
+    report = {
+        "rank_before": 0,
+        "rank_after": 3,
+        "added": 3,
+        "rho": 1.0,
+        "rho_after": 0.1,
+        "energy": 0.99,
+        "rho_printed": 2.0,
+    }
+    entry = {"scene": "toy", "gaussians": "k", "spread": 1.0, "maps": {"layer0.query": report}}
     given = Basis({"layer0.query": q.astype(np.float32)}, weights, [entry])
     found = read_basis(publish_basis(tmp_path / "b", given))
     np.testing.assert_array_equal(found.bases["layer0.query"], given.bases["layer0.query"])

@@ -36,7 +36,7 @@ for number in range(int(sys.argv[3])):
             return None
         out = root / "store/cks" / sha256(f"{len(lineage)} {name}".encode()).hexdigest()[:16]
         with artifact.publish(out, Manifest(SCHEMA, out.name, "cks")) as tmp:
-            write_basis(tmp, Basis({}, {}, [*lineage, {"scene": who, "gaussians": name, "projections": {}}]))
+            write_basis(tmp, Basis({}, {}, [*lineage, {"scene": who, "gaussians": name, "spread": 0.0, "maps": {}}]))
         return out
 
     heads.extend(root / "basis-shared", build)
@@ -101,7 +101,7 @@ def test_processes_that_are_killed_lose_no_update_and_leave_no_half_revision(tmp
 
 
 def trained(path, key, seed):
-    """A checkpoint whose encoder is random and its attention weights of rank 1, so that many scenes have news."""
+    """A checkpoint whose encoder is random and its linear maps of rank 1, so that many scenes have news."""
     import torch
 
     from chebsplat.shape.encoder import RegionEncoder
@@ -109,12 +109,13 @@ def trained(path, key, seed):
     torch.manual_seed(seed)
     encoder = RegionEncoder(4, 3, width=32, n_layers=1)
     with torch.no_grad():
-        for weight in encoder.attention_weights().values():
-            weight.copy_(torch.randn(32, 1) @ torch.randn(1, 32))
+        for W in encoder.linear_maps().values():
+            W.copy_(torch.randn(len(W), 1) @ torch.randn(1, W.shape[1]))
     modules = {f"shape.encoder.{name}": value.numpy() for name, value in encoder.state_dict().items()}
     notes = {"encoder": {"n_inputs": 4, "n_channels": 3} | encoder.settings}
     cameras = Cameras(["a"], np.eye(3)[None], np.eye(4)[None], 5, 4)
-    with artifact.publish(path, Manifest(SCHEMA, key, "train")) as tmp:
+    config = {"describe": {}, "train": {}}
+    with artifact.publish(path, Manifest(SCHEMA, key, "train", config=config)) as tmp:
         write_gaussians(tmp, Gaussians(gaussian_parameters(), cameras, modules, notes=notes))
     return path
 
@@ -178,7 +179,7 @@ def test_a_head_whose_stage_fails_raises_its_error_and_stays_as_it_is(work, monk
 def test_a_head_moves_only_from_the_revision_that_was_read(tmp_path):
     first, second = (tmp_path / key_of(name) for name in "ab")
     for path in (first, second):
-        with artifact.publish(path, Manifest("chebsplat.basis/2", path.name, "cks")) as tmp:
+        with artifact.publish(path, Manifest("chebsplat.basis/3", path.name, "cks")) as tmp:
             write_basis(tmp, Basis({}, {}, []))
     folder = tmp_path / "basis-x"
     assert heads.advance(folder, 0, first)

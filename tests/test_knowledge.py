@@ -15,7 +15,7 @@ pytestmark = pytest.mark.xdist_group("toy")
 
 def train(toy, out, basis, **settings):
     """Checkpoint, facts and the columns of the trace, of a training of one step."""
-    config = TOY | {"train": TOY["train"] | {"steps": 1, "report_every": 1, "seed": 1} | settings}
+    config = TOY | {"train": TOY["train"] | {"steps": 1, "report_every": 1, "encode_every": 1, "seed": 1} | settings}
     inputs = {role: toy[of] for role, of in INPUTS["train"].items()} | ({"basis": basis} if basis else {})
     assert run_stage("train", out, inputs, config) == 0
     with (out / "trace.csv").open() as handle:
@@ -58,8 +58,50 @@ def test_a_second_revision_keeps_the_first_and_names_its_scene(toy, tmp_path):
         np.testing.assert_array_equal(second.bases[name][:, : columns.shape[1]], columns)
 
 
+def test_knowledge_pulls_in_the_steps_in_which_views_do(toy, tmp_path):
+    settings = {"steps": 8, "encode_every": 4, "encode_from": 0.5}
+    train(toy, tmp_path / "train", toy["cks"], **settings)
+    with (tmp_path / "train/trace.csv").open() as handle:
+        pulls = {int(float(row["step"])): float(row["loss_basis"]) > 0 for row in csv.DictReader(handle)}
+    assert [step for step, pulled in pulls.items() if pulled] == [4, 8]
+
+
+def test_the_modulation_is_kept_with_the_checkpoint_and_its_value_said(toy, tmp_path):
+    checkpoint, facts, columns = train(toy, tmp_path / "train", toy["cks"], alpha="network")
+    assert "shape.modulation.linear.weight" in checkpoint.modules
+    assert 1e-3 <= facts["alpha"] <= 10 and facts["alpha"] != 1
+    assert "loss_basis" in columns
+    plain, plain_facts, _ = train(toy, tmp_path / "plain", toy["cks"])
+    assert "alpha" not in plain_facts and not any("modulation" in name for name in plain.modules)
+
+
+def test_inputs_of_another_width_leave_their_own_map_out_and_carry_its_basis_on(toy, tmp_path):
+    _, facts, columns = train(toy, tmp_path / "train", toy["cks"], context="none")
+    assert [what for what in facts["left_out"] if what.startswith("knowledge of ")] == ["knowledge of embed_input"]
+    assert "loss_basis" in columns
+    assert run_stage("cks", tmp_path / "cks", {"gaussians": tmp_path / "train", "basis": toy["cks"]}) == 0
+    first, second = read_basis(toy["cks"]), read_basis(tmp_path / "cks")
+    np.testing.assert_array_equal(second.bases["embed_input"], first.bases["embed_input"])
+    assert second.lineage[1]["maps"].keys() == first.lineage[0]["maps"].keys() - {"embed_input"}
+    assert "knowledge of embed_input" in read_manifest(tmp_path / "cks").facts["left_out"]
+
+
+def test_a_revision_says_how_much_shape_varies_and_what_the_print_would_decide_by(toy):
+    (entry,) = read_basis(toy["cks"]).lineage
+    assert 0.1 < entry["spread"] < 10
+    for report in entry["maps"].values():
+        assert report["rho_printed"] == pytest.approx(report["rho"] * (1 + entry["spread"]))
+
+
+def test_without_descriptors_there_is_no_spread_and_the_stage_says_so(toy, tmp_path):
+    train(toy, tmp_path / "train", None, albo=False)
+    assert run_stage("cks", tmp_path / "cks", {"gaussians": tmp_path / "train"}) == 0
+    assert read_basis(tmp_path / "cks").lineage[0]["spread"] == 0
+    assert "spread of shape" in read_manifest(tmp_path / "cks").facts["left_out"]
+
+
 def test_a_basis_of_another_width_is_an_input_error(toy, tmp_path, capsys):
     inputs = {role: toy[of] for role, of in INPUTS["train"].items()} | {"basis": toy["cks"]}
     config = TOY | {"train": TOY["train"] | {"width": 16}}
     assert run_stage("train", tmp_path / "train", inputs, config) == 3
-    assert "does not fit the encoder at blocks.0" in capsys.readouterr().err
+    assert "does not fit the encoder at hidden" in capsys.readouterr().err

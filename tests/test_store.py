@@ -87,7 +87,7 @@ def test_links_and_heads_never_lead_out_of_the_work_folder(work, name):
 @pytest.mark.parametrize("number", ["100000000", "2", "9" * 9])
 def test_a_revision_without_the_one_before_is_named_at_once(work, number):
     path = store.artifact_path("cks", key_of("a"))
-    with artifact.publish(path, Manifest("chebsplat.basis/2", path.name, "cks")):
+    with artifact.publish(path, Manifest("chebsplat.basis/3", path.name, "cks")):
         pass
     folder = bases.head_folder("shared")
     folder.mkdir()
@@ -100,7 +100,7 @@ def test_a_revision_without_the_one_before_is_named_at_once(work, number):
 @pytest.mark.parametrize("key", ["/tmp/elsewhere", "../../../elsewhere", "", "abc"])
 def test_a_folder_s_manifest_cannot_say_where_its_copy_goes(work, tmp_path, key):
     folder = tmp_path / "knowledge"
-    with artifact.publish(folder, Manifest("chebsplat.basis/2", key_of("a"), "cks")):
+    with artifact.publish(folder, Manifest("chebsplat.basis/3", key_of("a"), "cks")):
         pass
     file = folder / "artifact.json"
     file.write_text(json.dumps(json.loads(file.read_text()) | {"key": key}))

@@ -9,6 +9,7 @@ import torch
 from torch import Tensor, nn
 
 from chebsplat.settings import DescribeSection, TrainSection
+from chebsplat.shape import cks
 from chebsplat.shape.descriptor import n_degrees
 from chebsplat.shape.encoder import RegionEncoder
 from chebsplat.shape.fusion import Gate, propagate, propagation_weights, share_undefined
@@ -58,6 +59,7 @@ class ShapeBranch(nn.Module):
             self.encoder.norm_input.set(self.n_described, torch.zeros(n_context), rms)
         self.keeps_norm = False  # an earlier scene's constants are kept, with its weights
         self.gate = Gate(n_channels, train.gate_start)
+        self.modulation = cks.Modulation(n_channels) if train.alpha == "network" else None
         self.regions: Regions | None = None
         self.described = Descriptors(describe, train.refresh_tolerance)
         self.ids = GaussianIds()
@@ -180,3 +182,8 @@ class ShapeBranch(nn.Module):
         wanted = features.detach()[members.clamp_min(0)]
         mask = members >= 0
         return ((fresh.values[:, None] - wanted).square().sum(-1) + 1e-12).sqrt()[mask].mean()
+
+    def basis_loss(self, bases: dict[str, Tensor], fresh: FreshEncodings) -> Tensor:
+        """How far the encoder lies outside earlier scenes' bases (Eq 14), modulated by the shapes it sees."""
+        loss = cks.basis_loss(self.encoder.linear_maps(), bases)
+        return loss if self.modulation is None else self.modulation(fresh.values.mean(0)) * loss

@@ -1,15 +1,20 @@
-"""The core knowledge space: a basis of the encoder's attention weights, carried from scene to scene (Eqs 14-15)."""
+"""The core knowledge space: a basis of each of the encoder's linear maps, carried from scene to scene (Eqs 14-15).
+
+A map takes z to z W, W [q, p]: the transpose of `nn.Linear.weight`. Its basis [q, r] spans inputs.
+"""
 
 from __future__ import annotations
 
+import math
 from typing import Any
 
 import numpy as np
 import torch
-from torch import Tensor
+from torch import Tensor, nn
 
 EPS = torch.finfo(torch.float64).eps
 DROPPED = 1e-6  # a column that keeps less of its length than this beside the others is dropped
+WEAKEST, STRONGEST = 1e-3, 10.0  # α, at least and at most
 
 
 def project(W: Tensor, basis: Tensor) -> tuple[Tensor, Tensor]:
@@ -23,40 +28,62 @@ def project(W: Tensor, basis: Tensor) -> tuple[Tensor, Tensor]:
     return W - residual, residual
 
 
+def spread(descriptors: Tensor, mask: Tensor) -> float:
+    """σ_f of a scene (Eq 15): how much shape varies within its regions; about 1 in rooms, 0 where there are none.
+
+    Args: descriptors [M, n, ...], mask [M, n] true where a member exists.
+    Choices: of a region, the deviation of its members' descriptors, rms over channels (the printed ‖σ‖ / √Q); mean over
+      regions that have members. Descriptors are not standardised: they have no unit, and a scene's own constants
+      would make a flat scene as rich as any.
+    """
+    values, there = descriptors.double().flatten(2), mask[..., None].double()
+    count = there.sum(1).clamp_min(1)
+    rest = (values - (values * there).sum(1, keepdim=True) / count[:, None]) * there
+    deviations = (rest.square().sum(1) / count).mean(-1).sqrt()[mask.any(1)]
+    return float(deviations.mean()) if deviations.numel() else 0.0
+
+
 def update(
     basis: Tensor | None,
     W: Tensor,
     *,
     energy: float = 0.96,
     tolerance: float = 0.2,
-    max_rank: float = 0.5,
+    max_rank: float = 0.875,
+    max_added: float = 0.5,
     rule: str = "total",
+    novelty: float = 1.0,
+    update_rule: str = "residual",
 ) -> tuple[Tensor, dict[str, Any]]:
     """Extend a basis by what it misses of W (Eq 15).
 
     Args:
       basis:     [q, r] orthonormal to 1e-4, or None before the first scene.
-      W:         [q, p] attention weight of the new scene.
+      W:         [q, p] linear map of the new scene.
       energy:    fraction of energy to reach: of captured + residual (`total`), or of the residual alone (the
                  printed rule, which always adds a vector).
-      tolerance: κ below which the scene is no news and nothing is added (ε = 0.2).
+      tolerance: ρ or ρ′ below which the scene is no news and nothing is added (ε = 0.2).
       max_rank:  ceiling of r as a fraction of q, below 1: at r = q the regulariser would vanish for ever.
+      max_added: columns that a scene may add, as a fraction of those left below the ceiling; one at least.
+      novelty:   1 + κ σ_f of the scene: ρ′ = ρ × novelty.
+      update_rule: what is compared with the tolerance: ρ (`residual`), or ρ′ (`printed`).
     Returns: basis [q, r'] float32 with BᵀB = I to 3e-8 (dense columns, q ≥ 32; one ulp else); the given columns
       come first, untouched. Report: `rank_before`, `rank_after`, `added`; `rho` and `rho_after`, the residual
-      relative to W, before and after; `energy`, the fraction of ‖W‖² captured after.
+      relative to W, before and after; `rho_printed`, ρ′; `energy`, the fraction of ‖W‖² captured after.
     Raises:  ValueError on values that are not finite, shapes that disagree, a basis that is not orthonormal, or a
       rule or fraction that does not exist.
-    Choices: scaled by max|W|. κ is the residual's σ_f / √Q, its rms entry, in units of W's own: √Q cancels and κ = ρ.
-      No update if the residual is rounding, ρ ≤ 10 eps √q, nor, by `total`, if W is captured to `energy` already. New
-      columns are orthogonalised twice. The first basis comes from the SVD of W. A basis beyond the ceiling is kept,
-      never cut.
+    Choices: scaled by max|W|. No update if the residual is rounding, ρ ≤ 10 eps √q, nor, by `total`, if W is captured
+      to `energy` already. New columns are orthogonalised twice. The first basis comes from the SVD of W. A basis beyond
+      the ceiling is kept, never cut.
     """
-    _check(basis, W, energy, max_rank, rule)
+    _check(basis, W, energy, max_rank, max_added, novelty)
+    if rule not in ("total", "residual") or update_rule not in ("residual", "printed"):
+        raise ValueError(f"rule {rule!r} is neither 'total' nor 'residual', or {update_rule!r} not 'printed' either")
     q = W.shape[0]
     given = torch.zeros(q, 0) if basis is None else basis.float()
     rank = given.shape[1]
     report: dict[str, Any] = {"rank_before": rank, "rank_after": rank, "added": 0}
-    report |= {"rho": 0.0, "rho_after": 0.0, "energy": 1.0}
+    report |= {"rho": 0.0, "rho_after": 0.0, "rho_printed": 0.0, "energy": 1.0}
     largest = W.double().abs().max() if W.numel() else torch.tensor(0.0)
     if largest == 0:
         return given, report
@@ -64,14 +91,15 @@ def update(
     _, residual = project(scaled, old)
     total, missed = float((scaled**2).sum()), float((residual**2).sum())
     rho = min((missed / total) ** 0.5, 1.0)
-    report |= {"rho": rho, "rho_after": rho, "energy": 1 - rho**2}
+    report |= {"rho": rho, "rho_after": rho, "rho_printed": rho * novelty, "energy": 1 - rho**2}
     room = int(max_rank * q) - rank
-    if rho <= max(10 * EPS * q**0.5, tolerance if rank else 0.0) or room <= 0:
+    news = rho * novelty if update_rule == "printed" else rho
+    if rho <= 10 * EPS * q**0.5 or (rank and news <= tolerance) or room <= 0:
         return given, report
     vectors, values, _ = torch.linalg.svd(residual, full_matrices=False)
     gained = torch.nn.functional.pad(torch.cumsum(values**2, 0), (1, 0))  # by 0, 1, 2, ... of the vectors
     reached = (total - missed + gained) / total if rule == "total" else gained / missed
-    count = min(int((reached < energy).sum()), room, len(values))
+    count = min(int((reached < energy).sum()), max(int(max_added * room), 1), len(values))
     if count == 0:
         return given, report
     grown = _orthonormal(torch.cat([old, vectors[:, :count]], 1))
@@ -81,13 +109,13 @@ def update(
     return _rounded(grown, given), report
 
 
-def _check(basis: Tensor | None, W: Tensor, energy: float, max_rank: float, rule: str) -> None:
+def _check(basis: Tensor | None, W: Tensor, energy: float, max_rank: float, max_added: float, novelty: float) -> None:
     if W.ndim != 2 or not torch.isfinite(W).all():
         raise ValueError(f"W {tuple(W.shape)} is not finite, or not a matrix")
-    if rule not in ("total", "residual"):
-        raise ValueError(f"rule {rule!r} is neither 'total' nor 'residual'")
-    if not (0 < energy <= 1 and 0 < max_rank < 1):
-        raise ValueError(f"energy {energy} is not within (0, 1], or max_rank {max_rank} not within (0, 1)")
+    if not (0 < energy <= 1 and 0 < max_rank < 1 and 0 < max_added <= 1):
+        raise ValueError(f"energy {energy}, max_added {max_added} or max_rank {max_rank} is not within (0, 1], or is 1")
+    if not 1 <= novelty < math.inf:
+        raise ValueError(f"novelty {novelty} is below 1, or not finite")
     if basis is None:
         return
     if basis.ndim != 2 or basis.shape[0] != W.shape[0]:
@@ -139,7 +167,7 @@ def _rounded(columns: Tensor, given: Tensor) -> Tensor:
 class _Outside(torch.autograd.Function):
     """Share of each W's energy outside its basis, [n], and its gradient in closed form: 2 (W − B Bᵀ W) / ‖W‖².
 
-    A graph of a dozen small operations a weight takes twice as long; torch instead of NumPy, whose products of so
+    A graph of a dozen small operations a map takes twice as long; torch instead of NumPy, whose products of so
     small matrices wake no threads, up to ten times.
     """
 
@@ -170,15 +198,33 @@ def regularizer(W: Tensor, basis: Tensor) -> Tensor:
 
     Args: W [q, p]; basis [q, r] orthonormal.
     Choices: relative, so that shrinking W does not lower it: the denominator carries no gradient. Scaled by max|W|
-      first, so that 1e±25 neither overflows nor vanishes. The printed α is `train.weight_basis`: learned by this loss
-      its best value would be 0, and without a gradient from it nothing teaches it.
+      first, so that 1e±25 neither overflows nor vanishes. The printed α is `Modulation`, or 1.
     """
     return basis_loss({"": W}, {"": basis})
 
 
-def basis_loss(attention: dict[str, Tensor], bases: dict[str, Tensor]) -> Tensor:
-    """Mean over attention weights of `regularizer`; 0 without bases (the first scene)."""
+def basis_loss(maps: dict[str, Tensor], bases: dict[str, Tensor]) -> Tensor:
+    """Mean over linear maps of `regularizer`; 0 without bases (the first scene)."""
     if not bases:
         return torch.tensor(0.0)
-    loss: Tensor = _Outside.apply(list(bases.values()), *(attention[name] for name in bases)).mean()
+    loss: Tensor = _Outside.apply(list(bases.values()), *(maps[name] for name in bases)).mean()
     return loss
+
+
+class Modulation(nn.Module):
+    """α of Eq 14: softplus(w · z̄ + b) of the mean z̄ [C] of the encoded regions, within [1e-3, 10].
+
+    Choices: taught by its own loss, α goes to 0 whatever z̄ is; no other loss sees it. So no gradient reaches w, b or
+      z̄, and α stays what was drawn: 1 at z̄ = 0, a fixed function of the shapes in view. (With α L - log α it would
+      learn 1 / L: finite, not in print, and the pull would be strongest where it is needed least.)
+    """
+
+    def __init__(self, n_channels: int):
+        super().__init__()
+        with torch.random.fork_rng(devices=[]):  # what is drawn after it is drawn as it would be without it
+            self.linear = nn.Linear(n_channels, 1)
+        nn.init.constant_(self.linear.bias, math.log(math.e - 1))
+
+    def forward(self, mean_encoding: Tensor) -> Tensor:
+        alpha: Tensor = nn.functional.softplus(self.linear(mean_encoding.detach()))[0]
+        return alpha.clamp(WEAKEST, STRONGEST).detach()

@@ -155,10 +155,13 @@ class RegionEncoder(nn.Module):
         encoder.load_state_dict({name: torch.from_numpy(value) for name, value in weights.items()})
         return encoder.eval()
 
-    def attention_weights(self) -> dict[str, Tensor]:
-        """The linear maps of attention that the knowledge space follows, by name."""
-        return {
-            f"blocks.{index}.{part}": getattr(block.attention, part).weight
-            for index, block in enumerate(self.blocks)
-            for part in ("query", "key", "value", "output")
-        }
+    def linear_maps(self) -> dict[str, Tensor]:
+        """W [q, p] by name of each linear map z W that the knowledge space follows: inputs, attention and decoder."""
+        layers: dict[str, nn.Linear] = {"embed_position": self.embed_position, "hidden": self.hidden}
+        if self.n_inputs:
+            layers["embed_input"] = self.embed_input
+        for index, block in enumerate(self.blocks):
+            for part in ("query", "key", "value", "output"):
+                layers[f"blocks.{index}.{part}"] = getattr(block.attention, part)
+        layers |= {f"decode.{k}": layer for k, layer in enumerate(self.decode) if isinstance(layer, nn.Linear)}
+        return {name: layer.weight.T for name, layer in layers.items()}

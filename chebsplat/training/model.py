@@ -11,7 +11,7 @@ from torch import Tensor, nn
 
 from chebsplat.rasterize import CELL, rasterize
 from chebsplat.settings import DescribeSection, TrainSection
-from chebsplat.shape.branch import ShapeBranch
+from chebsplat.shape.branch import FreshEncodings, ShapeBranch
 from chebsplat.shape.regions import Regions, covering
 from chebsplat.splats.sh_kernels import colors_in_view
 from chebsplat.training import prune, sh_mask_network, sh_prune
@@ -26,13 +26,14 @@ GATES = {"product": prune.SemanticGate, "printed": prune.PrintedGate}
 class Auxiliary:
     """What losses need beside the picture; None where it was not wanted or does not exist.
 
-    soft_mask: m̂ [V] of the pruning gates; band_masks [V, 3]; delta: δ [V, 4] of the printed mask network;
-    shape_distance []: of encodings that were computed anew to the features of their members.
+    soft_mask: m̂ [V] of the pruning gates; band_masks [V, 3]; delta: δ [V, 4] of the printed mask network; fresh:
+    encodings that were computed anew, at least one, and shape_distance []: of these to the features of their members.
     """
 
     soft_mask: Tensor | None = None
     band_masks: Tensor | None = None
     delta: Tensor | None = None
+    fresh: FreshEncodings | None = None
     shape_distance: Tensor | None = None
 
 
@@ -204,6 +205,7 @@ class SceneModel:
             fresh = None if generator is None else self.shape.sample(raw["features"], index, generator)
             features = self.shape.fuse(raw["features"], index, fresh)
             if fresh is not None and len(fresh.regions):
+                auxiliary.fresh = fresh
                 auxiliary.shape_distance = self.shape.distance(raw["features"], fresh)
         elif "features" in raw:
             features = take(raw["features"], index)

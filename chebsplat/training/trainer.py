@@ -13,7 +13,6 @@ from torch import Tensor
 from chebsplat.errors import DataFailure
 from chebsplat.evaluation.metrics import psnr
 from chebsplat.settings import TrainSection
-from chebsplat.shape import cks
 from chebsplat.shape.regions import Regions, regions_of
 from chebsplat.training import sh_mask_network, sh_prune
 from chebsplat.training.laps import Laps
@@ -219,9 +218,8 @@ class Trainer:
             losses["sh"] = settings.weight_sh * sh_mask_network.sh_loss(auxiliary.delta)
         elif auxiliary.band_masks is not None:
             losses["sh"] = settings.weight_sh * sh_prune.sh_loss(auxiliary.band_masks, self._guided(rendered.index))
-        if self.basis and self.model.shape is not None:
-            weights = self.model.shape.encoder.attention_weights()
-            losses["basis"] = settings.weight_basis * cks.basis_loss(weights, self.basis)
+        if self.basis and self.model.shape is not None and auxiliary.fresh is not None:  # as often as views pull it
+            losses["basis"] = settings.weight_basis * self.model.shape.basis_loss(self.basis, auxiliary.fresh)
         loss = torch.stack(list(losses.values())).sum()
         if not torch.isfinite(loss):
             bad = [name for name, value in losses.items() if not torch.isfinite(value)]

@@ -36,7 +36,7 @@ def newest(name: str) -> tuple[Path, Basis]:
 @click.argument("name")
 @click.option("--out", type=click.Path(path_type=Path), help="folder for lineage.csv and lineage.png")
 def log(name: str, out: Path | None) -> None:
-    """Revisions: the scene, ranks, ρ before and after, energy; means over attention weights."""
+    """Revisions: the scene, ranks, ρ before and after, σ_f and ρ′, energy; means over linear maps."""
     from chebsplat.formats import artifact
     from chebsplat.pipelines import lineage
 
@@ -57,7 +57,7 @@ def log(name: str, out: Path | None) -> None:
 @basis.command()
 @click.argument("name")
 def show(name: str) -> None:
-    """One revision: each attention weight, and which scene added which of its columns."""
+    """One revision: each linear map, and which scene added which of its columns."""
     from chebsplat.pipelines import lineage
 
     path, one = newest(name)

@@ -171,7 +171,7 @@ def _without_a_rank(folder: Path) -> Asked:
     from chebsplat.formats.manifest import Manifest
 
     with artifact.publish(folder / "knowledge", Manifest(SCHEMA, KEY, "cks")) as tmp:
-        write_basis(tmp, Basis({}, {}, [{"scene": "toy", "gaussians": KEY, "projections": {}}]))
+        write_basis(tmp, Basis({}, {}, [{"scene": "toy", "gaussians": KEY, "spread": 0.0, "maps": {}}]))
     return Asked(["basis", "verify", f"{folder / 'knowledge'}/"], "config.cks.max_rank")
 
 

@@ -190,8 +190,16 @@ def _encoder(out: Path) -> None:
 def _basis(out: Path) -> None:
     from chebsplat.formats.basis import Basis, write_basis
 
-    report = {"rank_before": 0, "rank_after": 2, "added": 2, "rho": 1.0, "rho_after": 0.1, "energy": 0.99}
-    entry = {"scene": "toy", "gaussians": KEY, "projections": {"blocks.0.query": report}}
+    report = {
+        "rank_before": 0,
+        "rank_after": 2,
+        "added": 2,
+        "rho": 1.0,
+        "rho_after": 0.1,
+        "energy": 0.99,
+        "rho_printed": 2.0,
+    }
+    entry = {"scene": "toy", "gaussians": KEY, "spread": 1.0, "maps": {"blocks.0.query": report}}
     bases = {"blocks.0.query": np.eye(8, 2, dtype=np.float32)}
     write_basis(out, Basis(bases, {"blocks.0.query": np.eye(8, dtype=np.float32)}, [entry]))
 
@@ -219,6 +227,6 @@ WRITERS: dict[str, tuple[str, Callable[[Path], None]]] = {
     "train": ("chebsplat.gaussians/1", _gaussians),
     "export": ("chebsplat.scene/2", _scene),
     "onnx": ("chebsplat.encoder/2", _encoder),
-    "cks": ("chebsplat.basis/2", _basis),
+    "cks": ("chebsplat.basis/3", _basis),
     "evaluate": ("chebsplat.evaluation/1", _evaluation),
 }

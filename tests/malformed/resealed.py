@@ -65,7 +65,11 @@ DOCUMENTS: dict[str, dict[str, list[tuple[tuple[Any, ...], Any]]]] = {  # stage,
         ],
     },
     "describe": {"settings.json": [((), []), (("radius",), ...), (("radius",), -1.0), (("n_angles",), 4)]},
-    "cks": {"lineage.json": [((), {}), ((0,), 5), ((0, "scene"), ...), ((0, "projections"), []), ((), [])]},
+    "cks": {
+        "lineage.json": [
+            ((), {}), ((0,), 5), ((0, "scene"), ...), ((0, "maps"), []), ((0, "spread"), ...), ((), [])
+        ],
+    },
 }  # fmt: skip
 
 
