@@ -112,7 +112,7 @@ class CksSection(Section):
     energy_rule: Literal["total", "residual"] = setting(
         "total", "of all a scene holds, or (the printed rule) of what the basis misses"
     )
-    max_added: float = number(0.5, "columns that a scene may add, as a fraction of those left", 1e-3, 1)
+    max_added: float = number(0.25, "columns that a scene may add, as a fraction of those left", 1e-3, 1)
     update_rule: Literal["residual", "printed"] = setting(
         "residual", "what decides if a scene adds: its relative residual ρ; printed: ρ′ = ρ (1 + κ σ_f)"
     )

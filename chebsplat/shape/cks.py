@@ -50,7 +50,7 @@ def update(
     energy: float = 0.96,
     tolerance: float = 0.2,
     max_rank: float = 0.875,
-    max_added: float = 0.5,
+    max_added: float = 0.25,
     rule: str = "total",
     novelty: float = 1.0,
     update_rule: str = "residual",
