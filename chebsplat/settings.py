@@ -155,7 +155,12 @@ class TrainSection(Section):
     # weights
     weight_ssim: float = number(0.2, "share of SSIM in the colour loss", 0, 1)
     weight_features: float = number(1.0, "of the feature loss", 0, 1e4)
-    feature_loss: Literal["length", "l1"] = setting("length", "l1: the paper's and Feature-3DGS'")
+    feature_loss: Literal["length", "l1", "cross-entropy"] | None = setting(
+        None,
+        "l1: the paper's and Feature-3DGS'; cross-entropy: of labels, weighted by confidence; "
+        "default: that for labels that a source brings, else length",
+    )
+    label_temperature: float = number(0.1, "of the logits that cross-entropy is of", 1e-4, 1e4)
     weight_shape: float = number(1.0, "of encodings' distance to their members' features; 0: the printed loss", 0, 1e4)
     weight_mask: float = number(1e-2, "of the penalty that closes pruning masks", 0, 1e4)
     weight_sh: float = number(4e-5, "of the penalty that closes SH bands", 0, 1e4)

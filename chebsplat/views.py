@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import torch
 from torch import Tensor
@@ -56,9 +57,21 @@ def remembered(read: Callable[[int], Tensor], budget: int) -> Callable[[int], Te
     return recall
 
 
+class TaughtLabels(NamedTuple):
+    """What a teacher takes a view's cells for: classes i64 [h, w], -1 where it says nothing; confidence [h, w] in
+    [0, 1]; class_codes [L, C] that features of a label are near.
+    """
+
+    classes: Tensor
+    confidence: Tensor
+    class_codes: Tensor
+
+
 @dataclass
 class Views:
-    """Training views. images [V, H, W, 3] u8; masks [V, H, W] bool or None; features: view index -> [h, w, C]."""
+    """Training views. images [V, H, W, 3] u8; masks [V, H, W] bool or None; features: view index -> [h, w, C]; labels:
+    view index -> `TaughtLabels` of these h × w cells, None where the teacher has none.
+    """
 
     names: list[str]
     images: Tensor
@@ -66,6 +79,7 @@ class Views:
     viewmats: Tensor
     masks: Tensor | None = None
     features: Callable[[int], Tensor] | None = None
+    labels: Callable[[int], TaughtLabels] | None = None
 
     def camera(self, index: int, factor: int) -> View:
         """The view's camera at 1/factor of its resolution."""

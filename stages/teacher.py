@@ -128,6 +128,8 @@ def from_labels(job: Job, capture: Capture, settings: TeacherSection) -> Feature
         rows.append(model.noisy_features(confused, codes, settings.blur, settings.noise, generator).astype(np.float16))
     features = np.stack(rows)
     pseudo, confidence = decode(features.astype(np.float32), codes)
+    ignored = ~features.any(-1)
+    pseudo[ignored], confidence[ignored] = model.IGNORE, 0.0
     convention = {"kind": "labels", "normalized": True, "n_scales": 1, "flips": False} | settings.model_dump(
         mode="json", include={"downscale", "confusion", "blur", "noise", "seed", "n_channels"}
     )

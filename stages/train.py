@@ -11,7 +11,15 @@ from chebsplat.errors import DataFailure
 from chebsplat.stages.command import Job, command, n_threads
 from chebsplat.stages.resume import Saves
 from chebsplat.stages.stopping import deferred
-from chebsplat.stages.train_inputs import described, first_regions, knowledge, model_of, training_views, within_cap
+from chebsplat.stages.train_inputs import (
+    described,
+    first_regions,
+    knowledge,
+    model_of,
+    training_views,
+    with_feature_loss,
+    within_cap,
+)
 
 if TYPE_CHECKING:
     import numpy as np
@@ -39,6 +47,7 @@ def run(job: Job) -> None:
     capture, given = read_capture(job.inputs["capture"]), read_points(job.inputs["points"])
     descriptors, points = described(job, given), within_cap(job, given)
     features = read_features(job.inputs["features"]) if "features" in job.inputs and train.semantics else None
+    train = with_feature_loss(train, features)
     note_left_out(job, train, features is not None)
     import torch  # once its inputs are known to be usable
 

@@ -4,11 +4,13 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from chebsplat.errors import DataFailure, InputError
+from chebsplat.errors import ConfigError, DataFailure, InputError
 from chebsplat.stages.command import Job
 from chebsplat.stages.restored import without_basis
 
 if TYPE_CHECKING:
+    from collections.abc import Callable
+
     from torch import Tensor
 
     from chebsplat.formats.capture import Capture
@@ -18,7 +20,7 @@ if TYPE_CHECKING:
     from chebsplat.settings import DescribeSection, TrainSection
     from chebsplat.shape.regions import Regions
     from chebsplat.training.model import SceneModel
-    from chebsplat.views import Views
+    from chebsplat.views import TaughtLabels, Views
 
 FEATURE_BYTES = 64 << 20  # of features that are kept in memory; what is beyond is read when its view is looked at
 
@@ -39,7 +41,7 @@ def training_views(capture: Capture, points: Points, features: Features | None) 
     names = [points.names[k] for k in used]
     images, masks = capture.images[:], capture.loss_mask
     chosen = [row[name] for name in names]
-    of = None
+    of = labels_of = None
     if features is not None:
         source = {name: view for view, name in enumerate(features.names)}
         absent = [name for name in names if name not in source]
@@ -51,6 +53,9 @@ def training_views(capture: Capture, points: Points, features: Features | None) 
         def of(index: int) -> torch.Tensor:
             return read(index).float()
 
+        if features.pseudo_labels is not None and features.confidence is not None:
+            labels_of = taught_labels(features, [source[name] for name in names])
+
     return Views(
         names,
         torch.from_numpy(images[chosen]),
@@ -58,7 +63,39 @@ def training_views(capture: Capture, points: Points, features: Features | None) 
         torch.from_numpy(points.cam_from_world[used]).float(),
         None if masks is None else torch.from_numpy(masks[:][chosen]),
         of,
+        labels_of,
     )
+
+
+def taught_labels(features: Features, rows: list[int]) -> Callable[[int], TaughtLabels]:
+    """The labels of the training views, whose rows in the features these are."""
+    import torch
+
+    from chebsplat.views import TaughtLabels
+
+    labels, confidence, codes = features.pseudo_labels, features.confidence, torch.from_numpy(features.label_embeddings)
+    assert labels is not None
+    assert confidence is not None
+
+    def of(index: int) -> TaughtLabels:
+        row = rows[index]
+        return TaughtLabels(torch.from_numpy(labels[row]).long(), torch.from_numpy(confidence[row]).float(), codes)
+
+    return of
+
+
+def with_feature_loss(train: TrainSection, features: Features | None) -> TrainSection:
+    """The loss that features ask for, where the config leaves it open. Raises ConfigError if theirs cannot be had."""
+    if features is None:
+        return train
+    if train.feature_loss is None:
+        given = features.convention.get("kind") == "given"
+        return train.model_copy(update={"feature_loss": "cross-entropy" if given else "length"})
+    if train.feature_loss == "cross-entropy" and (features.pseudo_labels is None or features.confidence is None):
+        raise ConfigError(
+            "train.feature_loss is cross-entropy, but the teacher brings no labels with a confidence; use length"
+        )
+    return train
 
 
 def model_of(

@@ -42,16 +42,23 @@ def sphere(n: int) -> np.ndarray:
     return torch.nn.functional.normalize(points, dim=-1).numpy()
 
 
-def tiny_trainer(means: np.ndarray | None = None, views: Views | None = None, **settings: Any) -> Trainer:
+def tiny_trainer(
+    means: np.ndarray | None = None,
+    views: Views | None = None,
+    describe: dict[str, Any] | None = None,
+    **settings: Any,
+) -> Trainer:
     """A trainer of few Gaussians, by default 300 on a unit sphere.
 
-    Args: settings: what differs in the config's train section.
+    Args: settings: what differs in the config's train section; describe: in the other one.
     """
     means = sphere(300) if means is None else means
     colors = (torch.rand(len(means), 3, generator=torch.Generator().manual_seed(2)) * 255).byte().numpy()
     shapes = local_shape(means, 8)[0] if len(means) > 1 else np.eye(3, dtype=np.float32)[None] * 0.01
     small = {"steps": 20, "min_gaussians": 8, "max_gaussians": len(means) + 100, "n_densify": 2, "width": 16}
-    config = Config.model_validate({"train": small | settings, "describe": {"n_regions": 24, "region_size": 16}})
+    config = Config.model_validate(
+        {"train": small | settings, "describe": {"n_regions": 24, "region_size": 16} | (describe or {})}
+    )
     torch.manual_seed(config.train.seed)
     model = SceneModel(initial_gaussians(means, colors, shapes, opacity=0.5), config.describe, config.train, CHANNELS)
     return Trainer(model, four_views() if views is None else views, config.train, 1.0)

@@ -67,6 +67,7 @@ def noisy_features(
     """Unit features [h, w, C]: code vectors of labels, blurred over boundaries, with Gaussian noise.
 
     Args: labels [h, w], class_codes [L, C] unit; blur: sigma in feature pixels; noise: deviation a channel.
+    Returns: zero at ignored pixels, which teach nothing.
     Choices: ignored pixels hold the zero vector before blur; normalised at the end.
     """
     from scipy.ndimage import gaussian_filter
@@ -75,5 +76,6 @@ def noisy_features(
     if blur > 0:
         features = gaussian_filter(features, (blur, blur, 0))
     features = features + generator.normal(0, noise, features.shape)
-    unit: np.ndarray = features / np.linalg.norm(features, axis=-1, keepdims=True).clip(1e-6)
-    return unit
+    unit = features / np.linalg.norm(features, axis=-1, keepdims=True).clip(1e-6)
+    kept: np.ndarray = np.where((labels != IGNORE)[..., None], unit, 0.0)
+    return kept

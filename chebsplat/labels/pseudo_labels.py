@@ -15,8 +15,8 @@ def voted(
     Args: labels i16 [H, W], IGNORE none; confidence [H, W] in [0, 1]; class_codes [L, C] unit.
     Returns: features f32 [h, w, C]: the unit mean of the class codes by votes, zero without a vote; labels i16 [h, w]
       with the most votes, IGNORE without any; confidence f32 [h, w]: the votes for it by pixel.
-    Choices: a cell at the right or lower edge has fewer pixels. What the paper says of confidences is a weight in the
-      loss; here they decide what a cell of several labels is taught, and a cell without any is taught nothing.
+    Choices: a cell at the right or lower edge has fewer pixels. Confidences decide what a cell of several labels is
+      taught, and weigh it in the loss (`training.semantic_loss`); a cell without any is taught nothing.
     """
     height, width = labels.shape
     h, w = -(-height // factor), -(-width // factor)

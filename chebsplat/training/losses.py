@@ -105,24 +105,36 @@ class _FeatureDistance(torch.autograd.Function):
         return grad * gradient, None, None, None
 
 
-def _cell_shares(mask: Tensor | None, size: tuple[int, int], kind: torch.dtype) -> Tensor:
-    """What each cell of the target counts, [h, w], summing to 1 (or 0): the mean of its pixels' mask."""
+def cell_shares(mask: Tensor | None, size: tuple[int, int], kind: torch.dtype, counted: Tensor | None = None) -> Tensor:
+    """What each cell of the target counts, [h, w], summing to 1 (or 0): the mean of its pixels' mask [H, W], and
+    nothing where `counted` [h, w] is false.
+    """
     if mask is None:
-        return torch.full(size, 1 / (size[0] * size[1]), dtype=kind)
-    share = torch.nn.functional.adaptive_avg_pool2d(mask[None].to(kind), size)[0]
-    return share / share.sum().clamp_min(1e-6)
+        share = torch.full(size, 1 / (size[0] * size[1]), dtype=kind)
+    else:
+        share = torch.nn.functional.adaptive_avg_pool2d(mask[None].to(kind), size)[0]
+    if counted is not None:
+        share = share * counted
+    return share if mask is None and counted is None else share / share.sum().clamp_min(1e-6)
 
 
-def feature_distance(render: Tensor, target: Tensor, mask: Tensor | None = None, kind: str = "length") -> Tensor:
+def feature_distance(
+    render: Tensor,
+    target: Tensor,
+    mask: Tensor | None = None,
+    kind: str = "length",
+    counted: Tensor | None = None,
+) -> Tensor:
     """Mean distance to the teacher's features at the teacher's resolution.
 
     Args: render [H, W, C]; target [h, w, C], h ≤ H; mask [H, W] bool, true where a pixel counts, or float ≥ 0, how
-      much it does; float32. kind: `length` of the difference over √C, or `l1`, its mean magnitude by channel.
+      much it does; float32. kind: `length` of the difference over √C, or `l1`, its mean magnitude by channel;
+      counted [h, w] bool: cells of the target that say something, None: all do.
     Choices: the render is averaged over each cell of the target; a cell counts by the mean of its pixels' mask.
       Where views disagree about a Gaussian the shortest total length is at their geometric median, which lies near the
       most common vector; the median channel by channel, where L1 is least, may be near none of them.
     """
-    share = _cell_shares(mask, (target.shape[0], target.shape[1]), render.dtype)
+    share = cell_shares(mask, (target.shape[0], target.shape[1]), render.dtype, counted)
     loss: Tensor = _FeatureDistance.apply(render, target.to(render.dtype), share, kind == "l1")
     return loss
 
@@ -135,4 +147,4 @@ def feature_distance_reference(
     pooled = torch.nn.functional.adaptive_avg_pool2d(render.permute(2, 0, 1), size).permute(1, 2, 0)
     difference = pooled - target
     distance = difference.abs().mean(-1) if kind == "l1" else difference.square().mean(-1).clamp_min(1e-30).sqrt()
-    return (distance * _cell_shares(mask, size, render.dtype)).sum()
+    return (distance * cell_shares(mask, size, render.dtype)).sum()

@@ -16,10 +16,11 @@ from chebsplat.settings import TrainSection
 from chebsplat.shape.regions import Regions, regions_of
 from chebsplat.training import sh_mask_network, sh_prune
 from chebsplat.training.laps import Laps
-from chebsplat.training.losses import feature_distance, photometric
+from chebsplat.training.losses import photometric
 from chebsplat.training.model import SceneModel
 from chebsplat.training.population import Population, broken
 from chebsplat.training.schedule import Schedule, adam
+from chebsplat.training.semantic_loss import semantic_loss
 from chebsplat.views import Views
 
 PROGRESS = ("step", "seconds", "order", "members", "guidance")
@@ -207,7 +208,8 @@ class Trainer:
         self.laps.mark("render")
         losses = {"color": photometric(rendered.rgb, target, mask, settings.weight_ssim)}
         if rendered.features is not None and wanted is not None:
-            distance = feature_distance(rendered.features, wanted, mask, settings.feature_loss)
+            labels = None if self.views.labels is None else self.views.labels(index)
+            distance = semantic_loss(rendered.features, wanted, labels, mask, settings)
             losses["features"] = settings.weight_features * distance
         auxiliary = rendered.auxiliary
         if auxiliary.soft_mask is not None and pruning:
