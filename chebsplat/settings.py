@@ -53,7 +53,7 @@ class DescribeSection(Section):
     from_degree: int | None = number(None, "first degree; default: 2 (0 and 1 are constant), 0 of a cut spectrum", 0, 2)
     region_size: int = number(32, "Gaussians in a region, at most", 4, 64)
     n_regions: int = number(768, "regions that cover the scene", 1, 200_000)
-    radius: float | None = number(None, "of regions, scene units; default: such that they cover the scene", 1e-9, 1e9)
+    region_radius: float | None = number(None, "scene units; default: such that regions cover the scene", 1e-9, 1e9)
     overlap: float = number(1.5, "radius of regions over the least that covers the scene", 1, 10)
     thinning: bool = setting(True, "members from a thinned set, to fill a region; false: the nearest to its centre")
     seed: int = seed("of the choice of regions")

@@ -38,7 +38,7 @@ def regions_of(
         ids=ids,
         earlier=earlier,
         overlap=settings.overlap,
-        radius=settings.radius,
+        radius=settings.region_radius,
         thinning=settings.thinning,
     )
 
