@@ -22,13 +22,6 @@ Spectrum = Literal["full", "taper", "hard"]
 Metric = Literal["relative", "printed"]
 Axis = Literal["tangent", "world"]
 OF_REGIONS = {"n_regions", "region_size", "seed", "region_radius", "overlap", "thinning"}  # not of values
-    "n_regions",
-    "region_size",
-    "seed",
-    "region_radius",
-    "overlap",
-    "thinning",
-}  # settings of these, not of values
 Values = TypeVar("Values")  # Tensor or np.ndarray
 
 
