@@ -162,8 +162,7 @@ def described(job: Job, points: Points) -> Descriptors | None:
     if max(stored.members.max(initial=-1), stored.centers.max(initial=-1)) >= len(points.means):
         raise InputError(f"{path} describes other points; run the describe stage on these points")
     describe = job.config.describe
-    wanted = describe.model_dump(exclude={"radius"} if describe.radius is None else None)  # the stored one was found
-    wrong = [f"describe.{name}" for name, value in wanted.items() if stored.settings.get(name) != value]
+    wrong = [f"describe.{name}" for name, value in describe.model_dump().items() if stored.settings.get(name) != value]
     if wrong:
         raise InputError(f"{path} has another {wrong[0]}; run the describe stage with this config")
     if stored.values.shape[1:3] != (stored.members.shape[1], describe.n_angles):
