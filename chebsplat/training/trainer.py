@@ -17,7 +17,7 @@ from chebsplat.shape.regions import Regions, regions_of
 from chebsplat.training import sh_mask_network, sh_prune
 from chebsplat.training.laps import Laps
 from chebsplat.training.losses import photometric
-from chebsplat.training.model import SceneModel
+from chebsplat.training.model import Rendered, SceneModel
 from chebsplat.training.population import Population, broken
 from chebsplat.training.schedule import Schedule, adam
 from chebsplat.training.semantic_loss import semantic_loss
@@ -206,22 +206,7 @@ class Trainer:
             grid=None if wanted is None else (wanted.shape[0], wanted.shape[1]),
         )
         self.laps.mark("render")
-        losses = {"color": photometric(rendered.rgb, target, mask, settings.weight_ssim)}
-        if rendered.features is not None and wanted is not None:
-            labels = None if self.views.labels is None else self.views.labels(index)
-            distance = semantic_loss(rendered.features, wanted, labels, mask, settings)
-            losses["features"] = settings.weight_features * distance
-        auxiliary = rendered.auxiliary
-        if auxiliary.soft_mask is not None and pruning:
-            losses["mask"] = settings.weight_mask * auxiliary.soft_mask.mean()
-        if auxiliary.shape_distance is not None and settings.weight_shape > 0:
-            losses["shape"] = settings.weight_shape * auxiliary.shape_distance
-        if auxiliary.delta is not None:
-            losses["sh"] = settings.weight_sh * sh_mask_network.sh_loss(auxiliary.delta)
-        elif auxiliary.band_masks is not None:
-            losses["sh"] = settings.weight_sh * sh_prune.sh_loss(auxiliary.band_masks, self._guided(rendered.index))
-        if self.basis and self.model.shape is not None and auxiliary.fresh is not None:  # as often as views pull it
-            losses["basis"] = settings.weight_basis * self.model.shape.basis_loss(self.basis, auxiliary.fresh)
+        losses = self._losses(rendered, target, mask, wanted, index)
         loss = torch.stack(list(losses.values())).sum()
         if not torch.isfinite(loss):
             bad = [name for name, value in losses.items() if not torch.isfinite(value)]
@@ -240,6 +225,28 @@ class Trainer:
         self.optimizer.step()
         self.laps.mark("optimizer")
         return {"loss": float(loss.detach())} | {f"loss_{k}": float(v.detach()) for k, v in losses.items()}
+
+    def _losses(
+        self, rendered: Rendered, target: Tensor, mask: Tensor | None, wanted: Tensor | None, view: int
+    ) -> dict[str, Tensor]:
+        """Weighted losses by name (docs/method.md, section 8), those that this training and step have."""
+        settings, auxiliary = self.settings, rendered.auxiliary
+        losses = {"color": photometric(rendered.rgb, target, mask, settings.weight_ssim)}
+        if rendered.features is not None and wanted is not None:
+            labels = None if self.views.labels is None else self.views.labels(view)
+            distance = semantic_loss(rendered.features, wanted, labels, mask, settings)
+            losses["features"] = settings.weight_features * distance
+        if auxiliary.soft_mask is not None:
+            losses["mask"] = settings.weight_mask * auxiliary.soft_mask.mean()
+        if auxiliary.shape_distance is not None and settings.weight_shape > 0:
+            losses["shape"] = settings.weight_shape * auxiliary.shape_distance
+        if auxiliary.delta is not None:
+            losses["sh"] = settings.weight_sh * sh_mask_network.sh_loss(auxiliary.delta)
+        elif auxiliary.band_masks is not None:
+            losses["sh"] = settings.weight_sh * sh_prune.sh_loss(auxiliary.band_masks, self._guided(rendered.index))
+        if self.basis and self.model.shape is not None and auxiliary.fresh is not None:  # as often as views pull it
+            losses["basis"] = settings.weight_basis * self.model.shape.basis_loss(self.basis, auxiliary.fresh)
+        return losses
 
     @torch.no_grad()
     def held_in_psnr(self, indices: list[int]) -> float:
