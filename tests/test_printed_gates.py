@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 import torch
+from shared import ROOT
 
 from chebsplat.splats.sh import basis
 from chebsplat.stages.train import guidance
@@ -136,6 +137,9 @@ def test_penalties_reach_gate_and_histogram_weights_only_where_guidance_is_on(sc
     sh_mask_network.sh_loss(guided(scene["band_logits"], scene["features"], found, scene["nearest"])).backward()
     assert all(value.grad.abs().max() > 0 for value in guided.parameters())
     assert coefficients.grad.abs().max() > 0
+    gate = randomized(prune.PrintedGate(C))
+    gate(scene["features"], scene["logits"]).mean().backward()  # L_mask
+    assert all(value.grad.abs().max() > 0 for value in gate.parameters())
     alone = randomized(BandMaskNetwork(C, guided=False))
     delta = alone(scene["band_logits"], None, None, scene["nearest"])
     assert torch.equal(delta, alone(scene["band_logits"], -scene["features"], found, scene["nearest"]))
@@ -189,3 +193,17 @@ def test_what_guidance_changed_is_read_off_a_finished_training():
     assert found["band_spread"] == pytest.approx((1 - (30 / 16 + 6) / 36) / 2)
     alone = guidance({"features": features, "degrees": degrees}, None, np.eye(2, dtype=np.float32))
     assert alone["labels_changed"] is None and alone["mask_spread"] is None
+
+
+def test_without_guidance_a_training_has_no_gate_and_no_histogram_to_teach(monkeypatch):
+    monkeypatch.syspath_prepend(str(ROOT))
+    from benchmarks.stability.training import tiny_trainer
+
+    chosen = {"prune_gate": "printed", "sh_masks": "printed"}
+    guided, alone = tiny_trainer(**chosen), tiny_trainer(**chosen, prune_semantic=False, sh_guided=False)
+    assert isinstance(guided.model.semantic_gate, prune.PrintedGate)
+    assert guided.model.band_network.guided
+    assert alone.model.semantic_gate is None
+    assert not alone.model.band_network.guided and not hasattr(alone.model.band_network, "embed")
+    rates = {group["name"]: group["rate"] for group in guided.optimizer.param_groups}
+    assert rates["gates"] == 1e-2 != rates["modules"]
