@@ -139,13 +139,13 @@ class TrainSection(Section):
     refresh_tolerance: float = number(0.0, "change, in radii, that leaves a region's descriptors as they are", 0, 1e3)
     report_every: int = number(100, "steps between rows of the trace", 1, 1_000_000)
     # rates
-    # None: 3DGS's, which are of 30,000 steps, times (30,000 / steps)^p, at most what 1000 steps take
-    lr_means: float | None = number(None, "of centres, relative to the scene's size; default: 1.6e-4, p = 0.61", 0, 10)
-    lr_scales: float | None = number(None, "of log scales; default: 5e-3, p = 0.32", 0, 10)
-    lr_quats: float | None = number(None, "of rotations; default: 1e-3, p = 0.32", 0, 10)
+    # 3DGS's are of 30,000 steps; a training of fewer goes further in each, of fewer than 1000 as far as one of 1000
+    lr_means: float | None = number(None, "of centres, in scene sizes; default: 1.6e-4 (30,000 / steps)^0.61", 0, 10)
+    lr_scales: float | None = number(None, "of log scales; default: 5e-3 (30,000 / steps)^0.32", 0, 10)
+    lr_quats: float | None = number(None, "of rotations; default: 1e-3 (30,000 / steps)^0.32", 0, 10)
     lr_opacities: float = number(5e-2, "learning rate of opacities before the sigmoid", 0, 10)
-    lr_sh0: float | None = number(None, "of SH band 0; default: 2.5e-3, p = 0.41", 0, 10)
-    lr_sh: float | None = number(None, "of SH bands 1 to 3; default: 1.25e-4, p = 0.41", 0, 10)
+    lr_sh0: float | None = number(None, "of SH band 0; default: 2.5e-3 (30,000 / steps)^0.41", 0, 10)
+    lr_sh: float | None = number(None, "of SH bands 1 to 3; default: 1.25e-4 (30,000 / steps)^0.41", 0, 10)
     lr_features: float | None = number(
         None, "of features; default: 10 / steps, at most 5e-2; more fits each view's errors", 0, 10
     )
