@@ -24,7 +24,8 @@ from chebsplat.shape.encoder import RegionEncoder
 from chebsplat.shape.region_inputs import RegionInputs
 from chebsplat.stages.command import n_threads
 from chebsplat.stages.encode import CHUNK, gaussians, inputs_of, opened
-from chebsplat.stages.onnx import restored_fusion, trained_with
+from chebsplat.stages.onnx import restored_fusion
+from chebsplat.stages.restored import trained_with
 
 
 def chunks(inputs: RegionInputs) -> list[dict[str, np.ndarray]]:

@@ -37,7 +37,8 @@ def opened(path):
 
 def restored(toy):
     from chebsplat.shape.encoder import RegionEncoder
-    from chebsplat.stages.onnx import restored_fusion, trained_with
+    from chebsplat.stages.onnx import restored_fusion
+    from chebsplat.stages.restored import trained_with
 
     held = read_gaussians(toy["train"])
     encoder = RegionEncoder.restored(*held.encoder())
