@@ -68,7 +68,9 @@ def training_views(capture: Capture, points: Points, features: Features | None) 
 
 
 def taught_labels(features: Features, rows: list[int]) -> Callable[[int], TaughtLabels]:
-    """The labels of the training views, whose rows in the features these are."""
+    """The labels of the training views, whose rows in the features these are; kept in memory, to FEATURE_BYTES."""
+    from functools import lru_cache
+
     import torch
 
     from chebsplat.views import TaughtLabels
@@ -77,6 +79,9 @@ def taught_labels(features: Features, rows: list[int]) -> Callable[[int], Taught
     assert labels is not None
     assert confidence is not None
 
+    entry = 12 * labels.shape[1] * labels.shape[2]  # bytes of a view: i64 and f32 by cell
+
+    @lru_cache(maxsize=max(FEATURE_BYTES // max(entry, 1), 1))
     def of(index: int) -> TaughtLabels:
         row = rows[index]
         return TaughtLabels(torch.from_numpy(labels[row]).long(), torch.from_numpy(confidence[row]).float(), codes)
