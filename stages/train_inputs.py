@@ -68,25 +68,18 @@ def training_views(capture: Capture, points: Points, features: Features | None) 
 
 
 def taught_labels(features: Features, rows: list[int]) -> Callable[[int], TaughtLabels]:
-    """The labels of the training views, whose rows in the features these are; kept in memory, to FEATURE_BYTES."""
-    from functools import lru_cache
-
+    """The labels of the training views, whose rows in the features these are; FEATURE_BYTES of a kind are kept."""
     import torch
 
-    from chebsplat.views import TaughtLabels
+    from chebsplat.views import TaughtLabels, remembered
 
     labels, confidence, codes = features.pseudo_labels, features.confidence, torch.from_numpy(features.label_embeddings)
     assert labels is not None
     assert confidence is not None
 
-    entry = 12 * labels.shape[1] * labels.shape[2]  # bytes of a view: i64 and f32 by cell
-
-    @lru_cache(maxsize=max(FEATURE_BYTES // max(entry, 1), 1))
-    def of(index: int) -> TaughtLabels:
-        row = rows[index]
-        return TaughtLabels(torch.from_numpy(labels[row]).long(), torch.from_numpy(confidence[row]).float(), codes)
-
-    return of
+    classes = remembered(lambda index: torch.from_numpy(labels[rows[index]]).long(), FEATURE_BYTES)
+    certainty = remembered(lambda index: torch.from_numpy(confidence[rows[index]]).float(), FEATURE_BYTES)
+    return lambda index: TaughtLabels(classes(index), certainty(index), codes)
 
 
 def with_feature_loss(train: TrainSection, features: Features | None) -> TrainSection:

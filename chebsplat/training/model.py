@@ -113,7 +113,10 @@ class SceneModel:
         return [self.raw[name] for name in ("sh0", "sh1", "sh2", "sh3") if name in self.raw]
 
     def sh_kept(self) -> float:
-        """Part of all SH coefficients up to degree 3 that the Gaussians keep."""
+        """Part of all SH coefficients up to degree 3 that the Gaussians keep; until the freeze, would keep.
+
+        Printed masks are computed from the features before fusion here: this is for the trace alone.
+        """
         counts = [len(band) for band in self.bands()[1:]]
         if "sh_logits" in self.raw:
             open_bands = self.final_band_masks(self.raw.get("features")) > 0.5
