@@ -52,6 +52,7 @@ def run(job: Job) -> None:
             tolerance=settings.tolerance,
             max_rank=settings.max_rank,
             max_added=settings.max_added,
+            n_scenes=settings.n_scenes,
             rule=settings.energy_rule,
             novelty=1 + settings.kappa * sigma,
             update_rule=settings.update_rule,

@@ -113,6 +113,7 @@ class CksSection(Section):
         "total", "of all a scene holds, or (the printed rule) of what the basis misses"
     )
     max_added: float = number(0.25, "columns that a scene may add, as a fraction of those left", 1e-3, 1)
+    n_scenes: int = number(20, "scenes that can each add a column: the first ones leave enough of them", 1, 10_000)
     update_rule: Literal["residual", "printed"] = setting(
         "residual", "what decides if a scene adds: its relative residual ρ; printed: ρ′ = ρ (1 + κ σ_f)"
     )

@@ -105,8 +105,8 @@ def test_what_is_already_inside_adds_no_column_and_changes_no_bit(rule):
 def test_only_the_printed_rule_adds_noise_when_relevance_is_not_asked_for():
     basis, _ = update(None, weights(rank=4), energy=0.999999)
     noisy = weights(rank=4) + 1e-4 * weights(seed=8)
-    assert update(basis, noisy, rule="residual", tolerance=1e-9, max_added=0.5)[1]["added"] == 12
-    assert update(basis, noisy, rule="total", tolerance=1e-9, max_added=0.5)[1]["added"] == 0
+    assert update(basis, noisy, rule="residual", tolerance=1e-9, max_added=0.5, n_scenes=1)[1]["added"] == 12
+    assert update(basis, noisy, rule="total", tolerance=1e-9, max_added=0.5, n_scenes=1)[1]["added"] == 0
 
 
 def test_an_exactly_captured_scene_is_no_update_even_without_tolerance():
@@ -129,7 +129,7 @@ def test_earlier_columns_stay_as_they_were_when_new_ones_are_added():
 @pytest.mark.parametrize("energy", [0.5, 0.9, 0.96])
 def test_total_rule_reaches_its_energy_with_as_few_columns_as_it_can(energy):
     W = weights(64, 64, rank=20)
-    basis, report = update(None, W, energy=energy, max_rank=0.9, max_added=1.0)
+    basis, report = update(None, W, energy=energy, max_rank=0.9, max_added=1.0, n_scenes=1)
     captured = (project(W, basis)[0] ** 2).sum() / (W.double() ** 2).sum()
     assert report["energy"] == pytest.approx(captured.item(), abs=1e-6)
     assert captured >= energy - 1e-6
@@ -140,8 +140,8 @@ def test_total_rule_reaches_its_energy_with_as_few_columns_as_it_can(energy):
 def test_total_rule_adds_fewer_columns_than_the_residual_rule():
     basis, _ = update(None, weights(rank=6), energy=0.9999)
     new = weights(rank=6) + weights(seed=5)
-    total, _ = update(basis, new, rule="total", max_added=1.0)
-    residual, _ = update(basis, new, rule="residual", max_added=1.0)
+    total, _ = update(basis, new, rule="total", max_added=1.0, n_scenes=1)
+    residual, _ = update(basis, new, rule="residual", max_added=1.0, n_scenes=1)
     assert basis.shape[1] <= total.shape[1] < residual.shape[1]
 
 
@@ -244,7 +244,7 @@ def test_a_basis_spans_the_inputs_that_a_map_reads():
         for W in encoder.linear_maps().values():
             W[3:] = 0
     for name, W in encoder.linear_maps().items():
-        basis, report = update(None, W.detach(), energy=0.999999, max_added=1.0)
+        basis, report = update(None, W.detach(), energy=0.999999, max_added=1.0, n_scenes=1)
         assert basis.shape == (W.shape[0], 3), name
         assert basis[3:].abs().max() == 0
         assert torch.linalg.matrix_rank(W) == 3 and report["energy"] == pytest.approx(1)
@@ -358,9 +358,19 @@ def test_of_two_scenes_of_equal_rho_only_the_one_of_rich_shapes_adds_by_the_prin
 def test_a_scene_takes_a_share_of_the_room_and_leaves_some_to_those_after_it():
     ranks, basis = [], None
     for seed in range(8):
-        basis, report = update(basis, weights(seed=seed), max_rank=0.875, max_added=0.25)
+        basis, report = update(basis, weights(seed=seed), max_rank=0.875, max_added=0.25, n_scenes=1)
         ranks.append(report["rank_after"])
     assert ranks == [7, 12, 16, 19, 21, 22, 23, 24]
+
+
+@pytest.mark.parametrize(("q", "ranks"), [(32, [7, 9, *range(10, 29)]), (24, [2, *range(3, 22)]), (8, range(1, 8))])
+def test_as_many_scenes_as_asked_for_can_each_add_a_column_where_the_width_allows_it(q, ranks):
+    basis, found = None, []
+    for seed in range(24):
+        basis, report = update(basis, weights(q, q, seed=seed))  # that share nothing
+        found.append(report["rank_after"])
+        assert (report["added"] > 0) == (seed < len(ranks))
+    assert found == [*ranks, *[int(0.875 * q)] * (24 - len(ranks))]
 
 
 def test_regulariser_is_nothing_before_there_is_knowledge():
@@ -383,6 +393,7 @@ def test_regulariser_is_nothing_before_there_is_knowledge():
         ({"update_rule": "both"}, "printed"),
         ({"novelty": math.inf}, "novelty"),
         ({"max_added": 0.0}, "max_added"),
+        ({"n_scenes": 0}, "n_scenes"),
         ({"max_rank": 1.0}, "max_rank"),
         ({"energy": 0.0}, "energy"),
     ],

@@ -51,6 +51,7 @@ def update(
     tolerance: float = 0.2,
     max_rank: float = 0.875,
     max_added: float = 0.25,
+    n_scenes: int = 20,
     rule: str = "total",
     novelty: float = 1.0,
     update_rule: str = "residual",
@@ -65,6 +66,8 @@ def update(
       tolerance: ρ or ρ′ below which the scene is no news and nothing is added (ε = 0.2).
       max_rank:  ceiling of r as a fraction of q, below 1: at r = q the regulariser would vanish for ever.
       max_added: columns that a scene may add, as a fraction of those left below the ceiling; one at least.
+      n_scenes:  the first so many scenes can each add a column where the ceiling is as high: of more than n_scenes - 1
+                 columns left, a scene leaves n_scenes - 1.
       novelty:   1 + κ σ_f of the scene: ρ′ = ρ × novelty.
       update_rule: what is compared with the tolerance: ρ (`residual`), or ρ′ (`printed`).
     Returns: basis [q, r'] float32 with BᵀB = I to 3e-8 (dense columns, q ≥ 32; one ulp else); the given columns
@@ -76,7 +79,7 @@ def update(
       to `energy` already. New columns are orthogonalised twice. The first basis comes from the SVD of W. A basis beyond
       the ceiling is kept, never cut.
     """
-    _check(basis, W, energy, max_rank, max_added, novelty)
+    _check(basis, W, energy, max_rank, max_added, n_scenes, novelty)
     if rule not in ("total", "residual") or update_rule not in ("residual", "printed"):
         raise ValueError(f"rule {rule!r} is neither 'total' nor 'residual', or {update_rule!r} not 'printed' either")
     q = W.shape[0]
@@ -99,7 +102,8 @@ def update(
     vectors, values, _ = torch.linalg.svd(residual, full_matrices=False)
     gained = torch.nn.functional.pad(torch.cumsum(values**2, 0), (1, 0))  # by 0, 1, 2, ... of the vectors
     reached = (total - missed + gained) / total if rule == "total" else gained / missed
-    count = min(int((reached < energy).sum()), max(int(max_added * room), 1), len(values))
+    most = max(min(int(max_added * room), room - n_scenes + 1), 1)
+    count = min(int((reached < energy).sum()), most, len(values))
     if count == 0:
         return given, report
     grown = _orthonormal(torch.cat([old, vectors[:, :count]], 1))
@@ -109,11 +113,15 @@ def update(
     return _rounded(grown, given), report
 
 
-def _check(basis: Tensor | None, W: Tensor, energy: float, max_rank: float, max_added: float, novelty: float) -> None:
+def _check(
+    basis: Tensor | None, W: Tensor, energy: float, max_rank: float, max_added: float, n_scenes: int, novelty: float
+) -> None:
     if W.ndim != 2 or not torch.isfinite(W).all():
         raise ValueError(f"W {tuple(W.shape)} is not finite, or not a matrix")
     if not (0 < energy <= 1 and 0 < max_rank < 1 and 0 < max_added <= 1):
         raise ValueError(f"energy {energy}, max_added {max_added} or max_rank {max_rank} is not within (0, 1], or is 1")
+    if n_scenes < 1:
+        raise ValueError(f"n_scenes {n_scenes} is below 1")
     if not 1 <= novelty < math.inf:
         raise ValueError(f"novelty {novelty} is below 1, or not finite")
     if basis is None:
