@@ -52,7 +52,7 @@ def share_undefined(
     temperature: float = 1.0,
 ) -> float:
     """Of the points that a region covers, the part whose weights (Eq 8) are 0 / 0 in float32 if computed as printed."""
-    covered = cover[:, 0] >= 0
+    covered = (cover >= 0).any(-1)
     logits = _logits(means, cover, centers, rotmats, scales, radius, 0.0, temperature)
     total = logits.float().exp().masked_fill(cover < 0, 0.0).sum(-1)
     return float((total[covered] == 0).float().mean()) if covered.any() else 0.0
@@ -71,8 +71,8 @@ def _logits(
     """Of Eq 8 [N, k], before the softmax."""
     index = cover.clamp_min(0)
     local = torch.einsum("nkji,nkj->nki", rotmats[index], (means[:, None] - centers[index]) / radius)
-    variances = ((scales[index] / radius) ** 2 + inflation**2).clamp_min(LEAST)
-    return -(local**2 / variances).sum(-1) / temperature
+    deviations = ((scales[index] / radius) ** 2 + inflation**2).clamp_min(LEAST).sqrt()
+    return -((local / deviations) ** 2).sum(-1) / temperature  # a variance has no square in the gradient's float32
 
 
 def propagate(encodings: Tensor, cover: Tensor, weights: Tensor) -> Tensor:

@@ -11,6 +11,7 @@ from chebsplat.shape.descriptor import compiles, describe_members
 from chebsplat.shape.regions import Regions, covering, regions_of
 
 Position = Literal["region", "center", "both"]
+FARTHEST = 1e6  # extents: beyond, float32 has no octave left and a token's norm overflows
 
 
 class RegionInputs(NamedTuple):
@@ -48,12 +49,13 @@ def in_scene(means: np.ndarray) -> np.ndarray:
     """Centres [N, 3] of Gaussians in units of their scene: 95 of 100 within ±1 of its centre along every axis.
 
     Choices: the paper encodes c_i in whatever units a scene comes in, whose highest octave would repeat every few
-      centimetres or never. Medians and a quantile, so that a few Gaussians far away do not set the unit.
+      centimetres or never. Medians and a quantile, so that a few Gaussians far away do not set the unit; these lie
+      within ±`FARTHEST`. An extent below 1e-12 counts as that.
     """
     away = means - np.median(means, axis=0).astype(means.dtype)
     extent = np.quantile(np.abs(away).max(1), 0.95)
     scaled: np.ndarray = away / means.dtype.type(max(extent, 1e-12))
-    return scaled
+    return scaled.clip(-FARTHEST, FARTHEST)
 
 
 def region_inputs(

@@ -15,6 +15,7 @@ if TYPE_CHECKING:
     from scipy.spatial import cKDTree
 
 SHRINK = 1.6  # 3DGS's divisor of the scales of two Gaussians that replace one
+LARGEST = 1e300  # of the excess: no volume grows nothing, however steep
 
 
 class Additions(NamedTuple):
@@ -87,7 +88,7 @@ def densify(
     if budget > 0 and len(steep) and alive.sum() > 3:
         means, ids = raw["means"].detach().double().numpy()[alive], np.flatnonzero(alive)
         tree = cKDTree(means)
-        excess = (gradient[steep].double() / threshold - 1).clamp_max(np.inf if printed else 1).numpy()
+        excess = (gradient[steep].double() / threshold - 1).clamp_max(LARGEST if printed else 1).numpy()
         inside = np.where(alive, np.cumsum(alive) - 1, -1)[members[steep].clamp_min(0).numpy()]
         inside[members[steep].numpy() < 0] = -1
         centers, radii, spacings = _balls(tree, means, inside)
