@@ -93,7 +93,7 @@ def test_gradients_of_both_gates_agree_with_finite_differences(scene):
     gate, network = randomized(prune.PrintedGate(C)), randomized(BandMaskNetwork(C, n_bins=4, width=3))
     few = torch.arange(6)
     features, logits = (scene[name][few].clone().requires_grad_() for name in ("features", "logits"))
-    assert torch.autograd.gradcheck(lambda *a: gate(*a), (features, logits), atol=1e-5)
+    assert torch.autograd.gradcheck(lambda *a: gate(*a), (features, logits), rtol=1e-5, atol=1e-8)
     members = scene["members"][:2, :3]
     used, index = members.unique(return_inverse=True)
     coefficients = scene["coefficients"][used].clone().requires_grad_()
@@ -103,7 +103,7 @@ def test_gradients_of_both_gates_agree_with_finite_differences(scene):
         found = region_histograms(coefficients, scene["directions"][used], index, 4)
         return network(bands, scene["features"][few], found, torch.tensor([0, 1, 0, 1, -1, 0]))
 
-    assert torch.autograd.gradcheck(masks, (coefficients, bands), atol=1e-5)
+    assert torch.autograd.gradcheck(masks, (coefficients, bands), rtol=1e-5, atol=1e-8)
 
 
 def test_both_start_alike_for_all_and_as_the_logits_alone_would():
