@@ -143,6 +143,27 @@ def stretched(name: str) -> Outcome:
     return compare(region, aspect(region.scales))
 
 
+# the printed metric, of scales in scene units, turned about the world's axis
+
+PRINTED: dict[str, Callable[[Region], Region]] = {
+    "scales 1e-20": lambda r: r._replace(scales=1e-20 * r.scales),
+    "scales 1e+20": lambda r: r._replace(scales=1e20 * r.scales),
+    "scales 1e-20 to 1e20": lambda r: r._replace(scales=10.0 ** np.linspace(-20, 20, 48).reshape(16, 3)),
+    "all scales equal": lambda r: r._replace(scales=np.full((16, 3), 0.3)),
+    "all scales 0": lambda r: r._replace(scales=0 * r.scales),
+    "all alike and coincident": lambda r: upright(0 * r.means),
+    "along the axis": lambda r: r._replace(means=r.means * [0, 0, 1]),
+    "units 1e-20": lambda r: r._replace(means=1e-20 * r.means, scales=1e-20 * r.scales),
+    "units 1e+20": lambda r: r._replace(means=1e20 * r.means, scales=1e20 * r.scales),
+}
+
+
+@case("as printed, {name}", name=PRINTED)
+def printed_metric(name: str) -> Outcome:
+    region = PRINTED[name](cloud())
+    return compare(region, aspect(region.scales), metric="printed", axis="world")
+
+
 # graphs that fall apart
 
 

@@ -13,10 +13,11 @@ import torch
 from torch import Tensor
 
 from benchmarks.stability.case import Outcome, case, naive, relative
-from chebsplat.shape.fusion import propagation_weights
+from chebsplat.shape.fusion import LEAST, propagation_weights, share_undefined
 from chebsplat.splats.rotations import rotation_matrices
 
-TOLERANCE = 1e-5  # logits reach 16, and float32 rounds each to 1e-6
+TOLERANCE = 1e-5  # logits reach 16, and float32 rounds each to 1e-6; where they are larger one region takes all
+UNDERFLOWS = 87.0, 104.0  # -logits between which exp in float32 goes to 0, by the processor's mode
 N_POINTS, N_REGIONS = 60, 12
 
 
@@ -43,17 +44,20 @@ def printed(means: Tensor, cover: Tensor, centers: Tensor, rotmats: Tensor, scal
 
 def exact_weights(
     means: Tensor, cover: Tensor, centers: Tensor, rotmats: Tensor, scales: Tensor, radius: float,
-    temperature: float = 1.0,
-) -> np.ndarray:  # fmt: skip
-    """The documented weights in 60 digits."""
+    temperature: float = 1.0, inflation: float = 0.25,
+) -> tuple[np.ndarray, np.ndarray]:  # fmt: skip
+    """The documented weights in 60 digits, and of each point the least -logit of a region that covers it, else inf."""
     mp = np.frompyfunc(mpmath.mpf, 1, 1)
     with mpmath.workdps(60):
         p, c, R, s = (mp(v.double().numpy()) for v in (means, centers, rotmats, scales))
-        local = ((p[:, None] - c)[:, :, None, :] @ R[None])[:, :, 0]
-        lengths = (local**2 / (s**2 + (mpmath.mpf(radius) / 4) ** 2)).sum(-1)
-        weights = np.frompyfunc(mpmath.exp, 1, 1)(-lengths / temperature) * mp((cover >= 0).double().numpy())
+        local = ((p[:, None] - c)[:, :, None, :] @ R[None])[:, :, 0] / mpmath.mpf(radius)
+        variances = np.maximum((s / mpmath.mpf(radius)) ** 2 + mpmath.mpf(inflation) ** 2, mpmath.mpf(LEAST))
+        lengths = np.where(cover.numpy() >= 0, (local**2 / variances).sum(-1) / temperature, mpmath.inf)
+        least = lengths.min(1)
+        shifted = lengths - np.where(least < mpmath.inf, least, mpmath.mpf(0))[:, None]
+        weights = np.frompyfunc(mpmath.exp, 1, 1)(-shifted)
         total = weights.sum(1, keepdims=True)
-        return (weights / np.where(total > 0, total, mpmath.mpf(1))).astype(np.float64)
+        return (weights / np.where(total > 0, total, mpmath.mpf(1))).astype(np.float64), least.astype(np.float64)
 
 
 def compare(arguments: tuple[Any, ...], condition: str, **options: float) -> Outcome:
@@ -73,8 +77,14 @@ def compare(arguments: tuple[Any, ...], condition: str, **options: float) -> Out
             return f"{100 * bad:.0f} % of points NaN"
         return f"{1 / weights[reached].square().sum(1).mean():.1f} regions of {N_REGIONS}"
 
-    error = relative(found.detach(), exact_weights(*arguments, **options))
-    return Outcome(condition, naive(attempt), error, TOLERANCE)
+    exact, least = exact_weights(*arguments, **options)
+    if options.get("inflation") == 0:
+        covered, share = least[np.isfinite(least)], share_undefined(*arguments)
+        surely, perhaps = ((covered > limit).mean() if len(covered) else 0.0 for limit in reversed(UNDERFLOWS))
+        if not surely - 1e-6 <= share <= perhaps + 1e-6:
+            raise ValueError(f"guarded {share}, not {surely} to {perhaps}")
+        condition = f"{condition}, guarded {100 * share:.0f} %"
+    return Outcome(condition, naive(attempt), relative(found.detach(), exact), TOLERANCE)
 
 
 SPLATS: dict[str, tuple[float, ...]] = {
@@ -123,3 +133,25 @@ def uncovered() -> Outcome:
 @case("temperature {temperature:.0e}", temperature=[1e-6, 1e-3, 1e6])
 def temperatures(temperature: float) -> Outcome:
     return compare(room(), f"temperature {temperature:.0e}", temperature=temperature)
+
+
+# as printed: a centre's own deviations, without inflation
+
+_means, _cover, _centers, *_rest = room()
+_half = torch.where(torch.arange(N_POINTS)[:, None] % 2 > 0, _cover, -1)
+PRINTED: dict[str, tuple[Any, ...]] = {
+    **{name: room(SPLATS[name]) for name in ("round splats", "flat splats", "splats of width 1e-9")},
+    "needles of no width": room(SPLATS["needles of no width"]),
+    "scales 0": room((0, 0, 0)),
+    "scales 1e-20": room((1e-20,) * 3),
+    "scales 1e+20": room((1e20,) * 3),
+    "scales 1e-20 to 1e+20": room((1e-20, 1, 1e20)),
+    "points that nothing covers": (_means, _half, _centers, *_rest),
+    "coincident centres and points": (0 * _means, _cover, 0 * _centers, *_rest),
+}
+
+
+@case("as printed, {name}", name=PRINTED)
+def as_printed(name: str) -> Outcome:
+    """Weights, gradients, and the share of points that the guard is counted for: those that are 0 / 0 in print."""
+    return compare(PRINTED[name], f"s/r {PRINTED[name][4].min() / PRINTED[name][5]:.0e}", inflation=0.0)

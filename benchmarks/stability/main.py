@@ -16,10 +16,13 @@ from benchmarks.stability import (  # noqa: F401  # importing a module registers
     descriptor,
     fusion,
     gates,
+    growth,
     knowledge,
+    losses,
     pruning,
     rasterizer,
     regions,
+    tokens,
     training,
 )
 from benchmarks.stability.case import CASES, Row, run

@@ -6,8 +6,10 @@ naming its step. The naive column says how it ended.
 
 from __future__ import annotations
 
+import tomllib
 from collections.abc import Callable
 from dataclasses import replace
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -129,6 +131,13 @@ def _rates(factor: float) -> Trainer:
     return trainer
 
 
+def _printed(means: np.ndarray) -> Trainer:
+    """A training as `ablation=paper` has it."""
+    path = Path(__file__).parents[2] / "pipelines" / "configs" / "ablations" / "paper.toml"
+    settings = tomllib.loads(path.read_text())
+    return tiny_trainer(means, describe=settings["describe"], **{"min_gaussians": 1} | settings["train"])
+
+
 def _flat() -> np.ndarray:
     return sphere(300) * np.array([1, 1, 0], np.float32)
 
@@ -148,6 +157,10 @@ SCENES: dict[str, Callable[[], Trainer]] = {
         prune_gate="printed",
         sh_masks="printed",
     ),
+    "printed form, one Gaussian": lambda: _printed(sphere(1)),
+    "printed form, coincident Gaussians": lambda: _printed(np.zeros((40, 3), np.float32)),
+    "printed form, one plane": lambda: _printed(_flat()),
+    "printed form, units of 1e6": lambda: _printed(1e6 * sphere(300)),
     "one Gaussian": lambda: tiny_trainer(sphere(1), min_gaussians=1),
     "two coincident Gaussians": lambda: tiny_trainer(np.zeros((2, 3), np.float32), min_gaussians=1),
     "one plane": lambda: tiny_trainer(_flat()),

@@ -1,0 +1,118 @@
+"""Labels and features that break printed losses: cross-entropy and L1 (docs/method.md, section 8).
+
+Errors are the larger of a loss' and its gradient's, relative.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import NamedTuple
+
+import mpmath
+import torch
+from torch import Tensor
+
+from benchmarks.stability.case import Outcome, case, naive, relative
+from chebsplat.training.losses import feature_distance, feature_distance_reference
+from chebsplat.training.semantic_loss import label_entropy
+from chebsplat.views import TaughtLabels
+
+HEIGHT, WIDTH, CHANNELS, CLASSES = 8, 12, 5, 4
+TOLERANCE = 1e-5  # logits of 10 are rounded by 1e-6, and a gradient is a difference of two of their exponentials
+
+
+def normal(*shape: int, seed: int = 0) -> Tensor:
+    return torch.randn(*shape, generator=torch.Generator().manual_seed(seed))
+
+
+class Seen(NamedTuple):
+    """A view: its render, and labels of cells of 2 x 2 pixels."""
+
+    render: Tensor
+    labels: TaughtLabels
+    temperature: float = 0.5
+    mask: Tensor | None = None
+
+
+def seen(size: float = 1.0, n_classes: int = CLASSES, confidence: float = 1.0, unlabelled: bool = False) -> Seen:
+    g = torch.Generator().manual_seed(1)
+    classes = torch.randint(n_classes, (HEIGHT // 2, WIDTH // 2), generator=g)
+    certainty = confidence * torch.rand(classes.shape, generator=g)
+    labels = TaughtLabels(classes - 10 * unlabelled, certainty, normal(n_classes, CHANNELS, seed=2))
+    return Seen(size * normal(HEIGHT, WIDTH, CHANNELS), labels)
+
+
+VIEWS: dict[str, Callable[[], Seen]] = {
+    "no votes at all": lambda: seen(unlabelled=True),
+    "confidence 0": lambda: seen(confidence=0.0),
+    "confidence 1e-30": lambda: seen(confidence=1e-30),
+    "nothing counts": lambda: seen()._replace(mask=torch.zeros(HEIGHT, WIDTH, dtype=torch.bool)),
+    "one class": lambda: seen(n_classes=1),
+    "logits of 0": lambda: seen(0.0),
+    "logits of 1e-20": lambda: seen(1e-20),
+    "logits of 1e20": lambda: seen(1e20),
+    "logits of 1e20, one class": lambda: seen(1e20, n_classes=1),
+    "temperature 1e-3": lambda: seen()._replace(temperature=1e-3),
+    "temperature 1e6": lambda: seen()._replace(temperature=1e6),
+}
+
+
+def exact_entropy(view: Seen) -> float:
+    """In 60 digits, cell by cell."""
+    if view.mask is not None:
+        return 0.0
+    labels, terms = view.labels, []
+    with mpmath.workdps(60):
+        for i, j in (labels.classes >= 0).nonzero().tolist():
+            cell = view.render[2 * i : 2 * i + 2, 2 * j : 2 * j + 2].reshape(4, -1).double().tolist()
+            mean = [mpmath.fsum(column) / 4 for column in zip(*cell, strict=True)]
+            logits = [mpmath.fdot(mean, code) / view.temperature for code in labels.class_codes.double().tolist()]
+            highest = max(logits)
+            total = mpmath.log(mpmath.fsum(mpmath.exp(logit - highest) for logit in logits))
+            terms.append(labels.confidence[i, j].item() * (highest + total - logits[int(labels.classes[i, j])]))
+        return float(mpmath.fsum(terms) / max(len(terms), 1))
+
+
+def gradient(loss: Tensor, render: Tensor) -> Tensor:
+    (slope,) = torch.autograd.grad(loss, render)
+    return slope.detach()
+
+
+@case("cross-entropy, {name}", name=VIEWS)
+def cross_entropy(name: str) -> Outcome:
+    """The loss against 60 digits, its gradient against float64. Naive: -log softmax, confidences over their sum."""
+    view = VIEWS[name]()
+    render, double = (view.render.to(kind).requires_grad_(True) for kind in (torch.float32, torch.float64))
+    loss = label_entropy(render, view.labels, view.mask, view.temperature)
+    slope = gradient(loss, render)
+    exact = gradient(label_entropy(double, view.labels, view.mask, view.temperature), double)
+
+    def attempt() -> str:
+        given = view.render.clone().requires_grad_(True)
+        cells = given.unflatten(1, (-1, 2)).unflatten(0, (-1, 2)).mean((1, 3))
+        power = (cells @ view.labels.class_codes.T / view.temperature).exp()
+        likelihood = (power / power.sum(-1, keepdim=True)).gather(-1, view.labels.classes.clamp_min(0)[..., None])
+        counted = view.labels.confidence * (view.labels.classes >= 0)
+        found = -(counted * likelihood[..., 0].log()).sum() / counted.sum()
+        bad = 100 * (1 - gradient(found, given).isfinite().double().mean().item())
+        return f"loss {found.item():.1e}, gradient {bad:.0f} % NaN"
+
+    error = max(relative(loss.detach(), exact_entropy(view)), relative(slope, exact))
+    return Outcome(f"loss {abs(loss.item()):.0e}", naive(attempt), error, TOLERANCE)
+
+
+@case("L1 of features {size:.0e} to {target:.0e}", size=[0.0, 1e-20, 1e20], target=[0.0, 1e-20, 1e20])
+def feature_l1(size: float, target: float) -> Outcome:
+    """The fused loss against float64 in plain torch; the naive is the length in float32."""
+    features = target * normal(HEIGHT // 2, WIDTH // 2, CHANNELS, seed=3)
+    drawn = size * normal(HEIGHT, WIDTH, CHANNELS)
+    render, double = (drawn.to(kind).requires_grad_(True) for kind in (torch.float32, torch.float64))
+    loss, exact = feature_distance(render, features, kind="l1"), feature_distance_reference(double, features, kind="l1")
+    error = max(relative(loss.detach(), exact.detach()), relative(gradient(loss, render), gradient(exact, double)))
+
+    def attempt() -> str:
+        given = (size * normal(HEIGHT // 2, WIDTH // 2, CHANNELS)).requires_grad_(True)
+        found = (given - features).square().mean(-1).sqrt().mean()
+        return f"{found.item():.1e}, gradient {100 * (1 - gradient(found, given).isfinite().double().mean()):.0f} % NaN"
+
+    return Outcome(f"loss {loss.item():.0e}", naive(attempt), error, TOLERANCE)
