@@ -77,6 +77,9 @@ class TrainSection(Section):
     seed: int = seed("of the order of views and of all that is drawn in training")
     # what is built
     semantics: bool = setting(True, "false: colour only")
+    features: Literal["trained", "lifted"] = setting(
+        "trained", "of Gaussians; lifted: colour alone is trained, and the teacher's features are lifted afterwards"
+    )
     encoder: Literal["transformer", "mlp", "off"] = setting(
         "transformer", 'of regions; mlp: the paper\'s "no TLE"; off: no shape branch'
     )

@@ -12,6 +12,8 @@ from chebsplat.stages.sources.common import unread
 if TYPE_CHECKING:
     from chebsplat.formats.teacher_model import TeacherModel
 
+LIFTED = "train.features is lifted"
+
 
 def teacher_kind(config: Any, probe: dict[str, bool]) -> tuple[str, str]:
     """The teacher really meant, and why there is none if there is none."""
@@ -34,7 +36,9 @@ def left_out_stages(config: Any, kind: str, why: str, probe: dict[str, bool]) ->
     left_out: dict[str, str] = {}
     if kind == "none":
         left_out |= {"teacher": why, "describe": f"no semantics to describe shape for ({why})"}
-        left_out |= {"onnx": f"no encoder is trained ({why})"}
+        left_out |= {"onnx": f"no encoder is trained ({why})", "lift": f"no teacher's features to lift ({why})"}
+    elif config.train.features == "lifted":
+        left_out |= {"describe": LIFTED, "onnx": LIFTED}
     elif config.train.encoder == "off":
         left_out |= {"describe": "train.encoder is off", "onnx": "train.encoder is off"}
     elif not config.train.albo:
@@ -46,8 +50,16 @@ def left_out_stages(config: Any, kind: str, why: str, probe: dict[str, bool]) ->
     return left_out
 
 
+def unread_inputs(config: Any, stage: str) -> set[str]:
+    """Roles of a stage's inputs that are there, and that this configuration does not read."""
+    lifted = config.train.features == "lifted"
+    return {"train": {"features"} if lifted else set(), "export": set() if lifted else {"lifted"}}.get(stage, set())
+
+
 def left_out_knowledge(config: Any, kind: str, why: str, basis: Path | None, keep: bool) -> dict[str, str]:
     """Why a scene does not train on a given basis, or keeps nothing of its knowledge, if so."""
+    if kind != "none" and config.train.features == "lifted":
+        kind, why = "none", LIFTED
     reasons = {"off": "train.encoder is off", "mlp": "train.encoder is mlp: it has no attention weights"}
     unable = f"no encoder is trained ({why})" if kind == "none" else reasons.get(config.train.encoder, "")
     left_out = {} if basis is None or not unable else {"basis": unable}

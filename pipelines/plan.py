@@ -23,6 +23,7 @@ from chebsplat.pipelines.needs import (
     source_sentence,
     teacher_kind,
     text_packages,
+    unread_inputs,
 )
 from chebsplat.pipelines.raw import Hashes, content_hash, hashes, raw_files
 from chebsplat.pipelines.scenes import absent, expanded, folder_of, read_toml, scene_values
@@ -174,7 +175,8 @@ class Planner:
         for stage in STAGES.values():
             if stage.name in left_out:
                 continue
-            inputs = {role: steps[of].path for role, of in stage.roles.items() if of in steps}
+            unread = unread_inputs(config, stage.name)
+            inputs = {role: steps[of].path for role, of in stage.roles.items() if of in steps and role not in unread}
             if basis is not None and "basis" not in left_out and stage.name in ("train", "cks"):
                 inputs["basis"] = basis
             keys = {role: path.name for role, path in inputs.items()}

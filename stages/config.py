@@ -38,6 +38,7 @@ class Config(Section):
     teacher: parts.TeacherSection = parts.TeacherSection()
     describe: DescribeSection = DescribeSection()
     train: TrainSection = TrainSection()
+    lift: parts.LiftSection = parts.LiftSection()
     export: parts.ExportSection = parts.ExportSection()
     onnx: parts.OnnxSection = parts.OnnxSection()
     cks: parts.CksSection = parts.CksSection()

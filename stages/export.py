@@ -11,12 +11,16 @@ from chebsplat.stages.command import Job, command
 def run(job: Job) -> None:
     """The trained Gaussians in order of SH degree, each with its label.
 
-    Reads `gaussians` and, for names of labels, `features`. Writes `scene`.
+    Reads `gaussians`, for names of labels `features` and, in place of trained features, `lifted`. Writes `scene`.
+
+    Choices: a Gaussian that no training view sees has lifted features of zero: no label, and no part in what a view of
+      the features shows.
     """
     import numpy as np
 
     from chebsplat.formats.features import read_features
     from chebsplat.formats.gaussians import read_gaussians
+    from chebsplat.formats.lifted import read_lifted
     from chebsplat.formats.scene import Scene, write_scene
     from chebsplat.labels.decode import decode_labels
 
@@ -27,7 +31,13 @@ def run(job: Job) -> None:
     wanted = ("means", "log_scales", "quats", "logit_opacities", "sh0", "shN", "degrees")
     parameters = {name: gaussians.parameters[name][order] for name in wanted}
     semantic = gaussians.parameters.get("fused", gaussians.parameters.get("features"))
-    if "fused" in gaussians.parameters:
+    if "lifted" in job.inputs:
+        semantic = read_lifted(job.inputs["lifted"]).features
+        if len(semantic) != len(order):
+            raise InputError(
+                f"{job.inputs['lifted']} is of {len(semantic)} Gaussians, not these {len(order)}; lift again"
+            )
+    elif "fused" in gaussians.parameters:
         parameters["raw_features"] = gaussians.parameters["features"][order]
     labelled: dict[str, Any] = {}
     if semantic is None:
@@ -39,9 +49,10 @@ def run(job: Job) -> None:
         parameters["features"] = semantic[order]
         if semantic.shape[1] != teacher.label_embeddings.shape[1]:
             raise InputError(f"{job.inputs['features']} has other channels than the checkpoint; pass its own")
-        labels = decode_labels(parameters["features"], teacher.label_embeddings)
+        labels = decode_labels(parameters["features"], teacher.label_embeddings).astype(np.int32)
+        labels[~parameters["features"].any(1)] = -1
         labelled = {
-            "labels": labels.astype(np.int32),
+            "labels": labels,
             "label_names": teacher.label_names,
             "label_embeddings": teacher.label_embeddings,
         }

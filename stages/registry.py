@@ -38,7 +38,11 @@ STAGES: dict[str, Stage] = {
               (("capture", "ingest"), ("points", "sfm")),
               (("features", "teacher"), ("descriptors", "describe"), ("basis", "cks")),
               help="Train the semantic Gaussian scene (Eqs 7-13)."),
-        Stage("export", "chebsplat.scene/2", ("export",), (("gaussians", "train"),), (("features", "teacher"),),
+        Stage("lift", "chebsplat.lifted/1", ("lift",),
+              (("capture", "ingest"), ("gaussians", "train"), ("features", "teacher")),
+              help="Features of the teacher on trained Gaussians, and how much the views agree, without training."),
+        Stage("export", "chebsplat.scene/2", ("export",), (("gaussians", "train"),),
+              (("features", "teacher"), ("lifted", "lift")),
               help="Write PLY files, ragged zarr, the label dictionary and the summary."),
         Stage("onnx", "chebsplat.encoder/2", ("onnx",), (("gaussians", "train"),),
               help="Export the local encoder to ONNX and check it against torch."),
@@ -48,7 +52,8 @@ STAGES: dict[str, Stage] = {
               (("features", "teacher"),), help="Measure the exported scene on the test views."),
         Stage("report", "chebsplat.report/1", ("report",), (("evaluation", "evaluate"), ("gaussians", "train")),
               (("capture", "ingest"), ("points", "sfm"), ("channels", "channels"), ("features", "teacher"),
-               ("descriptors", "describe"), ("scene", "export"), ("encoder", "onnx"), ("basis", "cks")),
+               ("descriptors", "describe"), ("lifted", "lift"), ("scene", "export"), ("encoder", "onnx"),
+               ("basis", "cks")),
               help="One self-contained HTML page with pictures, tables and error against run time."),
     )
 }  # fmt: skip

@@ -21,6 +21,7 @@ STAGE_OF = {
     "features": "teacher",
     "descriptors": "describe",
     "gaussians": "train",
+    "lifted": "lift",
     "scene": "export",
     "encoder": "onnx",
     "basis": "cks",
@@ -40,8 +41,8 @@ FRAMES = {"color": "colour", "color_and_features": "colour and features"}
 def run(job: Job) -> None:
     """One HTML page, and the figures as CSV, of what was measured and where it comes from.
 
-    Reads `evaluation` and `gaussians`, and of `capture`, `points`, `channels`, `features`, `descriptors`, `scene`,
-    `encoder` and `basis` what there is. Writes `report`.
+    Reads `evaluation` and `gaussians`, and of `capture`, `points`, `channels`, `features`, `descriptors`, `lifted`,
+    `scene`, `encoder` and `basis` what there is. Writes `report`.
     """
     import json
 
@@ -128,6 +129,7 @@ def absent_stages(job: Job, gaussians: Gaussians) -> dict[str, str]:
     reasons = {
         "features": "rendering only: the scene has no semantics" if "features" not in gaussians.parameters else "",
         "descriptors": unneeded if encoder is None else "the encoder's tokens hold no descriptor",
+        "lifted": "the scene has no teacher, or its features were not lifted",
         "encoder": unneeded if encoder is None else "",
         "basis": "no sequence is named",
     }

@@ -96,6 +96,14 @@ class ChannelsSection(Section):
     n_rooms: int = number(8, "generated rooms that the channels are fitted to", 1, 100)
 
 
+class LiftSection(Section):
+    """docs/method.md, section 12."""
+
+    gate: float = number(0.1, "a pixel belongs to Gaussians of this part of its largest weight; 0: to all", 0, 1)
+    median_steps: int = number(0, "from the mean of the views towards their geometric median", 0, 100)
+    min_weight: float = number(0.1, "pixels that a Gaussian makes up of a view that sees it", 0, 1e6)
+
+
 class ExportSection(Section):
     split_by_degree: bool = setting(True, "write a PLY for each SH degree, too")
 

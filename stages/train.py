@@ -46,7 +46,8 @@ def run(job: Job) -> None:
     train = job.config.train
     capture, given = read_capture(job.inputs["capture"]), read_points(job.inputs["points"])
     descriptors, points = described(job, given), within_cap(job, given)
-    features = read_features(job.inputs["features"]) if "features" in job.inputs and train.semantics else None
+    taught = "features" in job.inputs and train.semantics and train.features == "trained"
+    features = read_features(job.inputs["features"]) if taught else None
     train = with_feature_loss(train, features)
     note_left_out(job, train, features is not None)
     import torch  # once its inputs are known to be usable
@@ -144,6 +145,8 @@ def note_left_out(job: Job, train: TrainSection, has_semantics: bool) -> None:
     """Say what this training does without, and why."""
     if not has_semantics:
         why = "no teacher features: rendering only" if train.semantics else "train.semantics is false"
+        if train.semantics and train.features == "lifted":
+            why = "train.features is lifted: they follow the training"
         job.left_out("semantic branch", why)
     unneeded = {
         "shape encoder": [(not has_semantics, "no semantics to encode"), (train.encoder == "off", "encoder is off")],

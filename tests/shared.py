@@ -27,6 +27,7 @@ INPUTS = {
     "describe": {"points": "sfm"},
     "train": {"capture": "ingest", "points": "sfm", "features": "teacher", "descriptors": "describe"},
     "export": {"gaussians": "train", "features": "teacher"},
+    "lift": {"capture": "ingest", "gaussians": "train", "features": "teacher"},
     "onnx": {"gaussians": "train"},
     "cks": {"gaussians": "train"},
     "evaluate": {"capture": "ingest", "scene": "export", "features": "teacher"},

@@ -26,6 +26,7 @@ PACKAGES = {
     "rasterize": {"kernels", "splats"},
     "render": {"rasterize", "splats", "views"},
     "shape": {"kernels", "settings", "splats"},
+    "lifting": {"kernels", "rasterize"},
     "evaluation": {"labels", "rasterize", "render", "views"},
     "training": {"evaluation", "kernels", "rasterize", "settings", "shape", "splats", "views"},
 }
@@ -84,6 +85,7 @@ def test_a_stage_is_known_by_every_kernel_it_runs_and_every_package_it_loads():
     found: dict[str, list] = {}
     code = Code(installed(), found)
     code.stage("train")
+    code.stage("lift")
     kernels = [
         path for path in installed()["chebsplat"].rglob("*.py") if "chebsplat.kernels.jit import" in path.read_text()
     ]

@@ -8,7 +8,7 @@ import pytest
 from shared import KEY, gaussian_parameters
 
 from chebsplat.errors import InputError
-from chebsplat.formats import artifact, capture, descriptors, evaluation, features, ply, points, scene
+from chebsplat.formats import artifact, capture, descriptors, evaluation, features, lifted, ply, points, scene
 from chebsplat.formats.cameras import Cameras
 from chebsplat.formats.manifest import Manifest
 
@@ -110,12 +110,26 @@ def make_evaluation():
     return evaluation.Evaluation(figures, pictures)
 
 
+def make_lifted():
+    rng = np.random.default_rng(7)
+    return lifted.Lifted(
+        rng.normal(size=(6, 4)).astype(np.float32),
+        rng.random(6, dtype=np.float32),
+        np.arange(6, dtype=np.int32),
+        rng.random(6, dtype=np.float32),
+        rng.normal(size=(2, 6, 4)).astype(np.float32),
+        rng.integers(0, 3, (2, 6)).astype(np.int32),
+        {"views": ["a", "b"], "n_observations": 9},
+    )
+
+
 CASES = {
     "capture": (make_capture, capture.write_capture, capture.read_capture, capture.SCHEMA),
     "points": (make_points, points.write_points, points.read_points, points.SCHEMA),
     "features": (make_features, features.write_features, features.read_features, features.SCHEMA),
     "descriptors": (make_descriptors, descriptors.write_descriptors, descriptors.read_descriptors, descriptors.SCHEMA),
     "scene": (make_scene, scene.write_scene, scene.read_scene, scene.SCHEMA),
+    "lifted": (make_lifted, lifted.write_lifted, lifted.read_lifted, lifted.SCHEMA),
     "evaluation": (make_evaluation, evaluation.write_evaluation, evaluation.read_evaluation, evaluation.SCHEMA),
 }
 

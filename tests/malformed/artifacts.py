@@ -168,6 +168,17 @@ def _gaussians(out: Path) -> None:
     write_gaussians(out, Gaussians(_parameters(), _cameras(), modules, {}, trace, notes))
 
 
+def _lifted(out: Path) -> None:
+    from chebsplat.formats.lifted import Lifted, write_lifted
+
+    ones, views = np.ones(N, np.float32), np.full((2, N), 2, np.int32)
+    features = np.random.default_rng(3).normal(size=(N, C)).astype(np.float32)
+    notes = {"views": VIEWS[1:], "n_observations": 4 * N}
+    write_lifted(
+        out, Lifted(features, ones, views.sum(0, dtype=np.int32), ones, np.stack([features] * 2), views, notes)
+    )
+
+
 def _scene(out: Path) -> None:
     from chebsplat.formats.scene import Scene, write_scene
 
@@ -225,6 +236,7 @@ WRITERS: dict[str, tuple[str, Callable[[Path], None]]] = {
     "teacher": ("chebsplat.features/1", _features),
     "describe": ("chebsplat.descriptors/1", _descriptors),
     "train": ("chebsplat.gaussians/1", _gaussians),
+    "lift": ("chebsplat.lifted/1", _lifted),
     "export": ("chebsplat.scene/2", _scene),
     "onnx": ("chebsplat.encoder/2", _encoder),
     "cks": ("chebsplat.basis/3", _basis),

@@ -18,12 +18,13 @@ READERS: dict[str, tuple[str, dict[str, str]]] = {  # stage of the artifact: the
     "teacher": ("export", {"gaussians": "train"}),
     "describe": ("train", {"capture": "ingest", "points": "sfm"}),
     "train": ("export", {}),
+    "lift": ("export", {"gaussians": "train", "features": "teacher"}),
     "export": ("extract", {}),
     "cks": ("cks", {"gaussians": "train"}),
     "evaluate": ("report", {"gaussians": "train"}),
 }
 ROLES = {"ingest": "capture", "sfm": "points", "teacher": "features", "describe": "descriptors", "train": "gaussians",
-         "export": "scene", "cks": "basis", "evaluate": "evaluation", "onnx": "encoder"}  # fmt: skip
+         "lift": "lifted", "export": "scene", "cks": "basis", "evaluate": "evaluation", "onnx": "encoder"}  # fmt: skip
 Damage = Callable[[Path], None]
 DOCUMENTS: dict[str, dict[str, list[tuple[tuple[Any, ...], Any]]]] = {  # stage, file: keys and value (...: taken away)
     "ingest": {
@@ -47,6 +48,7 @@ DOCUMENTS: dict[str, dict[str, list[tuple[tuple[Any, ...], Any]]]] = {  # stage,
                        (("encoder", "width"), 10**9), (("encoder", "n_layers"), -1), (("encoder", "n_inputs"), ...)],
         "cameras.json": [(("names",), 3), (("width",), 0), (("width",), 10**9), (("height",), "16"), ((), None)],
     },
+    "lift": {"notes.json": [((), []), (("views",), 5), (("n_observations",), -1), (("n_observations",), ...)]},
     "export": {
         "summary.json": [((), []), (("bytes",), 5), (("bytes", "ply"), -1), (("n",), "40"), (("left_out",), [1])],
         "labels.json": [((), []), ((), {"0": "a"}), ((), {"0": "a", "1": "b", "5": "c"}),

@@ -1,0 +1,101 @@
+"""The loops over observations, in numba: rows of Gaussian i are starts[i] to starts[i + 1], in order of views.
+
+A Gaussian is worked off by one thread, in float64 and in this order: the same bits for any number of threads.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+
+from chebsplat.kernels.jit import kernel, prange, serial
+
+PARTS = 64  # Gaussians are dealt out in so many, whatever the threads
+
+
+@kernel
+def place(ids, weights, sums, view, cursors, views, to_weights, to_means):
+    """Append one view's observations, each Gaussian at most once: at its cursor, which moves on."""
+    for m in prange(len(ids)):
+        row = cursors[ids[m]]
+        cursors[ids[m]] = row + 1
+        views[row], to_weights[row] = view, weights[m]
+        for c in range(sums.shape[1]):
+            to_means[row, c] = sums[m, c] / weights[m]
+
+
+@serial
+def _direction(means, lengths, factors, first, last, chosen, out):
+    """out = Σ factor · b / |b| over the chosen rows; returns Σ factor."""
+    out[:] = 0.0
+    total = 0.0
+    for row in range(first, last):
+        if chosen[row - first]:
+            total += factors[row - first]
+            scale = factors[row - first] / lengths[row - first]
+            for c in range(len(out)):
+                out[c] += scale * means[row, c]
+    return total
+
+
+@serial
+def _average(means, weights, lengths, first, last, chosen, steps, floor, factors, direction, out):
+    """Mean of the chosen rows, after `steps` towards the geometric median of their directions; returns r of the mean.
+
+    Every step takes a row's weight over its chord to the direction of the last average, or over `floor` if less.
+    """
+    for row in range(first, last):
+        factors[row - first] = weights[row]
+    total = _direction(means, lengths, factors, first, last, chosen, direction)
+    out[:] = np.float32(0)
+    if total == 0:
+        return 0.0
+    agreement = math.sqrt((direction**2).sum()) / total
+    for _ in range(steps):
+        size = max(math.sqrt((direction**2).sum()), 1e-12)
+        for row in range(first, last):
+            cosine = 0.0
+            for c in range(len(direction)):
+                cosine += means[row, c] * direction[c]
+            cosine /= lengths[row - first] * size
+            factors[row - first] = weights[row] / max(math.sqrt(max(2 - 2 * cosine, 0.0)), floor)
+        _direction(means, lengths, factors, first, last, chosen, direction)
+    direction[:] = 0.0
+    total = 0.0
+    for row in range(first, last):
+        if chosen[row - first]:
+            total += factors[row - first]
+            for c in range(len(out)):
+                direction[c] += factors[row - first] * means[row, c]
+    for c in range(len(out)):
+        out[c] = direction[c] / total
+    return agreement
+
+
+@kernel
+def averages(starts, views, weights, means, steps, floor):
+    """Averages f32 [3, N, C] over all, even and odd views, and agreement r f32 [N] (see `observations`)."""
+    n, channels = len(starts) - 1, means.shape[1]
+    features, agreement = np.zeros((3, n, channels), np.float32), np.zeros(n, np.float32)
+    for part in prange(PARTS):
+        longest = 0
+        for i in range(part * n // PARTS, (part + 1) * n // PARTS):
+            longest = max(longest, starts[i + 1] - starts[i])
+        lengths, factors, direction = np.empty(longest), np.empty(longest), np.empty(channels)
+        chosen = np.empty(longest, np.bool_)
+        for i in range(part * n // PARTS, (part + 1) * n // PARTS):
+            first, last = starts[i], starts[i + 1]
+            for row in range(first, last):
+                square = 0.0
+                for c in range(channels):
+                    square += np.float64(means[row, c]) * means[row, c]
+                lengths[row - first] = max(math.sqrt(square), 1e-12)
+            for half in range(3):
+                for row in range(first, last):
+                    chosen[row - first] = half == 0 or (views[row] & 1) == half - 1
+                r = _average(means, weights, lengths, first, last, chosen, steps, floor, factors, direction,
+                             features[half, i])  # fmt: skip
+                if half == 0:
+                    agreement[i] = r
+    return features, agreement

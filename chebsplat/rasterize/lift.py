@@ -1,0 +1,147 @@
+"""The transpose of rendering cell means: what every cell of a view says, summed by the Gaussians that make it up.
+
+A Gaussian's weight in a cell is the sum over its pixels of w = α T. As in `tiles_adjoint`, a tile fills the records of
+its pairs, and every Gaussian's records are summed in the order of its pairs: the same bits for any number of threads.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+
+from chebsplat.kernels.jit import kernel, lanes, prange, serial
+from chebsplat.kernels.simd import load, splat, store, where
+from chebsplat.rasterize import binning, cell_adjoint, cells, ellipses, tiles
+from chebsplat.rasterize.binning import TILE, band_start
+from chebsplat.rasterize.cells import AHEAD, LANES, SHAPE, ZERO
+from chebsplat.rasterize.tiles import begin, fill_shapes, spread
+
+MAX_ALPHA, NEAR, FAR, EPS2D = np.float32(0.99), 0.01, 1e10, 0.3  # as `reference.rasterize` has them
+
+
+class Lifted(NamedTuple):
+    """What one view says of M Gaussians: ids i32 [M], ascending; weights f32 [M] > 0; sums f32 [M, C]."""
+
+    ids: np.ndarray
+    weights: np.ndarray
+    sums: np.ndarray
+
+
+@lanes
+def gated(weights, count, gate):
+    """weights[m] = 0 at the lanes where it is below `gate` times the lane's largest."""
+    largest = splat(ZERO)
+    for m in range(count):
+        weight = load(weights, LANES * m)
+        largest = where(weight > largest, weight, largest)
+    limit = splat(gate) * largest
+    for m in range(count):
+        weight = load(weights, LANES * m)
+        store(weights, LANES * m, where(weight >= limit, weight, splat(ZERO)))
+
+
+@serial
+def _lift_tile(splats, ranks, pair, start, stop, left, top, width, height, values, counts, gate, base, records):
+    """One tile of `_lift`: adds to the records of its pairs."""
+    n, across = stop - start, counts.shape[1]
+    states = np.empty((LANES, 2, LANES), np.float32)
+    begin(states, width - left, height - top)
+    shapes, masks = np.empty((n, SHAPE), np.float32), np.empty(n, np.uint16)
+    alphas, weights = np.empty((n + AHEAD + 1, LANES), np.float32), np.empty((n + 1, LANES), np.float32)
+    hits, rows = np.empty(n + AHEAD + 1, np.int64), np.empty(n, np.int64)
+    shares, slots = np.empty(n, np.float32), np.empty(n, np.int64)
+    fill_shapes(splats, ranks, start, n, left, top, shapes)
+    for k in range(n):
+        masks[k] = cells.reach(shapes, k)
+    for cell in range(LANES):
+        x, y = left // 4 + (cell & 3), top // 4 + (cell >> 2)
+        if y >= counts.shape[0] or x >= across or counts[y, x] == ZERO:
+            continue
+        count = cells.listed(masks, 0, n, cell, hits)
+        count = cells.sweep(shapes, hits, count, cell, MAX_ALPHA, states, alphas, weights, rows)
+        gated(weights, count, gate)
+        cells.sum_lanes(weights, count, shares)
+        kept = 0
+        for m in range(count):
+            if shares[m] > ZERO:
+                shares[kept], slots[kept] = shares[m], pair[start + rows[m]] - base
+                kept += 1
+        cell_adjoint.record_means(shares, values, kept, y * across + x, slots, 0, records)
+
+
+@kernel
+def _lift(splats, shown, tile_starts, ranks, pair, pair_starts, values, counts, width, height, gate):
+    """Sums f32 [shown, E] of values [cells, E], E a multiple of 16, by rank; a cell whose count is 0 is passed over."""
+    columns, rows = (width + TILE - 1) // TILE, (height + TILE - 1) // TILE
+    bands, room = len(pair_starts), 0
+    for band in range(bands):
+        room = max(room, pair_starts[band, shown] - pair_starts[band, 0])
+    records, sums = np.empty((room, values.shape[1]), np.float32), np.zeros((shown, values.shape[1]), np.float32)
+    for band in range(bands):
+        first_tile, base = band_start(band, rows) * columns, pair_starts[band, 0]
+        n_tiles = band_start(band + 1, rows) * columns - first_tile
+        for j in prange(16 * ((n_tiles + 15) // 16)):
+            if spread(j, n_tiles) < n_tiles:
+                tile = first_tile + spread(j, n_tiles)
+                for k in range(tile_starts[tile], tile_starts[tile + 1]):
+                    cell_adjoint.clear(records, pair[k] - base)
+                _lift_tile(
+                    splats, ranks, pair, tile_starts[tile], tile_starts[tile + 1], (tile % columns) * TILE,
+                    (tile // columns) * TILE, width, height, values, counts, gate, base, records,
+                )  # fmt: skip
+        for m in prange(shown):
+            for k in range(pair_starts[band, m] - base, pair_starts[band, m + 1] - base):
+                cell_adjoint.add_means(records, k, 0, sums, m)
+    return sums
+
+
+def lift(
+    gaussians: tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray],
+    viewmat: np.ndarray,
+    K: np.ndarray,
+    size: tuple[int, int],
+    values: np.ndarray,
+    counts: np.ndarray,
+    gate: float = 0.0,
+) -> Lifted:
+    """What the cells of one view say, summed by Gaussian: Σ w q b and Σ w q.
+
+    Args:
+      gaussians: means [N, 3], quats [N, 4], scales [N, 3], opacities [N], activated, float32.
+      viewmat:   [4, 4] world to camera, OpenCV axes; K [3, 3] pixels.
+      size:      width and height, pixels.
+      values:    b [⌈H/4⌉, ⌈W/4⌉, C], of cells of 4×4 pixels.
+      counts:    q [⌈H/4⌉, ⌈W/4⌉] >= 0, what each cell counts; where it is 0, b may be anything.
+      gate:      in [0, 1]: a pixel belongs to the Gaussians whose w in it is at least this part of the largest one's.
+    Returns: the Gaussians that have a weight, with Σ w q and Σ w q b.
+    Raises:  ValueError unless values and counts have a row for each cell, and are finite where they count.
+    Choices: w as `reference.rasterize` composites by default. The gate compares within each pixel: that of a whole
+      cell would hand a pixel at an edge to the larger side. Bitwise equal for any number of threads.
+    """
+    means, quats, scales, opacities = gaussians
+    width, height = size
+    shape = (height + 3) // 4, (width + 3) // 4
+    if values.shape[:2] != shape or counts.shape != shape:
+        raise ValueError(f"values {values.shape}, counts {counts.shape}; {width}×{height} pixels have cells {shape}")
+    n_channels = values.shape[2]
+    counted = counts > 0
+    said = np.zeros((*shape, int(cells.whole(n_channels + 1))), np.float32)
+    said[counted, :n_channels] = values[counted] * counts[counted][:, None]
+    said[counted, n_channels] = counts[counted]
+    if not (np.isfinite(said).all() and np.isfinite(counts).all()):
+        raise ValueError("a cell that counts holds a value that is not finite")
+    camera = (np.ascontiguousarray(matrix, np.float64) for matrix in (viewmat, K))
+    projected = ellipses.project(means, quats, scales, *camera, width, height, NEAR, FAR, EPS2D)
+    means2d, covariances, whitening, _, depths, radii, _ = projected
+    none = np.zeros((len(means), 0), np.float32)
+    bins = binning.bin_gaussians(means2d, covariances, depths, radii, opacities, none, none, width, height)
+    splats = tiles.pack(bins.order, means2d, whitening, opacities, none, none)
+    sums = _lift(
+        splats, len(bins.order), bins.tile_starts, bins.rank, bins.pair, bins.pair_starts,
+        said.reshape(-1, said.shape[2]), counted.astype(np.float32), width, height, np.float32(gate),
+    )  # fmt: skip
+    kept = np.flatnonzero(sums[:, n_channels] > 0)
+    kept = kept[np.argsort(bins.order[kept])]
+    chosen = sums[kept]
+    return Lifted(bins.order[kept], chosen[:, n_channels].copy(), chosen[:, :n_channels].copy())

@@ -1,0 +1,137 @@
+"""lift: what the 2D teacher says of each Gaussian of a trained scene, by one pass over the training views."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from typing import TYPE_CHECKING, Any
+
+from chebsplat.errors import DataFailure, InputError
+from chebsplat.stages.command import Job, command
+
+if TYPE_CHECKING:
+    import numpy as np
+
+    from chebsplat.formats.cameras import Cameras
+    from chebsplat.formats.capture import Capture
+    from chebsplat.formats.features import Features
+    from chebsplat.rasterize.lift import Lifted
+    from chebsplat.stages.progress import Progress
+    from chebsplat.stages.settings import LiftSection
+
+
+def run(job: Job) -> None:
+    """Lift features to Gaussians, with their evidence, without training (docs/method.md, section 12).
+
+    Reads `capture`, `gaussians` and `features`. Writes `lifted`.
+    """
+    from chebsplat.formats.capture import read_capture
+    from chebsplat.formats.features import read_features
+    from chebsplat.formats.gaussians import read_gaussians
+    from chebsplat.formats.lifted import write_lifted
+
+    capture, gaussians = read_capture(job.inputs["capture"]), read_gaussians(job.inputs["gaussians"])
+    features = read_features(job.inputs["features"])
+    lifted = lifted_from(capture, gaussians.cameras, gaussians.parameters, features, job.config.lift, job.progress)
+    n = len(lifted.features)
+    job.facts |= {
+        "n_gaussians": n,
+        "n_unseen": int((lifted.n_views == 0).sum()),
+        "n_observations": lifted.notes["n_observations"],
+        "n_views": len(lifted.notes["views"]),
+    }
+    write_lifted(job.out, lifted)
+
+
+def lifted_from(
+    capture: Capture,
+    cameras: Cameras,
+    parameters: dict[str, np.ndarray],
+    features: Features,
+    settings: LiftSection,
+    progress: Progress,
+) -> Any:
+    """The features of Gaussians with these raw parameters, by the training views among these cameras.
+
+    Returns: `formats.lifted.Lifted`.
+    Raises:  InputError if artifacts do not belong together, DataFailure if no view sees a Gaussian.
+    """
+    import numpy as np
+
+    from chebsplat.formats.lifted import Lifted
+    from chebsplat.lifting.observations import estimate, gathered
+
+    names = training_names(capture, cameras, features)
+    views = lifted_views(capture, cameras, parameters, features, names, settings.gate)
+    rounds = progress.track(views, len(names), "lift")
+    n, n_channels = len(parameters["means"]), features.features.shape[-1]
+    observations = gathered(n, n_channels, (view for view, _ in rounds))
+    if len(observations.views) == 0:
+        raise DataFailure(
+            "no training view sees a Gaussian that the teacher has features for; check that splat and cameras are in "
+            "the same frame"
+        )
+    found = estimate(observations, settings.median_steps, settings.min_weight)
+    notes = {"views": names, "n_observations": len(observations.views)}
+    return Lifted(**{name: np.ascontiguousarray(values) for name, values in vars(found).items()}, notes=notes)
+
+
+def training_names(capture: Capture, cameras: Cameras, features: Features) -> list[str]:
+    """Names of the training views with a camera, in its order. Raises InputError where artifacts do not fit."""
+    is_test = dict(zip(capture.names, capture.is_test.tolist(), strict=True))
+    if unknown := [name for name in cameras.names if name not in is_test]:
+        raise InputError(f"the cameras have a view {unknown[0]} that the capture has not; pass artifacts of one scene")
+    if capture.size != (cameras.width, cameras.height):
+        raise InputError("the cameras are of another size than the capture; pass artifacts of one scene")
+    names = [name for name in cameras.names if not is_test[name]]
+    known = set(features.names)
+    if absent := [name for name in names if name not in known]:
+        raise InputError(f"the features have no view {absent[0]}; run the teacher stage on this capture")
+    if not names:
+        raise DataFailure("no training view has a camera; lower ingest.test_every's share of test views")
+    return names
+
+
+def lifted_views(
+    capture: Capture,
+    cameras: Cameras,
+    parameters: dict[str, np.ndarray],
+    features: Features,
+    names: list[str],
+    gate: float,
+) -> Iterator[Lifted]:
+    """What each of these views says of the Gaussians."""
+    import numpy as np
+    from scipy.special import expit
+
+    from chebsplat.lifting.cell_maps import to_cells
+    from chebsplat.rasterize.lift import lift
+
+    p = parameters
+    gaussians = p["means"], p["quats"], np.exp(p["log_scales"]), expit(p["logit_opacities"])
+    place, taught = ({name: k for k, name in enumerate(of.names)} for of in (cameras, features))
+    row = {name: k for k, name in enumerate(capture.names)}
+    for name in names:
+        values = features.features[taught[name]]
+        mask = None if capture.loss_mask is None else capture.loss_mask[row[name]]
+        said, share = to_cells(values, counts_of(features, taught[name], values), capture.size, mask)
+        camera = cameras.cam_from_world[place[name]], cameras.Ks[place[name]]
+        yield lift(gaussians, *camera, capture.size, said, share, gate)
+
+
+def counts_of(features: Features, view: int, values: np.ndarray) -> np.ndarray:
+    """What each entry of a view's features counts, f32 [h, w].
+
+    Choices: nothing where the teacher has no label; its confidence where the source brought the labels with one, as
+      the loss of a training has it; 1 elsewhere.
+    """
+    import numpy as np
+
+    if features.pseudo_labels is None:
+        return np.ones(values.shape[:2], np.float32)
+    labelled = (features.pseudo_labels[view] >= 0).astype(np.float32)
+    if features.convention.get("kind") == "given" and features.confidence is not None:
+        return labelled * features.confidence[view].astype(np.float32)  # type: ignore[no-any-return]
+    return labelled
+
+
+main = command("lift", run)
