@@ -47,7 +47,8 @@ def chain():
         reports, weights = {}, {}
         for name in NAMES:
             W = torch.randn(16, 2, generator=g) @ torch.randn(2, 16, generator=g)
-            held, reports[name] = update(torch.from_numpy(grown[name]) if name in grown else None, W, energy=0.9999)
+            before = torch.from_numpy(grown[name]) if name in grown else None
+            held, reports[name] = update(before, W, energy=0.9999, n_scenes=1)
             grown[name], weights[f"{name}.weight"] = held.numpy(), W.numpy()
         lineage.append({"scene": scene, "gaussians": f"g{number}", "spread": 1.0, "maps": reports})
         earlier = key_of(number - 1) if number > 1 else None
