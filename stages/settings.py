@@ -36,7 +36,7 @@ class SourceSection(Section):
     )
     path: Text | None = setting(None, "the source's folder")
     seed: int = seed("of a generated scene")
-    preset: Literal["office", "room", "toy"] = setting("office", "what a generated scene is furnished as")
+    preset: Literal["office", "room", "shuffled", "toy"] = setting("office", "what a generated scene is furnished as")
 
 
 class IngestSection(Section):

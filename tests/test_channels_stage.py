@@ -12,7 +12,6 @@ from chebsplat.formats.channels import SCHEMA, read_channels
 from chebsplat.formats.images import SUFFIXES
 from chebsplat.pipelines.plan import Planner
 from chebsplat.stages.channels import generated
-from chebsplat.synthetic import seeds
 
 
 @pytest.fixture
@@ -88,12 +87,10 @@ def test_what_cannot_be_reduced_is_named(tmp_path, tiny, bad, capsys):
     assert not (tmp_path / "out").exists()
 
 
-def test_the_reference_rooms_are_the_same_every_time_and_serve_nothing_else():
+def test_the_reference_rooms_are_the_same_every_time():
     digests = [[hashlib.sha256(image.tobytes()).digest() for _, image in generated(range(8000, 8001))] for _ in "ab"]
     assert digests[0] == digests[1]
     assert len(set(digests[0])) == len(digests[0]) > 1
-    ranges = [set(seeds.SCENES), set(seeds.REFERENCE), set(seeds.HELD_OUT), set(seeds.TRAINING)]
-    assert sum(map(len, ranges)) == len(set().union(*ranges))
 
 
 def key(planner, scene, settings, stage="channels"):

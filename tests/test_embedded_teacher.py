@@ -52,7 +52,8 @@ def test_a_held_out_room_is_told_about_as_well_as_the_published_figures_say():
 
 
 def test_no_seed_serves_two_ends():
-    ranges = [seeds.SCENES, seeds.REFERENCE, seeds.HELD_OUT, seeds.TRAINING]
+    ranges = [seeds.SCENES, seeds.REFERENCE, seeds.HELD_OUT, seeds.TRAINING, seeds.KNOWLEDGE]
+    assert ranges == sorted((r for r in vars(seeds).values() if isinstance(r, range)), key=lambda r: r.start)
     assert all(a.stop <= b.start for a, b in pairwise(ranges))
     for path in (ROOT / "pipelines/configs/scenes").glob("*.toml"):
         source = tomllib.loads(path.read_text())["source"]
@@ -71,7 +72,7 @@ def test_training_takes_no_other_seeds_and_its_validation_none_of_its_own():
 
 
 def test_shuffled_rooms_differ_in_layout_and_keep_their_furniture_inside():
-    from chebsplat.teachers.rooms import shuffled
+    from chebsplat.synthetic.shuffled import shuffled
 
     rooms = [shuffled(seed) for seed in seeds.TRAINING[4:9]]
     assert len({len(room.soup.triangles) for room in rooms}) > 1

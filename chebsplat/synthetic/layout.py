@@ -88,7 +88,7 @@ def shell(b: Builder, p: Palette, rng: np.random.Generator, size: tuple[float, f
 
 
 def build(preset: str, seed: int) -> Room:
-    """The room of a preset and a seed. Raises ValueError on an unknown preset."""
+    """The room of a preset and a seed. Raises KeyError on an unknown preset."""
     rng = np.random.default_rng(seed)
     small = preset == "toy"
     size = (3.4, 2.8, 2.5) if small else (rng.uniform(4.7, 5.3), rng.uniform(3.8, 4.2), 2.7)

@@ -10,7 +10,9 @@ if TYPE_CHECKING:
     from chebsplat.synthetic.layout import Room
     from chebsplat.synthetic.rays import Hits, RayCaster
 
-SIZES = {"office": (80, 320, 240), "room": (80, 320, 240), "toy": (16, 96, 72)}  # views, width, height
+SIZES = {  # views, width, height
+    "office": (80, 320, 240), "room": (80, 320, 240), "shuffled": (80, 320, 240), "toy": (16, 96, 72),
+}  # fmt: skip
 EDGE_SAMPLES = 3  # rays along each side of a pixel on an edge
 
 
@@ -19,9 +21,9 @@ def capture(name: str, seed: int, preset: str) -> dict[str, Any]:
     from concurrent.futures import ThreadPoolExecutor
 
     from chebsplat.synthetic import CLASS_NAMES
-    from chebsplat.synthetic.layout import build
     from chebsplat.synthetic.path import intrinsics, walk
     from chebsplat.synthetic.rays import RayCaster
+    from chebsplat.synthetic.rooms import build
 
     n_views, width, height = SIZES[preset]
     room = build(preset, seed)
