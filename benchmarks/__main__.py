@@ -42,6 +42,9 @@ BENCHMARKS = {
     "encoder": Benchmark(
         "encoder", "the region encoder: error against run time of torch and onnxruntime", ("export", "onnx")
     ),
+    "lift": Benchmark(
+        "lift", "features lifted to a finished scene: seconds, error", ("train", "teacher"), "train.features=lifted"
+    ),
     "layouts": Benchmark("layouts", "the exported layouts: bytes, and images beside the checkpoint's", ("export",)),
     "store": Benchmark("store", "the feature store: bytes, error, label decisions, bandwidth, memory"),
     "stability": Benchmark("stability.main", "every extreme case of the maths, naive and ours; fails if one does"),

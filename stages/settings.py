@@ -97,10 +97,14 @@ class ChannelsSection(Section):
 
 
 class LiftSection(Section):
-    """docs/method.md, section 12."""
+    """docs/method.md, section 12.
 
-    gate: float = number(0.1, "a pixel belongs to Gaussians of this part of its largest weight; 0: to all", 0, 1)
-    median_steps: int = number(0, "from the mean of the views towards their geometric median", 0, 100)
+    Choices: by agreement with a fifth of the training views that was held out (office0, noisy labels, 70 views): 42.8
+      mIoU for the mean, 43.5 after 5 median steps; gates from 0 to 0.2 are alike within 0.1, and more costs.
+    """
+
+    gate: float = number(0.05, "a pixel belongs to Gaussians of this part of its largest weight; 0: to all", 0, 1)
+    median_steps: int = number(5, "from the mean of the views towards their geometric median", 0, 100)
     min_weight: float = number(0.1, "pixels that a Gaussian makes up of a view that sees it", 0, 1e6)
 
 

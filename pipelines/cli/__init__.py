@@ -16,15 +16,16 @@ class Commands(Guarded):
     """Stages are listed from their table and imported only when called, so that --help stays instant."""
 
     def list_commands(self, context: click.Context) -> list[str]:
-        return [*super().list_commands(context), *STAGES]
+        return [*(name for name in super().list_commands(context) if name not in STAGES), *STAGES]
 
     def get_command(self, context: click.Context, name: str) -> click.Command | None:
-        if name in STAGES:  # for the listing, which shows a name and a line
+        if name in STAGES and name not in self.commands:  # for the listing, which shows a name and a line
             return click.Command(name, help=STAGES[name].help)
         return super().get_command(context, name)
 
     def resolve_command(self, context: click.Context, args: list[str]) -> Any:
-        if args[0] in STAGES:
+        of_a_file = len(args) > 1 and (not args[1].startswith("-") or "--capture" in args)
+        if args[0] in STAGES and not (of_a_file and args[0] in self.commands):  # `lift` is of a file, too
             from importlib import import_module
 
             return args[0], import_module(f"chebsplat.stages.{args[0]}").main, args[1:]

@@ -1,4 +1,4 @@
-"""What is done with a finished scene, or before one: query, extract, encode, check-teacher."""
+"""What is done with a finished scene, or before one: query, extract, encode, lift, check-teacher."""
 
 from __future__ import annotations
 
@@ -86,4 +86,25 @@ def encode(scene: str, encoder: str | None, features: Path | None, out: Path) ->
     print(out)
 
 
-COMMANDS = (query, check_teacher, extract, encode)
+@click.command()
+@click.argument("ply", type=click.Path(path_type=Path))
+@click.option("--capture", required=True, help="a finished scene of the same photos, or an ingest artifact")
+@click.option("--teacher", type=click.Path(path_type=Path), help=".onnx; default: the scene's, else the embedded one")
+@click.option("--out", type=click.Path(path_type=Path), required=True, help="the folder to make")
+def lift(ply: Path, capture: str, teacher: Path | None, out: Path) -> None:
+    """Give the Gaussians of a .PLY, trained elsewhere on the photos of a capture, the 2D teacher's features and labels.
+
+    Without a .PLY, the stage of this name: --help says more.
+    """
+    from chebsplat.pipelines.finished import artifact_of, is_artifact, links, scene_folder
+    from chebsplat.stages.lift_ply import lift_ply
+
+    source = artifact_of(capture, "ingest")
+    beside = {} if is_artifact(Path(capture)) else links(scene_folder(capture))
+    features = None if teacher else beside.get("teacher")
+    figures = lift_ply(ply, source, beside.get("sfm"), features, teacher, out)
+    print(", ".join(f"{name} {value}" for name, value in figures.items()), file=sys.stderr)
+    print(out)
+
+
+COMMANDS = (query, check_teacher, extract, encode, lift)

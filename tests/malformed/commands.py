@@ -63,6 +63,8 @@ NAMES: list[tuple[list[str], str, int]] = [
     (["encode", "nowhere.ply", "--out", "x.npz"], "--encoder", 2),
     (["encode", "nowhere.ply", "--encoder", "./nowhere", "--out", "x.npz"], "./nowhere", 3),
     (["encode", "nowhere.ply", "--encoder", "nowhere.onnx", "--out", "x.npz"], "nowhere.onnx", 2),
+    (["lift", "nowhere.ply", "--capture", "nowhere", "--out", "x"], "nowhere", 2),
+    (["lift", "nowhere.ply", "--capture", "./nowhere", "--out", "x"], "./nowhere", 3),
     (["check-teacher", "nowhere.onnx"], "nowhere.onnx", 3),
     (["basis", "show", "ofices"], "offices", 2),
     (["basis", "log", "./nowhere"], "nowhere", 2),

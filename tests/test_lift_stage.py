@@ -1,0 +1,91 @@
+"""Lifted features of small artifacts: of a checkpoint, in an export, and of a PLY that came from elsewhere."""
+
+import numpy as np
+import pytest
+from malformed.artifacts import VIEWS, N, artifacts, copied
+from shared import KEY, run_stage
+
+from chebsplat.errors import ConfigError, DataFailure, InputError
+from chebsplat.formats import artifact
+from chebsplat.formats.capture import SCHEMA, read_capture, write_capture
+from chebsplat.formats.gaussians import read_gaussians
+from chebsplat.formats.lifted import read_lifted
+from chebsplat.formats.manifest import Manifest
+from chebsplat.formats.ply import write_ply
+from chebsplat.formats.scene import read_scene
+from chebsplat.stages.lift_ply import lift_ply
+
+ROLES = {"capture": "ingest", "gaussians": "train", "features": "teacher"}
+
+
+@pytest.fixture
+def lifted(tmp_path):
+    assert run_stage("lift", tmp_path / "lift", {role: artifacts() / name for role, name in ROLES.items()}, {}) == 0
+    return tmp_path / "lift"
+
+
+def test_only_training_views_are_lifted_and_the_export_has_what_was(lifted, tmp_path):
+    held = read_lifted(lifted)
+    assert held.notes["views"] == VIEWS[1:]  # the first is a test view
+    assert held.n_views.max() <= 2
+    assert held.features.shape == (N, 5)
+    np.testing.assert_array_equal(held.half_views.sum(0), held.n_views)
+    inputs = {"gaussians": artifacts() / "train", "features": artifacts() / "teacher", "lifted": lifted}
+    assert run_stage("export", tmp_path / "export", inputs, {}) == 0
+    scene, unseen = read_scene(tmp_path / "export"), ~held.features.any(1)
+    assert unseen.any() and not unseen.all()
+    np.testing.assert_array_equal(scene.labels[np.argsort(scene.order)] == -1, unseen)
+    np.testing.assert_allclose(scene.parameters["features"], held.features[scene.order], atol=1e-4)
+    assert "raw_features" not in scene.parameters
+
+
+def test_a_ply_gets_what_its_checkpoint_gets_and_becomes_a_folder_of_artifacts(lifted, tmp_path):
+    parameters = read_gaussians(artifacts() / "train").parameters
+    write_ply(tmp_path / "a.ply", parameters, 0)
+    out = tmp_path / "out"
+    figures = lift_ply(tmp_path / "a.ply", artifacts() / "ingest", None, artifacts() / "teacher", None, out)
+    assert figures["gaussians"] == N
+    np.testing.assert_array_equal(read_lifted(out / "lift").features, read_lifted(lifted).features)
+    assert read_scene(out / "export").labels is not None
+    with pytest.raises(ConfigError, match="exists"):
+        lift_ply(tmp_path / "a.ply", artifacts() / "ingest", None, artifacts() / "teacher", None, out)
+
+
+def test_a_splat_in_another_frame_and_a_capture_without_poses_are_refused(tmp_path):
+    parameters = read_gaussians(artifacts() / "train").parameters
+    write_ply(tmp_path / "far.ply", parameters | {"means": parameters["means"] + np.float32(1000)}, 0)
+    with pytest.raises(DataFailure, match="same frame"):
+        lift_ply(tmp_path / "far.ply", artifacts() / "ingest", None, artifacts() / "teacher", None, tmp_path / "far")
+    record = read_capture(artifacts() / "ingest")
+    record.cam_from_world = None
+    with artifact.publish(tmp_path / "capture", Manifest(SCHEMA, KEY, "test")) as tmp:
+        write_capture(tmp, record)
+    with pytest.raises(InputError, match="has no poses"):
+        lift_ply(tmp_path / "far.ply", tmp_path / "capture", None, artifacts() / "teacher", None, tmp_path / "out")
+    assert not (tmp_path / "out").exists()
+
+
+def test_features_of_another_number_of_gaussians_are_refused(lifted, tmp_path, capsys):
+    from malformed.artifacts import resealed
+    from safetensors.numpy import load_file, save_file
+
+    inputs = {"gaussians": copied("train", tmp_path), "features": artifacts() / "teacher", "lifted": lifted}
+    file = inputs["gaussians"] / "parameters.safetensors"
+    save_file({name: np.ascontiguousarray(values[:-1]) for name, values in load_file(file).items()}, file)
+    resealed(inputs["gaussians"])
+    assert run_stage("export", tmp_path / "export", inputs, {}) == 3
+    assert "lift again" in capsys.readouterr().err
+
+
+def test_the_command_is_a_stage_without_a_file_and_a_use_with_one():
+    import click
+    from click.testing import CliRunner
+
+    from chebsplat.pipelines.cli import main
+
+    runner = CliRunner()
+    assert "--in-gaussians" in runner.invoke(main, ["lift", "--help"]).output
+    context = click.Context(main)
+    assert {p.name for p in main.resolve_command(context, ["lift", "a.ply"])[1].params} >= {"ply", "capture", "out"}
+    listed = main.list_commands(context)
+    assert listed.count("lift") == 1
