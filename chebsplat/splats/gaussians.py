@@ -77,3 +77,16 @@ def covariances(quats: Tensor, scales: Tensor) -> Tensor:
 
     factor = rotation_matrices(quats) * scales[:, None, :]
     return factor @ factor.transpose(1, 2)
+
+
+def surface_of(parameters: Mapping[str, np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
+    """Normals f32 [N, 3], unit and of any sign, and colours f32 [N, 3] in [0, 1], of raw parameters.
+
+    Choices: the normal is the shortest axis, the first of equal ones; the colour that of SH degree 0.
+    """
+    from chebsplat.splats.rotations import rotation_matrices_f64
+
+    axes = rotation_matrices_f64(parameters["quats"])
+    normals = axes[np.arange(len(axes)), :, parameters["log_scales"].argmin(1)]
+    colors = np.clip(parameters["sh0"][:, 0] * _C0 + 0.5, 0, 1)
+    return normals.astype(np.float32), colors.astype(np.float32)

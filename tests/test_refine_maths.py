@@ -1,0 +1,185 @@
+"""Smoothing, blend, calibration and carrying over: transcriptions in float64, and what must hold at the extremes."""
+
+import math
+
+import numpy as np
+import pytest
+
+from chebsplat.lifting.blend import STRENGTHS, blend, calibrate
+from chebsplat.lifting.carry import carry
+from chebsplat.lifting.smoothing import N_NEIGHBORS, REACH, Affinities, affinities, room_unit, smooth
+
+
+def unit(vectors):
+    return vectors / np.linalg.norm(vectors, axis=-1, keepdims=True)
+
+
+@pytest.fixture
+def scene():
+    rng = np.random.default_rng(0)
+    n = 300
+    means, normals = rng.uniform(0, 0.8, (n, 3)), unit(rng.normal((0, 0, 2), size=(n, 3)))
+    colors = rng.uniform(0.4, 0.6, (n, 3))
+    return means, normals, colors, rng.normal(size=(n, 5)), rng.integers(0, 9, n)
+
+
+def transcribed(means, normals, colors, features, evidence, scale):
+    """The formula of `smooth` over `affinities`, in Python floats."""
+    smoothed = []
+    for i in range(len(means)):
+        offsets = (means - means[i]) / scale
+        distances = np.linalg.norm(offsets, axis=1)
+        nearest = [j for j in np.argsort(distances) if j != i and distances[j] <= REACH][:N_NEIGHBORS]
+        sums, total = evidence[i] * features[i], float(evidence[i])
+        for j in nearest:
+            angle = math.acos(min(abs(float(normals[i] @ normals[j])), 1.0))
+            across, tone = float(normals[i] @ offsets[j]), float(((colors[i] - colors[j]) ** 2).sum())
+            exponent = distances[j] ** 2 / 0.15**2 + tone / 0.1**2 + angle**2 / 0.5**2 + across**2 / 0.03**2
+            weight = math.exp(-exponent / 2) * evidence[j]
+            sums, total = sums + weight * features[j], total + weight
+        smoothed.append(sums / total if total > 0 else features[i])
+    return np.array(smoothed)
+
+
+@pytest.mark.parametrize("scale", [1.0, 40.0])
+def test_smoothing_is_its_formula_in_scenes_of_any_unit(scene, scale):
+    means, normals, colors, features, evidence = scene
+    near = affinities(means * scale + 7 * scale, normals, colors, scale)
+    assert ((near.weights > 0).sum(1) == N_NEIGHBORS).any()
+    found = smooth(features, evidence, near)
+    # float32 features and weights
+    np.testing.assert_allclose(found, transcribed(means, normals, colors, features, evidence, 1.0), atol=1e-5)
+    assert np.abs(found - features).max() > 0.1
+
+
+def test_smoothing_stops_at_colors_creases_and_steps():
+    flat = np.stack([np.linspace(0, 0.2, 20), np.zeros(20), np.zeros(20)], 1)
+    up, grey = np.tile([0.0, 0, 1], (20, 1)), np.full((20, 3), 0.5)
+    second = np.arange(20) >= 10
+    other = {
+        "color": (flat, up, grey + 0.5 * second[:, None]),
+        "normal": (flat, np.where(second[:, None], (1.0, 0, 0), up), grey),
+        "plane": (flat + second[:, None] * (0, 0, 0.2), up, grey),
+    }
+    features = np.stack([~second, second], 1).astype(float)
+    for what, given in other.items():
+        found = smooth(features, np.ones(20), affinities(*given))
+        assert np.abs(found - features).max() < 0.05, what
+    assert np.abs(smooth(features, np.ones(20), affinities(flat, up, grey)) - features).max() > 0.2
+
+
+@pytest.mark.parametrize("n", [0, 1, 2, 60])
+@pytest.mark.parametrize("case", ["coincident", "far", "no evidence", "one color"])
+def test_smoothing_is_finite_at_the_extremes(n, case):
+    rng = np.random.default_rng(1)
+    means = np.full((n, 3), 1e3) if case == "coincident" else rng.normal(size=(n, 3)) * (1e6 if case == "far" else 1)
+    colors, normals = np.full((n, 3), 0.3), np.tile([0.0, 1, 0], (n, 1))
+    features, evidence = rng.normal(size=(n, 3)).astype(np.float32), np.full(n, float(case != "no evidence"))
+    assert np.isfinite(room_unit(means))
+    assert room_unit(means) > 0
+    found = smooth(features, evidence, affinities(means, normals, colors))
+    assert found.shape == features.shape
+    assert np.isfinite(found).all()
+    if case == "coincident" and n == 2:
+        np.testing.assert_allclose(found, np.tile(features.mean(0), (n, 1)), atol=1e-6)
+    if case in ("far", "no evidence"):
+        np.testing.assert_allclose(found, features, rtol=1e-6)
+
+
+def test_what_no_view_sees_takes_what_its_neighbours_say_and_gives_nothing():
+    means, normals = np.array([[0, 0, 0], [0.05, 0, 0.0]]), np.tile([0.0, 0, 1], (2, 1))
+    found = smooth(np.array([[0.0, 9], [1, 0]]), np.array([0, 3]), affinities(means, normals, np.full((2, 3), 0.5)))
+    np.testing.assert_allclose(found, [[1, 0], [1, 0]], atol=1e-6)
+
+
+def test_affinities_refuse_a_unit_that_is_none(scene):
+    with pytest.raises(ValueError, match="positive unit"):
+        affinities(*scene[:3], unit=0.0)
+
+
+def test_the_blend_counts_knowledge_as_so_many_views():
+    f, g = np.array([[1.0, 0], [1, 0], [1, 0], [1, 0]]), np.array([[0, 1.0], [0, 1], [0, 0], [0, 1]])
+    n = np.array([4, 0, 2, 2])
+    np.testing.assert_allclose(blend(f, n, g, 2.0), [[2 / 3, 1 / 3], [0, 1], [1, 0], [0.5, 0.5]], atol=1e-7)
+    np.testing.assert_array_equal(blend(f, n, g, 0.0), f)
+
+
+def votes(n_views, spread, seed=0):
+    """Halves of a plane of 400 Gaussians of two materials, what is true of them, and their affinities."""
+    rng = np.random.default_rng(seed)
+    means = np.concatenate([rng.uniform(0, 1, (400, 2)), np.zeros((400, 1))], 1)
+    second = means[:, 0] > 0.5
+    truth = np.eye(4)[second.astype(int)]
+    halves = np.stack([unit(truth + spread / np.sqrt(n_views) * rng.normal(size=truth.shape)) for _ in "ab"])
+    colors = np.where(second[:, None], 0.2, 0.8) * np.ones(3)
+    near = affinities(means, np.tile([0.0, 0, 1], (400, 1)), colors)
+    return halves.astype(np.float32), np.full((2, 400), n_views), truth, near
+
+
+def test_calibration_smooths_where_votes_are_noisy_and_not_where_neighbours_differ():
+    halves, n_views, _, near = votes(2, 1.0)
+    found = calibrate(halves, n_views, near)
+    assert found.smooth
+    assert found.strength == 0
+    assert set(found.curve["on"]) == set(found.curve["off"]) == {0.0}
+    rng = np.random.default_rng(3)
+    own = unit(rng.normal(size=(400, 4)))  # each Gaussian is something else, and all views agree on it
+    assert not calibrate(np.stack([own, own]), n_views, near).smooth
+
+
+def test_calibration_trusts_knowledge_as_far_as_views_are_noisy():
+    chosen = {}
+    for spread in (0.02, 1.0):
+        halves, n_views, truth, near = votes(2, spread)
+        wrong = np.where(np.arange(400)[:, None] % 10 == 0, np.eye(4)[3], truth)  # knowledge errs, too
+        near = Affinities(near.neighbors, np.zeros_like(near.weights))
+        found = calibrate(halves, n_views, near, wrong)
+        assert set(found.curve["off"]) == set(STRENGTHS)
+        assert not found.smooth  # nobody has a neighbour: a tie
+        chosen[spread] = found.strength
+    assert chosen[0.02] < 1 <= chosen[1.0]
+
+
+def test_calibration_treats_both_halves_alike_and_ignores_what_one_half_does_not_see():
+    halves, n_views, truth, near = votes(2, 1.0)
+    turned = calibrate(halves[::-1], n_views[::-1], near, truth)
+    there = calibrate(halves, n_views, near, truth)
+    assert turned[:2] == there[:2]
+    np.testing.assert_allclose(list(turned.curve["on"].values()), list(there.curve["on"].values()), rtol=1e-12)
+    none = calibrate(halves, n_views * np.array([[1], [0]]), near, truth)
+    assert none[:2] == (False, 0.0)
+
+
+def test_carrying_over_is_its_formula(scene):
+    means, normals, _, values, _ = scene
+    points, point_normals, at, facing = means[:200], normals[:200], means[200:], normals[200:]
+    found, distances = carry(values[:200], points * 3, point_normals, at * 3, facing, 3.0)
+    for i in range(100):
+        d = np.linalg.norm(points - at[i], axis=1)
+        nearest = np.argsort(d)[:3]
+        weights = np.maximum(np.abs(point_normals[nearest] @ facing[i]), 0.1) ** 2 / (d[nearest] ** 2 + 1e-4)
+        np.testing.assert_allclose(found[i], weights @ values[nearest] / weights.sum(), atol=1e-5)  # float32
+        assert distances[i] == pytest.approx(3 * d.min(), rel=1e-5)
+
+
+@pytest.mark.parametrize("n_points", [1, 2, 3])
+def test_few_or_coincident_points_are_carried_over(n_points):
+    values = np.eye(3)[:n_points]
+    points, up = np.zeros((n_points, 3)), np.tile([0.0, 0, 1], (n_points, 1))
+    found, _ = carry(values, points, up, np.zeros((4, 3)), np.tile([1.0, 0, 0], (4, 1)))
+    np.testing.assert_allclose(found, np.tile(values.mean(0), (4, 1)), atol=1e-6)
+    with pytest.raises(ValueError, match="no points"):
+        carry(values[:0], points[:0], up[:0], np.zeros((4, 3)), np.zeros((4, 3)))
+
+
+def test_a_room_has_about_its_own_unit():
+    from chebsplat.synthetic.rooms import build
+
+    rng = np.random.default_rng(0)
+    for preset, seed in (("office", 100), ("room", 200), ("shuffled", 301)):
+        soup = build(preset, seed).soup
+        corners = soup.vertices[soup.triangles].astype(np.float64)
+        areas = np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1)
+        chosen = corners[rng.choice(len(areas), 5000, p=areas / areas.sum())]
+        means = np.einsum("nk,nkd->nd", rng.dirichlet(np.ones(3), 5000), chosen)
+        assert room_unit(40 * means) == pytest.approx(40, rel=0.25)
