@@ -36,8 +36,8 @@ class Scene:
     """N Gaussians sorted by SH degree, stably; raw float32 parameters as in `gaussians/1`.
 
     parameters: `means`, `log_scales`, `quats`, `logit_opacities`, `sh0` [N,1,3], `shN` [N,15,3] (zero above a
-                Gaussian's degree), `degrees` u8 [N] ascending; where there are semantics `features` [N,C], fused if
-                the scene has an encoder; where it has one, `raw_features` [N,C] that encoder and gate see.
+                Gaussian's degree), `degrees` u8 [N] ascending; where there are semantics `features` [N,C], refined or
+                fused; where the scene has an encoder, `raw_features` [N,C] that encoder and gate see.
     cameras:    of the views it can be evaluated on.
     order:      i64 [N], row of each Gaussian in the checkpoint, on which the regions depend.
     labels:     i32 [N] class index, -1 none; None without semantics. label_names, label_embeddings f32 [L, C].

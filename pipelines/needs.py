@@ -37,6 +37,7 @@ def left_out_stages(config: Any, kind: str, why: str, probe: dict[str, bool]) ->
     if kind == "none":
         left_out |= {"teacher": why, "describe": f"no semantics to describe shape for ({why})"}
         left_out |= {"onnx": f"no encoder is trained ({why})", "lift": f"no teacher's features to lift ({why})"}
+        left_out |= {"refine": f"no semantic features to refine ({why})"}
     elif config.train.features == "lifted":
         left_out |= {"describe": LIFTED, "onnx": LIFTED}
     elif config.train.encoder == "off":
@@ -53,7 +54,7 @@ def left_out_stages(config: Any, kind: str, why: str, probe: dict[str, bool]) ->
 def unread_inputs(config: Any, stage: str) -> set[str]:
     """Roles of a stage's inputs that are there, and that this configuration does not read."""
     lifted = config.train.features == "lifted"
-    return {"train": {"features"} if lifted else set(), "export": set() if lifted else {"lifted"}}.get(stage, set())
+    return {"train": {"features"} if lifted else set(), "export": {"lifted"}}.get(stage, set())
 
 
 def left_out_knowledge(config: Any, kind: str, why: str, basis: Path | None, keep: bool) -> dict[str, str]:

@@ -106,7 +106,7 @@ def overrides(text: str) -> dict[str, Any]:
 
 def parsed(key: str, value: str) -> Any:
     """A value as TOML reads it, text where it does not; `on` and `off` are switches, where `off` is no choice."""
-    if value == "off" and key in ("train.encoder", "train.densify"):
+    if value in ("on", "off") and key in ("train.encoder", "train.densify", "refine.smooth"):
         return value
     try:
         return tomllib.loads(f"v = {value}")["v"]

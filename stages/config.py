@@ -39,6 +39,7 @@ class Config(Section):
     describe: DescribeSection = DescribeSection()
     train: TrainSection = TrainSection()
     lift: parts.LiftSection = parts.LiftSection()
+    refine: parts.RefineSection = parts.RefineSection()
     export: parts.ExportSection = parts.ExportSection()
     onnx: parts.OnnxSection = parts.OnnxSection()
     cks: parts.CksSection = parts.CksSection()

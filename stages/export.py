@@ -2,16 +2,20 @@
 
 from __future__ import annotations
 
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from chebsplat.errors import DataFailure, InputError
 from chebsplat.stages.command import Job, command
+
+if TYPE_CHECKING:
+    import numpy as np
 
 
 def run(job: Job) -> None:
     """The trained Gaussians in order of SH degree, each with its label.
 
-    Reads `gaussians`, for names of labels `features` and, in place of trained features, `lifted`. Writes `scene`.
+    Reads `gaussians`, for names of labels `features` and, in place of trained features, `refined` or `lifted`. Writes
+    `scene`.
 
     Choices: a Gaussian that no training view sees has lifted features of zero: no label, and no part in what a view of
       the features shows.
@@ -20,7 +24,6 @@ def run(job: Job) -> None:
 
     from chebsplat.formats.features import read_features
     from chebsplat.formats.gaussians import read_gaussians
-    from chebsplat.formats.lifted import read_lifted
     from chebsplat.formats.scene import Scene, write_scene
     from chebsplat.labels.decode import decode_labels
 
@@ -31,13 +34,9 @@ def run(job: Job) -> None:
     wanted = ("means", "log_scales", "quats", "logit_opacities", "sh0", "shN", "degrees")
     parameters = {name: gaussians.parameters[name][order] for name in wanted}
     semantic = gaussians.parameters.get("fused", gaussians.parameters.get("features"))
-    if "lifted" in job.inputs:
-        semantic = read_lifted(job.inputs["lifted"]).features
-        if len(semantic) != len(order):
-            raise InputError(
-                f"{job.inputs['lifted']} is of {len(semantic)} Gaussians, not these {len(order)}; lift again"
-            )
-    elif "fused" in gaussians.parameters:
+    given = later_features(job, len(order))
+    semantic = semantic if given is None else given
+    if "fused" in gaussians.parameters:  # what encoder and gate see, whatever the scene's features are made of
         parameters["raw_features"] = gaussians.parameters["features"][order]
     labelled: dict[str, Any] = {}
     if semantic is None:
@@ -66,6 +65,21 @@ def run(job: Job) -> None:
     scene = Scene(parameters, gaussians.cameras, order, **labelled, summary=summary)
     sizes = write_scene(job.out, scene, job.config.export.split_by_degree)
     job.facts |= {"n_gaussians": len(order), "by_degree": counts, "bytes": sizes}
+
+
+def later_features(job: Job, n: int) -> np.ndarray | None:
+    """Features [n, C] made after training, refined before lifted; None where the trained ones are the scene's."""
+    from chebsplat.formats.lifted import read_lifted
+    from chebsplat.formats.refined import read_refined
+
+    readers: dict[str, Any] = {"refined": read_refined, "lifted": read_lifted}
+    role = next((role for role in readers if role in job.inputs), None)
+    if role is None:
+        return None
+    features: np.ndarray = readers[role](job.inputs[role]).features
+    if len(features) != n:
+        raise InputError(f"{job.inputs[role]} is of {len(features)} Gaussians, not these {n}; make it again")
+    return features
 
 
 main = command("export", run)

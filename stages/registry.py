@@ -41,8 +41,11 @@ STAGES: dict[str, Stage] = {
         Stage("lift", "chebsplat.lifted/1", ("lift",),
               (("capture", "ingest"), ("gaussians", "train"), ("features", "teacher")),
               help="Features of the teacher on trained Gaussians, and how much the views agree, without training."),
+        Stage("refine", "chebsplat.refined/1", ("refine",), (("gaussians", "train"), ("lifted", "lift")),
+              (("capture", "ingest"), ("features", "teacher")),
+              help="Smooth the features of a finished scene where its training views agree better with it."),
         Stage("export", "chebsplat.scene/2", ("export",), (("gaussians", "train"),),
-              (("features", "teacher"), ("lifted", "lift")),
+              (("features", "teacher"), ("lifted", "lift"), ("refined", "refine")),
               help="Write PLY files, ragged zarr, the label dictionary and the summary."),
         Stage("onnx", "chebsplat.encoder/2", ("onnx",), (("gaussians", "train"),),
               help="Export the local encoder to ONNX and check it against torch."),
@@ -52,8 +55,8 @@ STAGES: dict[str, Stage] = {
               (("features", "teacher"),), help="Measure the exported scene on the test views."),
         Stage("report", "chebsplat.report/1", ("report",), (("evaluation", "evaluate"), ("gaussians", "train")),
               (("capture", "ingest"), ("points", "sfm"), ("channels", "channels"), ("features", "teacher"),
-               ("descriptors", "describe"), ("lifted", "lift"), ("scene", "export"), ("encoder", "onnx"),
-               ("basis", "cks")),
+               ("descriptors", "describe"), ("lifted", "lift"), ("refined", "refine"), ("scene", "export"),
+               ("encoder", "onnx"), ("basis", "cks")),
               help="One self-contained HTML page with pictures, tables and error against run time."),
     )
 }  # fmt: skip

@@ -22,6 +22,7 @@ STAGE_OF = {
     "descriptors": "describe",
     "gaussians": "train",
     "lifted": "lift",
+    "refined": "refine",
     "scene": "export",
     "encoder": "onnx",
     "basis": "cks",
@@ -42,7 +43,7 @@ def run(job: Job) -> None:
     """One HTML page, and the figures as CSV, of what was measured and where it comes from.
 
     Reads `evaluation` and `gaussians`, and of `capture`, `points`, `channels`, `features`, `descriptors`, `lifted`,
-    `scene`, `encoder` and `basis` what there is. Writes `report`.
+    `refined`, `scene`, `encoder` and `basis` what there is. Writes `report`.
     """
     import json
 
@@ -74,7 +75,7 @@ def run(job: Job) -> None:
         versions |= manifest.versions
         settings |= manifest.config
     by_degree = facts["scene"]["by_degree"] if "scene" in facts else None
-    rows = summary_rows(figures, by_degree, facts["gaussians"])
+    rows = summary_rows(figures, by_degree, facts["gaussians"]) + refined_rows(facts.get("refined"))
     write_table(job.out / "figures.csv", rows)
     write_table(job.out / "trace.csv", [list(gaussians.trace[0]), *(list(row.values()) for row in gaussians.trace)])
     names = parts.label_names(job.inputs, figures)
@@ -130,6 +131,7 @@ def absent_stages(job: Job, gaussians: Gaussians) -> dict[str, str]:
         "features": "rendering only: the scene has no semantics" if "features" not in gaussians.parameters else "",
         "descriptors": unneeded if encoder is None else "the encoder's tokens hold no descriptor",
         "lifted": "the scene has no teacher, or its features were not lifted",
+        "refined": "the scene has no teacher, or its features were not refined",
         "encoder": unneeded if encoder is None else "",
         "basis": "no sequence is named",
     }
@@ -178,6 +180,24 @@ def summary_rows(figures: dict[str, Any], by_degree: list[int] | None, trained: 
         share = f"{known['agreement']:.1%} (the commonest label: {known['commonest']:.1%})"
         rows.append(["Gaussians that encodings alone name as their features do", share, ""])
     rows += [[f"ms a training step, {part}", f"{v:.2f}", ""] for part, v in trained["milliseconds"].items()]
+    return rows
+
+
+def refined_rows(facts: dict[str, Any] | None) -> list[list[str]]:
+    """(figure, scene, teacher) of how the features were refined: what was chosen, and the agreements it rests on."""
+    if facts is None:
+        return []
+    changed = {name: facts.get(f"changed_by_{name}") for name in ("smoothing", "knowledge")}
+    words = {name: "" if share is None else f", {share:.1%} of the labels changed" for name, share in changed.items()}
+    counts = f"counts as {facts['strength']:g} views" if facts["strength"] else "none"
+    rows = [
+        ["smoothing of features", ("on" if facts["smooth"] else "off") + words["smoothing"], ""],
+        ["knowledge in features", counts + words["knowledge"], ""],
+    ]
+    for name, curve in facts["curve"].items():
+        shown = " / ".join(f"{value:.4f}" for value in curve.values())
+        rows.append([f"agreement of half the training views with the other, smoothing {name}, at k = "
+                     + " / ".join(curve), shown, ""])  # fmt: skip
     return rows
 
 

@@ -94,7 +94,16 @@ class Reported(TypedDict):
     lpips: float | None
 
 
-FACTS: dict[str, Any] = {"features": Teacher, "gaussians": Trained, "scene": Exported}  # by role
+class Refined(Facts):
+    start: Literal["trained", "lifted"]
+    smooth: bool
+    strength: float
+    curve: dict[Literal["off", "on"], dict[str, float]]
+    changed_by_smoothing: NotRequired[float]
+    changed_by_knowledge: NotRequired[float]
+
+
+FACTS: dict[str, Any] = {"features": Teacher, "gaussians": Trained, "refined": Refined, "scene": Exported}  # by role
 
 
 def facts_of(role: str, path: Path, manifest: Manifest) -> dict[str, Any]:

@@ -108,6 +108,15 @@ class LiftSection(Section):
     min_weight: float = number(0.1, "pixels that a Gaussian makes up of a view that sees it", 0, 1e6)
 
 
+class RefineSection(Section):
+    """docs/method.md, section 13."""
+
+    start: Literal["trained", "lifted"] = setting("trained", "features that are refined; lifted where none are trained")
+    smooth: Literal["auto", "on", "off"] = setting(
+        "auto", "bilateral smoothing; auto: where half the training views agree better with it with the other half"
+    )
+
+
 class ExportSection(Section):
     split_by_degree: bool = setting(True, "write a PLY for each SH degree, too")
 

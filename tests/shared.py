@@ -28,6 +28,7 @@ INPUTS = {
     "train": {"capture": "ingest", "points": "sfm", "features": "teacher", "descriptors": "describe"},
     "export": {"gaussians": "train", "features": "teacher"},
     "lift": {"capture": "ingest", "gaussians": "train", "features": "teacher"},
+    "refine": {"capture": "ingest", "gaussians": "train", "lifted": "lift", "features": "teacher"},
     "onnx": {"gaussians": "train"},
     "cks": {"gaussians": "train"},
     "evaluate": {"capture": "ingest", "scene": "export", "features": "teacher"},

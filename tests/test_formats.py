@@ -8,7 +8,7 @@ import pytest
 from shared import KEY, gaussian_parameters
 
 from chebsplat.errors import InputError
-from chebsplat.formats import artifact, capture, descriptors, evaluation, features, lifted, ply, points, scene
+from chebsplat.formats import artifact, capture, descriptors, evaluation, features, lifted, ply, points, refined, scene
 from chebsplat.formats.cameras import Cameras
 from chebsplat.formats.manifest import Manifest
 
@@ -123,6 +123,12 @@ def make_lifted():
     )
 
 
+def make_refined():
+    rng = np.random.default_rng(8)
+    notes = {"start": "trained", "smooth": True, "strength": 2.0, "curve": {"off": {"0": 0.9}, "on": {"0": 0.95}}}
+    return refined.Refined(rng.normal(size=(6, 4)).astype(np.float32), rng.random(6, dtype=np.float32), notes)
+
+
 CASES = {
     "capture": (make_capture, capture.write_capture, capture.read_capture, capture.SCHEMA),
     "points": (make_points, points.write_points, points.read_points, points.SCHEMA),
@@ -130,6 +136,7 @@ CASES = {
     "descriptors": (make_descriptors, descriptors.write_descriptors, descriptors.read_descriptors, descriptors.SCHEMA),
     "scene": (make_scene, scene.write_scene, scene.read_scene, scene.SCHEMA),
     "lifted": (make_lifted, lifted.write_lifted, lifted.read_lifted, lifted.SCHEMA),
+    "refined": (make_refined, refined.write_refined, refined.read_refined, refined.SCHEMA),
     "evaluation": (make_evaluation, evaluation.write_evaluation, evaluation.read_evaluation, evaluation.SCHEMA),
 }
 

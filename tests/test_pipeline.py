@@ -19,7 +19,7 @@ from chebsplat.pipelines.scenes import CONFIGS, names, read_toml
 from chebsplat.stages.registry import STAGES
 
 ALL = [stage for stage in STAGES if stage not in ("channels", "cks")]  # of a scene: channels are its teacher's
-AFTER_TRAIN = ["train", "lift", "export", "onnx", "evaluate", "report"]
+AFTER_TRAIN = ["train", "lift", "refine", "export", "onnx", "evaluate", "report"]
 
 
 @pytest.fixture(autouse=True)
@@ -124,7 +124,8 @@ SETTING_CHANGES = [
     ("teacher.confusion=0.2", ["teacher", *AFTER_TRAIN]),
     ("describe.bandwidth=0.8", ["describe", *AFTER_TRAIN]),
     ("sfm.max_points=700", ["sfm", "describe", *AFTER_TRAIN]),
-    ("lift.gate=0.3", ["lift", "report"]),
+    ("lift.gate=0.3", ["lift", "refine", "export", "evaluate", "report"]),
+    ("refine.smooth=off", ["refine", "export", "evaluate", "report"]),
     ("export.split_by_degree=false", ["export", "evaluate", "report"]),
     ("onnx.tolerance=1e-4", ["onnx", "report"]),
     ("evaluate.boundary=3", ["evaluate", "report"]),
@@ -258,8 +259,8 @@ def test_generated_and_replica_scenes_never_share_a_key(tmp_path, monkeypatch):
     ("settings", "left_out"),
     [
         ("", {"channels", "cks"}),
-        ("train.semantics=false", {"channels", "teacher", "describe", "lift", "onnx", "cks"}),
-        ("teacher.kind=none", {"channels", "teacher", "describe", "lift", "onnx", "cks"}),
+        ("train.semantics=false", {"channels", "teacher", "describe", "lift", "refine", "onnx", "cks"}),
+        ("teacher.kind=none", {"channels", "teacher", "describe", "lift", "refine", "onnx", "cks"}),
         ("train.features=lifted", {"channels", "describe", "onnx", "cks"}),
         ("train.encoder=off", {"channels", "describe", "onnx", "cks"}),
         ("train.albo=false", {"channels", "describe", "cks"}),
@@ -276,9 +277,10 @@ def test_lifted_features_reach_the_export_and_trained_ones_do_not_wait_for_them(
     by_stage = {step.stage: set(step.inputs) for step in Planner().plan("toy", "train.features=lifted").steps}
     assert by_stage["train"] == {"capture", "points"}
     assert by_stage["lift"] == {"capture", "gaussians", "features"}
-    assert by_stage["export"] == {"gaussians", "features", "lifted"}
+    assert by_stage["refine"] == {"capture", "gaussians", "features", "lifted"}
+    assert by_stage["export"] == {"gaussians", "features", "refined"}
     by_stage = {step.stage: set(step.inputs) for step in Planner().plan("toy").steps}
-    assert by_stage["export"] == {"gaussians", "features"}
+    assert by_stage["export"] == {"gaussians", "features", "refined"}
     assert "features" in by_stage["train"]
 
 

@@ -23,6 +23,11 @@ class Calibration(NamedTuple):
     strength: float
     curve: dict[str, dict[float, float]]
 
+    def best_strength(self, smoothed: bool) -> float:
+        """The strength of the largest agreement where smoothing is decided by others; the least of equal ones."""
+        row = self.curve["on" if smoothed else "off"]
+        return max(row, key=lambda k: (row[k], -k))
+
 
 def blend(features: np.ndarray, n_views: np.ndarray, knowledge: np.ndarray, strength: float) -> np.ndarray:
     """(n f + k g) / (n + k), f32 [N, C].
@@ -64,6 +69,25 @@ def calibrate(
             curve[name][k] = agreed / max(float(weights.sum()), 1.0)
     best = max(((value, name == "off", -k) for name, row in curve.items() for k, value in row.items()))
     return Calibration(not best[1], -best[2], curve)
+
+
+def confidence(
+    features: np.ndarray,
+    n_views: np.ndarray,
+    agreement: np.ndarray,
+    knowledge: np.ndarray | None = None,
+    strength: float = 0.0,
+) -> np.ndarray:
+    """How long the mean of all votes is beside one vote for nothing: |n r f/|f| + k g/|g|| / (n + k + 1), f32 [N].
+
+    Args: agreement r [N] in [0, 1] of the views; the others as for `blend`.
+    """
+    direction = features / np.linalg.norm(features, axis=1, keepdims=True).clip(1e-12)
+    votes, total = (n_views * agreement)[:, None] * direction, n_views + 1.0
+    if knowledge is not None:
+        lengths = np.linalg.norm(knowledge, axis=1, keepdims=True)
+        votes, total = votes + strength * knowledge / lengths.clip(1e-12), total + strength * (lengths[:, 0] > 0)
+    return (np.linalg.norm(votes, axis=1) / total).clip(0, 1).astype(np.float32)  # type: ignore[no-any-return]
 
 
 def cosines(a: np.ndarray, b: np.ndarray) -> np.ndarray:

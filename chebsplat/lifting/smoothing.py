@@ -38,8 +38,8 @@ def affinities(means: np.ndarray, normals: np.ndarray, colors: np.ndarray, unit:
     """How much each Gaussian's neighbours are like it.
 
     Args: means [N, 3] scene units; normals [N, 3] unit, of any sign; colors [N, 3] in [0, 1]; unit > 0.
-    Returns: the N_NEIGHBORS nearest within REACH. The weight of one at offset x, with colour difference c and an angle θ
-      between its normal and the own n, is
+    Returns: the N_NEIGHBORS nearest within REACH. The weight of one at offset x, with colour difference c and an angle
+      θ between its normal and the own n, is
 
           exp(-|x|² / 2 DISTANCE² - |c|² / 2 COLOR² - θ² / 2 ANGLE² - (n·x)² / 2 PLANE²)
 

@@ -179,6 +179,14 @@ def _lifted(out: Path) -> None:
     )
 
 
+def _refined(out: Path) -> None:
+    from chebsplat.formats.refined import Refined, write_refined
+
+    features = np.random.default_rng(4).normal(size=(N, C)).astype(np.float32)
+    notes = {"start": "trained", "smooth": True, "strength": 0.0, "curve": {"off": {"0": 0.8}, "on": {"0": 0.9}}}
+    write_refined(out, Refined(features, np.ones(N, np.float32), notes))
+
+
 def _scene(out: Path) -> None:
     from chebsplat.formats.scene import Scene, write_scene
 
@@ -237,6 +245,7 @@ WRITERS: dict[str, tuple[str, Callable[[Path], None]]] = {
     "describe": ("chebsplat.descriptors/1", _descriptors),
     "train": ("chebsplat.gaussians/1", _gaussians),
     "lift": ("chebsplat.lifted/1", _lifted),
+    "refine": ("chebsplat.refined/1", _refined),
     "export": ("chebsplat.scene/2", _scene),
     "onnx": ("chebsplat.encoder/2", _encoder),
     "cks": ("chebsplat.basis/3", _basis),

@@ -18,13 +18,15 @@ READERS: dict[str, tuple[str, dict[str, str]]] = {  # stage of the artifact: the
     "teacher": ("export", {"gaussians": "train"}),
     "describe": ("train", {"capture": "ingest", "points": "sfm"}),
     "train": ("export", {}),
-    "lift": ("export", {"gaussians": "train", "features": "teacher"}),
+    "lift": ("refine", {"gaussians": "train", "features": "teacher"}),
+    "refine": ("export", {"gaussians": "train", "features": "teacher"}),
     "export": ("extract", {}),
     "cks": ("cks", {"gaussians": "train"}),
     "evaluate": ("report", {"gaussians": "train"}),
 }
 ROLES = {"ingest": "capture", "sfm": "points", "teacher": "features", "describe": "descriptors", "train": "gaussians",
-         "lift": "lifted", "export": "scene", "cks": "basis", "evaluate": "evaluation", "onnx": "encoder"}  # fmt: skip
+         "lift": "lifted", "refine": "refined", "export": "scene", "cks": "basis", "evaluate": "evaluation",
+         "onnx": "encoder"}  # fmt: skip
 Damage = Callable[[Path], None]
 DOCUMENTS: dict[str, dict[str, list[tuple[tuple[Any, ...], Any]]]] = {  # stage, file: keys and value (...: taken away)
     "ingest": {
@@ -49,6 +51,8 @@ DOCUMENTS: dict[str, dict[str, list[tuple[tuple[Any, ...], Any]]]] = {  # stage,
         "cameras.json": [(("names",), 3), (("width",), 0), (("width",), 10**9), (("height",), "16"), ((), None)],
     },
     "lift": {"notes.json": [((), []), (("views",), 5), (("n_observations",), -1), (("n_observations",), ...)]},
+    "refine": {"notes.json": [((), []), (("smooth",), 5), (("strength",), -1), (("start",), "a"), (("curve",), ...),
+                              (("curve", "on", "0"), 7)]},
     "export": {
         "summary.json": [((), []), (("bytes",), 5), (("bytes", "ply"), -1), (("n",), "40"), (("left_out",), [1])],
         "labels.json": [((), []), ((), {"0": "a"}), ((), {"0": "a", "1": "b", "5": "c"}),
