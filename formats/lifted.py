@@ -38,7 +38,7 @@ class Lifted:
     weights:    f32 [N], pixels: Σ α T over all training views.
     n_views:    i32 [N], training views that see it.
     agreement:  f32 [N] in [0, 1]: length of the weighted mean of the views' directions; 1: all say the same.
-    halves:     f32 [2, N, C], features by every other training view alone; half_views i32 [2, N], how many see it.
+    halves:     f32 [2, N, C], features by each half of the training views; half_views i32 [2, N], how many see it.
     notes:      names of the views, in order, and the number of observations.
     """
 

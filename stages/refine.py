@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, Any
 
-from chebsplat.errors import InputError
+from chebsplat.errors import DataFailure, InputError
 from chebsplat.stages.command import Job, command
 
 if TYPE_CHECKING:
@@ -29,6 +29,8 @@ def run(job: Job) -> None:
     settings = job.config.refine
     gaussians, lifted = read_gaussians(job.inputs["gaussians"]), read_lifted(job.inputs["lifted"])
     p = gaussians.parameters
+    if len(p["means"]) == 0:
+        raise DataFailure("the checkpoint holds no Gaussians; train the scene again with milder pruning")
     if len(lifted.features) != len(p["means"]):
         raise InputError(
             f"{job.inputs['lifted']} is of {len(lifted.features)} Gaussians, not {len(p['means'])}; lift again"

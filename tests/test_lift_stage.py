@@ -36,7 +36,8 @@ def test_only_training_views_are_lifted_and_the_export_has_what_was(lifted, tmp_
     assert unseen.any() and not unseen.all()
     np.testing.assert_array_equal(scene.labels[np.argsort(scene.order)] == -1, unseen)
     np.testing.assert_allclose(scene.parameters["features"], held.features[scene.order], atol=1e-4)
-    assert "raw_features" not in scene.parameters
+    raw = read_gaussians(artifacts() / "train").parameters["features"][scene.order]  # what the encoder sees stays
+    np.testing.assert_allclose(scene.parameters["raw_features"], raw, atol=1e-3)
 
 
 def test_a_ply_gets_what_its_checkpoint_gets_and_becomes_a_folder_of_artifacts(lifted, tmp_path):
@@ -74,7 +75,7 @@ def test_features_of_another_number_of_gaussians_are_refused(lifted, tmp_path, c
     save_file({name: np.ascontiguousarray(values[:-1]) for name, values in load_file(file).items()}, file)
     resealed(inputs["gaussians"])
     assert run_stage("export", tmp_path / "export", inputs, {}) == 3
-    assert "lift again" in capsys.readouterr().err
+    assert "make it again" in capsys.readouterr().err
 
 
 def test_the_command_is_a_stage_without_a_file_and_a_use_with_one():

@@ -458,7 +458,7 @@ def test_a_run_makes_the_report_and_a_second_run_does_nothing(work):
     assert "to run" not in second.stderr
     assert times == {p: p.stat().st_mtime_ns for p in work.glob("store/*/*/artifact.json")}
     only = chebsplat("run", "--scene", "toy", "--set", FAST + ",report.n_pictures=1")
-    assert "to run: report   fresh: 8" in only.stderr
+    assert f"to run: report   fresh: {len(ALL) - 1}" in only.stderr
     assert "report: done" in only.stderr
     assert "already there" not in only.stderr
     assert "profile" not in first.stderr + only.stderr

@@ -5,7 +5,7 @@ import math
 import numpy as np
 import pytest
 
-from chebsplat.lifting.blend import STRENGTHS, blend, calibrate
+from chebsplat.lifting.blend import STRENGTHS, blend, calibrate, effective
 from chebsplat.lifting.carry import carry
 from chebsplat.lifting.smoothing import N_NEIGHBORS, REACH, Affinities, affinities, room_unit, smooth
 
@@ -97,10 +97,15 @@ def test_affinities_refuse_a_unit_that_is_none(scene):
         affinities(*scene[:3], unit=0.0)
 
 
+def test_views_that_err_alike_count_for_fewer():
+    n = np.array([0, 1, 2, 6, 10_000])
+    np.testing.assert_allclose(effective(n), [0, 1, 2 / 1.2, 3, 5], rtol=1e-3)
+
+
 def test_the_blend_counts_knowledge_as_so_many_views():
     f, g = np.array([[1.0, 0], [1, 0], [1, 0], [1, 0]]), np.array([[0, 1.0], [0, 1], [0, 0], [0, 1]])
-    n = np.array([4, 0, 2, 2])
-    np.testing.assert_allclose(blend(f, n, g, 2.0), [[2 / 3, 1 / 3], [0, 1], [1, 0], [0.5, 0.5]], atol=1e-7)
+    n = np.array([6, 0, 2, 1])
+    np.testing.assert_allclose(blend(f, n, g, 3.0), [[0.5, 0.5], [0, 1], [1, 0], [0.25, 0.75]], atol=1e-7)
     np.testing.assert_array_equal(blend(f, n, g, 0.0), f)
 
 

@@ -150,10 +150,20 @@ def only_test_views(toy, tmp):
     return inputs_of(toy, "train") | {"capture": path}, TOY
 
 
+def only_test_views_to_lift(toy, tmp):
+    inputs, config = only_test_views(toy, tmp)
+    return inputs_of(toy, "lift") | {"capture": inputs["capture"]}, config
+
+
 def without_gaussians(toy, tmp):
     record = read_gaussians(toy["train"])
     record.parameters = {name: values[:0] for name, values in record.parameters.items()}
     return {"gaussians": published(tmp / "g", "chebsplat.gaussians/1", write_gaussians, record)}, TOY
+
+
+def nothing_to_refine(toy, tmp):
+    inputs, config = without_gaussians(toy, tmp)
+    return inputs_of(toy, "refine") | inputs, config
 
 
 def strict_tolerance(toy, tmp):
@@ -188,6 +198,8 @@ FAILURES = {
     "teacher": without_labels,
     "describe": without_points,
     "train": only_test_views,
+    "lift": only_test_views_to_lift,
+    "refine": nothing_to_refine,
     "export": without_gaussians,
     "onnx": strict_tolerance,
     "cks": encoder_without_attention,

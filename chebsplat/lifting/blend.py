@@ -8,7 +8,9 @@ import numpy as np
 
 from chebsplat.lifting.smoothing import Affinities, smooth
 
-STRENGTHS = (0.0, 0.5, 1.0, 2.0, 4.0, 8.0, 16.0)  # views that knowledge may count for
+STRENGTHS = (0.0, 0.25, 0.5, 1.0, 2.0, 4.0, 8.0)  # views that knowledge may count for, as halves try them
+ALIKE = 0.2  # correlation of the errors of two views of a thing
+TRUST = 2.0  # over the strength that the halves ask for
 
 
 class Calibration(NamedTuple):
@@ -26,21 +28,31 @@ class Calibration(NamedTuple):
     def best_strength(self, smoothed: bool) -> float:
         """The strength of the largest agreement where smoothing is decided by others; the least of equal ones."""
         row = self.curve["on" if smoothed else "off"]
-        return max(row, key=lambda k: (row[k], -k))
+        return TRUST * max(row, key=lambda k: (row[k], -k))
 
 
 def blend(features: np.ndarray, n_views: np.ndarray, knowledge: np.ndarray, strength: float) -> np.ndarray:
-    """(n f + k g) / (n + k), f32 [N, C].
+    """(n' f + k g) / (n' + k), f32 [N, C], with n' of `effective`.
 
     Args: features f [N, C]; n_views n [N] >= 0; knowledge g [N, C], a row of zeros where nothing is known;
           strength k >= 0.
     Choices: f where n + k is 0, and where g is a row of zeros, which is no answer.
     """
-    n = n_views.astype(np.float32)[:, None]
+    n = effective(n_views)[:, None]
     k = np.float32(strength) * knowledge.any(1, keepdims=True).astype(np.float32)
     total = n + k
     blended = (n * features + k * knowledge) / np.where(total > 0, total, 1)
     return np.where((total > 0) & (k > 0), blended, features).astype(np.float32)
+
+
+def effective(n_views: np.ndarray) -> np.ndarray:
+    """n' = n / (1 + ALIKE (n - 1)): how many views with errors of their own n views are worth, f32 [N].
+
+    Choices: a teacher errs alike in neighbouring views, so that a hundred of them never count for more than five. ALIKE
+      was chosen with TRUST on generated rooms that knowledge is taught on the likes of, never on a scene's test views.
+    """
+    n = n_views.astype(np.float32)
+    return np.asarray(n / (1 + ALIKE * np.maximum(n - 1, 0)), np.float32)
 
 
 def calibrate(
@@ -48,13 +60,14 @@ def calibrate(
 ) -> Calibration:
     """Whether to smooth and how far to trust knowledge: what makes half the training views agree with the other half.
 
-    Args: halves [2, N, C], features by even and by odd training views; half_views [2, N] how many of them see each;
+    Args: halves [2, N, C], features by each half of the training views; half_views [2, N] how many of them see each;
           near: affinities of the Gaussians; knowledge [N, C], or None: only smoothing is decided.
     Returns: the choice of the largest agreement: the cosine between what is made of one half (smoothed, blended by its
       own views) and the other half's mean features, averaged over the Gaussians that both see, by the other half's
       views, both ways alike.
     Choices: no test view is looked at, and no label. On ties, and without a Gaussian that both halves see, what changes
-      less wins. What the teacher gets wrong in all views alike counts as right here, so the choice is a cautious one.
+      less wins. What the teacher gets wrong in all views alike counts as right here, so that the halves ask for too
+      little: the strength is TRUST times what they ask for.
     """
     strengths = STRENGTHS if knowledge is not None else STRENGTHS[:1]
     weights = np.where((half_views > 0).all(0), half_views, 0).astype(np.float64)
@@ -68,7 +81,7 @@ def calibrate(
                 agreed += float(weights[other] @ cosines(result, halves[other]))
             curve[name][k] = agreed / max(float(weights.sum()), 1.0)
     best = max(((value, name == "off", -k) for name, row in curve.items() for k, value in row.items()))
-    return Calibration(not best[1], -best[2], curve)
+    return Calibration(not best[1], -TRUST * best[2], curve)
 
 
 def confidence(

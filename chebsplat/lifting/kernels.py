@@ -74,8 +74,8 @@ def _average(means, weights, lengths, first, last, chosen, steps, floor, factors
 
 
 @kernel
-def averages(starts, views, weights, means, steps, floor):
-    """Averages f32 [3, N, C] over all, even and odd views, and agreement r f32 [N] (see `observations`)."""
+def averages(starts, views, weights, means, half_of, steps, floor):
+    """Averages f32 [3, N, C] over all views and by each half of them, `half_of` [V] 0 or 1; agreement r f32 [N]."""
     n, channels = len(starts) - 1, means.shape[1]
     features, agreement = np.zeros((3, n, channels), np.float32), np.zeros(n, np.float32)
     for part in prange(PARTS):
@@ -93,7 +93,7 @@ def averages(starts, views, weights, means, steps, floor):
                 lengths[row - first] = max(math.sqrt(square), 1e-12)
             for half in range(3):
                 for row in range(first, last):
-                    chosen[row - first] = half == 0 or (views[row] & 1) == half - 1
+                    chosen[row - first] = half == 0 or half_of[views[row]] == half - 1
                 r = _average(means, weights, lengths, first, last, chosen, steps, floor, factors, direction,
                              features[half, i])  # fmt: skip
                 if half == 0:

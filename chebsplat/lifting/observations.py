@@ -10,6 +10,7 @@ import numpy as np
 from chebsplat.lifting import kernels
 from chebsplat.rasterize.lift import Lifted
 
+N_BLOCKS = 8  # of views in order, taken in turn by the halves
 NEAREST = 0.1  # a chord of directions, below which a view weighs no more for being nearer to the median
 
 
@@ -36,7 +37,7 @@ class Estimate:
     weights:    f32 [N], pixels, over all views.
     n_views:    i32 [N] views that give a Gaussian at least the weight asked for.
     agreement:  f32 [N], r = |Σ w b / |b|| / Σ w: 1 if all views say the same, 0 without a view.
-    halves:     f32 [2, N, C], features by the even and by the odd views alone; half_views i32 [2, N], as n_views.
+    halves:     f32 [2, N, C], features by each half of the views alone; half_views i32 [2, N], as n_views.
     """
 
     features: np.ndarray
@@ -74,11 +75,21 @@ def estimate(observations: Observations, median_steps: int = 0, min_weight: floa
       least-squares solution does. Chords below NEAREST count as NEAREST: no single view takes all.
     """
     starts, seen = observations.starts, observations.weights >= min_weight
-    features, agreement = kernels.averages(*vars(observations).values(), median_steps, NEAREST)
+    half_of = halves_of(int(observations.views.max(initial=-1)) + 1)
+    features, agreement = kernels.averages(*vars(observations).values(), half_of, median_steps, NEAREST)
     owner = np.repeat(np.arange(len(starts) - 1), np.diff(starts))
     n = len(starts) - 1
     half_views = np.stack(
-        [np.bincount(owner[seen & (observations.views % 2 == half)], minlength=n) for half in (0, 1)]
+        [np.bincount(owner[seen & (half_of[observations.views] == half)], minlength=n) for half in (0, 1)]
     ).astype(np.int32)
     weights = np.bincount(owner, observations.weights, minlength=n).astype(np.float32)
     return Estimate(features[0], weights, half_views.sum(0, dtype=np.int32), agreement, features[1:], half_views)
+
+
+def halves_of(n_views: int) -> np.ndarray:
+    """Which half each view is of, i8 [V].
+
+    Choices: N_BLOCKS blocks of successive views, by turns: neighbours on a path see alike and err alike, so that halves
+      of every other view would agree on what is wrong.
+    """
+    return (np.arange(n_views) // max(n_views // N_BLOCKS, 1) % 2).astype(np.int8)
