@@ -113,7 +113,7 @@ class RefineSection(Section):
 
     start: Literal["trained", "lifted"] = setting("trained", "features that are refined; lifted where none are trained")
     smooth: Literal["auto", "on", "off"] = setting(
-        "auto", "bilateral smoothing; auto: where half the training views agree better with it with the other half"
+        "off", "bilateral smoothing; auto: where half the training views agree better with it with the other half"
     )
 
 
