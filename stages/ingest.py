@@ -89,6 +89,39 @@ def split(names: list[str], own: Any, settings: IngestSection) -> tuple[Any, dic
     return is_test, record | by_index
 
 
+def thinned(fields: dict[str, Any], max_train_views: int | None) -> dict[str, Any]:
+    """Those of a capture's fields that hold a thing a view, with at most so many training views, evenly chosen."""
+    import numpy as np
+
+    from chebsplat.formats.capture import OPTIONAL
+
+    training = np.flatnonzero(~fields["is_test"])
+    if max_train_views is None or len(training) <= max_train_views:
+        return {}
+    chosen = training[np.linspace(0, len(training) - 1, max_train_views).round().astype(int)]
+    kept = np.union1d(np.flatnonzero(fields["is_test"]), chosen)
+    held = {name: fields.get(name) for name in ("images", "Ks", "cam_from_world", "is_test", *OPTIONAL)}
+    views = {name: np.asarray(values[:])[kept] for name, values in held.items() if values is not None}
+    return views | {"names": [fields["names"][row] for row in kept]}
+
+
+def renamed(fields: dict[str, Any], classes: dict[str, list[str]]) -> dict[str, Any]:
+    """Labels [V, H, W] in these classes, -1 where the source's class stands for none, and their names.
+
+    Raises: ConfigError where the source has no labels, or no class of a name that is given.
+    """
+    import numpy as np
+
+    own, labels = fields.get("class_names"), fields.get("labels")
+    if own is None or labels is None:
+        raise ConfigError("ingest.classes renames a source's labels, and this one has none; leave it away")
+    if absent := [name for group in classes.values() for name in group if name not in own]:
+        raise ConfigError(f"ingest.classes: the source has no class {absent[0]}; it has {', '.join(own)}")
+    number = {name: k for k, group in enumerate(classes.values()) for name in group}
+    table = np.array([*(number.get(name, -1) for name in own), -1], np.int16)
+    return {"labels": table[np.asarray(labels[:])], "class_names": list(classes)}
+
+
 def run(job: Job) -> None:
     """Take a source's images, cameras, depth and labels as one capture, and choose the views that are tested.
 
@@ -106,12 +139,17 @@ def run(job: Job) -> None:
         log.info("%s", note)
     n_views = len(fields["names"])
     fields["is_test"], protocol = split(fields["names"], fields.pop("is_test", None), settings)
+    fields |= thinned(fields, settings.max_train_views)
+    if settings.classes is not None:
+        fields |= renamed(fields, settings.classes)
     optional: dict[str, Any] = {"depth": None, "labels": None, "loss_mask": None, "class_names": None}
     capture = Capture(**(optional | fields), protocol=protocol)
     for what in ("depth", "labels"):
         if fields.get(what) is None:
             job.left_out(what, f"the {source.kind} source has none")
-    job.facts |= {"source": capture.source, "n_views": n_views, "n_test": int(np.sum(capture.is_test))}
+    if len(capture.names) < n_views:
+        job.left_out("views", f"{n_views - len(capture.names)} that ingest.max_train_views spares the training")
+    job.facts |= {"source": capture.source, "n_views": len(capture.names), "n_test": int(np.sum(capture.is_test))}
     write_capture(job.out, capture)
 
 

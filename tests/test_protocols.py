@@ -19,7 +19,7 @@ from chebsplat.evaluation.protocols import (
 )
 from chebsplat.evaluation.protocols.split import every
 from chebsplat.evaluation.protocols.task import EvaluatedView, MapsByName, Task, bilinear, resized
-from chebsplat.stages.ingest import split
+from chebsplat.stages.ingest import renamed, split, thinned
 from chebsplat.stages.settings import IngestSection
 
 ADE = [replica_f3.SPELT.get(k, f"label_{k}") for k in range(1, 151)]
@@ -318,3 +318,26 @@ def test_bilinear_resizing_equals_torch_with_aligned_corners():
             torch.from_numpy(features).permute(2, 0, 1)[None], size, mode="bilinear", align_corners=True
         )
         assert np.abs(bilinear(features, size) - theirs[0].permute(1, 2, 0).numpy()).max() < 1e-6
+
+
+def test_few_training_views_are_chosen_evenly_and_all_test_views_stay():
+    names = [f"{k:02}" for k in range(20)]
+    is_test = np.arange(20) % 8 == 2
+    images = np.arange(20, dtype=np.uint8)[:, None, None, None] * np.ones((20, 2, 2, 3), np.uint8)
+    fields = {"names": names, "images": images, "Ks": np.zeros((20, 3, 3)), "cam_from_world": None, "is_test": is_test}
+    kept = thinned(fields, 4)
+    assert kept["names"] == ["00", "02", "06", "10", "13", "18", "19"]
+    assert [f"{row[0, 0, 0]:02}" for row in kept["images"]] == kept["names"]
+    assert kept["is_test"].tolist() == [name in ("02", "10", "18") for name in kept["names"]]
+    assert thinned(fields, 17) == thinned(fields, None) == {}
+
+
+def test_a_source_s_classes_are_renamed_and_merged():
+    fields = {"labels": np.array([[[0, 1, 2, -1]]], np.int16), "class_names": ["RoomWall", "HouseWall", "Cup"]}
+    found = renamed(fields, {"table": [], "wall": ["HouseWall", "RoomWall"]})
+    assert found["class_names"] == ["table", "wall"]
+    assert found["labels"].tolist() == [[[1, 1, -1, -1]]]
+    with pytest.raises(ConfigError, match="no class Sofa; it has RoomWall"):
+        renamed(fields, {"sofa": ["Sofa"]})
+    with pytest.raises(ConfigError, match="has none"):
+        renamed({"labels": None, "class_names": None}, {"wall": []})
