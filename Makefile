@@ -17,9 +17,9 @@ CHOICE := $(if $(scene),--scene '$(scene)') $(if $(sequence),--sequence '$(seque
 
 # `make scene=office0` needs no target: naming a scene, a sequence, a study or a benchmark means running it.
 .DEFAULT_GOAL := $(if $(study),study,$(if $(bench),bench-$(bench),$(if $(scene)$(sequence),run,help)))
-.PHONY: help run study plan verify clean-stale setup test test-all malformed soak stability bench text-model nouns teacher teacher-quality lint lock
+.PHONY: help run study plan verify clean-stale setup test test-all malformed soak stability bench text-model nouns knowledge teacher teacher-quality lint lock
 
-run: $(READY)  ## make scene=NAME|FOLDER [stage=] [set=a.b=c,...] [ablation=] [basis=NAME@REVISION] [cores=] [device=]; or sequence=NAME
+run: $(READY)  ## make scene=NAME|FOLDER [stage=] [set=a.b=c,...] [ablation=] [basis=NAME@REVISION|none] [cores=] [device=]; or sequence=NAME
 	@$(CHEBSPLAT) run $(CHOICE) $(if $(stage),--stage '$(stage)') $(if $(cores),--cores '$(cores)') $(if $(device),--device '$(device)')
 
 study: $(READY)  ## make study=NAME [cores=] [threads=] [args=--no-run]: its runs, then table, figure, page in build/studies
@@ -68,6 +68,9 @@ text-model: $(READY)
 
 nouns: text-model  ## teachers/embedded.npz from teachers/nouns.txt, by the sentence model of the extra `text`
 	@$(PY) -m chebsplat.teachers.nouns
+
+knowledge: $(READY)  ## teach knowledge of shape over generated rooms for the embedded teacher (teacher=MODEL.onnx, out=FOLDER)
+	@$(CHEBSPLAT) knowledge $(if $(teacher),--teacher '$(teacher)') $(if $(out),--out '$(out)')
 
 teacher: text-model  ## train, export and measure the embedded teacher: seeds fixed; about half an hour on 4 cores
 	@OMP_WAIT_POLICY=PASSIVE $(PY) -m chebsplat.teachers.train $(args)

@@ -38,3 +38,28 @@ def unproject(depth: np.ndarray, K: np.ndarray, cam_from_world: np.ndarray, pixe
     camera = rays * z[:, None]
     world: np.ndarray = (camera - cam_from_world[:3, 3]) @ cam_from_world[:3, :3]
     return world
+
+
+def common_up(cam_from_world: np.ndarray) -> tuple[np.ndarray, float]:
+    """The direction [3] against gravity that cameras [V, 4, 4] held upright share, and how sure that is, in [0, 1].
+
+    Choices: the direction that the cameras' horizontal axes span least; its sign from where their tops point. The
+      confidence is 1 less the ratio of the two least spreads of these axes: 0 where all cameras look the same way,
+      whose pitch cannot be told, or where they are rolled at random; times the mean cosine of their tops with it.
+    """
+    rights, tops = cam_from_world[:, 0, :3], -cam_from_world[:, 1, :3]
+    spreads, axes = np.linalg.eigh(rights.T @ rights)
+    up = axes[:, 0] * (1.0 if (tops @ axes[:, 0]).sum() >= 0 else -1.0)
+    certainty = 1.0 - spreads[0] / spreads[1] if spreads[1] > 1e-6 * spreads[2] else 0.0
+    return up, float(np.clip(certainty * (tops @ up).mean(), 0.0, 1.0))
+
+
+def upright(up: np.ndarray) -> np.ndarray:
+    """A rotation [3, 3] that turns `up` into z. Raises ValueError where it has no length."""
+    length = float(np.linalg.norm(up))
+    if not length > 0:
+        raise ValueError("up has no length")
+    z = np.asarray(up, np.float64) / length
+    x = np.cross(np.eye(3)[np.abs(z).argmin()], z)
+    x /= np.linalg.norm(x)
+    return np.stack([x, np.cross(z, x), z])

@@ -80,8 +80,10 @@ class TrainSection(Section):
     features: Literal["trained", "lifted"] = setting(
         "trained", "of Gaussians; lifted: colour alone is trained, and the teacher's features are lifted afterwards"
     )
-    encoder: Literal["transformer", "mlp", "off"] = setting(
-        "transformer", 'of regions; mlp: the paper\'s "no TLE"; off: no shape branch'
+    encoder: Literal["points", "transformer", "mlp", "off"] = setting(
+        "points",
+        "of points: taught over many rooms, frozen, used once the scene is trained; transformer: the paper's, of "
+        'regions, trained with the scene; mlp: its "no TLE"; off: no shape branch',
     )
     albo: bool = setting(True, "tokens hold descriptors")
     prune: bool = setting(True, "remove Gaussians that add nothing")
@@ -173,6 +175,11 @@ class TrainSection(Section):
     alpha: Literal["network", "constant"] = setting(
         "constant", "what modulates that pull; network: the paper's, of the shapes in view"
     )
+
+    @property
+    def trains_encoder(self) -> bool:
+        """Whether the training holds an encoder, of regions."""
+        return self.encoder in ("transformer", "mlp")
 
     @model_validator(mode="after")
     def _fits_together(self) -> TrainSection:

@@ -33,9 +33,18 @@ def raw_files(stage: str, sections: dict[str, Any]) -> tuple[Path | None, list[P
         return None, _of_channels(sections["channels"])
     if stage == "teacher" and sections["teacher"]["model"]:
         return None, _of_teacher(sections["teacher"])
+    if stage == "teach":
+        return None, _of_model(sections["knowledge"]["model"])
     if stage == "evaluate" and sections["evaluate"]["lpips_weights"]:
         return None, [_named(sections["evaluate"]["lpips_weights"], "evaluate.lpips_weights")]
     return None, []
+
+
+def _of_model(model: str | None) -> list[Path]:
+    """The files of a teacher, the embedded one if none is named."""
+    from chebsplat.formats.teacher_model import EMBEDDED, read_teacher
+
+    return read_teacher(Path(model) if model else EMBEDDED).files()
 
 
 def _of_teacher(settings: dict[str, Any]) -> list[Path]:

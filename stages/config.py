@@ -40,6 +40,7 @@ class Config(Section):
     train: TrainSection = TrainSection()
     lift: parts.LiftSection = parts.LiftSection()
     refine: parts.RefineSection = parts.RefineSection()
+    knowledge: parts.KnowledgeSection = parts.KnowledgeSection()
     export: parts.ExportSection = parts.ExportSection()
     onnx: parts.OnnxSection = parts.OnnxSection()
     cks: parts.CksSection = parts.CksSection()

@@ -16,6 +16,8 @@ class Stage:
     optional: tuple[tuple[str, str], ...] = ()
     help: str = ""
 
+    of_scene: bool = True  # false: never a part of a scene's run, only what such a run is given
+
     @property
     def roles(self) -> dict[str, str]:
         return dict(self.inputs + self.optional)
@@ -32,6 +34,8 @@ STAGES: dict[str, Stage] = {
               help="From a teacher's channels to the fewer that all scenes are trained in."),
         Stage("teacher", "chebsplat.features/1", ("teacher",), (("capture", "ingest"),),
               (("channels", "channels"),), help="Per-view semantic features of a 2D teacher."),
+        Stage("teach", "chebsplat.knowledge/1", ("onnx", "knowledge"), (("channels", "channels"),), of_scene=False,
+              help="Knowledge that scenes start from: a point encoder, taught over generated rooms."),
         Stage("describe", "chebsplat.descriptors/1", ("describe",), (("points", "sfm"),),
               help="Anisotropic Chebyshev descriptors of the initial Gaussians (Eqs 1-6)."),
         Stage("train", "chebsplat.gaussians/1", ("describe", "train"),
@@ -42,8 +46,8 @@ STAGES: dict[str, Stage] = {
               (("capture", "ingest"), ("gaussians", "train"), ("features", "teacher")),
               help="Features of the teacher on trained Gaussians, and how much the views agree, without training."),
         Stage("refine", "chebsplat.refined/1", ("refine",), (("gaussians", "train"), ("lifted", "lift")),
-              (("capture", "ingest"), ("features", "teacher")),
-              help="Smooth the features of a finished scene where its training views agree better with it."),
+              (("capture", "ingest"), ("points", "sfm"), ("features", "teacher"), ("knowledge", "teach")),
+              help="Smooth the features of a finished scene and blend them with knowledge, as its training views ask."),
         Stage("export", "chebsplat.scene/2", ("export",), (("gaussians", "train"),),
               (("features", "teacher"), ("lifted", "lift"), ("refined", "refine")),
               help="Write PLY files, ragged zarr, the label dictionary and the summary."),

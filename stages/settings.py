@@ -47,6 +47,12 @@ class IngestSection(Section):
     test_offset: int | None = number(None, "the first view that is tested; default: the protocol's own", 0, 10_000)
     max_side: int = number(640, "pixels; images are reduced to this, never enlarged", 16, 8192)
     max_views: int | None = number(None, "at most so many views, evenly chosen; default: all", 2, 100_000)
+    max_train_views: int | None = number(
+        None, "at most so many that are trained on, evenly chosen; all test views stay", 2, 100_000
+    )
+    classes: dict[Text, list[Text]] | None = setting(
+        None, "names, each with the source's classes that it stands for; what stands for none is not counted"
+    )
     min_views: int = number(3, "fewer usable views are an error", 1, 100_000)
 
 
@@ -113,8 +119,25 @@ class RefineSection(Section):
 
     start: Literal["trained", "lifted"] = setting("trained", "features that are refined; lifted where none are trained")
     smooth: Literal["auto", "on", "off"] = setting(
-        "off", "bilateral smoothing; auto: where half the training views agree better with it with the other half"
+        "auto", "bilateral smoothing; auto: where half the training views agree better with it with the other half"
     )
+    knowledge: Text | None = setting(
+        None,
+        "folder of a knowledge artifact (`chebsplat knowledge`), or none; default: the one that is shipped for the "
+        "teacher",
+    )
+
+
+class KnowledgeSection(Section):
+    """What scenes start from: a point encoder, taught once a teacher over generated rooms."""
+
+    model: Text | None = setting(None, ".onnx of the teacher; default: the embedded one")
+    n_rooms: int = number(64, "generated rooms to teach on", 1, 900)
+    n_held_out: int = number(6, "rooms that the card's figures are of; six kinds of room take turns", 1, 100)
+    n_views: int = number(40, "photos of a room", 2, 1000)
+    n_points: int = number(14_500, "points of a room, drawn within 0.62 to 1.38 of it", 100, 200_000)
+    steps: int = number(4000, "of teaching", 1, 1_000_000)
+    seed: int = seed("of what is drawn in teaching")
 
 
 class ExportSection(Section):

@@ -37,7 +37,7 @@ def text_embeddings(names: list[str], teacher: TeacherModel) -> np.ndarray:
     embeddings = None
     if teacher.labels is not None:
         known, embeddings = read_label_table(teacher.labels)
-    row = {} if embeddings is None else {folded(name): k for k, name in reversed(list(enumerate(known)))}
+    row = rows_of(known) if embeddings is not None else {}
     vectors: dict[str, np.ndarray] = {}
     unknown: list[str] = []
     for name in dict.fromkeys(names):
@@ -52,6 +52,17 @@ def text_embeddings(names: list[str], teacher: TeacherModel) -> np.ndarray:
         vectors |= zip(unknown, _encoded(unknown, teacher, row), strict=True)
     rows = np.stack([vectors[name] for name in names]).astype(np.float32)
     return rows / np.linalg.norm(rows, axis=1, keepdims=True).clip(1e-12)
+
+
+def found(names: list[str], known: list[str]) -> list[int]:
+    """Where each name stands among those known, -1 where it does not; looked up as in a table of labels."""
+    row = rows_of(known)
+    return [next((row[form] for form in forms(name) if form in row), -1) for name in names]
+
+
+def rows_of(known: list[str]) -> dict[str, int]:
+    """Where each name stands, as it is compared: the first of equal ones."""
+    return {folded(name): k for k, name in reversed(list(enumerate(known)))}
 
 
 def folded(name: str) -> str:

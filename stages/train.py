@@ -149,7 +149,10 @@ def note_left_out(job: Job, train: TrainSection, has_semantics: bool) -> None:
             why = "train.features is lifted: they follow the training"
         job.left_out("semantic branch", why)
     unneeded = {
-        "shape encoder": [(not has_semantics, "no semantics to encode"), (train.encoder == "off", "encoder is off")],
+        "shape encoder": [
+            (not has_semantics, "no semantics to encode"),
+            (not train.trains_encoder, f"train.encoder is {train.encoder}"),
+        ],
         "pruning": [(not train.prune, "train.prune is false")],
         "densification": [(train.densify == "off", "train.densify is off")],
         "SH pruning": [(not train.sh_prune, "train.sh_prune is false")],

@@ -8,7 +8,19 @@ import pytest
 from shared import KEY, gaussian_parameters
 
 from chebsplat.errors import InputError
-from chebsplat.formats import artifact, capture, descriptors, evaluation, features, lifted, ply, points, refined, scene
+from chebsplat.formats import (
+    artifact,
+    capture,
+    descriptors,
+    evaluation,
+    features,
+    knowledge,
+    lifted,
+    ply,
+    points,
+    refined,
+    scene,
+)
 from chebsplat.formats.cameras import Cameras
 from chebsplat.formats.manifest import Manifest
 
@@ -129,12 +141,20 @@ def make_refined():
     return refined.Refined(rng.normal(size=(6, 4)).astype(np.float32), rng.random(6, dtype=np.float32), notes)
 
 
+def make_knowledge():
+    weights = {"embed.0.weight": np.random.default_rng(8).normal(size=(4, 6)).astype(np.float32)}
+    matrix = np.eye(7, 3, dtype=np.float32)
+    of = "a", "b", {"n_channels": 3}, weights, matrix, {"n_angles": 8}
+    return knowledge.Knowledge(*of, ["sofa", "wall"], np.eye(2, 3, dtype=np.float16), {"n_rooms": 2})
+
+
 CASES = {
     "capture": (make_capture, capture.write_capture, capture.read_capture, capture.SCHEMA),
     "points": (make_points, points.write_points, points.read_points, points.SCHEMA),
     "features": (make_features, features.write_features, features.read_features, features.SCHEMA),
     "descriptors": (make_descriptors, descriptors.write_descriptors, descriptors.read_descriptors, descriptors.SCHEMA),
     "scene": (make_scene, scene.write_scene, scene.read_scene, scene.SCHEMA),
+    "knowledge": (make_knowledge, knowledge.write_knowledge, knowledge.read_knowledge, knowledge.SCHEMA),
     "lifted": (make_lifted, lifted.write_lifted, lifted.read_lifted, lifted.SCHEMA),
     "refined": (make_refined, refined.write_refined, refined.read_refined, refined.SCHEMA),
     "evaluation": (make_evaluation, evaluation.write_evaluation, evaluation.read_evaluation, evaluation.SCHEMA),

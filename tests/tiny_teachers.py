@@ -47,6 +47,15 @@ def color_teacher(folder, stride=4, channels=3, weights=None, shape=(1, 3, "H", 
     return path
 
 
+def knowing_rooms(path):
+    """The same teacher, whose table has the classes of generated rooms, too, each beside a colour."""
+    from chebsplat.synthetic import CLASS_NAMES
+
+    names = (*COLORS, *CLASS_NAMES)
+    write_table(path.with_name("tiny.npz"), names, np.random.default_rng(0).normal(size=(len(names), 3)))
+    return path
+
+
 def color_reference(folder, n_images=2, size=(48, 64)):
     """A folder of images of coloured noise in blocks."""
     from PIL import Image

@@ -6,6 +6,7 @@ from collections.abc import Iterator
 
 import numpy as np
 
+TEMPERATURE = 0.1  # of cosines
 BLOCK = 4_000_000  # cosines that are held at once
 
 
@@ -18,7 +19,7 @@ def decode(features: np.ndarray, embeddings: np.ndarray) -> tuple[np.ndarray, np
     labels, confidence = (np.zeros(features.shape[:-1], kind) for kind in (np.int16, np.float32))
     for rows, cosines in _cosines(features, embeddings):
         labels.reshape(-1)[rows] = cosines.argmax(-1)
-        weights = np.exp((cosines - cosines.max(-1, keepdims=True)) / 0.1)
+        weights = np.exp((cosines - cosines.max(-1, keepdims=True)) / TEMPERATURE)
         confidence.reshape(-1)[rows] = 1 / weights.sum(-1)
     return labels, confidence
 
@@ -29,6 +30,15 @@ def decode_labels(features: np.ndarray, embeddings: np.ndarray) -> np.ndarray:
     for rows, cosines in _cosines(features, embeddings):
         labels.reshape(-1)[rows] = cosines.argmax(-1)
     return labels
+
+
+def shares(features: np.ndarray, embeddings: np.ndarray) -> np.ndarray:
+    """How likely each label is, f32 [..., L], rows of sum 1: the softmax that `decode` takes the largest entry of."""
+    found = np.zeros((*features.shape[:-1], len(embeddings)), np.float32)
+    for rows, cosines in _cosines(features, embeddings):
+        weights = np.exp((cosines - cosines.max(-1, keepdims=True)) / TEMPERATURE)
+        found.reshape(-1, len(embeddings))[rows] = weights / weights.sum(-1, keepdims=True)
+    return found
 
 
 def _cosines(features: np.ndarray, embeddings: np.ndarray) -> Iterator[tuple[slice, np.ndarray]]:

@@ -82,7 +82,7 @@ class SceneModel:
             self.raw["sh_logits"] = torch.zeros(n, 3)
         for value in self.raw.values():
             value.requires_grad_(True)
-        self.shape = ShapeBranch(n_channels, describe, train) if n_channels and train.encoder != "off" else None
+        self.shape = ShapeBranch(n_channels, describe, train) if n_channels and train.trains_encoder else None
         self.threshold = train.mask_threshold
         self.semantic_gate: prune.SemanticGate | prune.PrintedGate | None = None
         if n_channels and train.prune and train.prune_semantic:

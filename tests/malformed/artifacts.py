@@ -187,6 +187,18 @@ def _refined(out: Path) -> None:
     write_refined(out, Refined(features, np.ones(N, np.float32), notes))
 
 
+def _knowledge(out: Path) -> None:
+    from chebsplat.formats.knowledge import Knowledge, write_knowledge
+    from chebsplat.settings import DescribeSection
+
+    encoder = {"n_channels": C, "n_descriptors": 0, "n_components": 0, "width": 4, "hidden": 4, "n_scales": 4}
+    weights = {"embed.0.weight": np.zeros((64, 6), np.float32)}
+    describe, card = DescribeSection().model_dump(mode="json"), {"n_rooms": 1}
+    matrix = np.eye(C + 2, C, dtype=np.float32)
+    words = ["wall"], np.ones((1, C), np.float16)
+    write_knowledge(out, Knowledge("tiny", "0" * 64, encoder, weights, matrix, describe, *words, card))
+
+
 def _scene(out: Path) -> None:
     from chebsplat.formats.scene import Scene, write_scene
 
@@ -243,6 +255,7 @@ WRITERS: dict[str, tuple[str, Callable[[Path], None]]] = {
     "sfm": ("chebsplat.points/1", _points),
     "teacher": ("chebsplat.features/1", _features),
     "describe": ("chebsplat.descriptors/1", _descriptors),
+    "teach": ("chebsplat.knowledge/1", _knowledge),
     "train": ("chebsplat.gaussians/1", _gaussians),
     "lift": ("chebsplat.lifted/1", _lifted),
     "refine": ("chebsplat.refined/1", _refined),

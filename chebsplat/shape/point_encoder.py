@@ -1,0 +1,171 @@
+"""The point encoder: what surrounds a point at several radii in, the 2D teacher's semantic vector of it out (Eq 7).
+
+It sees geometry alone, answers for every point, and is taught over many rooms, so that it cannot repeat what a teacher
+gets wrong for reasons of texture or of view (docs/method.md, section 14).
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+import torch
+from torch import Tensor, nn
+
+from chebsplat.shape.encoder import Standardize
+from chebsplat.shape.point_inputs import N_OWN, RADII, PointInputs
+
+N_RELATIVE = 10
+CHUNK = 4096  # points encoded at once
+
+
+class Cloud(NamedTuple):
+    """`PointInputs` as tensors; neighbors i64."""
+
+    own: Tensor
+    means: Tensor
+    normals: Tensor
+    descriptors: Tensor
+    neighbors: Tensor
+
+
+def cloud_of(inputs: PointInputs) -> Cloud:
+    """Tensors of the arrays; they share memory."""
+    own, means, normals, descriptors = (torch.from_numpy(v) for v in inputs[:4])
+    return Cloud(own, means, normals, descriptors, torch.from_numpy(inputs.neighbors.astype(np.int64)))
+
+
+class Scale(nn.Module):
+    """One radius: an MLP of each neighbour, then mean and maximum over them; zero where there is none."""
+
+    def __init__(self, width: int, hidden: int):
+        super().__init__()
+        self.point, self.neighbor = nn.Linear(width, hidden), nn.Linear(width, hidden, bias=False)
+        self.relative, self.mix = nn.Linear(N_RELATIVE, hidden, bias=False), nn.Linear(hidden, hidden)
+
+    def forward(self, embedded: Tensor, centers: Tensor, neighbors: Tensor, relative: Tensor) -> Tensor:
+        """embedded [U, width], centers [B], neighbors [B, K] rows of it, -1: none; relative [B, K, 10] -> [B, 2 h]."""
+        present, rows = (neighbors >= 0)[..., None], neighbors.clamp_min(0)
+        tokens = self.point(embedded[centers])[:, None] + self.neighbor(embedded)[rows] + self.relative(relative)
+        tokens = nn.functional.silu(self.mix(nn.functional.silu(tokens)))
+        mean = (tokens * present).sum(1) / present.sum(1).clamp_min(1)
+        largest = tokens.masked_fill(~present, -1e9).amax(1)
+        return torch.cat([mean, torch.where(present.any(1), largest, torch.zeros_like(largest))], 1)
+
+
+class PointEncoder(nn.Module):
+    """An answer per point.
+
+    Args:
+      n_descriptors: values of a point's descriptors over all radii; 0: it sees none.
+      n_components:  that these are reduced to, whitened (`set_inputs`).
+      n_channels:    of the answer; n_scales: radii, the first of `RADII`.
+    Choices: pooling over neighbours, where attention gained nothing at equal seconds. The answer is the mean of unit
+      vectors of a teacher over views; its length says how alike these were, and so how sure it is.
+    """
+
+    components: Tensor
+
+    def __init__(
+        self,
+        n_channels: int,
+        n_descriptors: int,
+        n_components: int = 48,
+        width: int = 48,
+        hidden: int = 32,
+        n_scales: int = len(RADII),
+    ):
+        super().__init__()
+        n_components = min(n_components, n_descriptors)
+        self.settings = {"n_channels": n_channels, "n_descriptors": n_descriptors, "n_components": n_components}
+        self.settings |= {"width": width, "hidden": hidden, "n_scales": n_scales}
+        self.norm_own, self.norm_descriptors = Standardize(N_OWN), Standardize(n_descriptors)
+        self.register_buffer("components", torch.zeros(n_descriptors, n_components))
+        self.embed = nn.Sequential(nn.Linear(N_OWN + n_components, 64), nn.SiLU(), nn.Linear(64, width))
+        self.scales = nn.ModuleList(Scale(width, hidden) for _ in range(n_scales))
+        total = width + 2 * hidden * n_scales
+        self.decode = nn.Sequential(
+            nn.Linear(total, 96), nn.SiLU(), nn.Linear(96, 96), nn.SiLU(), nn.Linear(96, n_channels)
+        )
+
+    @torch.no_grad()
+    def set_inputs(self, clouds: list[Cloud], sample: int = 11) -> None:
+        """Constants of the inputs, from every `sample`-th point: means, deviations, and the descriptors' principal
+        directions, each scaled to a deviation of 1.
+        """
+        own = torch.cat([cloud.own[::sample] for cloud in clouds])
+        self.norm_own.set(0, own.mean(0), own.std(0))
+        if not self.settings["n_descriptors"]:
+            return
+        descriptors = torch.cat([cloud.descriptors[::sample] for cloud in clouds])
+        self.norm_descriptors.set(0, descriptors.mean(0), descriptors.std(0))
+        standard = self.norm_descriptors(descriptors).double()
+        values, axes = torch.linalg.eigh(standard.T @ standard / len(standard))
+        count = self.settings["n_components"]
+        kept = axes.flip(1)[:, :count] / values.flip(0)[:count].clamp_min(1e-6).sqrt()
+        signs = torch.where(kept.gather(0, kept.abs().argmax(0)[None]) < 0, -1.0, 1.0)
+        self.components.copy_(kept * signs)
+
+    def embedded(self, own: Tensor, descriptors: Tensor) -> Tensor:
+        """[U, width] of points by themselves."""
+        parts = [self.norm_own(own)]
+        if self.settings["n_descriptors"]:
+            parts.append(self.norm_descriptors(descriptors) @ self.components)
+        embedded: Tensor = self.embed(torch.cat(parts, 1))
+        return embedded
+
+    def forward(self, cloud: Cloud, embedded: Tensor, centers: Tensor, neighbors: Tensor) -> Tensor:
+        """Answers [B, C] for rows `centers` [B]; `neighbors` [B, S, K] are rows of cloud and of embedded [U, width]."""
+        parts = [embedded[centers]]
+        for index, scale in enumerate(self.scales):
+            rows = neighbors[:, index]
+            parts.append(scale(embedded, centers, rows, relative(cloud, centers, rows, RADII[index])))
+        answers: Tensor = self.decode(torch.cat(parts, 1))
+        return answers
+
+    @torch.no_grad()
+    def predict(self, inputs: PointInputs) -> np.ndarray:
+        """Answers f32 [N, C] of all points."""
+        cloud = cloud_of(inputs)
+        embedded = self.embedded(cloud.own, cloud.descriptors)
+        parts = [torch.zeros(0, self.settings["n_channels"])]
+        for start in range(0, len(cloud.own), CHUNK):
+            rows = torch.arange(start, min(start + CHUNK, len(cloud.own)))
+            parts.append(self(cloud, embedded, rows, cloud.neighbors[rows]))
+        return torch.cat(parts).numpy()
+
+    @classmethod
+    def restored(cls, settings: dict[str, int], weights: dict[str, np.ndarray]) -> PointEncoder:
+        """Constructor settings, and weights by name. Raises RuntimeError on a misfit."""
+        encoder = cls(**settings)
+        encoder.load_state_dict({name: torch.from_numpy(value) for name, value in weights.items()})
+        return encoder.eval()
+
+    def linear_maps(self) -> dict[str, Tensor]:
+        """W [q, p] by name of each linear map z W, for the knowledge space."""
+        layers = {name: module for name, module in self.named_modules() if isinstance(module, nn.Linear)}
+        return {name: layer.weight.T for name, layer in layers.items()}
+
+
+def relative(cloud: Cloud, centers: Tensor, neighbors: Tensor, radius: float) -> Tensor:
+    """How neighbours [B, K] lie about points [B], in radii: [B, K, 10].
+
+    Choices: the offset itself, its length, its length in the horizontal and its height's size; along the point's normal
+      and across it; the product of both normals, and the difference of normal · up. Teaching turns rooms about the
+      vertical, so that the offset's direction there says nothing.
+    """
+    rows = neighbors.clamp_min(0)
+    offset = (cloud.means[rows] - cloud.means[centers][:, None]) / radius
+    normal, others = cloud.normals[centers][:, None], cloud.normals[rows]
+    along = (offset * normal).sum(-1, keepdim=True)
+    parts = [
+        offset,
+        offset.norm(dim=-1, keepdim=True),
+        offset[..., :2].norm(dim=-1, keepdim=True),
+        offset[..., 2:].abs(),
+        along,
+        (offset - along * normal).norm(dim=-1, keepdim=True),
+        (normal * others).sum(-1, keepdim=True),
+        others[..., 2:] - normal[..., 2:],
+    ]
+    return torch.cat(parts, -1)

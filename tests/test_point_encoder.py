@@ -1,0 +1,175 @@
+"""The point encoder sees shape alone: whichever way a room stands, in whatever unit, and however dense its points."""
+
+import math
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+
+from chebsplat.cameras import common_up, upright
+from chebsplat.shape import point_encoder, teach
+from chebsplat.shape.point_encoder import PointEncoder, cloud_of
+from chebsplat.shape.point_inputs import RADII, REACH, point_inputs
+from chebsplat.splats.gaussians import local_shape
+from chebsplat.synthetic.path import look_at, walk
+
+UP = np.array([0.0, 0.0, 1.0])
+
+
+def corner(n=900, seed=0):
+    """Points, normals and covariances of a floor and a wall of 2 m, with a box on the floor."""
+    rng = np.random.default_rng(seed)
+    a, b = rng.uniform(0, 2, (2, n))
+    floor, wall = np.stack([a, b, 0 * a], 1)[: n // 2], np.stack([0 * a, a, b], 1)[n // 2 :]
+    box = np.array([0.8, 0.8, 0]) + rng.uniform(0, 0.4, (n // 4, 3))
+    box[np.arange(len(box)), rng.integers(0, 3, len(box))] = 0.4
+    means = np.concatenate([floor, wall, box]) + rng.normal(0, 1e-4, (n + n // 4, 3))
+    covariances, normals = local_shape(means, 16)
+    normals[np.einsum("ni,ni->n", normals, np.array([1.5, 1.5, 1.5]) - means) < 0] *= -1
+    return means, normals, covariances
+
+
+def turn(seed=3):
+    return np.linalg.qr(np.random.default_rng(seed).normal(size=(3, 3)))[0] * [1, 1, 1]
+
+
+@pytest.fixture(scope="module")
+def seen():
+    return point_inputs(*corner(), up=UP)
+
+
+@pytest.fixture(scope="module")
+def encoder(seen):
+    torch.manual_seed(0)
+    made = PointEncoder(5, seen.descriptors.shape[1])
+    made.set_inputs([cloud_of(seen)], sample=1)
+    return made.eval()
+
+
+def test_a_room_that_stands_otherwise_in_another_unit_is_the_same_room(seen):
+    means, normals, covariances = corner()
+    R = turn()
+    R *= np.linalg.det(R)
+    scale = 7.0
+    other = point_inputs(
+        scale * means @ R.T + 100,
+        (normals @ R.T).astype(np.float32),
+        scale**2 * np.einsum("ij,njk,lk->nil", R, covariances, R).astype(np.float32),
+        up=R @ UP,
+        unit=scale,
+    )
+    np.testing.assert_allclose(other.own, seen.own, atol=2e-4)
+
+    def across(inputs):
+        return np.linalg.norm(inputs.means[:, None, :2] - inputs.means[None, :50, :2], axis=-1)
+
+    np.testing.assert_allclose(across(other), across(seen), atol=1e-4)
+
+
+def test_neighbours_lie_within_reach_and_far_ones_are_seen_at_large_radii(seen):
+    for index, radius in enumerate(RADII):
+        rows = seen.neighbors[:, index]
+        distance = np.linalg.norm(seen.means[rows] - seen.means[:, None], axis=-1)
+        assert distance[rows >= 0].max() <= REACH * radius * (1 + 1e-5)
+    rows = seen.neighbors[:, 2]
+    far = np.linalg.norm(seen.means[rows] - seen.means[:, None], axis=-1) * (rows >= 0)
+    assert np.median(far.max(1)) > 0.5 * RADII[2]  # 24 neighbours reach as far as the radius, not as the spacing
+
+
+def test_the_answer_is_the_written_formula(seen, encoder):
+    """One point in float64, neighbour by neighbour."""
+    point, double = 17, PointEncoder(**encoder.settings).double()
+    double.load_state_dict(encoder.state_dict())
+    cloud = point_encoder.Cloud(*(v.double() if v.is_floating_point() else v for v in cloud_of(seen)))
+    embedded = double.embedded(cloud.own, cloud.descriptors)
+    parts = [embedded[point]]
+    for index, (radius, scale) in enumerate(zip(RADII, double.scales, strict=True)):
+        tokens = []
+        for j in seen.neighbors[point, index][seen.neighbors[point, index] >= 0]:
+            o = (cloud.means[j] - cloud.means[point]) / radius
+            n, m = cloud.normals[point], cloud.normals[j]
+            along = o @ n
+            lengths = [o.norm(), o[:2].norm(), o[2].abs(), along, (o - along * n).norm(), n @ m, m[2] - n[2]]
+            between = torch.cat([o, torch.stack(lengths)])
+            hidden = scale.point(embedded[point]) + scale.neighbor(embedded[j]) + scale.relative(between)
+            tokens.append(torch.nn.functional.silu(scale.mix(torch.nn.functional.silu(hidden))))
+        stacked = torch.stack(tokens)
+        parts += [stacked.mean(0), stacked.amax(0)]
+    wanted = double.decode(torch.cat(parts)).detach()
+    answer = double(cloud, embedded, torch.tensor([point]), cloud.neighbors[[point]])[0].detach()
+    torch.testing.assert_close(answer, wanted, rtol=1e-12, atol=1e-12)
+    np.testing.assert_allclose(encoder.predict(seen)[point], wanted.numpy(), atol=1e-5)
+
+
+def test_a_point_without_neighbours_and_coincident_points_have_finite_answers(encoder):
+    for means in (np.zeros((1, 3)), np.zeros((40, 3)), np.array([[0.0, 0, 0], [1e4, 0, 0]])):
+        n = len(means)
+        inputs = point_inputs(means, np.tile(UP, (n, 1)), np.tile(1e-4 * np.eye(3), (n, 1, 1)), up=UP)
+        answers = encoder.predict(inputs)
+        assert answers.shape == (n, 5)
+        assert np.isfinite(answers).all()
+    with pytest.raises(ValueError, match="finite"):
+        point_inputs(np.array([[np.nan, 0, 0]]), np.array([UP]), np.eye(3)[None], up=UP)
+
+
+def test_it_learns_what_shape_tells(seen):
+    """Floor, wall and box top have a vector each; taught on one room, the encoder knows them in another."""
+    codes = np.eye(5, dtype=np.float32)[:3]
+
+    def lesson(seed):
+        means, normals, covariances = corner(seed=seed)
+        labels = np.where(np.abs(normals[:, 2]) < 0.5, 0, np.where(means[:, 2] > 0.2, 1, 2))
+        inputs = point_inputs(means, normals, covariances, up=UP)
+        return teach.Lesson(cloud_of(inputs), torch.from_numpy(codes[labels]), np.full(len(means), 3), labels), inputs
+
+    (first, _), (second, inputs) = lesson(1), lesson(2)
+    torch.manual_seed(0)
+    encoder = PointEncoder(5, first.cloud.descriptors.shape[1])
+    encoder.set_inputs([first.cloud], sample=1)
+    losses = list(teach.taught(encoder, [first], teach.Course(steps=120, batch=128)))
+    assert np.mean(losses[-10:]) < 0.5 * np.mean(losses[:3])
+    found = (encoder.predict(inputs)[:, :3]).argmax(1)
+    assert (found == second.labels).mean() > 0.9
+    with pytest.raises(ValueError, match="seen in 2 views"):
+        replace(first, n_views=np.zeros(len(first.labels), np.int64)).odds()
+
+
+def test_rare_things_are_drawn_more_often_and_what_no_view_saw_never():
+    lesson = teach.Lesson(None, None, np.array([3] * 90 + [3] * 9 + [1]), np.array([0] * 90 + [1] * 9 + [2]))
+    odds = lesson.odds()
+    assert odds.sum() == pytest.approx(1)
+    assert odds[-1] == 0
+    assert 1.5 < odds[95] / odds[0] < math.sqrt(10)
+
+
+def test_up_is_where_the_cameras_tops_point():
+    poses = walk((5.0, 4.0, 2.7), 40, 0)
+    up, sure = common_up(poses)
+    np.testing.assert_allclose(up, UP, atol=1e-6)
+    assert sure > 0.9
+    R = turn(5)
+    R *= np.linalg.det(R)
+    moved = poses.copy()
+    moved[:, :3, :3] = poses[:, :3, :3] @ R.T
+    np.testing.assert_allclose(common_up(moved)[0], R @ UP, atol=1e-6)
+
+
+def test_cameras_that_cannot_tell_up_say_so():
+    same = np.tile(look_at(np.array([0, 0, 1.0]), np.array([3, 0, 0.0])), (5, 1, 1))
+    assert common_up(same)[1] == 0
+    from scipy.spatial.transform import Rotation
+
+    rolled = np.tile(np.eye(4), (200, 1, 1))
+    rolled[:, :3, :3] = Rotation.random(200, rng=0).as_matrix()
+    assert common_up(rolled)[1] < 0.3
+
+
+def test_upright_is_a_rotation_whatever_up_is():
+    for up in (UP, -UP, np.array([1.0, 2, 3]), np.array([1e-9, 0, 0])):
+        R = upright(up)
+        np.testing.assert_allclose(R @ R.T, np.eye(3), atol=1e-12)
+        assert np.linalg.det(R) == pytest.approx(1)
+        np.testing.assert_allclose(R @ up, [0, 0, np.linalg.norm(up)], atol=1e-12)
+    with pytest.raises(ValueError, match="no length"):
+        upright(np.zeros(3))
