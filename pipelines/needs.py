@@ -13,6 +13,7 @@ if TYPE_CHECKING:
     from chebsplat.formats.teacher_model import TeacherModel
 
 LIFTED = "train.features is lifted"
+POINTS = "train.encoder is points: the training holds none"
 
 
 def teacher_kind(config: Any, probe: dict[str, bool]) -> tuple[str, str]:
@@ -42,6 +43,8 @@ def left_out_stages(config: Any, kind: str, why: str, probe: dict[str, bool]) ->
         left_out |= {"describe": LIFTED, "onnx": LIFTED}
     elif config.train.encoder == "off":
         left_out |= {"describe": "train.encoder is off", "onnx": "train.encoder is off"}
+    elif config.train.encoder == "points":
+        left_out |= {"describe": POINTS, "onnx": f"{POINTS}: it comes with the knowledge, in ONNX, too"}
     elif not config.train.albo:
         left_out |= {"describe": "train.albo is false: tokens hold no descriptor"}
     if probe["poses"] and probe["depth"]:
@@ -61,7 +64,11 @@ def left_out_knowledge(config: Any, kind: str, why: str, basis: Path | None, kee
     """Why a scene does not train on a given basis, or keeps nothing of its knowledge, if so."""
     if kind != "none" and config.train.features == "lifted":
         kind, why = "none", LIFTED
-    reasons = {"off": "train.encoder is off", "mlp": "train.encoder is mlp: it has no attention weights"}
+    reasons = {
+        "mlp": "train.encoder is mlp: it has no attention weights",
+        "points": POINTS,
+        "off": "train.encoder is off",
+    }
     unable = f"no encoder is trained ({why})" if kind == "none" else reasons.get(config.train.encoder, "")
     left_out = {} if basis is None or not unable else {"basis": unable}
     if unable or not keep:

@@ -143,12 +143,16 @@ class Planner:
         Args: settings: `set=`; basis: an earlier scene's basis to train on; keep_knowledge: end with a cks step;
               values: config sections that replace the scene's own, before ablation and settings (a study's).
         Raises: ConfigError, InputError.
+        Choices: a scene of a sequence, or on a basis, trains the encoder of regions, which a basis is of.
         """
+        from chebsplat.pipelines.knowledge import given
         from chebsplat.stages import config as configs
         from chebsplat.stages import ingest
 
         name, own = scene_values(scene)
         values, title = merged(own, values or {}), ""
+        if basis is not None or keep_knowledge:
+            values = merged({"train": {"encoder": "transformer"}}, values)
         if ablation:
             values = merged(values, read_toml("ablations", ablation))
             title += f"@{ablation}"
@@ -170,15 +174,22 @@ class Planner:
         model = read_teacher(Path(teacher.model)) if kind == "onnx" and teacher.model else None
         left_out = left_out_stages(config, kind, why, probe) | left_out_channels(kind, model)
         left_out |= left_out_knowledge(config, kind, why, basis, keep_knowledge)
+        known, unknown = given(config, kind, self.running) if "refine" not in left_out else (None, "")
+        left_out |= {"knowledge of shape": unknown} if unknown else {}
+        config = config.model_copy(update={"refine": config.refine.model_copy(update={"knowledge": None})})  # an input
         steps: dict[str, Step] = {}
         used = {"teacher": text_packages(model, teacher.labels)}
         for stage in STAGES.values():
-            if stage.name in left_out:
+            if stage.name in left_out or not stage.of_scene:
                 continue
             unread = unread_inputs(config, stage.name)
             inputs = {role: steps[of].path for role, of in stage.roles.items() if of in steps and role not in unread}
             if basis is not None and "basis" not in left_out and stage.name in ("train", "cks"):
                 inputs["basis"] = basis
+            if stage.name == "refine" and known is not None:
+                inputs["knowledge"] = known
+            elif stage.name == "refine":
+                inputs.pop("points", None)
             keys = {role: path.name for role, path in inputs.items()}
             steps[stage.name] = self.step(stage, config, inputs, keys, used.get(stage.name, ()))
         title = self._named(scene) + title

@@ -1,14 +1,16 @@
-"""refine: the features of a finished scene, smoothed and blended with knowledge where its training views agree."""
+"""refine: the features of a finished scene, smoothed, and blended with knowledge as far as its training views ask."""
 
 from __future__ import annotations
 
 from typing import TYPE_CHECKING, Any
 
-from chebsplat.errors import DataFailure, InputError
+from chebsplat.errors import ConfigError, DataFailure, InputError
 from chebsplat.stages.command import Job, command
 
 if TYPE_CHECKING:
     import numpy as np
+
+    from chebsplat.formats.gaussians import Gaussians
 
 METRIC = ("generated", "replica", "scannet", "seven_scenes")  # sources whose scene unit is the metre
 
@@ -16,13 +18,13 @@ METRIC = ("generated", "replica", "scannet", "seven_scenes")  # sources whose sc
 def run(job: Job) -> None:
     """Smooth the features of trained Gaussians, then blend them with knowledge (docs/method.md, section 13).
 
-    Reads `gaussians` and `lifted`, for the scene's unit `capture`, and for the share of labels that change `features`.
-    Writes `refined`.
+    Reads `gaussians` and `lifted`, for the scene's unit `capture`, for what knowledge says `knowledge`, `points` and
+    `features`, by which the share of labels that change is counted, too. Writes `refined`.
     """
     from chebsplat.formats.gaussians import read_gaussians
     from chebsplat.formats.lifted import read_lifted
     from chebsplat.formats.refined import Refined, write_refined
-    from chebsplat.lifting.blend import blend, calibrate, confidence
+    from chebsplat.lifting.blend import blend, calibrate, confidence, effective, reliable, trusted
     from chebsplat.lifting.smoothing import affinities, smooth
     from chebsplat.splats.gaussians import surface_of
 
@@ -43,27 +45,68 @@ def run(job: Job) -> None:
         features = lifted.features
     unit = scene_unit(job, p["means"])
     near = affinities(p["means"], *surface_of(p), unit)
-    knowledge: np.ndarray | None = None  # [N, C], where an earlier scene or `knowledge` has some
+    knowledge = known(job, gaussians, unit)
     choice = calibrate(lifted.halves, lifted.half_views, near, knowledge)
     smoothed = choice.smooth if settings.smooth == "auto" else settings.smooth == "on"
-    strength = choice.best_strength(smoothed)
+    strength = choice.strength
     made = [features, smooth(features, lifted.n_views, near) if smoothed else features]
-    made.append(made[1] if knowledge is None else blend(made[1], lifted.n_views, knowledge, strength))
+    made.append(made[1])
+    if knowledge is not None:
+        evidence = effective(lifted.n_views) * reliable(lifted.halves, lifted.half_views)
+        blended = blend(made[1], evidence, knowledge, strength)
+        made[2] = smooth(blended, evidence + trusted(knowledge, strength), near) if smoothed else blended
     curve = {name: {f"{k:g}": value for k, value in row.items()} for name, row in choice.curve.items()}
     notes = {"start": started, "smooth": smoothed, "strength": strength, "curve": curve}
-    known = confidence(made[1], lifted.n_views, lifted.agreement, knowledge, strength)
-    write_refined(job.out, Refined(made[2], known, notes))
+    sure = confidence(made[1], lifted.n_views, lifted.agreement, knowledge, strength)
+    write_refined(job.out, Refined(made[2], sure, notes))
     job.facts |= {"n_gaussians": len(features), "unit": unit, **notes} | shares(job, made)
 
 
+def known(job: Job, gaussians: Gaussians, unit: float) -> np.ndarray | None:
+    """What knowledge of shape says of the Gaussians, f32 [N, C]: of the points beside them.
+
+    Choices: points are those of depth; without it, those of the surface that the Gaussians show to the training views.
+    """
+    from chebsplat.formats.capture import read_capture
+    from chebsplat.formats.features import read_features
+    from chebsplat.formats.points import read_points
+    from chebsplat.lifting.carry import carry
+    from chebsplat.splats.gaussians import surface_of
+    from chebsplat.stages.known_shapes import Cloud, known_shapes, shown
+
+    if "knowledge" not in job.inputs:
+        return None
+    if absent := [role for role in ("points", "features") if role not in job.inputs]:
+        raise ConfigError(f"knowledge is of points and a teacher; pass --in-{absent[0]}, too")
+    points, features = read_points(job.inputs["points"]), read_features(job.inputs["features"])
+    p, cameras = gaussians.parameters, gaussians.cameras
+    capture = read_capture(job.inputs["capture"]) if "capture" in job.inputs else None
+    try:
+        if capture is None or capture.depth is not None:
+            source, cloud = "points", Cloud(points.means, points.normals, points.covariances)
+        else:
+            test = {name for name, is_test in zip(capture.names, capture.is_test, strict=True) if is_test}
+            rows = [row for row, name in enumerate(cameras.names) if name not in test]
+            size = cameras.width, cameras.height
+            source, cloud = "rendered depth", shown(p, cameras.cam_from_world[rows], cameras.Ks[rows], size, unit)
+        answers, facts = known_shapes(job.inputs["knowledge"], features, cloud, points.cam_from_world, unit)
+    except DataFailure as error:
+        job.left_out("knowledge of shape", str(error))
+        return None
+    carried, _ = carry(answers, cloud.means, cloud.normals, p["means"], surface_of(p)[0], unit)
+    job.facts["knowledge"] = facts | {"of": source, "n_points": len(cloud.means)}
+    return carried
+
+
 def scene_unit(job: Job, means: np.ndarray) -> float:
-    """Scene units of a metre: 1 where the source is metric, otherwise by the scene's extent, which facts say."""
+    """Scene units of a metre: 1 where the source is metric or has depth, otherwise by the extent; facts say which."""
     from chebsplat.formats.capture import read_capture
     from chebsplat.lifting.smoothing import room_unit
 
-    kind = read_capture(job.inputs["capture"]).source.get("kind") if "capture" in job.inputs else None
-    job.facts["unit_from"] = "source" if kind in METRIC else "extent"
-    return 1.0 if kind in METRIC else room_unit(means)
+    capture = read_capture(job.inputs["capture"]) if "capture" in job.inputs else None
+    metric = capture is not None and (capture.depth is not None or capture.source.get("kind") in METRIC)
+    job.facts["unit_from"] = "source" if metric else "extent"
+    return 1.0 if metric else room_unit(means)
 
 
 def shares(job: Job, made: list[np.ndarray]) -> dict[str, Any]:

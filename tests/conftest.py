@@ -5,7 +5,7 @@ import json
 
 import pytest
 from shared import INPUTS, KEY, ROOT, TOY, remember, run_stage
-from tiny_teachers import color_reference, color_teacher
+from tiny_teachers import color_reference, color_teacher, knowing_rooms
 
 
 @pytest.fixture(scope="session")
@@ -24,8 +24,9 @@ def code_memo():
 def toy(tmp_path_factory):
     """Paths of toy artifacts by stage."""
     root = tmp_path_factory.mktemp("toy")
-    model, reference = color_teacher(root), color_reference(root / "reference")
+    model, reference = knowing_rooms(color_teacher(root)), color_reference(root / "reference")
     config = TOY | {"channels": {"model": str(model), "reference": str(reference)}}
+    config["knowledge"] = TOY["knowledge"] | {"model": str(model)}
     made = {}
     for stage, roles in INPUTS.items():
         made[stage] = root / stage

@@ -25,8 +25,8 @@ PACKAGES = {
     "views": set(),
     "rasterize": {"kernels", "splats"},
     "render": {"rasterize", "splats", "views"},
-    "shape": {"kernels", "settings", "splats"},
-    "lifting": {"kernels", "rasterize"},
+    "shape": {"cameras", "kernels", "settings", "splats"},
+    "lifting": {"cameras", "kernels", "rasterize", "splats"},
     "evaluation": {"labels", "rasterize", "render", "views"},
     "training": {"evaluation", "kernels", "rasterize", "settings", "shape", "splats", "views"},
 }

@@ -209,7 +209,9 @@ def two_shapes() -> tuple[SceneModel, torch.Tensor]:
     flat, ball = generator.normal(size=(n, 3)) * [1, 1, 0.02], generator.normal(size=(n, 3))
     means = np.concatenate([flat, ball + np.array([20, 0, 0])])
     spread = np.concatenate([np.tile(np.diag([0.04, 0.04, 1e-5]), (n, 1, 1)), np.tile(np.eye(3) * 0.02, (n, 1, 1))])
-    config = Config.model_validate({"describe": {"n_regions": 60, "n_angles": 2}, "train": {"context": "none"}})
+    config = Config.model_validate(
+        {"describe": {"n_regions": 60, "n_angles": 2}, "train": {"encoder": "transformer", "context": "none"}}
+    )
     raw = initial_gaussians(means, np.full((2 * n, 3), 128, np.uint8), spread)
     model = SceneModel(raw, config.describe, config.train, 2)
     kind = (torch.arange(2 * n) >= n).long()

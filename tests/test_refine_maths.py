@@ -5,7 +5,7 @@ import math
 import numpy as np
 import pytest
 
-from chebsplat.lifting.blend import STRENGTHS, blend, calibrate, effective
+from chebsplat.lifting.blend import LEAST, STRENGTHS, blend, calibrate, confidence, effective, reliable
 from chebsplat.lifting.carry import carry
 from chebsplat.lifting.smoothing import N_NEIGHBORS, REACH, Affinities, affinities, room_unit, smooth
 
@@ -104,9 +104,30 @@ def test_views_that_err_alike_count_for_fewer():
 
 def test_the_blend_counts_knowledge_as_so_many_views():
     f, g = np.array([[1.0, 0], [1, 0], [1, 0], [1, 0]]), np.array([[0, 1.0], [0, 1], [0, 0], [0, 1]])
-    n = np.array([6, 0, 2, 1])
+    n = effective(np.array([6, 0, 2, 1]))
     np.testing.assert_allclose(blend(f, n, g, 3.0), [[0.5, 0.5], [0, 1], [1, 0], [0.25, 0.75]], atol=1e-7)
     np.testing.assert_array_equal(blend(f, n, g, 0.0), f)
+    unsure = blend(f, n, 0.5 * g, 3.0)  # counts for 3 / 8 of a view
+    np.testing.assert_allclose(unsure[3], [1 / 1.375, 0.5 * 0.375 / 1.375], atol=1e-7)
+
+
+def test_views_count_by_how_far_their_halves_agree():
+    halves = np.array([[[1.0, 0], [1, 0], [2, 0], [0, 0]], [[1, 0], [0, 1], [1, 1], [1, 0]]])
+    views = np.array([[2, 2, 2, 0], [1, 1, 1, 1]])
+    mean = (1 + 0 + 0.5**0.5) / 3
+    np.testing.assert_allclose(reliable(halves, views), [1, 0, 0.5**6, mean**12], rtol=1e-5)
+    np.testing.assert_array_equal(reliable(halves, 0 * views), 1)
+
+
+def test_confidence_grows_with_votes_that_agree_and_falls_where_they_do_not():
+    f, n = np.tile([2.0, 0], (4, 1)), np.array([0, 1, 6, 6])
+    alone = confidence(f, n, np.array([1, 1, 1, 0.5]))
+    np.testing.assert_allclose(alone, [0, 1 / 2, 3 / 4, 1.5 / 4], atol=1e-6)
+    same, other = (confidence(f, n, np.ones(4), np.tile(g, (4, 1)), 2.0) for g in ([1.0, 0], [0, 1.0]))
+    np.testing.assert_allclose(same, [2 / 3, 3 / 4, 5 / 6, 5 / 6], atol=1e-6)
+    assert (other[1:] < same[1:]).all()
+    nothing = confidence(f, n, np.ones(4), np.zeros((4, 2)), 2.0)
+    np.testing.assert_allclose(nothing, [0, 1 / 2, 3 / 4, 3 / 4], atol=1e-6)
 
 
 def votes(n_views, spread, seed=0):
@@ -141,8 +162,10 @@ def test_calibration_trusts_knowledge_as_far_as_views_are_noisy():
         found = calibrate(halves, n_views, near, wrong)
         assert set(found.curve["off"]) == set(STRENGTHS)
         assert not found.smooth  # nobody has a neighbour: a tie
-        chosen[spread] = found.strength
-    assert chosen[0.02] < 1 <= chosen[1.0]
+        assert found.strength >= LEAST
+        evidence = effective(n_views.sum(0)) * reliable(halves, n_views)
+        chosen[spread] = found.strength / (evidence.mean() + found.strength)  # its share of a vote
+    assert chosen[0.02] < 0.5 < chosen[1.0]
 
 
 def test_calibration_treats_both_halves_alike_and_ignores_what_one_half_does_not_see():

@@ -129,6 +129,13 @@ def teacher_of_nothing(toy, tmp):
     return {}, {"channels": {"model": str(model), "reference": str(color_reference(tmp / "reference"))}}
 
 
+def photos_apart(toy, tmp):
+    from tiny_teachers import color_teacher, knowing_rooms
+
+    model = knowing_rooms(color_teacher(tmp))
+    return inputs_of(toy, "teach"), changed(knowledge={"model": str(model), "n_views": 2, "n_points": 100})
+
+
 def without_labels(toy, tmp):
     record = read_capture(toy["ingest"])
     record.labels = None
@@ -196,6 +203,7 @@ FAILURES = {
     "sfm": without_depth,
     "channels": teacher_of_nothing,
     "teacher": without_labels,
+    "teach": photos_apart,
     "describe": without_points,
     "train": only_test_views,
     "lift": only_test_views_to_lift,

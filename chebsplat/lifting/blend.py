@@ -8,9 +8,11 @@ import numpy as np
 
 from chebsplat.lifting.smoothing import Affinities, smooth
 
-STRENGTHS = (0.0, 0.25, 0.5, 1.0, 2.0, 4.0, 8.0)  # views that knowledge may count for, as halves try them
+STRENGTHS = (0.0, 0.5, 1.0, 2.0, 4.0, 8.0)  # views that knowledge may count for
 ALIKE = 0.2  # correlation of the errors of two views of a thing
-TRUST = 2.0  # over the strength that the halves ask for
+SURE = 3  # power of its length by which knowledge counts
+AGREED = 12  # power of the agreement of two halves of the views by which views count
+LEAST = 1.0  # strength: what a teacher gets wrong alike in both halves counts as right when they are asked
 
 
 class Calibration(NamedTuple):
@@ -25,34 +27,46 @@ class Calibration(NamedTuple):
     strength: float
     curve: dict[str, dict[float, float]]
 
-    def best_strength(self, smoothed: bool) -> float:
-        """The strength of the largest agreement where smoothing is decided by others; the least of equal ones."""
-        row = self.curve["on" if smoothed else "off"]
-        return TRUST * max(row, key=lambda k: (row[k], -k))
 
+def blend(features: np.ndarray, evidence: np.ndarray, knowledge: np.ndarray, strength: float) -> np.ndarray:
+    """(e f + k' g) / (e + k'), f32 [N, C], with k' of `trusted`; f where that is 0.
 
-def blend(features: np.ndarray, n_views: np.ndarray, knowledge: np.ndarray, strength: float) -> np.ndarray:
-    """(n' f + k g) / (n' + k), f32 [N, C], with n' of `effective`.
-
-    Args: features f [N, C]; n_views n [N] >= 0; knowledge g [N, C], a row of zeros where nothing is known;
-          strength k >= 0.
-    Choices: f where n + k is 0, and where g is a row of zeros, which is no answer.
+    Args: features f [N, C]; evidence e [N] >= 0, see `effective` and `reliable`; knowledge g [N, C]; strength k >= 0.
     """
-    n = effective(n_views)[:, None]
-    k = np.float32(strength) * knowledge.any(1, keepdims=True).astype(np.float32)
-    total = n + k
-    blended = (n * features + k * knowledge) / np.where(total > 0, total, 1)
-    return np.where((total > 0) & (k > 0), blended, features).astype(np.float32)
+    e, k = evidence[:, None], trusted(knowledge, strength)[:, None]
+    blended = (e * features + k * knowledge) / np.where(e + k > 0, e + k, 1)
+    return np.where(k > 0, blended, features).astype(np.float32)
+
+
+def trusted(knowledge: np.ndarray, strength: float) -> np.ndarray:
+    """k' = k |g|^SURE: views that knowledge counts for, f32 [N].
+
+    Choices: an answer is the mean of unit vectors of a teacher over views, so that its length says how alike these
+      were where shapes were like this one; small things, of which shape says least, are left to the views.
+    """
+    lengths = np.linalg.norm(knowledge, axis=1).clip(0, 1)
+    return np.asarray(strength * lengths**SURE, np.float32)
 
 
 def effective(n_views: np.ndarray) -> np.ndarray:
     """n' = n / (1 + ALIKE (n - 1)): how many views with errors of their own n views are worth, f32 [N].
 
-    Choices: a teacher errs alike in neighbouring views, so that a hundred of them never count for more than five. ALIKE
-      was chosen with TRUST on generated rooms that knowledge is taught on the likes of, never on a scene's test views.
+    Choices: a teacher errs alike in neighbouring views, so that a hundred of them never count for more than five.
     """
     n = n_views.astype(np.float32)
     return np.asarray(n / (1 + ALIKE * np.maximum(n - 1, 0)), np.float32)
+
+
+def reliable(halves: np.ndarray, half_views: np.ndarray) -> np.ndarray:
+    """ρ^AGREED, f32 [N]: what views count for where half of them agree with the other half by a cosine of ρ.
+
+    Args: halves [2, N, C], features by each half of the views; half_views [2, N] how many of them see each.
+    Choices: the mean ρ where only one half sees a Gaussian, 1 where none is seen by both. Views whose errors are their
+      own agree in their means however wrong each is; a teacher out of its depth says other things from elsewhere.
+    """
+    both, agreed = (half_views > 0).all(0), cosines(*halves).clip(0, 1)
+    mean = float(agreed[both].mean()) if both.any() else 1.0
+    return np.asarray(np.where(both, agreed, mean) ** AGREED, np.float32)
 
 
 def calibrate(
@@ -62,14 +76,14 @@ def calibrate(
 
     Args: halves [2, N, C], features by each half of the training views; half_views [2, N] how many of them see each;
           near: affinities of the Gaussians; knowledge [N, C], or None: only smoothing is decided.
-    Returns: the choice of the largest agreement: the cosine between what is made of one half (smoothed, blended by its
-      own views) and the other half's mean features, averaged over the Gaussians that both see, by the other half's
-      views, both ways alike.
+    Returns: whether smoothing alone makes the halves agree better, and the strength from LEAST up at which they agree
+      best. Agreement is the cosine between what is made of one half (smoothed, blended by its own views) and the other
+      half's mean features, averaged over the Gaussians that both see, by the other half's views, both ways alike.
     Choices: no test view is looked at, and no label. On ties, and without a Gaussian that both halves see, what changes
-      less wins. What the teacher gets wrong in all views alike counts as right here, so that the halves ask for too
-      little: the strength is TRUST times what they ask for.
+      less wins. The strength is that for features as they are: what smoothing has made of a half is no longer evidence
+      of its views alone, and asks for less.
     """
-    strengths = STRENGTHS if knowledge is not None else STRENGTHS[:1]
+    strengths, reliability = STRENGTHS if knowledge is not None else STRENGTHS[:1], reliable(halves, half_views)
     weights = np.where((half_views > 0).all(0), half_views, 0).astype(np.float64)
     curve: dict[str, dict[float, float]] = {"off": {}, "on": {}}
     for name in curve:
@@ -77,11 +91,13 @@ def calibrate(
         for k in strengths:
             agreed = 0.0
             for own, other in ((0, 1), (1, 0)):
-                result = made[own] if knowledge is None else blend(made[own], half_views[own], knowledge, k)
+                evidence = effective(half_views[own]) * reliability
+                result = made[own] if knowledge is None else blend(made[own], evidence, knowledge, k)
                 agreed += float(weights[other] @ cosines(result, halves[other]))
             curve[name][k] = agreed / max(float(weights.sum()), 1.0)
-    best = max(((value, name == "off", -k) for name, row in curve.items() for k, value in row.items()))
-    return Calibration(not best[1], -TRUST * best[2], curve)
+    tried = [k for k in strengths if k >= LEAST] if weights.any() else []
+    strength = max(tried, key=lambda k: (curve["off"][k], -k), default=0.0)
+    return Calibration(curve["on"][0.0] > curve["off"][0.0], strength, curve)
 
 
 def confidence(
@@ -91,16 +107,21 @@ def confidence(
     knowledge: np.ndarray | None = None,
     strength: float = 0.0,
 ) -> np.ndarray:
-    """How long the mean of all votes is beside one vote for nothing: |n r f/|f| + k g/|g|| / (n + k + 1), f32 [N].
+    """How long the mean of all votes is beside one for nothing: |n' r f/|f| + k' g/|g|| / (n' + k' + 1), f32 [N].
 
     Args: agreement r [N] in [0, 1] of the views; the others as for `blend`.
     """
-    direction = features / np.linalg.norm(features, axis=1, keepdims=True).clip(1e-12)
-    votes, total = (n_views * agreement)[:, None] * direction, n_views + 1.0
+    n = effective(n_views)
+    votes, total = (n * agreement)[:, None] * unit(features), n + 1
     if knowledge is not None:
-        lengths = np.linalg.norm(knowledge, axis=1, keepdims=True)
-        votes, total = votes + strength * knowledge / lengths.clip(1e-12), total + strength * (lengths[:, 0] > 0)
+        k = trusted(knowledge, strength)
+        votes, total = votes + k[:, None] * unit(knowledge), total + k
     return (np.linalg.norm(votes, axis=1) / total).clip(0, 1).astype(np.float32)  # type: ignore[no-any-return]
+
+
+def unit(rows: np.ndarray) -> np.ndarray:
+    """Rows of length 1, or of zeros."""
+    return np.asarray(rows / np.linalg.norm(rows, axis=1, keepdims=True).clip(1e-12))
 
 
 def cosines(a: np.ndarray, b: np.ndarray) -> np.ndarray:

@@ -29,7 +29,9 @@ def plans(
     try:
         if sequence is not None:
             return sequences.chain(planner, sequence, settings, ablation)
-        if not basis:
+        if basis == "none":
+            settings = ",".join(part for part in (settings, "refine.knowledge=none") if part)
+        if basis in ("", "none"):
             return [planner.plan(str(scene), settings, ablation)]
         earlier, path, name = bases.before(planner, basis, settings, ablation)
         plan = planner.plan(str(scene), settings, ablation, path)
@@ -60,7 +62,9 @@ OPTIONS = [
     click.option("--set", "settings", default="", help="section.key=value,..."),
     click.option("--ablation", default="", help="a named set of settings"),
     click.option(
-        "--basis", default="", help="start from this knowledge: NAME[@REVISION] of a sequence or HEAD, FOLDER/"
+        "--basis",
+        default="",
+        help="start from this knowledge: NAME[@REVISION] of a sequence or HEAD, FOLDER/; none: nor what is shipped",
     ),
 ]
 

@@ -1,7 +1,8 @@
-"""What is done with a finished scene, or before one: query, extract, encode, lift, check-teacher."""
+"""What is done with a finished scene, or before one: query, extract, encode, lift, label, check-teacher, knowledge."""
 
 from __future__ import annotations
 
+import os
 import sys
 from pathlib import Path
 
@@ -107,4 +108,63 @@ def lift(ply: Path, capture: str, teacher: Path | None, out: Path) -> None:
     print(out)
 
 
-COMMANDS = (query, check_teacher, extract, encode, lift)
+@click.command()
+@click.option("--teacher", type=click.Path(path_type=Path), help=".onnx; default: the embedded teacher")
+@click.option("--set", "settings", default="", help="section.key=value,... of knowledge and channels")
+@click.option("--out", type=click.Path(path_type=Path), help="folder to copy it to; later: refine.knowledge=FOLDER")
+@click.option("--cores", type=click.IntRange(1), default=os.cpu_count())
+def knowledge(teacher: Path | None, settings: str, out: Path | None, cores: int) -> int:
+    """Teach what shapes look like to a TEACHER, over generated rooms; scenes of that teacher start from it."""
+    from chebsplat.formats import artifact
+    from chebsplat.pipelines import store
+    from chebsplat.pipelines.knowledge import teaching
+    from chebsplat.pipelines.plan import Planner
+    from chebsplat.pipelines.run import execute
+
+    if out is not None and os.path.lexists(out):
+        raise ConfigError(f"{out} exists; remove it, or choose another --out")
+    planner = Planner(running=True)
+    try:
+        store.make_work()
+        plan = teaching(planner, teacher, settings)
+    finally:
+        planner.save()
+    code = execute([plan], "teach", cores)
+    if code == 0 and out is not None:
+        made = plan.targets["teach"]
+        artifact.copy(made, out, artifact.verify(made))
+        print(out.absolute())
+    return code
+
+
+@click.command()
+@click.argument("ply", type=click.Path(path_type=Path))
+@click.option("--words", help="to choose among, with commas; default: the classes of generated rooms")
+@click.option("--up", default="0,0,1", show_default=True, help="x,y,z against gravity, in the PLY's frame")
+@click.option("--unit", type=click.FloatRange(0, min_open=True), help="PLY units in a metre; default: by its extent")
+@click.option("--knowledge", type=click.Path(path_type=Path), help="an artifact; default: the one that is shipped")
+@click.option("--out", type=click.Path(path_type=Path), required=True, help="the .ply to write; an .npz beside it")
+def label(ply: Path, words: str | None, up: str, unit: float | None, knowledge: Path | None, out: Path) -> None:
+    """Name the Gaussians of any .PLY of a room by shape alone, with a confidence: no photo, no 2D teacher."""
+    import numpy as np
+
+    from chebsplat.formats.knowledge import SHIPPED
+    from chebsplat.stages.label_ply import label_ply
+    from chebsplat.synthetic import CLASS_NAMES
+
+    try:
+        direction = np.array([float(part) for part in up.split(",")])
+    except ValueError:
+        direction = np.zeros(0)
+    length = np.linalg.norm(direction)
+    if direction.shape != (3,) or not 0 < length < np.inf:
+        raise ConfigError(f"--up {up}: three numbers are needed, such as 0,0,1")
+    names = [word.strip() for word in words.split(",") if word.strip()] if words else list(CLASS_NAMES)
+    figures = label_ply(ply, knowledge or SHIPPED, names, direction / length, unit, out)
+    for name, share in sorted(figures["shares"].items(), key=lambda entry: -entry[1]):
+        if share > 0:
+            print(f"{name:12s}{share:6.1%}", file=sys.stderr)
+    print(out)
+
+
+COMMANDS = (query, check_teacher, extract, encode, lift, label, knowledge)

@@ -1,0 +1,120 @@
+"""Points on the surface that Gaussians show: rendered depth of many views, fused.
+
+For splats without a depth image: descriptors are of surfaces, and the Gaussians' own centres lie off them.
+"""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Mapping
+from typing import NamedTuple
+
+import numpy as np
+import torch
+
+from chebsplat.cameras import upright
+from chebsplat.rasterize import rasterize
+from chebsplat.splats.gaussians import activated, surface_of
+
+GRAZING = 0.15  # cosine of the view's angle to a plane below which its depth is that of the centre
+OPAQUE = 0.8  # least coverage of a pixel whose depth counts
+NEAREST = 0.05  # metres
+EDGE = 0.04  # metres, of the cubes that one point stands for
+LEAST = 3  # pixels in such a cube
+LOOKOUT_SIZE, LOOKOUT_ANGLE = (192, 144), 1.4  # pixels; rad, across
+
+
+class Surface(NamedTuple):
+    """M points: means f64 [M, 3] scene units; eyes f64 [M, 3], the mean of the cameras that saw them."""
+
+    means: np.ndarray
+    eyes: np.ndarray
+
+
+def surface(
+    parameters: Mapping[str, np.ndarray],
+    cam_from_world: np.ndarray,
+    Ks: np.ndarray,
+    size: tuple[int, int],
+    unit: float = 1.0,
+    n_pixels: int = 300_000,
+) -> Surface:
+    """Points of the surface, at most one in a cube of edge EDGE.
+
+    Args: parameters: raw, of N Gaussians; cam_from_world [V, 4, 4] and Ks [V, 3, 3] of views of `size` (width, height);
+          unit: scene units of a metre; n_pixels: that are looked at, of all views alike, drawn.
+    Choices: a Gaussian is a plane through its centre across its shortest axis, whose inverse depth is linear in pixels,
+      so that it can be rendered as three channels: 1/z = q · (u, v, 1), q = K⁻ᵀ n / (n · μ). Inverse depth is averaged
+      by α T, points by cube.
+    """
+    raw = {name: torch.from_numpy(np.ascontiguousarray(values, np.float32)) for name, values in parameters.items()}
+    shapes, normals = activated(raw), surface_of(parameters)[0].astype(np.float64)
+    means, rng = parameters["means"].astype(np.float64), np.random.default_rng(0)
+    width, height = size
+    count = min(max(n_pixels // max(len(Ks), 1), 1), width * height)
+    seen, eyes = [np.zeros((0, 3))], [np.zeros((0, 3))]
+    for pose, K in zip(cam_from_world, Ks, strict=True):
+        planes = inverse_depths(means @ pose[:3, :3].T + pose[:3, 3], normals @ pose[:3, :3].T, K, NEAREST * unit)
+        camera = torch.from_numpy(pose).float()[None], torch.from_numpy(K).float()[None]
+        with torch.no_grad():
+            rendered, covered, _ = rasterize(*shapes, torch.from_numpy(planes.astype(np.float32)), *camera, *size)
+        pixels = rng.choice(width * height, count, replace=False)
+        rays = np.stack([pixels % width + 0.5, pixels // width + 0.5, np.ones(count)], 1)
+        opaque = covered.numpy().reshape(-1)[pixels].astype(np.float64)
+        inverse = np.einsum("pk,pk->p", rendered.numpy().reshape(-1, 3)[pixels], rays) / np.maximum(opaque, 1e-6)
+        used = (opaque > OPAQUE) & (inverse > 0) & (inverse * NEAREST * unit < 1)
+        points = rays[used] @ np.linalg.inv(K).T / inverse[used, None]
+        seen.append((points - pose[:3, 3]) @ pose[:3, :3])
+        eyes.append(np.tile(-pose[:3, :3].T @ pose[:3, 3], (int(used.sum()), 1)))
+    return fused(np.concatenate(seen), np.concatenate(eyes), EDGE * unit)
+
+
+def lookouts(means: np.ndarray, opacities: np.ndarray, up: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Views [V, 4, 4] from within a room, and their K [V, 3, 3], for a splat without cameras; of LOOKOUT_SIZE.
+
+    Args: means [N, 3] scene units, opacities [N] in (0, 1); up [3] unit.
+    Choices: nine places about the middle of what is opaque, at half its height, looking six ways, and up and down.
+    """
+    turn = upright(up)
+    solid = means[opacities > 0.5] if (opacities > 0.5).any() else means
+    low, high = np.quantile(solid @ turn.T, (0.02, 0.98), axis=0)
+    width, height = LOOKOUT_SIZE
+    focal = width / 2 / np.tan(LOOKOUT_ANGLE / 2)
+    K = np.array([[focal, 0, width / 2], [0, focal, height / 2], [0, 0, 1.0]])
+    poses = []
+    for x, y in np.ndindex(3, 3):
+        eye = low + (high - low) * (0.3 + 0.2 * x, 0.3 + 0.2 * y, 0.5)
+        for yaw, pitch in itertools.product(np.arange(6) * np.pi / 3, (0.25, -0.6)):
+            ahead = np.array([np.cos(yaw) * np.cos(pitch), np.sin(yaw) * np.cos(pitch), np.sin(pitch)])
+            right = np.array([np.sin(yaw), -np.cos(yaw), 0.0])
+            rotation = np.stack([right, np.cross(ahead, right), ahead])
+            pose = np.eye(4)
+            pose[:3, :3], pose[:3, 3] = rotation @ turn, -rotation @ eye
+            poses.append(pose)
+    return np.stack(poses), np.tile(K, (len(poses), 1, 1))
+
+
+def inverse_depths(means: np.ndarray, normals: np.ndarray, K: np.ndarray, nearest: float) -> np.ndarray:
+    """q [N, 3] of each Gaussian's plane, in a camera's frame: 1 / z = q · (u, v, 1) at pixel (u, v).
+
+    Choices: a plane that is seen at a grazing angle is taken to face the camera; its depth would be without bound.
+    """
+    along = np.einsum("nk,nk->n", normals, means)
+    grazing = np.abs(along) < GRAZING * np.linalg.norm(means, axis=1).clip(nearest)
+    planes: np.ndarray = normals @ np.linalg.inv(K) / np.where(grazing, 1.0, along)[:, None]
+    planes[grazing] = 0
+    planes[grazing, 2] = 1 / means[grazing, 2].clip(nearest)
+    return planes
+
+
+def fused(points: np.ndarray, eyes: np.ndarray, edge: float) -> Surface:
+    """The mean of the points in each cube of this edge that holds LEAST of them, and of their eyes."""
+    if len(points) == 0:
+        return Surface(points, eyes)
+    cells = np.floor((points - points.min(0)) / edge).astype(np.int64)
+    _, cell, count = np.unique(cells, axis=0, return_inverse=True, return_counts=True)
+    sums = np.zeros((2, len(count), 3))
+    np.add.at(sums[0], cell.ravel(), points)
+    np.add.at(sums[1], cell.ravel(), eyes)
+    kept = count >= LEAST
+    return Surface(*(total[kept] / count[kept, None] for total in sums))

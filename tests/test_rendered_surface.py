@@ -1,0 +1,81 @@
+"""Rendered depth lies on the planes that Gaussians are, wherever they are looked at from."""
+
+import numpy as np
+import pytest
+
+from chebsplat.cameras import centers, common_up, upright
+from chebsplat.lifting.surface import EDGE, LEAST, fused, inverse_depths, lookouts, surface
+from chebsplat.synthetic.path import intrinsics, look_at
+
+SIZE = 96, 72
+K = intrinsics(*SIZE)
+
+
+def tiles(normal, middle, spacing=0.1, half=8):
+    """Flat Gaussians that tile a plane: raw parameters."""
+    normal = np.asarray(normal, float) / np.linalg.norm(normal)
+    first = np.cross(normal, [1.0, 0, 0] if abs(normal[0]) < 0.9 else [0, 1.0, 0])
+    first /= np.linalg.norm(first)
+    axes = np.stack([first, np.cross(normal, first), normal], 1)
+    a, b = np.meshgrid(*[spacing * np.arange(-half, half + 1)] * 2)
+    means = np.asarray(middle) + np.stack([a.ravel(), b.ravel(), 0 * a.ravel()], 1) @ axes.T
+    from scipy.spatial.transform import Rotation
+
+    n, quat = len(means), Rotation.from_matrix(axes).as_quat(scalar_first=True)
+    scales = np.log([0.7 * spacing, 0.7 * spacing, 1e-3])
+    raw = {"means": means, "quats": np.tile(quat, (n, 1)), "log_scales": np.tile(scales, (n, 1))}
+    raw |= {"logit_opacities": np.full(n, 4.0), "sh0": np.zeros((n, 1, 3))}
+    return {name: values.astype(np.float32) for name, values in raw.items()}, normal
+
+
+@pytest.mark.parametrize("unit", [1.0, 30.0])
+@pytest.mark.parametrize("normal", [(0, 0, 1.0), (1.0, 0.2, 0.3)])
+def test_points_lie_on_the_plane_that_tilted_gaussians_tile(normal, unit):
+    raw, normal = tiles(normal, (0.2, -0.1, 0.5))
+    raw["means"] *= unit
+    raw["log_scales"] += np.float32(np.log(unit))
+    middle = unit * np.array([0.2, -0.1, 0.5])
+    poses = np.stack(
+        [look_at(middle + unit * (1.2 * normal + offset), middle) for offset in ((0.5, 0.1, 0), (0, 0.6, 0.2))]
+    )
+    found = surface(raw, poses, np.stack([K, K]), SIZE, unit)
+    assert len(found.means) > 200
+    assert np.abs((found.means - middle) @ normal).max() < 0.01 * unit
+    assert (np.linalg.norm(found.eyes - middle, axis=1) < 2 * unit).all()
+
+
+def test_a_plane_s_inverse_depth_is_linear_in_pixels():
+    rng = np.random.default_rng(0)
+    means, normals = rng.normal((0, 0, 3), 0.3, (50, 3)), rng.normal(size=(50, 3))
+    normals /= np.linalg.norm(normals, axis=1, keepdims=True)
+    planes = inverse_depths(means, normals, K, 0.05)
+    for mean, normal, plane in zip(means, normals, planes, strict=True):
+        pixel = np.array([40.0, 30.0, 1.0])
+        ray = np.linalg.inv(K) @ pixel
+        facing = abs(normal @ mean) < 0.15 * np.linalg.norm(mean)
+        depth = mean[2] if facing else normal @ mean / (normal @ ray)
+        assert plane @ pixel == pytest.approx(1 / depth, rel=1e-9)
+
+
+def test_lookouts_see_a_room_from_within_whichever_way_is_up():
+    rng = np.random.default_rng(0)
+    means = rng.uniform((-2, -3, 0), (2, 3, 2.5), (500, 3))
+    for up in ((0, 0, 1.0), (0, -1.0, 0), (0.6, 0, 0.8)):
+        turn = upright(np.array(up))
+        poses, Ks = lookouts(means @ turn, np.full(500, 0.9), np.array(up))
+        eyes = centers(poses) @ turn.T
+        assert len(poses) == len(Ks) == 108
+        assert (np.abs(eyes - (0, 0, 1.25)) < (1.2, 1.8, 0.2)).all()
+        found, sure = common_up(poses)
+        np.testing.assert_allclose(found, up, atol=1e-6)
+        assert sure > 0.8
+
+
+def test_cubes_of_few_pixels_and_empty_views_give_no_points():
+    points = np.array([[0, 0, 0.01]] * LEAST + [[1.0, 1, 1]] * (LEAST - 1))
+    found = fused(points, points + 1, EDGE)
+    np.testing.assert_allclose(found.means, [[0, 0, 0.01]])
+    np.testing.assert_allclose(found.eyes, [[1, 1, 1.01]])
+    raw, _ = tiles((0, 0, 1.0), (0, 0, 0))
+    away = look_at(np.array([0, 0, 1.0]), np.array([1.0, 0, 1.2]))[None]
+    assert len(surface(raw, away, K[None], SIZE).means) == 0

@@ -1,0 +1,163 @@
+"""Which knowledge of shape a scene starts from, and what teaches it."""
+
+import json
+import shutil
+
+import numpy as np
+import pytest
+from shared import INPUTS, KEY, run_stage
+from tiny_teachers import color_teacher, knowing_rooms
+
+from chebsplat.errors import ConfigError, InputError
+from chebsplat.formats import artifact
+from chebsplat.formats.features import read_features
+from chebsplat.formats.knowledge import ENCODER, SHIPPED, read_knowledge
+from chebsplat.formats.manifest import Manifest
+from chebsplat.pipelines.knowledge import teaching
+from chebsplat.pipelines.plan import Planner
+from chebsplat.stages.known_shapes import into_channels
+from chebsplat.synthetic import CLASS_NAMES
+from chebsplat.synthetic.seeds import HELD_OUT, KNOWLEDGE, REFERENCE, SCENES, TRAINING
+
+
+def refine_of(settings="", scene="office0"):
+    plan = Planner().plan(scene, settings)
+    return next(step for step in plan.steps if step.stage == "refine"), plan.left_out
+
+
+def test_a_scene_starts_from_the_knowledge_that_ships_unless_it_is_told_not_to(quick_plans):
+    step, left_out = refine_of()
+    assert step.inputs["knowledge"].name == artifact.read_manifest(SHIPPED).key
+    assert {"describe", "onnx"} <= set(left_out)
+    assert "knowledge of shape" not in left_out
+    for settings in ("refine.knowledge=none", "train.encoder=transformer", "train.encoder=off"):
+        step, left_out = refine_of(settings)
+        assert not {"knowledge", "points"} & set(step.inputs), settings
+        assert left_out["knowledge of shape"]
+    assert "knowledge" in refine_of("teacher.kind=labels")[0].inputs  # by the names of its classes
+    assert "knowledge" in refine_of(f"train.encoder=off,refine.knowledge={SHIPPED}")[0].inputs
+
+
+def test_where_knowledge_lies_is_no_matter_and_damage_is_noticed(quick_plans, tmp_path):
+    shutil.copytree(SHIPPED, tmp_path / "mine")
+    assert refine_of("refine.knowledge=mine")[0].key == refine_of()[0].key
+    (tmp_path / "mine/weights.safetensors").write_bytes(b"x")
+    with pytest.raises(InputError, match=r"weights\.safetensors"):
+        refine_of("refine.knowledge=mine")
+
+
+def test_a_scene_of_a_sequence_trains_the_encoder_that_a_basis_is_of(quick_plans):
+    plan = Planner().plan("office0", keep_knowledge=True)
+    train = next(step for step in plan.steps if step.stage == "train")
+    assert train.sections["train"]["encoder"] == "transformer"
+    assert "cks" in plan.targets
+    assert "knowledge of shape" in plan.left_out
+
+
+def test_another_teacher_has_none_until_it_is_taught(quick_plans, tmp_path):
+    model = knowing_rooms(color_teacher(tmp_path, name="mine"))
+    step, left_out = refine_of(f"teacher.kind=onnx,teacher.model={model}")
+    assert "knowledge" not in step.inputs
+    assert "chebsplat knowledge" in left_out["knowledge of shape"]
+    plan = teaching(Planner(), model, "knowledge.n_rooms=2")
+    assert [step.stage for step in plan.steps] == ["channels", "teach"]
+    assert plan.steps[1].sections["knowledge"]["n_rooms"] == 2
+    closed = color_teacher(tmp_path, name="closed", output="logits")
+    with pytest.raises(ConfigError, match="output is logits"):
+        teaching(Planner(), closed)
+
+
+def test_no_room_of_knowledge_is_one_of_a_scene_a_test_or_the_teacher():
+    ranges = (SCENES, REFERENCE, HELD_OUT, TRAINING, KNOWLEDGE)
+    assert sum(map(len, ranges)) == len(set().union(*ranges))
+    with pytest.raises(ValueError, match="not one for knowledge"):
+        from chebsplat.stages.settings import KnowledgeSection
+        from chebsplat.stages.teaching_rooms import rooms_of
+
+        rooms_of(101, KnowledgeSection(), None, np.eye(3))
+
+
+def test_what_ships_is_whole_small_and_says_what_it_was_taught():
+    manifest = artifact.verify(SHIPPED, "chebsplat.knowledge/1")
+    knowledge = read_knowledge(SHIPPED)
+    assert sum(path.stat().st_size for path in SHIPPED.iterdir()) < 2_000_000
+    assert "/" not in json.dumps(manifest.config)  # no path of the machine that taught it
+    assert knowledge.card["n_rooms"] >= 64
+    assert knowledge.card["held_out"]["shape"] > 0.8
+    assert set(CLASS_NAMES) <= set(knowledge.words)
+    assert (SHIPPED / ENCODER).is_file()
+
+
+@pytest.mark.xdist_group("toy")
+def test_scenes_of_codes_meet_knowledge_through_words(toy):
+    knowledge, features = read_knowledge(toy["teach"]), read_features(toy["teacher"])
+    words = [knowledge.words.index(name) for name in features.label_names]
+    translated = into_channels(toy["teach"], knowledge, features)
+    answers = knowledge.embeddings[words].astype(np.float32)
+    made = translated(answers)
+    assert made.shape == features.label_embeddings.shape
+    share = np.exp(10 * answers @ answers.T / np.linalg.norm(answers, axis=1)[:, None])
+    share /= share.sum(1, keepdims=True)
+    np.testing.assert_allclose(made, share @ features.label_embeddings, atol=1e-4)
+
+
+@pytest.mark.xdist_group("toy")
+def test_onnx_of_a_taught_encoder_says_what_torch_says(toy):
+    import onnxruntime
+
+    from chebsplat.shape.point_encoder import PointEncoder
+    from chebsplat.shape.point_inputs import point_inputs
+    from chebsplat.splats.gaussians import local_shape
+
+    knowledge = read_knowledge(toy["teach"])
+    means = np.random.default_rng(0).uniform(0, 3, (400, 3))
+    covariances, normals = local_shape(means, 16)
+    inputs = point_inputs(means, normals, covariances, up=np.array([0, 0, 1.0]))
+    wanted = PointEncoder.restored(knowledge.encoder, knowledge.weights).predict(inputs)
+    runner = onnxruntime.InferenceSession(toy["teach"] / ENCODER, providers=["CPUExecutionProvider"])
+    given = inputs._asdict() | {"neighbors": inputs.neighbors.astype(np.int64)}
+    np.testing.assert_allclose(runner.run(None, given)[0], wanted, rtol=1e-5, atol=1e-5)
+    assert artifact.read_manifest(toy["teach"]).facts["largest_difference"] < 1e-5
+
+
+def refined(toy, out, **changes):
+    """Facts of a refine stage of the toy with some inputs changed or, where None, left away."""
+    inputs = {role: toy[of] for role, of in INPUTS["refine"].items()} | changes
+    assert run_stage("refine", out, {role: path for role, path in inputs.items() if path is not None}) == 0
+    return artifact.read_manifest(out).facts
+
+
+@pytest.mark.xdist_group("toy")
+def test_shape_is_told_of_depth_s_points_or_of_what_the_gaussians_show(toy, tmp_path):
+    from chebsplat.formats.capture import SCHEMA, read_capture, write_capture
+
+    assert refined(toy, tmp_path / "a")["knowledge"]["of"] == "points"
+    capture = read_capture(toy["ingest"])
+    capture.depth = None
+    with artifact.publish(tmp_path / "flat", Manifest(SCHEMA, KEY, "test")) as tmp:
+        write_capture(tmp, capture)
+    facts = refined(toy, tmp_path / "b", capture=tmp_path / "flat")
+    assert facts["knowledge"]["of"] == "rendered depth"
+    assert facts["unit_from"] == "source"  # generated: metric without depth, too
+    assert "knowledge" not in refined(toy, tmp_path / "c", knowledge=None)
+
+
+@pytest.mark.xdist_group("toy")
+def test_labels_without_a_word_leave_knowledge_out_and_say_so(toy, tmp_path):
+    from chebsplat.formats.features import SCHEMA, write_features
+
+    features = read_features(toy["teacher"])
+    features.label_names = ["thingamajig", *features.label_names[1:]]
+    with artifact.publish(tmp_path / "f", Manifest(SCHEMA, KEY, "test")) as tmp:
+        write_features(tmp, features)
+    facts = refined(toy, tmp_path / "out", features=tmp_path / "f")
+    assert "thingamajig" in facts["left_out"]["knowledge of shape"]
+    assert facts["changed_by_knowledge"] == 0
+
+
+@pytest.mark.xdist_group("toy")
+def test_knowledge_of_another_teacher_is_refused(toy):
+    features = read_features(toy["teacher"])
+    features.convention |= {"kind": "onnx", "output": "features", "teacher": "another"}
+    with pytest.raises(InputError, match="the scene has another; teach knowledge for it"):
+        into_channels(toy["teach"], read_knowledge(toy["teach"]), features)
