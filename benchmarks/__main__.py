@@ -40,11 +40,15 @@ BENCHMARKS = {
     "descriptor": Benchmark("descriptor.main", "routes to the descriptor: error against run time, growth of sampling"),
     "shapes": Benchmark("shapes.main", "which shapes a classifier tells apart, ours beside FPFH and others"),
     "encoder": Benchmark(
-        "encoder", "the region encoder: error against run time of torch and onnxruntime", ("export", "onnx")
+        "encoder",
+        "the region encoder: error against run time of torch and onnxruntime",
+        ("export", "onnx"),
+        "train.encoder=transformer",
     ),
     "lift": Benchmark(
         "lift", "features lifted to a finished scene: seconds, error", ("train", "teacher"), "train.features=lifted"
     ),
+    "teaching": Benchmark("teaching", "what the encoder of points owes to rooms, radii, descriptor, size"),
     "layouts": Benchmark("layouts", "the exported layouts: bytes, and images beside the checkpoint's", ("export",)),
     "store": Benchmark("store", "the feature store: bytes, error, label decisions, bandwidth, memory"),
     "stability": Benchmark("stability.main", "every extreme case of the maths, naive and ours; fails if one does"),

@@ -20,7 +20,7 @@ from chebsplat.pipelines.scenes import read_toml
 from chebsplat.stages.config import Config
 from chebsplat.training.trainer import Trainer
 
-BAR, TURN, REHEARSAL = 1.6, 50, 100
+BAR, TURN, REHEARSAL = 1.25, 50, 100
 
 
 def begun(work: Path, ablation: str, steps: int) -> Trainer:

@@ -28,7 +28,13 @@ def main(arguments: Sequence[str]) -> None:
     options = parser.parse_args(arguments)
     print(f"chebsplat {chebsplat.__version__}, torch {torch.__version__} on {torch.get_num_threads()} threads; "
           f"{os.cpu_count()} cores, load {os.getloadavg()[0]:.1f}")  # fmt: skip
-    train = {"coarse_until": 0.0, "encode_from": 0.0, "n_densify": 0, "refresh_every": 1_000_000}
+    train = {
+        "encoder": "transformer",
+        "coarse_until": 0.0,
+        "encode_from": 0.0,
+        "n_densify": 0,
+        "refresh_every": 1_000_000,
+    }
     config = Config.model_validate({"train": train})
     plain = trainer_from(options.work, config)
     assert plain.model.shape is not None

@@ -43,7 +43,7 @@ def staleness(old: torch.Tensor, new: torch.Tensor) -> tuple[float, float]:
 def main(arguments: Sequence[str]) -> None:
     parser = shared.parser("refresh", __doc__, work=True)
     options = parser.parse_args(arguments)
-    train = {"n_densify": 0, "refresh_every": 1_000_000}
+    train = {"encoder": "transformer", "n_densify": 0, "refresh_every": 1_000_000}
     trainer = trainer_from(options.work, Config.model_validate({"train": train}))
     begin = round(trainer.settings.encode_from * trainer.settings.steps)
     before, spent, began = torch.zeros(0), 0.0, 0.0

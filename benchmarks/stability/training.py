@@ -57,7 +57,14 @@ def tiny_trainer(
     means = sphere(300) if means is None else means
     colors = (torch.rand(len(means), 3, generator=torch.Generator().manual_seed(2)) * 255).byte().numpy()
     shapes = local_shape(means, 8)[0] if len(means) > 1 else np.eye(3, dtype=np.float32)[None] * 0.01
-    small = {"steps": 20, "min_gaussians": 8, "max_gaussians": len(means) + 100, "n_densify": 2, "width": 16}
+    small = {
+        "encoder": "transformer",
+        "steps": 20,
+        "min_gaussians": 8,
+        "max_gaussians": len(means) + 100,
+        "n_densify": 2,
+        "width": 16,
+    }
     config = Config.model_validate(
         {"train": small | settings, "describe": {"n_regions": 24, "region_size": 16} | (describe or {})}
     )
