@@ -115,7 +115,7 @@ def test_views_count_by_how_far_their_halves_agree():
     halves = np.array([[[1.0, 0], [1, 0], [2, 0], [0, 0]], [[1, 0], [0, 1], [1, 1], [1, 0]]])
     views = np.array([[2, 2, 2, 0], [1, 1, 1, 1]])
     mean = (1 + 0 + 0.5**0.5) / 3
-    np.testing.assert_allclose(reliable(halves, views), [1, 0, 0.5**6, mean**12], rtol=1e-5)
+    np.testing.assert_allclose(reliable(halves, views), [1, 0, 0.5**3, mean**6], rtol=1e-5)
     np.testing.assert_array_equal(reliable(halves, 0 * views), 1)
 
 

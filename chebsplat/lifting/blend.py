@@ -11,7 +11,7 @@ from chebsplat.lifting.smoothing import Affinities, smooth
 STRENGTHS = (0.0, 0.5, 1.0, 2.0, 4.0, 8.0)  # views that knowledge may count for
 ALIKE = 0.2  # correlation of the errors of two views of a thing
 SURE = 3  # power of its length by which knowledge counts
-AGREED = 12  # power of the agreement of two halves of the views by which views count
+AGREED = 6  # power of the agreement of two halves of the views by which views count
 LEAST = 1.0  # strength: what a teacher gets wrong alike in both halves counts as right when they are asked
 
 
