@@ -75,7 +75,7 @@ def before(planner: Planner, text: str, settings: str, ablation: str) -> tuple[l
     Raises: ConfigError on a name or revision that does not exist; InputError on a damaged artifact.
     """
     if is_folder(text):
-        path = taken_in(Path(text).expanduser(), planner.running)
+        path = store.taken_in(Path(text).expanduser(), "cks", SCHEMA, planner.running)
         return [], path, path.name
     reference = parse(text)
     if is_sequence(reference.name):
@@ -122,15 +122,6 @@ def revisions(text: str) -> list[Path]:
             f"run make sequence={reference.name}, or name the folder of another (work/*/cks)"
         )
     return found
-
-
-def taken_in(folder: Path, running: bool) -> Path:
-    """The artifact's place in the store; to run, one from elsewhere is copied there, and the copy verified."""
-    manifest = artifact.verify(folder, SCHEMA)
-    path = store.artifact_path("cks", manifest.key)
-    if running and not store.is_fresh(path):
-        artifact.copy(folder, path, manifest)
-    return path
 
 
 def extend(name: str, gaussians: Path, scene: str) -> list[Path]:

@@ -6,7 +6,6 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from chebsplat.errors import ConfigError
-from chebsplat.formats import artifact
 from chebsplat.formats.knowledge import SCHEMA, SHIPPED, read_card
 from chebsplat.formats.teacher_model import EMBEDDED, read_teacher
 from chebsplat.pipelines import store
@@ -49,17 +48,8 @@ def given(config: Config, kind: str, running: bool) -> tuple[Path | None, str]:
     if wanted is None and config.train.encoder != "points":
         return None, f"train.encoder is {config.train.encoder}"
     if wanted is not None:
-        return _taken_in(Path(expanded(wanted)).expanduser().resolve(), running), ""
+        return store.taken_in(Path(expanded(wanted)).expanduser().resolve(), "teach", SCHEMA, running), ""
     model = read_teacher(Path(config.teacher.model or EMBEDDED)) if kind == "onnx" else None
     if model is not None and model.output == "features" and model.name != read_card(SHIPPED)["teacher"]:
         return None, f"none was taught for the teacher {model.name}; `chebsplat knowledge` teaches it"
-    return _taken_in(SHIPPED, running), ""
-
-
-def _taken_in(folder: Path, running: bool) -> Path:
-    """Its place in the store; to run, it is copied there."""
-    manifest = artifact.verify(folder, SCHEMA)
-    path = store.artifact_path("teach", manifest.key)
-    if running and not store.is_fresh(path):
-        artifact.copy(folder, path, manifest)
-    return path
+    return store.taken_in(SHIPPED, "teach", SCHEMA, running), ""

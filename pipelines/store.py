@@ -192,3 +192,15 @@ def remove(path: Path) -> None:
         return
     (path / "artifact.json").unlink(missing_ok=True)
     shutil.rmtree(path, ignore_errors=True)
+
+
+def taken_in(folder: Path, stage: str, schema: str, running: bool) -> Path:
+    """The place in the store of a stage's artifact that lies elsewhere; to run, it is copied there, and verified.
+
+    Raises: InputError on a damaged artifact, or one of another schema.
+    """
+    manifest = artifact.verify(folder, schema)
+    path = artifact_path(stage, manifest.key)
+    if running and not is_fresh(path):
+        artifact.copy(folder, path, manifest)
+    return path

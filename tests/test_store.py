@@ -106,6 +106,6 @@ def test_a_folder_s_manifest_cannot_say_where_its_copy_goes(work, tmp_path, key)
     file.write_text(json.dumps(json.loads(file.read_text()) | {"key": key}))
     before = sorted(tmp_path.rglob("*"))
     with pytest.raises(InputError, match="key is not 16 hexadecimal digits"):
-        bases.taken_in(folder, running=True)
+        store.taken_in(folder, "cks", "chebsplat.basis/3", running=True)
     assert sorted(tmp_path.rglob("*")) == before
     assert not os.path.lexists("/tmp/elsewhere")
