@@ -1,6 +1,7 @@
 """Semantic 3D Gaussian Splatting that understands shape."""
 
 import os
+from typing import Any
 
 # Idle OpenMP threads must sleep: spinning ones cost an order of magnitude on a busy machine. But not at once: a few
 # microseconds of waiting spare most wake-ups, a third of a training step, and cost a busy machine nothing measurable.
@@ -15,3 +16,18 @@ if os.environ.get("OMP_NUM_THREADS", "").isdigit():
 os.environ.setdefault("ORT_DISABLE_TELEMETRY", "1")
 
 __version__ = "0.2.0"
+
+API = ("load", "run_stage", "train")
+
+
+def __getattr__(name: str) -> Any:
+    """`chebsplat.load`, `train` and `run_stage`, which are imported when first asked for: most commands need none."""
+    if name in API:
+        from chebsplat.pipelines import api
+
+        return getattr(api, name)
+    raise AttributeError(f"module 'chebsplat' has no attribute {name!r}")
+
+
+def __dir__() -> list[str]:
+    return [*globals(), *API]

@@ -7,7 +7,8 @@ import torch
 from torch import Tensor
 
 from chebsplat.rasterize import rasterize
-from chebsplat.splats.gaussians import activated
+from chebsplat.splats.gaussians import activated, surface_of
+from chebsplat.splats.planes import inverse_depths
 from chebsplat.splats.sh import eval_sh
 from chebsplat.views import View, in_frustum
 
@@ -35,6 +36,7 @@ class SceneRenderer:
         raw = {name: torch.from_numpy(np.ascontiguousarray(values)) for name, values in parameters.items()}
         self.means, self.quats, self.scales, self.opacities = activated(raw)
         self.raw, self.reach = raw, 3 * self.scales.amax(1)
+        self.normals = surface_of(parameters)[0].astype(np.float64)
 
     @torch.no_grad()
     def render(self, view: View, with_features: bool = False) -> tuple[np.ndarray, np.ndarray | None]:
@@ -52,3 +54,25 @@ class SceneRenderer:
         render, _, _ = rasterize(*gaussians, channels, *camera)
         image = (render[0, ..., :3].clamp(0, 1) * 255).round().byte().numpy()
         return image, render[0, ..., 3:].numpy() if channels.shape[1] > 3 else None
+
+    @torch.no_grad()
+    def render_depth(self, view: View, nearest: float = 0.01) -> tuple[np.ndarray, np.ndarray]:
+        """Depth along the camera's axis f32 [H, W], scene units, and coverage f32 [H, W] in [0, 1].
+
+        Args: nearest: scene units; what is nearer has no depth.
+        Returns: depth is nan where nothing is covered.
+        Choices: Gaussians are planes, whose inverse depths are averaged by α T (`splats.planes.inverse_depths`).
+        """
+        index = in_frustum(self.means, view, self.reach)
+        K, pose = (matrix.numpy().astype(np.float64) for matrix in (view.K, view.viewmat))
+        means = self.means[index].numpy().astype(np.float64) @ pose[:3, :3].T + pose[:3, 3]
+        planes = inverse_depths(means, self.normals[index.numpy()] @ pose[:3, :3].T, K, nearest)
+        gaussians = (self.means[index], self.quats[index], self.scales[index], self.opacities[index])
+        camera = (view.viewmat[None], view.K[None], view.width, view.height)
+        render, alpha, _ = rasterize(*gaussians, torch.from_numpy(planes.astype(np.float32)), *camera)
+        u, v = np.meshgrid(np.arange(view.width) + 0.5, np.arange(view.height) + 0.5)
+        covered, q = alpha[0, ..., 0].numpy(), render[0].numpy()
+        inverse = q[..., 0] * u + q[..., 1] * v + q[..., 2]
+        seen = (covered > 1e-3) & (inverse > 0) & (inverse * nearest < covered)
+        depth = np.divide(covered, inverse, out=np.full(covered.shape, np.nan), where=seen)
+        return depth.astype(np.float32), covered

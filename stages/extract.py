@@ -3,13 +3,15 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 from chebsplat.errors import ConfigError, DataFailure
 from chebsplat.formats.files import atomic_path
 from chebsplat.formats.names import suggest
 
 if TYPE_CHECKING:
+    from collections.abc import Sequence
+
     import numpy as np
 
     from chebsplat.formats.scene import Scene
@@ -31,7 +33,6 @@ def extract(
     Raises:  ConfigError on a filter that the scene cannot answer, DataFailure if nothing is left.
     """
     import numpy as np
-    from scipy.special import expit
 
     from chebsplat.formats.ply import write_ply
     from chebsplat.formats.scene import read_scene
@@ -41,14 +42,7 @@ def extract(
     if out.exists():
         raise ConfigError(f"{out} exists; remove it, or choose another --out")
     scene = read_scene(path)
-    filters: dict[str, Any] = {}
-    if labels:
-        filters["label"] = has_label(scene, path, labels)
-    if min_opacity > 0:
-        filters["opacity"] = expit(scene.parameters["logit_opacities"]) >= min_opacity
-    if box is not None:
-        means = scene.parameters["means"]
-        filters["box"] = ((means >= box[:3]) & (means <= box[3:])).all(1)
+    filters = passing(scene, path, labels, min_opacity, box)
     n = len(scene.parameters["means"])
     left_out = {name: int(n - keep.sum()) for name, keep in filters.items()}
     kept = np.logical_and.reduce([np.ones(n, bool), *filters.values()])
@@ -60,6 +54,23 @@ def extract(
     with atomic_path(out) as temporary:
         write_ply(temporary, part, int(part["degrees"].max()), held, scene.label_names)
     return {"kept": int(kept.sum()), "of": n} | {f"left out by {name}": number for name, number in left_out.items()}
+
+
+def passing(
+    scene: Scene, path: Path, labels: tuple[str, ...], min_opacity: float, box: Sequence[float] | None
+) -> dict[str, np.ndarray]:
+    """Which Gaussians pass each filter that is asked for, bool [N] by its name. Args and errors as of `extract`."""
+    from scipy.special import expit
+
+    filters: dict[str, np.ndarray] = {}
+    if labels:
+        filters["label"] = has_label(scene, path, labels)
+    if min_opacity > 0:
+        filters["opacity"] = expit(scene.parameters["logit_opacities"]) >= min_opacity
+    if box is not None:
+        means = scene.parameters["means"]
+        filters["box"] = ((means >= list(box[:3])) & (means <= list(box[3:]))).all(1)
+    return filters
 
 
 def has_label(scene: Scene, path: Path, names: tuple[str, ...]) -> np.ndarray:

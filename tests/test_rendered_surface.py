@@ -4,7 +4,8 @@ import numpy as np
 import pytest
 
 from chebsplat.cameras import centers, common_up, upright
-from chebsplat.lifting.surface import EDGE, LEAST, fused, inverse_depths, lookouts, surface
+from chebsplat.lifting.surface import EDGE, LEAST, fused, lookouts, surface
+from chebsplat.splats.planes import inverse_depths
 from chebsplat.synthetic.path import intrinsics, look_at
 
 SIZE = 96, 72

@@ -15,8 +15,8 @@ import torch
 from chebsplat.cameras import upright
 from chebsplat.rasterize import rasterize
 from chebsplat.splats.gaussians import activated, surface_of
+from chebsplat.splats.planes import inverse_depths
 
-GRAZING = 0.15  # cosine of the view's angle to a plane below which its depth is that of the centre
 OPAQUE = 0.8  # least coverage of a pixel whose depth counts
 NEAREST = 0.05  # metres
 EDGE = 0.04  # metres, of the cubes that one point stands for
@@ -92,19 +92,6 @@ def lookouts(means: np.ndarray, opacities: np.ndarray, up: np.ndarray) -> tuple[
             pose[:3, :3], pose[:3, 3] = rotation @ turn, -rotation @ eye
             poses.append(pose)
     return np.stack(poses), np.tile(K, (len(poses), 1, 1))
-
-
-def inverse_depths(means: np.ndarray, normals: np.ndarray, K: np.ndarray, nearest: float) -> np.ndarray:
-    """q [N, 3] of each Gaussian's plane, in a camera's frame: 1 / z = q · (u, v, 1) at pixel (u, v).
-
-    Choices: a plane that is seen at a grazing angle is taken to face the camera; its depth would be without bound.
-    """
-    along = np.einsum("nk,nk->n", normals, means)
-    grazing = np.abs(along) < GRAZING * np.linalg.norm(means, axis=1).clip(nearest)
-    planes: np.ndarray = normals @ np.linalg.inv(K) / np.where(grazing, 1.0, along)[:, None]
-    planes[grazing] = 0
-    planes[grazing, 2] = 1 / means[grazing, 2].clip(nearest)
-    return planes
 
 
 def fused(points: np.ndarray, eyes: np.ndarray, edge: float) -> Surface:

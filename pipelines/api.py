@@ -1,0 +1,101 @@
+"""Python's way in: open a finished scene, bring a scene up to date, run one stage. The command line does the same."""
+
+from __future__ import annotations
+
+import json
+import os
+import re
+from collections.abc import Mapping
+from contextlib import suppress
+from pathlib import Path
+from typing import Any
+
+from chebsplat.errors import ChebsplatError, ConfigError, InputError
+from chebsplat.stages.opened import Camera, OpenedScene, Picture
+
+__all__ = ["Camera", "OpenedScene", "Picture", "load", "run_stage", "train"]
+
+
+def load(scene: str | Path) -> OpenedScene:
+    """Open a finished scene.
+
+    Args: scene: its name, its photo folder, its folder in `work`, or an `export` artifact.
+    Raises: ConfigError or InputError, which name what is missing and the remedy.
+    """
+    from chebsplat.formats.scene import read_scene
+    from chebsplat.pipelines.finished import artifact_of, is_artifact, scene_folder
+
+    path = artifact_of(str(scene), "export")
+    teacher = None
+    with suppress(ConfigError, InputError):  # an artifact alone, of no scene in `work`
+        teacher = scene_folder(str(scene)) / "teacher"
+    return OpenedScene(read_scene(path), Path(scene), teacher if teacher and is_artifact(teacher) else None)
+
+
+def train(
+    capture: str | Path,
+    *,
+    ablation: str = "",
+    basis: str = "",
+    cores: int | None = None,
+    device: str = "auto",
+    **settings: dict[str, Any],
+) -> OpenedScene:
+    """Bring a scene up to date from photos to report, computing only what is stale, and open it.
+
+    Args:
+      capture:  a folder of photos or another source, or the name of a scene.
+      ablation: a named set of settings; basis: as of `make scene=… basis=`; cores: default: all.
+      settings: sections of settings by name, as `train={"steps": 1000}` (`chebsplat settings` lists them).
+    Raises: ConfigError or InputError before anything runs; ChebsplatError if a stage fails, whose log says why.
+    """
+    from chebsplat.pipelines import store
+    from chebsplat.pipelines.cli.runs import plans
+    from chebsplat.pipelines.run import device_of, execute
+
+    chosen = plans(str(capture), None, as_text(settings), ablation, basis, running=True)
+    if execute(chosen, None, cores or os.cpu_count() or 1, device_of(device)):
+        raise ChebsplatError(f"{capture} could not be finished; the lines above name the stage and its log")
+    return load(store.work() / chosen[-1].title)
+
+
+def run_stage(
+    name: str, out: str | Path, inputs: Mapping[str, str | Path] | None = None, **settings: dict[str, Any]
+) -> Path:
+    """Run one stage in this process and publish its artifact at `out`; nothing if it is there already.
+
+    Args: name: of a stage; inputs: artifacts by role (`chebsplat STAGE --help` lists them); settings: sections by name.
+    Raises: ConfigError, InputError, DataFailure.
+    """
+    from importlib import import_module
+    from tempfile import TemporaryDirectory
+
+    from chebsplat.formats.names import suggest
+    from chebsplat.stages.command import publish
+    from chebsplat.stages.registry import STAGES
+
+    if name not in STAGES:
+        near = suggest(name, STAGES, 1)
+        raise ConfigError(f"no stage is called {name}" + (f"; did you mean {near[0]}?" if near else ""))
+    stage, given = STAGES[name], {role: Path(path) for role, path in (inputs or {}).items()}
+    needed = {role for role, _ in stage.inputs}
+    if unfit := sorted(needed - given.keys()) or sorted(given.keys() - stage.roles.keys()):
+        raise ConfigError(f"{name} {'needs' if unfit[0] in needed else 'does not read'} inputs[{unfit[0]!r}]; "
+                          f"it needs {', '.join(sorted(needed)) or 'none'}")  # fmt: skip
+    with TemporaryDirectory() as folder:
+        config = Path(folder) / "settings.json"
+        config.write_text(json.dumps(settings))
+        publish(name, import_module(f"chebsplat.stages.{name}").run, Path(out), given, config)
+    return Path(out)
+
+
+def as_text(settings: Mapping[str, Any]) -> str:
+    """Settings by section as `set=` takes them: section.key=value,... Raises ConfigError on what is no section."""
+    parts = []
+    for section, values in settings.items():
+        if not isinstance(values, Mapping):
+            raise ConfigError(f"{section} is a section: give a dict, as {section}={{'key': value}}")
+        for key, value in values.items():
+            plain = isinstance(value, str) and not re.search(r"""["',=\s]""", value)
+            parts.append(f"{section}.{key}={value if plain else json.dumps(value)}")
+    return ",".join(parts)

@@ -1,0 +1,131 @@
+"""A finished scene opened from Python: what it renders, answers and selects is what the stages say."""
+
+import numpy as np
+import pytest
+
+import chebsplat
+from chebsplat.errors import ConfigError
+from chebsplat.formats.ply import read_ply
+from chebsplat.formats.scene import read_scene
+from chebsplat.pipelines.api import as_text
+
+
+@pytest.fixture(scope="module")
+def scene(toy):
+    return chebsplat.load(toy["export"])
+
+
+def test_what_is_opened_is_the_exported_scene(scene, toy):
+    held = read_scene(toy["export"])
+    assert len(scene) == len(held.parameters["means"])
+    assert scene.features.shape == (len(scene), held.label_embeddings.shape[1])
+    assert [camera.name for camera in scene.cameras] == held.cameras.names
+    assert str(len(scene)) in repr(scene).replace(",", "")
+
+
+def test_a_render_is_the_one_that_was_evaluated(scene, toy):
+    from chebsplat.render import SceneRenderer
+    from chebsplat.stages.evaluate import camera
+
+    held, shown = read_scene(toy["export"]), scene.render(scene.cameras[2])
+    image, features = SceneRenderer(held.parameters).render(camera(held, 2), with_features=True)
+    np.testing.assert_array_equal(shown.color, image)
+    np.testing.assert_array_equal(shown.features, features)
+    assert shown.labels.min() >= -1
+    assert shown.labels.max() < len(scene.label_names)
+    assert (shown.labels[shown.alpha < 0.5] == -1).all()
+
+
+def test_depth_is_that_of_the_room(scene, toy):
+    from chebsplat.formats.capture import read_capture
+
+    capture = read_capture(toy["ingest"])
+    errors = []
+    for name in scene.cameras[0].name, scene.cameras[3].name:
+        view, truth = scene.camera(name), capture.depth[capture.names.index(name)]
+        found = scene.render(view).depth
+        both = np.isfinite(found) & (truth > 0)
+        assert both.mean() > 0.5
+        errors.append(np.abs(found - truth)[both] / truth[both])
+    assert np.median(np.concatenate(errors)) < 0.1
+
+
+def test_a_resized_camera_sees_the_same(scene):
+    small = scene.cameras[0].resized(scene.cameras[0].width // 2, scene.cameras[0].height // 2)
+    shown, whole = scene.render(small), scene.render(scene.cameras[0])
+    assert shown.color.shape[:2] == (small.height, small.width)
+    reduced = whole.color.astype(float).reshape(small.height, 2, small.width, 2, 3).mean((1, 3))
+    assert np.abs(reduced - shown.color).mean() < 12
+    eye = scene.cameras[0].cam_from_world @ [*scene.cameras[0].position, 1]
+    np.testing.assert_allclose(eye[:3], 0, atol=1e-6)
+
+
+def test_a_part_is_a_scene_and_a_ply(scene, tmp_path):
+    label = scene.label_names[int(np.bincount(scene.labels[scene.labels >= 0]).argmax())]
+    part = scene.select(label=label, min_opacity=0.05)
+    assert 0 < len(part) < len(scene)
+    assert set(part.labels) == {scene.label_names.index(label)}
+    path = part.to_ply(tmp_path / "part.ply")
+    parameters, _, labels = read_ply(path)
+    np.testing.assert_array_equal(parameters["means"], part.points()[0])
+    np.testing.assert_array_equal(labels, part.labels)
+    assert part.render(part.cameras[0]).alpha.max() <= 1
+    half = scene.select(np.arange(len(scene)) % 2 == 0)
+    assert len(half) == (len(scene) + 1) // 2
+    with pytest.raises(ConfigError, match="exists"):
+        part.to_ply(path)
+
+
+def test_a_query_is_that_of_the_command(toy):
+    from chebsplat.stages.opened import OpenedScene
+
+    held = read_scene(toy["export"])
+    scene = OpenedScene(held, toy["export"], toy["teacher"])
+    name = held.label_names[0]
+    scores = scene.query(name, against=held.label_names[1:])
+    assert scores.shape == (len(scene),)
+    assert scores[held.labels == 0].mean() > scores[held.labels > 0].mean()
+
+
+def test_what_cannot_be_is_said(scene):
+    with pytest.raises(ConfigError, match="no view zzz"):
+        scene.camera("zzz")
+    with pytest.raises(ConfigError, match=r"did you mean|there are"):
+        scene.select(label="zzz")
+    with pytest.raises(ConfigError, match="a mask bool"):
+        scene.select(np.ones(3, bool))
+    with pytest.raises(ConfigError, match="is left"):
+        scene.select(np.zeros(len(scene), bool))
+    with pytest.raises(ConfigError, match="artifact alone"):
+        scene.query("wall")
+    with pytest.raises(AttributeError):
+        chebsplat.nothing  # noqa: B018
+
+
+def test_settings_as_the_command_takes_them():
+    from chebsplat.pipelines.plan import overrides
+
+    given = {"train": {"steps": 10, "prune": False, "lr_means": 1e-4}, "source": {"path": "a, b"}}
+    assert overrides(as_text(given)) == given
+    with pytest.raises(ConfigError, match="is a section"):
+        as_text({"steps": 3})
+
+
+def test_one_stage_runs_alone(toy, tmp_path):
+    out = chebsplat.run_stage("export", tmp_path / "again", {"gaussians": toy["train"]})
+    assert len(chebsplat.load(out)) > 0
+    with pytest.raises(ConfigError, match="did you mean export"):
+        chebsplat.run_stage("exprt", tmp_path / "x")
+    with pytest.raises(ConfigError, match="needs inputs"):
+        chebsplat.run_stage("export", tmp_path / "x")
+
+
+def test_a_scene_is_brought_up_to_date_and_opened(quick_plans, monkeypatch):
+    from chebsplat.errors import ChebsplatError
+    from chebsplat.pipelines import run
+
+    asked = []
+    monkeypatch.setattr(run, "execute", lambda plans, stage, cores, device: asked.append(plans[0].title) or 4)
+    with pytest.raises(ChebsplatError, match="could not be finished"):
+        chebsplat.train("toy", train={"steps": 7})
+    assert asked == ["toy@train.steps=7"]
