@@ -60,6 +60,7 @@ def passing(
     scene: Scene, path: Path, labels: tuple[str, ...], min_opacity: float, box: Sequence[float] | None
 ) -> dict[str, np.ndarray]:
     """Which Gaussians pass each filter that is asked for, bool [N] by its name. Args and errors as of `extract`."""
+    import numpy as np
     from scipy.special import expit
 
     filters: dict[str, np.ndarray] = {}
@@ -69,7 +70,7 @@ def passing(
         filters["opacity"] = expit(scene.parameters["logit_opacities"]) >= min_opacity
     if box is not None:
         means = scene.parameters["means"]
-        filters["box"] = ((means >= list(box[:3])) & (means <= list(box[3:]))).all(1)
+        filters["box"] = np.all((means >= list(box[:3])) & (means <= list(box[3:])), axis=1)
     return filters
 
 

@@ -6,6 +6,8 @@ import re
 import pytest
 from shared import ROOT
 
+from chebsplat.formats.ply import read_ply
+from chebsplat.formats.scene import read_scene
 from chebsplat.stages.config import known_keys
 from chebsplat.stages.registry import STAGES
 
@@ -72,14 +74,20 @@ def test_citations_of_the_method_lead_to_a_section():
 
 
 @pytest.mark.xdist_group("toy")
-def test_the_python_of_the_readme_renders_a_scene(toy):
+def test_the_python_of_the_readme_renders_and_asks_a_scene(toy, tmp_path):
     text = (ROOT / "README.md").read_text()
     code = re.search(r"```python\n(.*?)```", text, re.DOTALL)[1]
-    assert '"work/office0/export"' in code
+    for stage in ("export", "teacher"):
+        (tmp_path / stage).symlink_to(toy[stage])
+    name = read_scene(toy["export"]).label_names[0]
+    for written, here in (("work/office0", tmp_path), ('"sofa"', f'"{name}", against=["{name}"]'), ("> 0.5", ">= 0")):
+        assert written in code
+        code = code.replace(written, str(here))
     found = {}
-    exec(code.replace("work/office0/export", str(toy["export"])), found)
-    assert found["image"].shape[2] == 3 and found["image"].std() > 0
-    assert found["features"].shape[:2] == found["image"].shape[:2]
+    exec(code.replace("sofa.ply", str(tmp_path / "part.ply")), found)
+    assert found["shown"].color.shape[2] == 3 and found["shown"].color.std() > 0
+    assert found["shown"].features.shape[:2] == found["shown"].labels.shape
+    assert len(read_ply(tmp_path / "part.ply")[0]["means"]) == len(found["scene"])
 
 
 def test_the_readme_is_short_and_answers_a_newcomer():
