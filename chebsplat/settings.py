@@ -121,6 +121,9 @@ class TrainSection(Section):
     width: int = number(32, "of the encoder's tokens", 4, 1024)
     n_layers: int = number(2, "of the encoder", 1, 64)
     n_heads: int = number(4, "of the encoder's attention; divides width", 1, 64)
+    feature_every: int | None = number(
+        None, "steps from one that teaches features to the next; default: views / 10, from 1 to 4", 1, 1_000_000
+    )
     encode_every: int = number(4, "steps from one that encodes regions anew to the next", 1, 1_000_000)
     regions_per_step: int = number(32, "encoded anew in such a step; the others come from the cache", 1, 4096)
     n_covers: int = number(4, "regions that reach a Gaussian, at most", 1, 64)
@@ -152,7 +155,7 @@ class TrainSection(Section):
     lr_sh0: float | None = number(None, "of SH band 0; default: 2.5e-3 (30,000 / steps)^0.41", 0, 10)
     lr_sh: float | None = number(None, "of SH bands 1 to 3; default: 1.25e-4 (30,000 / steps)^0.41", 0, 10)
     lr_features: float | None = number(
-        None, "of features; default: 10 / steps, at most 5e-2; more fits each view's errors", 0, 10
+        None, "of features; default: 10 / steps that teach them, at most 5e-2; more fits each view's errors", 0, 10
     )
     lr_encoder: float = number(3e-3, "learning rate of the encoder", 0, 10)
     lr_gates: float = number(1e-2, "learning rate of the printed gates' weights", 0, 10)

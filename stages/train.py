@@ -183,7 +183,8 @@ def follow(job: Job, trainer: Trainer, train: TrainSection) -> list[dict[str, fl
         job.facts["resumed_at"] = [*held["resumed_at"], trainer.step]
         log.info("resumed at step %d", trainer.step)
     with deferred() as asked:
-        losses: deque[float] = deque(maxlen=train.encode_every)  # some terms are in one step of so many alone
+        periods = train.encode_every, trainer.feature_every
+        losses: deque[float] = deque(maxlen=max(periods))  # some terms are in one step of so many alone
         rounds = job.progress.track(trainer.steps(), lambda: expected(trainer), "train", start=trainer.step)
         for figures, status in rounds:
             since.append(figures)

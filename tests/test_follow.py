@@ -23,7 +23,7 @@ class Alternating:
 
     def __init__(self, stop_at=None):
         self.step, self.seconds, self.stop_at = 0, 0.0, stop_at
-        self.views = SimpleNamespace(names=["a", "b"])
+        self.views, self.feature_every = SimpleNamespace(names=["a", "b"]), 1
         self.model = SimpleNamespace(sh_kept=lambda: 0.5)
         self.schedule = SimpleNamespace(last_step=lambda step, seconds: 12)
 

@@ -234,6 +234,24 @@ def test_the_features_rate_fits_the_number_of_steps(tiny_trainer, settings, rate
     assert groups["features"] == pytest.approx(rate)
 
 
+def test_features_are_taught_in_one_step_of_so_many_unless_views_are_few(tiny_trainer):
+    from chebsplat.settings import TrainSection
+    from chebsplat.training.schedule import feature_every, rates
+
+    settings = TrainSection(steps=1000)
+    assert [feature_every(settings, n) for n in (1, 10, 20, 40, 300)] == [1, 1, 2, 4, 4]
+    assert feature_every(TrainSection(feature_every=7), 10) == 7
+    assert rates(TrainSection(steps=1000, feature_every=4))["features"] == pytest.approx(4e-2)
+    made = tiny_trainer(steps=8, densify="off", prune=False, sh_prune=False, feature_every=3)
+    steps, changed = made.steps(), []
+    for _ in range(8):
+        before = made.model.raw["features"].detach().clone()
+        figures = next(steps)
+        changed.append(not torch.equal(before, made.model.raw["features"].detach()))
+        assert changed[-1] == ("loss_features" in figures)
+    assert changed == [False, False, True, False, False, True, False, False]
+
+
 def test_rates_follow_the_number_of_steps_unless_they_are_given():
     from chebsplat.settings import TrainSection
     from chebsplat.training.schedule import rates

@@ -19,7 +19,7 @@ from chebsplat.training.laps import Laps
 from chebsplat.training.losses import photometric
 from chebsplat.training.model import Rendered, SceneModel
 from chebsplat.training.population import Population, broken
-from chebsplat.training.schedule import Schedule, adam
+from chebsplat.training.schedule import Schedule, adam, feature_every
 from chebsplat.training.semantic_loss import semantic_loss
 from chebsplat.views import Views
 
@@ -48,6 +48,8 @@ class Trainer:
         regions: Regions | None = None,
         descriptors: Tensor | None = None,
     ):
+        self.feature_every = feature_every(settings, len(views.names))
+        settings = settings.model_copy(update={"feature_every": self.feature_every})
         self.model, self.views, self.settings, self.extent = model, views, settings, extent
         self.basis = basis if basis and model.shape is not None else {}
         self.schedule = Schedule(settings)
@@ -195,12 +197,13 @@ class Trainer:
     def _step(self, index: int, share: float) -> dict[str, float]:
         settings, factor = self.settings, self.schedule.factor(share)
         target, mask = self.views.target(index, factor)
-        pruning = self.schedule.prunes(share)
-        wanted = None if self.views.features is None else self.views.features(index)
+        pruning, taught = self.schedule.prunes(share), self.step % self.feature_every == 0
+        wanted = None if self.views.features is None or not taught else self.views.features(index)
         rendered = self.model.render(
             self.views.camera(index, factor),
             self.schedule.degree(share),
             masked=pruning,
+            semantic=taught,
             fused=self._encodes(share),
             generator=self.generator if self.step % settings.encode_every == 0 else None,
             grid=None if wanted is None else (wanted.shape[0], wanted.shape[1]),
