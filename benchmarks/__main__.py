@@ -48,6 +48,7 @@ BENCHMARKS = {
     "lift": Benchmark(
         "lift", "features lifted to a finished scene: seconds, error", ("train", "teacher"), "train.features=lifted"
     ),
+    "trust": Benchmark("trust", "whether views' agreement ranks 2D teachers as their true mIoU does; no training"),
     "teaching": Benchmark("teaching", "what the encoder of points owes to rooms, radii, descriptor, size"),
     "layouts": Benchmark("layouts", "the exported layouts: bytes, and images beside the checkpoint's", ("export",)),
     "store": Benchmark("store", "the feature store: bytes, error, label decisions, bandwidth, memory"),

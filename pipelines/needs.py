@@ -14,10 +14,20 @@ if TYPE_CHECKING:
 
 LIFTED = "train.features is lifted"
 POINTS = "train.encoder is points: the training holds none"
+PHOTOGRAPHS = ("photos", "colmap", "transforms", "seven_scenes")  # kinds of sources that hold photos of any place
+UNASKED = "no teacher is named"
+HOW = (
+    "the embedded one has seen generated rooms only. Bring one for photos (docs/teachers.md) and name it by "
+    "set=teacher.model=MODEL.onnx; teacher.kind=embedded uses the embedded one all the same"
+)
 
 
-def teacher_kind(config: Any, probe: dict[str, bool]) -> tuple[str, str]:
-    """The teacher really meant, and why there is none if there is none."""
+def teacher_kind(config: Any, source: str, probe: dict[str, bool]) -> tuple[str, str]:
+    """The teacher really meant, and why there is none if there is none.
+
+    Args: source: its kind; probe: what it has.
+    Choices: photographs without labels get the embedded teacher only if it is asked for: what it says of them is noise.
+    """
     wanted = config.teacher.kind
     if not config.train.semantics:
         return "none", "train.semantics is false"
@@ -25,20 +35,23 @@ def teacher_kind(config: Any, probe: dict[str, bool]) -> tuple[str, str]:
         raise ConfigError("teacher.kind is labels, but the source has none; use teacher.kind=auto, or teacher.model")
     if wanted == "given" and not probe.get("pseudo_labels"):
         raise ConfigError("teacher.kind is given, but the source brings no pseudo labels; use teacher.kind=auto")
-    if config.teacher.model and wanted in ("labels", "given", "none"):
+    if config.teacher.model and wanted in ("embedded", "labels", "given", "none"):
         raise ConfigError(f"teacher.kind is {wanted}, so teacher.model would not be used; set teacher.kind=onnx too")
     if wanted == "none":
         return "none", "teacher.kind is none"
-    return ("onnx" if wanted == "auto" else wanted), ""
+    if wanted == "auto" and not config.teacher.model and source in PHOTOGRAPHS and not probe["labels"]:
+        return "none", UNASKED
+    return ("onnx" if wanted in ("auto", "embedded") else wanted), ""
 
 
 def left_out_stages(config: Any, kind: str, why: str, probe: dict[str, bool]) -> dict[str, str]:
     """Stages that this scene does not need, and why."""
     left_out: dict[str, str] = {}
     if kind == "none":
-        left_out |= {"teacher": why, "describe": f"no semantics to describe shape for ({why})"}
+        left_out |= {"teacher": f"{why}: {HOW}" if why == UNASKED else why}
+        left_out |= {"describe": f"no semantics to describe shape for ({why})"}
         left_out |= {"onnx": f"no encoder is trained ({why})", "lift": f"no teacher's features to lift ({why})"}
-        left_out |= {"refine": f"no semantic features to refine ({why})"}
+        left_out |= {"refine": f"no semantic features to refine ({why})", "agree": f"no teacher's labels ({why})"}
     elif config.train.features == "lifted":
         left_out |= {"describe": LIFTED, "onnx": LIFTED}
     elif config.train.encoder == "off":

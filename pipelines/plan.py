@@ -44,6 +44,7 @@ class Step:
     sections: dict[str, Any]  # what the stage reads of the config
     code: dict[str, Any]
     raw: Hashes = field(default_factory=dict)  # of the files outside the store that it reads
+    after: list[Path] = field(default_factory=list)  # artifacts that are made first, although it reads nothing of them
 
     @property
     def fresh(self) -> bool:
@@ -165,7 +166,7 @@ class Planner:
         if source.path:  # REPLICA_ROOT may be relative
             source = source.model_copy(update={"path": str(Path(source.path).expanduser().resolve())})
         probe = self._probe(source, scene)
-        kind, why = teacher_kind(config, probe)
+        kind, why = teacher_kind(config, source.kind, probe)
         teacher = config.teacher.model_copy(update={"kind": kind})
         if kind == "onnx" and teacher.model is None:
             teacher = teacher.model_copy(update={"model": str(EMBEDDED)})
@@ -192,6 +193,7 @@ class Planner:
                 inputs.pop("points", None)
             keys = {role: path.name for role, path in inputs.items()}
             steps[stage.name] = self.step(stage, config, inputs, keys, used.get(stage.name, ()))
+            steps[stage.name].after = [steps[earlier].path for earlier in stage.after if earlier in steps]
         title = self._named(scene) + title
         return Plan(title, source_sentence(name, asked, source), list(steps.values()), left_out)
 

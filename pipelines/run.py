@@ -86,7 +86,7 @@ def wanted_steps(plan: Plan, stage: str | None, others: Iterable[Plan] = ()) -> 
     while waiting:
         step = waiting.pop()
         needed.add(step.key)
-        waiting += [by_path[path] for path in step.inputs.values() if path in by_path]
+        waiting += [by_path[path] for path in (*step.inputs.values(), *step.after) if path in by_path]
     return [step for step in by_path.values() if step.key in needed]
 
 
@@ -183,6 +183,7 @@ def entry(step: Step, state: dict[str, Any], device: str = "cpu") -> dict[str, A
         "key": step.key,
         "path": str(step.path),
         "inputs": {role: str(path) for role, path in step.inputs.items()},
+        "after": [str(path) for path in step.after],
         "config": step.sections,
         "code": step.code | state,
         "raw": step.raw,

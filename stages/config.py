@@ -38,6 +38,7 @@ class Config(Section):
     teacher: parts.TeacherSection = parts.TeacherSection()
     describe: DescribeSection = DescribeSection()
     train: TrainSection = TrainSection()
+    agree: parts.AgreeSection = parts.AgreeSection()
     lift: parts.LiftSection = parts.LiftSection()
     refine: parts.RefineSection = parts.RefineSection()
     knowledge: parts.KnowledgeSection = parts.KnowledgeSection()

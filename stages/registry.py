@@ -17,6 +17,7 @@ class Stage:
     help: str = ""
 
     of_scene: bool = True  # false: never a part of a scene's run, only what such a run is given
+    after: tuple[str, ...] = ()  # stages of the scene that come first, although nothing of theirs is read
 
     @property
     def roles(self) -> dict[str, str]:
@@ -34,6 +35,9 @@ STAGES: dict[str, Stage] = {
               help="From a teacher's channels to the fewer that all scenes are trained in."),
         Stage("teacher", "chebsplat.features/1", ("teacher",), (("capture", "ingest"),),
               (("channels", "channels"),), help="Per-view semantic features of a 2D teacher."),
+        Stage("agree", "chebsplat.agreement/1", ("agree",),
+              (("capture", "ingest"), ("points", "sfm"), ("features", "teacher")),
+              help="How far views agree on what the same points are: whether the teacher knows the scene."),
         Stage("teach", "chebsplat.knowledge/1", ("onnx", "knowledge"), (("channels", "channels"),), of_scene=False,
               help="Knowledge that scenes start from: a point encoder, taught over generated rooms."),
         Stage("describe", "chebsplat.descriptors/1", ("describe",), (("points", "sfm"),),
@@ -41,7 +45,7 @@ STAGES: dict[str, Stage] = {
         Stage("train", "chebsplat.gaussians/1", ("describe", "train"),
               (("capture", "ingest"), ("points", "sfm")),
               (("features", "teacher"), ("descriptors", "describe"), ("basis", "cks")),
-              help="Train the semantic Gaussian scene (Eqs 7-13)."),
+              after=("agree",), help="Train the semantic Gaussian scene (Eqs 7-13)."),
         Stage("lift", "chebsplat.lifted/1", ("lift",),
               (("capture", "ingest"), ("gaussians", "train"), ("features", "teacher")),
               help="Features of the teacher on trained Gaussians, and how much the views agree, without training."),
@@ -59,8 +63,8 @@ STAGES: dict[str, Stage] = {
               (("features", "teacher"),), help="Measure the exported scene on the test views."),
         Stage("report", "chebsplat.report/1", ("report",), (("evaluation", "evaluate"), ("gaussians", "train")),
               (("capture", "ingest"), ("points", "sfm"), ("channels", "channels"), ("features", "teacher"),
-               ("descriptors", "describe"), ("lifted", "lift"), ("refined", "refine"), ("scene", "export"),
-               ("encoder", "onnx"), ("basis", "cks")),
+               ("agreement", "agree"), ("descriptors", "describe"), ("lifted", "lift"), ("refined", "refine"),
+               ("scene", "export"), ("encoder", "onnx"), ("basis", "cks")),
               help="One self-contained HTML page with pictures, tables and error against run time."),
     )
 }  # fmt: skip

@@ -19,6 +19,7 @@ STAGE_OF = {
     "points": "sfm",
     "channels": "channels",
     "features": "teacher",
+    "agreement": "agree",
     "descriptors": "describe",
     "gaussians": "train",
     "lifted": "lift",
@@ -42,8 +43,8 @@ FRAMES = {"color": "colour", "color_and_features": "colour and features"}
 def run(job: Job) -> None:
     """One HTML page, and the figures as CSV, of what was measured and where it comes from.
 
-    Reads `evaluation` and `gaussians`, and of `capture`, `points`, `channels`, `features`, `descriptors`, `lifted`,
-    `refined`, `scene`, `encoder` and `basis` what there is. Writes `report`.
+    Reads `evaluation` and `gaussians`, and of `capture`, `points`, `channels`, `features`, `agreement`, `descriptors`,
+    `lifted`, `refined`, `scene`, `encoder` and `basis` what there is. Writes `report`.
     """
     import json
 
@@ -76,6 +77,7 @@ def run(job: Job) -> None:
         settings |= manifest.config
     by_degree = facts["scene"]["by_degree"] if "scene" in facts else None
     rows = summary_rows(figures, by_degree, facts["gaussians"]) + refined_rows(facts.get("refined"))
+    rows += agreement_rows(facts.get("agreement"))
     write_table(job.out / "figures.csv", rows)
     write_table(job.out / "trace.csv", [list(gaussians.trace[0]), *(list(row.values()) for row in gaussians.trace)])
     names = parts.label_names(job.inputs, figures)
@@ -87,6 +89,7 @@ def run(job: Job) -> None:
         source=figures["source"],
         protocol=figures["protocol"],
         teacher=teacher_words(facts["features"]) if "features" in facts else None,
+        doubt=facts.get("agreement", {}).get("doubt"),
         rows=rows[1:],
         tiles=parts.tiles(figures, gaussians),
         legend=parts.legend(pixels, names, colors),
@@ -129,6 +132,7 @@ def absent_stages(job: Job, gaussians: Gaussians) -> dict[str, str]:
     unneeded = "no shape encoder is trained"
     reasons = {
         "features": "rendering only: the scene has no semantics" if "features" not in gaussians.parameters else "",
+        "agreement": "the scene has no teacher, or its agreement was not measured",
         "descriptors": unneeded if encoder is None else "the encoder's tokens hold no descriptor",
         "lifted": "the scene has no teacher, or its features were not lifted",
         "refined": "the scene has no teacher, or its features were not refined",
@@ -199,6 +203,15 @@ def refined_rows(facts: dict[str, Any] | None) -> list[list[str]]:
         rows.append([f"agreement of half the training views with the other, smoothing {name}, at k = "
                      + " / ".join(curve), shown, ""])  # fmt: skip
     return rows
+
+
+def agreement_rows(facts: dict[str, Any] | None) -> list[list[str]]:
+    """(figure, scene, teacher) of how far views agree on what points are by their 2D teacher."""
+    if facts is None:
+        return []
+    value, count = facts["agreement"], facts["n_points"]
+    shown = "not measured" if value is None else f"{value:.2f}"
+    return [[f"agreement of views on labels of {count:,} points (1: always, 0: by chance)", "", shown]]
 
 
 def write_table(path: Path, rows: list[list[Any]]) -> None:

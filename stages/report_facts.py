@@ -103,7 +103,19 @@ class Refined(Facts):
     changed_by_knowledge: NotRequired[float]
 
 
-FACTS: dict[str, Any] = {"features": Teacher, "gaussians": Trained, "refined": Refined, "scene": Exported}  # by role
+class Agreed(Facts):
+    agreement: float | None
+    n_points: Count
+    doubt: NotRequired[str]
+
+
+FACTS: dict[str, Any] = {  # by role
+    "features": Teacher,
+    "agreement": Agreed,
+    "gaussians": Trained,
+    "refined": Refined,
+    "scene": Exported,
+}
 
 
 def facts_of(role: str, path: Path, manifest: Manifest) -> dict[str, Any]:

@@ -65,11 +65,14 @@ class SfmSection(Section):
 
 
 class TeacherSection(Section):
-    """`auto`: the ONNX model if one is given, otherwise the embedded teacher; `labels`: the noisy-labels teacher;
-    `given`: pseudo labels with a confidence that the source brings (Panoptic Lifting's ScanNet).
+    """`auto`: the ONNX model if one is given, otherwise the embedded teacher, but none for photographs without labels;
+    `embedded`: the embedded teacher for these, too; `labels`: the noisy-labels teacher; `given`: pseudo labels with a
+    confidence that the source brings (Panoptic Lifting's ScanNet).
     """
 
-    kind: Literal["auto", "labels", "given", "onnx", "none"] = setting("auto", "the 2D teacher; none: colour only")
+    kind: Literal["auto", "embedded", "labels", "given", "onnx", "none"] = setting(
+        "auto", "the 2D teacher; embedded: for photographs, too; none: colour only"
+    )
     downscale: int = number(4, "pixels of a view that an entry of its map is wide; a coarser model's own", 1, 32)
     n_channels: int = number(13, "channels of class codes: of labels, and of a closed-set segmenter", 2, MAX_CHANNELS)
     # an ONNX model (docs/teachers.md)
@@ -100,6 +103,14 @@ class ChannelsSection(Section):
     model: Text | None = setting(None, ".onnx; a run puts teacher.model here; default: the embedded teacher")
     reference: Text | None = setting(None, "folder of images that the channels are fitted to; default: generated rooms")
     n_rooms: int = number(8, "generated rooms that the channels are fitted to", 1, 100)
+
+
+class AgreeSection(Section):
+    """docs/method.md, section 9."""
+
+    n_points: int = number(5000, "points that views are compared on, at most", 16, 1_000_000)
+    low: float = number(0.2, "agreement below which a warning says that the teacher does not know the scene", 0, 1)
+    seed: int = seed("of the choice among points")
 
 
 class LiftSection(Section):

@@ -32,6 +32,7 @@ INPUTS = {
     "sfm": {"capture": "ingest"},
     "channels": {},
     "teacher": {"capture": "ingest"},
+    "agree": {"capture": "ingest", "points": "sfm", "features": "teacher"},
     "teach": {"channels": "channels"},
     "describe": {"points": "sfm"},
     "train": {"capture": "ingest", "points": "sfm", "features": "teacher", "descriptors": "describe"},
@@ -54,6 +55,7 @@ INPUTS = {
         "scene": "export",
         "encoder": "onnx",
         "features": "teacher",
+        "agreement": "agree",
     },
 }
 

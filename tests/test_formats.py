@@ -9,6 +9,7 @@ from shared import KEY, gaussian_parameters
 
 from chebsplat.errors import InputError
 from chebsplat.formats import (
+    agreement,
     artifact,
     capture,
     descriptors,
@@ -122,6 +123,11 @@ def make_evaluation():
     return evaluation.Evaluation(figures, pictures)
 
 
+def make_agreement():
+    labels = {"wall": {"share": 0.75, "agreement": 0.5}, "floor": {"share": 0.25, "agreement": 0.25}}
+    return agreement.ViewAgreement(0.375, 40, 2, labels)
+
+
 def make_lifted():
     rng = np.random.default_rng(7)
     return lifted.Lifted(
@@ -155,6 +161,7 @@ CASES = {
     "descriptors": (make_descriptors, descriptors.write_descriptors, descriptors.read_descriptors, descriptors.SCHEMA),
     "scene": (make_scene, scene.write_scene, scene.read_scene, scene.SCHEMA),
     "knowledge": (make_knowledge, knowledge.write_knowledge, knowledge.read_knowledge, knowledge.SCHEMA),
+    "agreement": (make_agreement, agreement.write_agreement, agreement.read_agreement, agreement.SCHEMA),
     "lifted": (make_lifted, lifted.write_lifted, lifted.read_lifted, lifted.SCHEMA),
     "refined": (make_refined, refined.write_refined, refined.read_refined, refined.SCHEMA),
     "evaluation": (make_evaluation, evaluation.write_evaluation, evaluation.read_evaluation, evaluation.SCHEMA),

@@ -14,7 +14,7 @@ from chebsplat.pipelines import store
 from chebsplat.pipelines.code import installed
 from chebsplat.pipelines.plan import Planner, overrides, suffix
 from chebsplat.pipelines.raw import content_hash, hashes
-from chebsplat.pipelines.run import failures
+from chebsplat.pipelines.run import failures, wanted_steps
 from chebsplat.pipelines.scenes import CONFIGS, names, read_toml
 from chebsplat.stages.registry import STAGES
 
@@ -121,9 +121,10 @@ def test_a_change_of_code_makes_exactly_these_stages_stale(source_tree, change, 
 SETTING_CHANGES = [
     ("train.steps=61", AFTER_TRAIN),
     ("train.albo=off", AFTER_TRAIN),
-    ("teacher.confusion=0.2", ["teacher", *AFTER_TRAIN]),
+    ("teacher.confusion=0.2", ["teacher", "agree", *AFTER_TRAIN]),
+    ("agree.n_points=700", ["agree", "report"]),
     ("describe.bandwidth=0.8", ["describe", *AFTER_TRAIN]),
-    ("sfm.max_points=700", ["sfm", "describe", *AFTER_TRAIN]),
+    ("sfm.max_points=700", ["sfm", "agree", "describe", *AFTER_TRAIN]),
     ("lift.gate=0.3", ["lift", "refine", "export", "evaluate", "report"]),
     ("refine.smooth=on", ["refine", "export", "evaluate", "report"]),
     ("export.split_by_degree=false", ["export", "evaluate", "report"]),
@@ -189,7 +190,7 @@ def test_paths_are_those_of_the_user_s_folder_not_of_the_stage_s(tmp_path, monke
         (tmp_path / name).write_text('labels = "table.npz"  # another')
         again = Planner().plan("toy", settings)
         changed = [a.stage for a, b in zip(plan.steps, again.steps, strict=True) if a.key != b.key]
-        assert changed == [*(["channels"] if name != "names.txt" else []), "teacher", *AFTER_TRAIN]
+        assert changed == [*(["channels"] if name != "names.txt" else []), "teacher", "agree", *AFTER_TRAIN]
         plan = again
 
 
@@ -200,13 +201,30 @@ def teacher_of(*arguments):
 def test_the_embedded_teacher_is_used_unless_another_is_asked_for(tmp_path):
     from chebsplat.formats.teacher_model import EMBEDDED
 
-    for scene in (("office0",), ("toy", "teacher.kind=auto"), (photo_folder(tmp_path / "photos"),)):
+    photos = photo_folder(tmp_path / "photos")
+    for scene in (("office0",), ("toy", "teacher.kind=auto"), (photos, "teacher.kind=embedded")):
         teacher = teacher_of(*scene)
         assert (teacher["kind"], teacher["model"]) == ("onnx", str(EMBEDDED))
     assert teacher_of("toy")["kind"] == teacher_of("office0", "teacher.kind=labels")["kind"] == "labels"
 
 
-@pytest.mark.parametrize("kind", ["labels", "none"])
+def test_photos_without_labels_get_no_teacher_unasked_and_learn_how_to_get_one(tmp_path):
+    plan = Planner().plan(photo_folder(tmp_path / "photos"))
+    assert "teacher" not in plan.targets
+    assert all(told in plan.left_out["teacher"] for told in ("teacher.model", "docs/teachers.md", "kind=embedded"))
+    assert "evaluate" in plan.targets
+
+
+def test_a_training_waits_for_the_agreement_of_views_and_reads_nothing_of_it():
+    steps = {step.stage: step for step in Planner().plan("toy").steps}
+    assert steps["train"].after == [steps["agree"].path]
+    assert steps["agree"].path not in steps["train"].inputs.values()
+    plan = Planner().plan("toy")
+    assert "agree" in [step.stage for step in wanted_steps(plan, "train")]
+    assert Planner().plan("toy", "teacher.kind=none").targets.keys() & {"agree"} == set()
+
+
+@pytest.mark.parametrize("kind", ["labels", "none", "embedded"])
 def test_a_model_that_would_not_be_used_is_an_error(kind):
     with pytest.raises(ConfigError, match=r"teacher\.kind=onnx"):
         Planner().plan("toy", f"teacher.kind={kind},teacher.model=model.onnx")
@@ -259,8 +277,8 @@ def test_generated_and_replica_scenes_never_share_a_key(tmp_path, monkeypatch):
     ("settings", "left_out"),
     [
         ("", {"channels", "cks"}),
-        ("train.semantics=false", {"channels", "teacher", "describe", "lift", "refine", "onnx", "cks"}),
-        ("teacher.kind=none", {"channels", "teacher", "describe", "lift", "refine", "onnx", "cks"}),
+        ("train.semantics=false", {"channels", "teacher", "agree", "describe", "lift", "refine", "onnx", "cks"}),
+        ("teacher.kind=none", {"channels", "teacher", "agree", "describe", "lift", "refine", "onnx", "cks"}),
         ("train.features=lifted", {"channels", "describe", "onnx", "cks"}),
         ("train.encoder=off", {"channels", "describe", "onnx", "cks"}),
         ("train.albo=false", {"channels", "describe", "cks"}),

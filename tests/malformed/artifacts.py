@@ -85,6 +85,7 @@ def _publish(path: Path, schema: str, stage: str, write: Callable[[Path], Any]) 
     manifest = Manifest(schema, KEY, stage, config=config.sections(("describe", "train")))
     manifest.facts = {
         "teacher": {"kind": "labels", "n_labels": len(LABELS), "convention": {"confusion": 0.1}},
+        "agree": {"agreement": 0.375, "n_points": N},
         "train": {"milliseconds": {"render": 1.0}},
         "export": {"by_degree": [N, 0, 0, 0]},
     }.get(stage, {})
@@ -166,6 +167,13 @@ def _gaussians(out: Path) -> None:
     notes = NOTES | {"encoder": encoder, "label_names": LABELS}
     modules = {"shape.gate.weight": np.ones((2, 2), np.float32)}
     write_gaussians(out, Gaussians(_parameters(), _cameras(), modules, {}, trace, notes))
+
+
+def _agreement(out: Path) -> None:
+    from chebsplat.formats.agreement import ViewAgreement, write_agreement
+
+    labels = {"wall": {"share": 0.75, "agreement": 0.5}, "floor": {"share": 0.25, "agreement": 0.25}}
+    write_agreement(out, ViewAgreement(0.375, N, V - 1, labels))
 
 
 def _lifted(out: Path) -> None:
@@ -254,6 +262,7 @@ WRITERS: dict[str, tuple[str, Callable[[Path], None]]] = {
     "ingest": ("chebsplat.capture/1", _capture),
     "sfm": ("chebsplat.points/1", _points),
     "teacher": ("chebsplat.features/1", _features),
+    "agree": ("chebsplat.agreement/1", _agreement),
     "describe": ("chebsplat.descriptors/1", _descriptors),
     "teach": ("chebsplat.knowledge/1", _knowledge),
     "train": ("chebsplat.gaussians/1", _gaussians),

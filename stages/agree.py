@@ -1,0 +1,122 @@
+"""agree: how far views agree on what the same points are; a teacher that does not know a scene is found early."""
+
+from __future__ import annotations
+
+import logging
+from typing import TYPE_CHECKING
+
+from chebsplat.errors import DataFailure, InputError
+from chebsplat.stages.command import Job, command
+
+if TYPE_CHECKING:
+    import numpy as np
+
+    from chebsplat.formats.capture import Capture
+    from chebsplat.formats.features import Features
+    from chebsplat.formats.points import Points
+
+log = logging.getLogger("chebsplat")
+
+
+def run(job: Job) -> None:
+    """The training views' agreement on the same points, without true labels (docs/method.md, section 9).
+
+    Reads `capture`, `points` and `features`. Writes `agreement`.
+    """
+    import numpy as np
+
+    from chebsplat.cameras import centers
+    from chebsplat.formats.agreement import ViewAgreement, write_agreement
+    from chebsplat.formats.capture import read_capture
+    from chebsplat.formats.features import read_features
+    from chebsplat.formats.points import read_points
+    from chebsplat.labels.agreement import between, far_pairs
+
+    settings, capture = job.config.agree, read_capture(job.inputs["capture"])
+    points, features = read_points(job.inputs["points"]), read_features(job.inputs["features"])
+    views = training_views(capture, points, features)
+    rng, n = np.random.default_rng(settings.seed), len(points.means)
+    chosen = np.sort(rng.choice(n, min(settings.n_points, n), replace=False))
+    said = labels_of(job, capture, points, features, views, chosen)
+    eyes = centers(points.cam_from_world)[[place for _, place, _ in views]]
+    row, first, second = far_pairs(points.means[chosen], eyes, said >= 0).T
+    names = features.label_names
+    found = between(said[row, first], said[row, second], len(names))
+    value = float(found.value) if len(row) else None
+    labels = {
+        name: {"share": float(share), "agreement": float(of_label)}
+        for name, share, of_label in zip(names, found.share, found.by_label, strict=True)
+        if share > 0
+    }
+    job.facts |= {"agreement": value, "n_points": len(row), "n_views": len(views), "n_labels": len(labels)}
+    if value is None:
+        log.warning("no point has a label in two views: how far they agree is not known")
+    elif value < settings.low:
+        job.facts["doubt"] = (
+            f"views agree by {value:.2f} on what points are (1: always, 0: by chance), below {settings.low:g}: the 2D "
+            "teacher does not know this scene; name another (docs/teachers.md), or teacher.kind=none for colour alone"
+        )
+        log.warning("%s", job.facts["doubt"])
+    else:
+        log.info("views agree by %.2f on what points are (1: always, 0: by chance)", value)
+    write_agreement(job.out, ViewAgreement(value, len(row), len(views), labels))
+
+
+def training_views(capture: Capture, points: Points, features: Features) -> list[tuple[int, int, int]]:
+    """Where each training view with a pose stands in capture, points and features. Raises InputError, DataFailure."""
+    row, taught = ({name: k for k, name in enumerate(names)} for names in (capture.names, features.names))
+    if unknown := [name for name in points.names if name not in row or name not in taught]:
+        raise InputError(f"the points have a view {unknown[0]} that capture or features lack; pass those of one scene")
+    found = [(row[name], k, taught[name]) for k, name in enumerate(points.names) if not capture.is_test[row[name]]]
+    if not found:
+        raise DataFailure("no training view has a camera; lower ingest.test_every's share of test views")
+    return found
+
+
+def labels_of(
+    job: Job,
+    capture: Capture,
+    points: Points,
+    features: Features,
+    views: list[tuple[int, int, int]],
+    chosen: np.ndarray,
+) -> np.ndarray:
+    """The label that each view says of each chosen point, i64 [N, V]; -1 where the view does not see it.
+
+    Choices: what hides a point is told by depth, where the capture has it in the frame of the points; by the tracks of
+      structure from motion, whose points were found in the views that see them; otherwise by nearer points.
+    """
+    import numpy as np
+
+    from chebsplat.labels.agreement import UNSEEN, project, unhidden
+    from chebsplat.labels.decode import decode_labels
+
+    means, size = points.means.astype(np.float64), capture.size
+    depths = capture.depth if capture.cam_from_world is not None else None
+    number_of = np.full(len(means), -1)
+    number_of[chosen] = np.arange(len(chosen))
+    found_in = np.zeros((len(chosen) + 1, len(points.names)), bool)  # the last row: of points that are not chosen
+    found_in[number_of[points.tracks[:, 0]], points.tracks[:, 1]] = True
+    said = np.full((len(chosen), len(views)), UNSEEN, np.int64)
+    for (number, (row, place, taught)), _ in job.progress.track(enumerate(views), len(views), "agree"):
+        image = project(means, points.Ks[place], points.cam_from_world[place], size)
+        if depths is not None:
+            seen = unhidden(image, size, depths[row])[chosen]
+        elif len(points.tracks):
+            seen = np.isfinite(image[chosen, 0]) & found_in[:-1, place]
+        else:
+            seen = unhidden(image, size)[chosen]
+        columns, rows = image[chosen[seen], :2].astype(np.int64).T
+        if features.pseudo_labels is None:
+            labels = decode_labels(features.features[taught].astype(np.float32), features.label_embeddings)
+        else:
+            labels = features.pseudo_labels[taught]
+        height, width = labels.shape
+        of_points = labels[rows * height // size[1], columns * width // size[0]].astype(np.int64)
+        if capture.loss_mask is not None:
+            of_points[~capture.loss_mask[row][rows, columns]] = UNSEEN
+        said[seen, number] = of_points
+    return said
+
+
+main = command("agree", run)
