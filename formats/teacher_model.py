@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import re
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from chebsplat.errors import InputError
+from chebsplat.formats.artifact import sha256_file
 from chebsplat.formats.files import parse_toml, read_text
 from chebsplat.formats.names import check_names, suggest, unprintable
 
@@ -29,6 +31,7 @@ class TeacherModel:
     mean, std: of RGB in [0, 1].
     size:      (H, W) that the model takes, or None: any whose sides are multiples of `multiple`.
     base:      long side in pixels that an image is resized to at scale 1, or None: its own.
+    origin:    where it was fetched, sha256: of the .onnx then; None of one that was not.
     labels:    table of names and embeddings; text, tokenizer: encoder of any words; prompt: what a name is put into.
     """
 
@@ -44,11 +47,21 @@ class TeacherModel:
     tokenizer: Path | None = None
     prompt: str = "{}"
     base: int | None = None
+    origin: str | None = None
+    sha256: str | None = None
 
     @property
     def settings(self) -> Path:
         """The TOML beside the model."""
         return self.path.with_suffix(".toml")
+
+    def verify(self) -> None:
+        """Raises InputError if the encoder is not the file whose checksum was recorded."""
+        if self.sha256 is not None and (found := sha256_file(self.path)) != self.sha256:
+            raise InputError(
+                f"{self.path} has the sha256 {found}, {self.settings} says {self.sha256}: it was damaged or replaced; "
+                f"remove the folder and fetch it again (chebsplat get-teacher), or correct `sha256`"
+            )
 
     def files(self) -> list[Path]:
         """All files that the teacher's results depend on."""
@@ -111,6 +124,8 @@ RULES = {
     "size": (f"[height, width], 1 to {MAX_SIDE} pixels", lambda v: _is_list(v, (int,), 2, 1, MAX_SIDE)),
     "multiple": (f"a whole number, 1 to {MAX_SIDE}", _is_side),
     "base": (f"a whole number of pixels, 1 to {MAX_SIDE}", _is_side),
+    "origin": ("a text", _is_text),
+    "sha256": ("64 hexadecimal digits", lambda v: isinstance(v, str) and re.fullmatch("[0-9a-f]{64}", v) is not None),
     "labels": ("a file's name", _is_text),
     "text": ("a file's name", _is_text),
     "tokenizer": ("a file's name", _is_text),

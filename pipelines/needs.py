@@ -17,8 +17,8 @@ POINTS = "train.encoder is points: the training holds none"
 PHOTOGRAPHS = ("photos", "colmap", "transforms", "seven_scenes")  # kinds of sources that hold photos of any place
 UNASKED = "no teacher is named"
 HOW = (
-    "the embedded one has seen generated rooms only. Bring one for photos (docs/teachers.md) and name it by "
-    "set=teacher.model=MODEL.onnx; teacher.kind=embedded uses the embedded one all the same"
+    "the embedded one has seen generated rooms only. `chebsplat get-teacher segformer-b0-ade` fetches one for photos "
+    "(docs/teachers.md), set=teacher.model=MODEL.onnx names it; teacher.kind=embedded uses the embedded one all the same"
 )
 
 

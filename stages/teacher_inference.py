@@ -29,6 +29,7 @@ class TeacherInference:
     def __init__(self, teacher: TeacherModel, threads: int):
         import onnxruntime
 
+        teacher.verify()
         self.teacher = teacher
         options = onnxruntime.SessionOptions()
         options.intra_op_num_threads, options.inter_op_num_threads = threads, 1

@@ -211,7 +211,7 @@ def test_the_embedded_teacher_is_used_unless_another_is_asked_for(tmp_path):
 def test_photos_without_labels_get_no_teacher_unasked_and_learn_how_to_get_one(tmp_path):
     plan = Planner().plan(photo_folder(tmp_path / "photos"))
     assert "teacher" not in plan.targets
-    assert all(told in plan.left_out["teacher"] for told in ("teacher.model", "docs/teachers.md", "kind=embedded"))
+    assert all(told in plan.left_out["teacher"] for told in ("get-teacher", "docs/teachers.md", "kind=embedded"))
     assert "evaluate" in plan.targets
 
 

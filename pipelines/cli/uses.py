@@ -1,4 +1,6 @@
-"""What is done with a finished scene, or before one: query, extract, encode, lift, label, check-teacher, knowledge."""
+"""What is done with a finished scene, or before one: query, extract, encode, lift, label, check-teacher,
+get-teacher, knowledge.
+"""
 
 from __future__ import annotations
 
@@ -45,6 +47,21 @@ def check_teacher(model: Path, photo: Path | None, labels: str | None) -> None:
 
     for what, finding in check(model, photo, labels):
         print(f"{what:9s}{finding}")
+
+
+@click.command("get-teacher")
+@click.argument("name")
+@click.option("--out", type=click.Path(path_type=Path), help="folder to make; default: called like the teacher, here")
+@click.option("--file", "graph", default="onnx/model.onnx", show_default=True, help="the ONNX file in the repository")
+def get_teacher(name: str, out: Path | None, graph: str) -> None:
+    """Fetch a segmenter from the Hugging Face hub as a teacher: segformer-b0-ade, or hf:OWNER/NAME[@REVISION]."""
+    from chebsplat.stages.get_teacher import get_teacher as fetch
+
+    model, findings = fetch(name, out, graph)
+    for what, finding in findings:
+        print(f"{what:9s}{finding}", file=sys.stderr)
+    print(f"use it: set=teacher.model={model},teacher.n_channels=32", file=sys.stderr)
+    print(model)
 
 
 @click.command()
@@ -167,4 +184,4 @@ def label(ply: Path, words: str | None, up: str, unit: float | None, knowledge: 
     print(out)
 
 
-COMMANDS = (query, check_teacher, extract, encode, lift, label, knowledge)
+COMMANDS = (query, check_teacher, get_teacher, extract, encode, lift, label, knowledge)

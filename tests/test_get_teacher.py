@@ -1,0 +1,183 @@
+"""Teachers from a stand-in of the hub: whole, interrupted, damaged, out of reach. The hub itself is never asked."""
+
+import os
+import shutil
+import subprocess
+import sys
+
+import numpy as np
+import pytest
+import stand_in_hub
+from stand_in_hub import COMMIT, REPOSITORY, Hub, serving
+
+from chebsplat.errors import ConfigError, InputError
+from chebsplat.formats.teacher_model import read_teacher
+from chebsplat.stages import teacher_check
+from chebsplat.stages.get_teacher import get_teacher, parsed
+
+NAME, SHORT = f"hf:{REPOSITORY}", "segmenter-b0"
+
+
+@pytest.fixture
+def constants():
+    return pytest.importorskip("huggingface_hub.constants", reason="the extra `hub` is not installed")
+
+
+@pytest.fixture
+def hub(constants, tmp_path, monkeypatch):
+    """A hub that answers, an empty cache, and a small photo for the check."""
+    photo = np.random.default_rng(0).integers(0, 255, (48, 64, 3), np.uint8)
+    monkeypatch.setattr(teacher_check, "shown", lambda _: ("photo", photo))
+    monkeypatch.setattr(constants, "HF_HUB_CACHE", str(tmp_path / "cache"))
+    monkeypatch.chdir(tmp_path)
+    found = Hub(stand_in_hub.files(tmp_path))
+    with serving(found) as address:
+        ask(constants, monkeypatch, address)
+        yield found
+
+
+def ask(constants, monkeypatch, address):
+    """As HF_ENDPOINT would, which the client reads when it is imported."""
+    template = constants.HUGGINGFACE_CO_URL_TEMPLATE.removeprefix(constants.ENDPOINT)
+    monkeypatch.setattr(constants, "HUGGINGFACE_CO_URL_TEMPLATE", address + template)
+    monkeypatch.setattr(constants, "ENDPOINT", address)
+
+
+def test_a_repository_becomes_a_teacher_of_three_files(hub, tmp_path):
+    model, findings = get_teacher(NAME)
+    assert sorted(p.name for p in (tmp_path / SHORT).iterdir()) == [
+        f"{SHORT}.{kind}" for kind in ("onnx", "toml", "txt")
+    ]
+    assert not list(tmp_path.glob(".part-*"))
+    assert model.read_bytes() == hub.files["onnx/model.onnx"]
+    teacher = read_teacher(model)
+    assert (teacher.output, teacher.size, teacher.base) == ("logits", (64, 64), 85)
+    assert teacher.mean == (0.485, 0.456, 0.406)
+    assert teacher.sha256 == hub.checksum("onnx/model.onnx") and teacher.origin == f"{NAME}@main/onnx/model.onnx"
+    assert (tmp_path / SHORT / f"{SHORT}.txt").read_text().splitlines() == ["wall", "floor", "sofa a seat", "wall (3)"]
+    assert "logits, 4 channels" in dict(findings)["output"]
+    hub.asked.clear()
+    assert get_teacher(NAME)[0] == model  # there already
+    assert hub.asked == []
+
+
+def test_a_download_that_broke_off_goes_on_where_it_was(hub, tmp_path):
+    hub.cut = 200_000
+    with pytest.raises(InputError, match=r"broke off at [\d,]+ of 40\d,\d+ bytes; run the same command again"):
+        get_teacher(NAME)
+    assert not (tmp_path / SHORT).exists()
+    there = (tmp_path / f".part-{SHORT}" / hub.checksum("onnx/model.onnx")).stat().st_size
+    assert 0 < there <= hub.cut
+    hub.cut, _ = None, hub.asked.clear()
+    model, _ = get_teacher(NAME)
+    assert model.read_bytes() == hub.files["onnx/model.onnx"]
+    got = [(path, part) for method, path, part in hub.asked if method == "GET"]
+    assert got == [("/large/onnx/model.onnx", f"bytes={there}-")]  # and the small files not again
+
+
+@pytest.mark.parametrize("name", ["onnx/model.onnx", "config.json"])
+def test_a_wrong_checksum_is_refused_and_nothing_stays(hub, tmp_path, name):
+    hub.sums[name] = "0" * len(hub.checksum(name))
+    with pytest.raises(InputError, match=r"has the checksum \w+, 0+ is right: damaged"):
+        get_teacher(NAME)
+    assert not (tmp_path / SHORT).exists()
+    del hub.sums[name]
+    assert get_teacher(NAME)[0].is_file()
+
+
+def test_an_encoder_that_was_replaced_later_is_refused(hub):
+    model, _ = get_teacher(NAME)
+    with model.open("ab") as handle:
+        handle.write(b"\0")
+    with pytest.raises(InputError, match="damaged or replaced"):
+        teacher_check.check(model)
+    with pytest.raises(InputError, match="damaged or replaced"):
+        get_teacher(NAME)
+    assert model.is_file()
+
+
+def cached(hub, constants):
+    """What the hub's own client leaves in its cache."""
+    from pathlib import Path
+
+    folder = Path(constants.HF_HUB_CACHE) / f"models--{REPOSITORY.replace('/', '--')}"
+    (folder / "refs").mkdir(parents=True)
+    (folder / "blobs").mkdir()
+    (folder / "refs/main").write_text(COMMIT)
+    for name, data in hub.files.items():
+        blob = folder / "blobs" / hub.checksum(name)
+        blob.write_bytes(data)
+        pointer = folder / "snapshots" / COMMIT / name
+        pointer.parent.mkdir(parents=True, exist_ok=True)
+        pointer.symlink_to(blob)
+    return folder / "blobs"
+
+
+def test_the_hub_s_cache_serves_where_there_is_no_network(hub, constants, monkeypatch, tmp_path):
+    blobs = cached(hub, constants)
+    get_teacher(NAME)
+    assert not [path for method, path, _ in hub.asked if method == "GET"]  # only asked what is right
+    shutil.rmtree(tmp_path / SHORT)
+    ask(constants, monkeypatch, "http://127.0.0.1:9")
+    assert get_teacher(NAME)[0].is_file()
+    shutil.rmtree(tmp_path / SHORT)
+    (blobs / hub.checksum("onnx/model.onnx")).write_bytes(b"damaged")
+    with pytest.raises(InputError, match="remove it from the hub's cache"):
+        get_teacher(NAME)
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        (lambda files: files.pop("onnx/model.onnx"), "has no onnx/model.onnx at main; name another ONNX file"),
+        (lambda files: files.update({"config.json": b"{}"}), "names no classes"),
+        (lambda files: files.update({"config.json": b"[]"}), "is no JSON object"),
+        (lambda files: files.update({"preprocessor_config.json": b"{}"}), "image_mean"),
+        (lambda files: files.update({"onnx/model.onnx": b"no graph"}), "onnx"),
+        (lambda files: files.update({"config.json": b'{"id2label": {"0": "wall"}}'}), "4 channels"),
+    ],
+)
+def test_a_repository_that_holds_no_teacher_is_one_line_and_leaves_no_folder(hub, tmp_path, change, message):
+    change(hub.files)
+    with pytest.raises(InputError, match=message) as error:
+        get_teacher(NAME)
+    assert "\n" not in str(error.value)
+    assert not (tmp_path / SHORT).exists()
+
+
+def test_a_repository_that_is_not_there_and_a_folder_of_something_else(hub, tmp_path):
+    with pytest.raises(InputError, match="is not there, private or gated"):
+        get_teacher("hf:some/other")
+    (tmp_path / SHORT).mkdir()
+    with pytest.raises(ConfigError, match="exists and is not"):
+        get_teacher(NAME)
+
+
+def test_names():
+    assert parsed("segformer-b0-ade") == ("Xenova/segformer-b0-finetuned-ade-512-512", "main", "segformer-b0-ade")
+    assert parsed("hf:some/Segmenter-B0@v1") == ("some/Segmenter-B0", "v1", "segmenter-b0")
+    for wrong in ("segformer", "hf:one", "hf:a/b/c", "hf:../..//x"):
+        with pytest.raises(ConfigError, match="segformer-b0-ade"):
+            parsed(wrong)
+
+
+def command(tmp_path, *arguments, **environment):
+    environment = os.environ | {"HF_HOME": str(tmp_path / "hf"), "HF_HUB_DISABLE_PROGRESS_BARS": "1"} | environment
+    call = [sys.executable, "-m", "chebsplat.pipelines.cli", "get-teacher", *arguments]
+    return subprocess.run(call, cwd=tmp_path, env=environment, capture_output=True, text=True)
+
+
+def test_the_command_takes_the_hub_that_the_environment_names(constants, tmp_path):
+    with serving(Hub(stand_in_hub.files(tmp_path))) as address:
+        done = command(tmp_path, NAME, "--out", "mine", HF_ENDPOINT=address)
+    assert (done.returncode, done.stdout) == (0, f"mine/{SHORT}.onnx\n"), done.stderr
+    assert "teacher.model=mine/" in done.stderr and "sees" in done.stderr
+
+
+@pytest.mark.parametrize("environment", [{"HF_ENDPOINT": "http://127.0.0.1:9"}, {"HF_HUB_OFFLINE": "1"}])
+def test_no_network_is_one_line_and_exit_code_3(constants, tmp_path, environment):
+    done = command(tmp_path, "segformer-b0-ade", **environment)
+    assert done.returncode == 3
+    assert done.stdout == "" and len(done.stderr.splitlines()) == 1
+    assert "is not in the hub's cache" in done.stderr and "HF_ENDPOINT" in done.stderr
+    assert not (tmp_path / "segformer-b0-ade").exists()
