@@ -18,7 +18,7 @@ PHOTOGRAPHS = ("photos", "colmap", "transforms", "seven_scenes")  # kinds of sou
 UNASKED = "no teacher is named"
 HOW = (
     "the embedded one has seen generated rooms only. `chebsplat get-teacher segformer-b0-ade` fetches one for photos "
-    "(docs/teachers.md), set=teacher.model=MODEL.onnx names it; teacher.kind=embedded uses the embedded one all the same"
+    "(docs/teachers.md), set=teacher.model=MODEL.onnx names it; teacher.kind=embedded uses the embedded one even so"
 )
 
 
