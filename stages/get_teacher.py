@@ -122,7 +122,7 @@ def download(address: str, path: Path, size: int, of_hub: bool) -> None:
       breaks here nothing is lost. Who asks is told to the hub alone, not to where it sends its large files.
     """
     from huggingface_hub import get_session
-    from huggingface_hub.utils import build_hf_headers, hf_raise_for_status
+    from huggingface_hub.utils import build_hf_headers, hf_raise_for_status  # type: ignore[attr-defined]
 
     done = path.stat().st_size if path.is_file() else 0
     if done >= size > 0:
@@ -189,7 +189,7 @@ def preparation(path: Path, repository: str) -> dict[str, Any]:
     size = values.get("size")
     if isinstance(size, dict):
         size = [size.get("height", size.get("shortest_edge")), size.get("width", size.get("shortest_edge"))]
-    sides = list(size) if isinstance(size, list) else [size, size]
+    sides: list[Any] = list(size) if isinstance(size, list) else [size, size]
     mean, std = values.get("image_mean"), values.get("image_std")
     if len(sides) != 2 or not all(isinstance(side, int) for side in sides) or mean is None or std is None:
         raise InputError(

@@ -106,10 +106,14 @@ class ChannelsSection(Section):
 
 
 class AgreeSection(Section):
-    """docs/method.md, section 9."""
+    """docs/method.md, section 9.
+
+    Choices: of 25 pairs of scene and teacher (make bench=trust), those with an agreement below 0.15 have a true mIoU of
+      at most 25 %, the others of at least 29 %.
+    """
 
     n_points: int = number(5000, "points that views are compared on, at most", 16, 1_000_000)
-    low: float = number(0.2, "agreement below which a warning says that the teacher does not know the scene", 0, 1)
+    low: float = number(0.15, "agreement below which a warning says that the teacher does not know the scene", 0, 1)
     seed: int = seed("of the choice among points")
 
 
