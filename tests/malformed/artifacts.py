@@ -250,7 +250,10 @@ def _evaluation(out: Path) -> None:
     sizes = dict.fromkeys(("unpruned_ply", "ply", "split", "ragged", "semantic"), 100)
     whole = {"miou": 0.5, "macc": 0.5, "oa": 0.5, "boundary_miou": None, "iou": {"wall": 0.5}}
     figures = {"names": VIEWS[:1], "image": {"psnr": 20.0, "ssim": 0.5, "per_view": {"psnr": [20.0], "ssim": [0.5]}}}
-    figures |= {"source": {"name": "toy", "kind": "generated"}, "protocol": {"name": "labels", "split": "every third"}}
+    figures |= {
+        "source": {"name": "toy", "kind": "generated", "notes": []},
+        "protocol": {"name": "labels", "split": "every third"},
+    }
     figures |= {"n_gaussians": N, "bytes": sizes, "frames_per_second": {}, "milliseconds": {}, "lpips": None}
     figures |= {"left_out": {}, "segmentation": {"classes": LABELS, "scene": whole, "teacher": whole}}
     labels = np.zeros((1, height, width), np.int16)
