@@ -114,6 +114,13 @@ class TrainSection(Section):
         0.5, "least distance of a new Gaussian to the nearest one, in local spacings", 1e-6, 1e3
     )
     grow_farthest: float = number(1.5, "largest one", 1e-6, 1e6)
+    # photos
+    exposure: Literal["auto", "on", "off"] = setting(
+        "auto", "learn an affine map of colours for each photo; auto: where photos of the same points differ"
+    )
+    poses: Literal["auto", "refined", "given"] = setting(
+        "auto", "of photos; refined: corrected while the scene is trained; auto: where they are estimates"
+    )
     # sizes
     sh_degree: int = number(3, "of colour, at most", 0, 3)
     max_gaussians: int = number(40_000, "growing stops here; more initial points are thinned", 16, 5_000_000)
@@ -160,6 +167,8 @@ class TrainSection(Section):
     lr_encoder: float = number(3e-3, "learning rate of the encoder", 0, 10)
     lr_gates: float = number(1e-2, "learning rate of the printed gates' weights", 0, 10)
     lr_masks: float = number(5e-2, "learning rate of pruning masks", 0, 10)
+    lr_exposure: float = number(5e-3, "learning rate of a photo's colours, from 0 to 1", 0, 10)
+    lr_poses: float = number(1.0, "of a photo's pose, in pixels that it moves the picture by", 0, 100)
     lr_sh_masks: float = number(0.4, "learning rate of SH masks; fast, under a weak penalty: docs/results.md", 0, 10)
     # weights
     weight_ssim: float = number(0.2, "share of SSIM in the colour loss", 0, 1)
@@ -173,6 +182,8 @@ class TrainSection(Section):
     weight_shape: float = number(1.0, "of encodings' distance to their members' features; 0: the printed loss", 0, 1e4)
     weight_mask: float = number(1e-2, "of the penalty that closes pruning masks", 0, 1e4)
     weight_sh: float = number(4e-5, "of the penalty that closes SH bands", 0, 1e4)
+    weight_exposure: float = number(1e-2, "of the pull of a photo's exposure towards the others'", 0, 1e4)
+    weight_depth: float = number(0.0, "of the distance to the depth that a capture brings, in scene sizes", 0, 1e4)
     weight_basis: float = number(1.0, "of the pull towards the earlier scenes' knowledge", 0, 1e4)
     warm_start: bool = setting(True, "start the encoder from the basis' stored weights")
     alpha: Literal["network", "constant"] = setting(

@@ -12,12 +12,15 @@ from torch import Tensor
 
 @dataclass
 class View:
-    """One camera at one resolution. K [3, 3] pixels, viewmat [4, 4], float32."""
+    """One camera at one resolution. K [3, 3] pixels, viewmat [4, 4], float32; twist: [6] zeros that take the gradient
+    of moving it (`training/poses.py`), or None.
+    """
 
     K: Tensor
     viewmat: Tensor
     width: int
     height: int
+    twist: Tensor | None = None
 
 
 def in_frustum(means: Tensor, view: View, reach: Tensor, margin: float = 0.15) -> Tensor:
@@ -70,7 +73,8 @@ class TaughtLabels(NamedTuple):
 @dataclass
 class Views:
     """Training views. images [V, H, W, 3] u8; masks [V, H, W] bool or None; features: view index -> [h, w, C]; labels:
-    view index -> `TaughtLabels` of these h × w cells, None where the teacher has none.
+    view index -> `TaughtLabels` of these h × w cells, None where the teacher has none; depth: view index and factor ->
+    z-depths [H, W] at 1/factor, scene units, nan where unknown.
     """
 
     names: list[str]
@@ -80,6 +84,7 @@ class Views:
     masks: Tensor | None = None
     features: Callable[[int], Tensor] | None = None
     labels: Callable[[int], TaughtLabels] | None = None
+    depth: Callable[[int, int], Tensor] | None = None
 
     def camera(self, index: int, factor: int) -> View:
         """The view's camera at 1/factor of its resolution."""

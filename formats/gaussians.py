@@ -13,7 +13,7 @@ from annotated_types import Ge, Le
 
 from chebsplat.errors import InputError
 from chebsplat.formats import artifact
-from chebsplat.formats.cameras import Cameras, read_cameras, write_cameras
+from chebsplat.formats.cameras import Cameras, check_cameras, read_cameras, write_cameras
 from chebsplat.formats.documents import Count, NotRequired, TypedDict, conform, read_document, write_document
 from chebsplat.formats.files import read_text
 from chebsplat.formats.manifest import Manifest, remedy_of
@@ -68,6 +68,7 @@ class Gaussians:
     optimizer:  moments and step counts, so that a training can be resumed.
     trace:      one row a report interval: error against run time.
     notes:      encoder sizes, label names, and what the scene left out and why.
+    given_poses: f64 [V, 4, 4] cam_from_world that the cameras had before the training refined them; None: it did not.
     """
 
     parameters: dict[str, np.ndarray]
@@ -76,6 +77,7 @@ class Gaussians:
     optimizer: dict[str, np.ndarray] = field(default_factory=dict)
     trace: list[dict[str, float]] = field(default_factory=list)
     notes: dict[str, Any] = field(default_factory=dict)
+    given_poses: np.ndarray | None = None
 
     def encoder(self) -> tuple[dict[str, int], dict[str, np.ndarray]]:
         """Settings and weights of the local encoder. Raises InputError if the scene was trained without one."""
@@ -96,7 +98,8 @@ def write_gaussians(out: Path, gaussians: Gaussians) -> None:
     write_tensors(out / "parameters.safetensors", gaussians.parameters | {"shN": kept})
     write_cameras(out, gaussians.cameras)
     write_document(out / "notes.json", gaussians.notes)
-    for name, arrays in (("modules", gaussians.modules), ("optimizer", gaussians.optimizer)):
+    given = {} if gaussians.given_poses is None else {"cam_from_world": gaussians.given_poses}
+    for name, arrays in (("modules", gaussians.modules), ("optimizer", gaussians.optimizer), ("given", given)):
         if arrays:
             write_tensors(out / f"{name}.safetensors", arrays)
     with (out / "trace.csv").open("w", newline="") as handle:
@@ -122,15 +125,19 @@ def read_gaussians(path: Path) -> Gaussians:
     parameters["shN"] = np.concatenate([shN, np.zeros((n, 15 - shN.shape[1], 3), np.float32)], 1)
     optional = {
         name: read_tensors(path, manifest, f"{name}.safetensors") if f"{name}.safetensors" in manifest.files else {}
-        for name in ("modules", "optimizer")
+        for name in ("modules", "optimizer", "given")
     }
+    cameras, given = read_cameras(path, manifest), optional["given"].get("cam_from_world")
+    if given is not None:
+        check_cameras(cameras.names, cameras.Ks, given, path / "given.safetensors", remedy)
     return Gaussians(
         parameters,
-        read_cameras(path, manifest),
+        cameras,
         optional["modules"],
         optional["optimizer"],
         read_trace(path, manifest),
         read_document(path, manifest, "notes.json", Notes),
+        given,
     )
 
 

@@ -140,6 +140,13 @@ def run(job: Job) -> None:
     n_views = len(fields["names"])
     fields["is_test"], protocol = split(fields["names"], fields.pop("is_test", None), settings)
     fields |= thinned(fields, settings.max_train_views)
+    strengths = settings.disturb_colors, settings.disturb_degrees, settings.disturb_shift
+    if any(strengths):
+        from chebsplat.stages.sources.disturbed import disturbed
+
+        if fields.get("cam_from_world") is None and any(strengths[1:]):
+            raise ConfigError("ingest.disturb_degrees and disturb_shift change poses, and this source has none")
+        fields |= disturbed(fields, *strengths, settings.disturb_seed)
     if settings.classes is not None:
         fields |= renamed(fields, settings.classes)
     optional: dict[str, Any] = {"depth": None, "labels": None, "loss_mask": None, "class_names": None}

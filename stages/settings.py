@@ -53,6 +53,11 @@ class IngestSection(Section):
     classes: dict[Text, list[Text]] | None = setting(
         None, "names, each with the source's classes that it stands for; what stands for none is not counted"
     )
+    # for studies: what real cameras do, of known strength, to the training views alone
+    disturb_colors: float = number(0.0, "exposures at random, in stops; a quarter of it in white balance", 0, 8)
+    disturb_degrees: float = number(0.0, "turns of the cameras at random", 0, 180)
+    disturb_shift: float = number(0.0, "shifts of the cameras at random, in scene units", 0, 1e6)
+    disturb_seed: int = seed("of these disturbances")
     min_views: int = number(3, "fewer usable views are an error", 1, 100_000)
 
 

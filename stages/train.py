@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 from chebsplat.errors import DataFailure
 from chebsplat.stages.command import Job, command, n_threads
+from chebsplat.stages.photo_models import camera_models, facts, reached
 from chebsplat.stages.resume import Saves
 from chebsplat.stages.stopping import deferred
 from chebsplat.stages.train_inputs import (
@@ -57,14 +58,17 @@ def run(job: Job) -> None:
     torch.set_num_threads(n_threads())  # sums of torch depend on it; the same bytes are promised for the same number
     model = model_of(points, features, train, job.config.describe)
     regions, described_values = first_regions(descriptors if points is given else None)
+    views = training_views(capture, points, features, train.weight_depth > 0)
+    models = camera_models(job, capture, points, views)
     trainer = Trainer(
         model,
-        training_views(capture, points, features),
+        views,
         train,
         extent(points.cam_from_world),
         basis=knowledge(job, model, train),
         regions=regions,
         descriptors=described_values,
+        cameras=models,
     )
     trace = follow(job, trainer, train)
     parameters, population = trainer.finish(), trainer.population
@@ -74,7 +78,9 @@ def run(job: Job) -> None:
     if left == 0:
         raise DataFailure("no Gaussian is left; lower train.weight_mask or raise train.min_gaussians")
     modules = {f"{n}.{k}": v.detach().numpy() for n, m in model.modules.items() for k, v in m.state_dict().items()}
-    cameras = Cameras(points.names, points.Ks, points.cam_from_world, *capture.size)
+    cameras = Cameras(points.names, points.Ks, reached(models, views, points), *capture.size)
+    given_poses = None if models.poses is None else points.cam_from_world
+    job.facts |= facts(models)
     notes: dict[str, Any] = {"left_out": job.facts.get("left_out", {}), "n_added": population.n_added}
     notes |= {"n_removed": population.n_removed, "n_broken": population.n_broken, "n_initial": len(points.means)}
     if features is not None:
@@ -95,7 +101,8 @@ def run(job: Job) -> None:
     timed = max(trainer.step - 1, 1)  # all but the first
     job.facts |= {"n_gaussians": left, "steps": trainer.step, "seconds_per_step": trace[-1]["seconds"] / timed}
     job.facts["milliseconds"] = {part: 1e3 * seconds / timed for part, seconds in trainer.laps.seconds.items()}
-    write_gaussians(job.out, Gaussians(parameters, cameras, modules, optimizer_state(trainer), trace, notes))
+    moments = optimizer_state(trainer)
+    write_gaussians(job.out, Gaussians(parameters, cameras, modules, moments, trace, notes, given_poses))
 
 
 def agreement(alone: np.ndarray, features: np.ndarray, embeddings: np.ndarray) -> dict[str, float]:

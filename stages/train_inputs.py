@@ -22,11 +22,15 @@ if TYPE_CHECKING:
     from chebsplat.training.model import SceneModel
     from chebsplat.views import TaughtLabels, Views
 
+DEPTH_BYTES = 512 << 20  # of depth that are kept in memory
 FEATURE_BYTES = 64 << 20  # of features that are kept in memory; what is beyond is read when its view is looked at
 
 
-def training_views(capture: Capture, points: Points, features: Features | None) -> Views:
-    """The registered training views, joined by name. Raises InputError if artifacts do not belong together."""
+def training_views(capture: Capture, points: Points, features: Features | None, with_depth: bool = False) -> Views:
+    """The registered training views, joined by name, with the capture's depth where asked for and there.
+
+    Raises: InputError if artifacts do not belong together.
+    """
     import torch
 
     from chebsplat.views import Views, remembered
@@ -56,6 +60,7 @@ def training_views(capture: Capture, points: Points, features: Features | None) 
         if features.pseudo_labels is not None and features.confidence is not None:
             labels_of = taught_labels(features, [source[name] for name in names])
 
+    depth_of = measured_depth(capture, chosen) if with_depth else None
     return Views(
         names,
         torch.from_numpy(images[chosen]),
@@ -64,7 +69,28 @@ def training_views(capture: Capture, points: Points, features: Features | None) 
         None if masks is None else torch.from_numpy(masks[:][chosen]),
         of,
         labels_of,
+        depth_of,
     )
+
+
+def measured_depth(capture: Capture, rows: list[int]) -> Callable[[int, int], Tensor] | None:
+    """z-depth of the views with these rows in the capture, every so many pixels; None where there is none, or where its
+    unit is not the scene's, as poses are not the capture's own.
+    """
+    import torch
+
+    from chebsplat.views import remembered
+
+    depth = capture.depth
+    if depth is None or capture.cam_from_world is None:
+        return None
+    read = remembered(lambda index: torch.from_numpy(depth[rows[index]]), DEPTH_BYTES)
+
+    def at(index: int, factor: int) -> Tensor:
+        height, width = (side // factor * factor for side in capture.size[::-1])
+        return read(index)[: height : factor, : width : factor]
+
+    return at
 
 
 def taught_labels(features: Features, rows: list[int]) -> Callable[[int], TaughtLabels]:

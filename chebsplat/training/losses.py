@@ -87,6 +87,20 @@ def photometric_reference(render: Tensor, target: Tensor, mask: Tensor | None, w
     return (1 - weight_ssim) * distance + weight_ssim * (weight * (1 - ssim_map(render, target))).sum()
 
 
+def depth_distance(depth: Tensor, alpha: Tensor, truth: Tensor, mask: Tensor | None) -> Tensor:
+    """How far rendered surfaces lie from measured ones, relative to their depth: mean |Σ wᵢ (zᵢ − d)| / d.
+
+    Args: depth [H, W] composited like a colour, alpha [H, W, 1]; truth [H, W], nan where unknown; mask [H, W] or None.
+    Choices: no division by alpha, so that a pixel that little covers pulls little; 0 where nothing is known.
+    """
+    known = torch.isfinite(truth) & (truth > 0)
+    if mask is not None:
+        known &= mask > 0
+    d = torch.where(known, truth, 1)
+    distance = torch.where(known, (depth - alpha[..., 0] * d).abs() / d, 0)
+    return distance.sum() / known.sum().clamp_min(1)
+
+
 class _FeatureDistance(torch.autograd.Function):
     """The fused loss: its gradient is computed with its value."""
 

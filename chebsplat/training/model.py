@@ -15,6 +15,7 @@ from chebsplat.shape.branch import FreshEncodings, ShapeBranch
 from chebsplat.shape.regions import Regions, covering
 from chebsplat.splats.sh_kernels import colors_in_view
 from chebsplat.training import prune, sh_mask_network, sh_prune
+from chebsplat.training.poses import moved
 from chebsplat.training.rows import take
 from chebsplat.training.sh_mask_network import BandMaskNetwork
 from chebsplat.views import View, in_frustum
@@ -40,7 +41,8 @@ class Auxiliary:
 @dataclass
 class Rendered:
     """rgb [H, W, 3], alpha [H, W, 1], features [H, W, C], [h, w, C] by cell of the rasterizer, or None; `index` [V]
-    the Gaussians in the frustum, with `means2d` [1, V, 2] and `radii` [1, V, 2] in `meta`.
+    the Gaussians in the frustum, with `means2d` [1, V, 2] and `radii` [1, V, 2] in `meta`; depth [H, W] z-depths of
+    the centres, scene units, composited like colours, or None.
     """
 
     rgb: Tensor
@@ -49,6 +51,7 @@ class Rendered:
     meta: dict[str, Any]
     index: Tensor
     auxiliary: Auxiliary
+    depth: Tensor | None = None
 
 
 class SceneModel:
@@ -189,18 +192,21 @@ class SceneModel:
         fused: bool = False,
         generator: torch.Generator | None = None,
         grid: tuple[int, int] | None = None,
+        depth: bool = False,
     ) -> Rendered:
         """Colour and features in one pass.
 
         degree: SH bands in use; masked: apply the pruning masks; semantic: render features too; fused: the fused ones,
         not the raw ones; grid: features are only wanted as means over h × w cells, and rendered so where these are the
-        rasterizer's.
+        rasterizer's; depth: render it too, a fourth channel beside the colours.
         """
         raw = self.raw
         with torch.no_grad():
             reach = 3 * raw["log_scales"].amax(1).exp()
             index = in_frustum(raw["means"], view, reach)
         means, quats = take(raw["means"], index), take(raw["quats"], index)
+        if view.twist is not None:
+            means, quats = moved(means, quats, view)
         scales, opacities = take(raw["log_scales"], index).exp(), take(raw["logit_opacities"], index).sigmoid()
         auxiliary = Auxiliary()
         features = None
@@ -223,6 +229,9 @@ class SceneModel:
         if not semantic:  # the masks have seen them
             features = None
         colors = colors_in_view(self.bands(), masks, index, raw["means"], eye, degree)
+        if depth:
+            colors = torch.cat([colors, (means @ view.viewmat[2, :3] + view.viewmat[2, 3])[:, None]], -1)
+        n_colors = colors.shape[1]
         gaussians, camera = (means, quats, scales, opacities), (view.viewmat[None], view.K[None])
         size = view.width, view.height
         if features is None or (grid is not None and size == (CELL * grid[1], CELL * grid[0])):
@@ -230,11 +239,13 @@ class SceneModel:
                 *gaussians, colors, *camera, *size, cell_colors=features, backend=self.backend
             )
             cells = None if features is None else meta["cells"][0]
-            return Rendered(render[0], alpha[0], cells, meta, index, auxiliary)
+            image, z = render[0].split([3, 1], -1) if depth else (render[0], None)
+            return Rendered(image, alpha[0], cells, meta, index, auxiliary, None if z is None else z[..., 0])
         channels = torch.cat([colors, features], -1)
         render, alpha, meta = rasterize(*gaussians, channels, *camera, *size, backend=self.backend)
-        parts = render[0].split([3, channels.shape[1] - 3], -1)  # one gradient, where two slices would make two
-        return Rendered(parts[0], alpha[0], parts[1], meta, index, auxiliary)
+        sizes = [3, n_colors - 3, channels.shape[1] - n_colors]
+        parts = render[0].split(sizes, -1)  # one gradient, where slices would make one each
+        return Rendered(parts[0], alpha[0], parts[2], meta, index, auxiliary, parts[1][..., 0] if depth else None)
 
     @torch.no_grad()
     def fused_features(self) -> np.ndarray | None:

@@ -15,8 +15,9 @@ from chebsplat.evaluation.metrics import psnr
 from chebsplat.settings import TrainSection
 from chebsplat.shape.regions import Regions, regions_of
 from chebsplat.training import sh_mask_network, sh_prune
+from chebsplat.training.camera_models import CameraModels
 from chebsplat.training.laps import Laps
-from chebsplat.training.losses import photometric
+from chebsplat.training.losses import depth_distance, photometric
 from chebsplat.training.model import Rendered, SceneModel
 from chebsplat.training.population import Population, broken
 from chebsplat.training.schedule import Schedule, adam, feature_every
@@ -33,6 +34,7 @@ class Trainer:
       extent:   scene units, scales the means' learning rate.
       basis:    matrices [q, r] by name of an earlier scene's knowledge; None: of none.
       regions, descriptors: of the model's Gaussians as they are; None: they are computed.
+      cameras:  what is learned of each view's camera; None: nothing.
     `state_dict()` between two steps holds all that the steps to come depend on: a trainer that loads it takes them as
     this one does, to the bit, with as many threads.
     """
@@ -47,11 +49,13 @@ class Trainer:
         basis: dict[str, Tensor] | None = None,
         regions: Regions | None = None,
         descriptors: Tensor | None = None,
+        cameras: CameraModels | None = None,
     ):
         self.feature_every = feature_every(settings, len(views.names))
         settings = settings.model_copy(update={"feature_every": self.feature_every})
         self.model, self.views, self.settings, self.extent = model, views, settings, extent
         self.basis = basis if basis and model.shape is not None else {}
+        self.cameras = cameras or CameraModels()
         self.schedule = Schedule(settings)
         self.guidance: Tensor | None = None
         self.optimizer = adam(self.model, self.settings, self.extent)
@@ -145,6 +149,7 @@ class Trainer:
             "order_generator": self.order_generator.bit_generator.state,
             "generator": self.generator.get_state(),
             "population": self.population.state_dict(),
+            "cameras": self.cameras.state_dict(),
             "progress": {name: getattr(self, name) for name in PROGRESS},
         }
 
@@ -164,6 +169,7 @@ class Trainer:
         for name, value in state["progress"].items():
             setattr(self, name, value)
         self.population.load_state_dict(state["population"])
+        self.cameras.load_state_dict(state["cameras"])
 
     def _encodes(self, share: float) -> bool:
         return self.model.shape is not None and self.schedule.encodes(share)
@@ -199,17 +205,22 @@ class Trainer:
         target, mask = self.views.target(index, factor)
         pruning, taught = self.schedule.prunes(share), self.step % self.feature_every == 0
         wanted = None if self.views.features is None or not taught else self.views.features(index)
+        surface = None if self.views.depth is None else self.views.depth(index, factor)
         rendered = self.model.render(
-            self.views.camera(index, factor),
+            self.cameras.camera(self.views, index, factor),
             self.schedule.degree(share),
             masked=pruning,
             semantic=taught,
             fused=self._encodes(share),
             generator=self.generator if self.step % settings.encode_every == 0 else None,
             grid=None if wanted is None else (wanted.shape[0], wanted.shape[1]),
+            depth=surface is not None,
         )
         self.laps.mark("render")
-        losses = self._losses(rendered, target, mask, wanted, index)
+        rendered.rgb = self.cameras.taken(rendered.rgb, index)
+        losses = self._losses(rendered, target, mask, wanted, index) | self.cameras.losses()
+        if surface is not None and rendered.depth is not None:
+            losses["depth"] = settings.weight_depth * depth_distance(rendered.depth, rendered.alpha, surface, mask)
         loss = torch.stack(list(losses.values())).sum()
         if not torch.isfinite(loss):
             bad = [name for name, value in losses.items() if not torch.isfinite(value)]
@@ -226,6 +237,7 @@ class Trainer:
             (loss - losses["color"]).backward()
         self.laps.mark("backward")
         self.optimizer.step()
+        self.cameras.step(index, share)
         self.laps.mark("optimizer")
         return {"loss": float(loss.detach())} | {f"loss_{k}": float(v.detach()) for k, v in losses.items()}
 
@@ -256,9 +268,9 @@ class Trainer:
         """Mean PSNR over training views at full resolution, dB."""
         scores = []
         for index in indices:
-            camera, degree = self.views.camera(index, 1), self.schedule.degree(self.share)
+            camera, degree = self.cameras.camera(self.views, index, 1, False), self.schedule.degree(self.share)
             rendered = self.model.render(camera, degree, semantic=False)
-            image = (rendered.rgb.clamp(0, 1) * 255).round().byte().numpy()
+            image = (self.cameras.taken(rendered.rgb, index).clamp(0, 1) * 255).round().byte().numpy()
             mask = None if self.views.masks is None else self.views.masks[index].numpy()
             truth = self.views.images[index].numpy()
             scores.append(psnr(image, truth) if mask is None else psnr(image[mask], truth[mask]))
