@@ -38,15 +38,16 @@ class SceneRenderer:
         self.raw, self.reach = raw, 3 * self.scales.amax(1)
         self.normals = surface_of(parameters)[0].astype(np.float64)
 
+    def colors(self, view: View, index: Tensor) -> Tensor:
+        """Colours [V, 3] of these Gaussians as the view's camera sees them."""
+        eye, raw = -view.viewmat[:3, :3].T @ view.viewmat[:3, 3], self.raw
+        return colors_by_degree(raw["sh0"][index], raw["shN"][index], self.means[index] - eye, raw["degrees"][index])
+
     @torch.no_grad()
     def render(self, view: View, with_features: bool = False) -> tuple[np.ndarray, np.ndarray | None]:
         """Image u8 [H, W, 3], and features f32 [H, W, C] where asked for and present."""
         index = in_frustum(self.means, view, self.reach)
-        eye = -view.viewmat[:3, :3].T @ view.viewmat[:3, 3]
-        raw = self.raw
-        channels = colors_by_degree(
-            raw["sh0"][index], raw["shN"][index], self.means[index] - eye, raw["degrees"][index]
-        )
+        raw, channels = self.raw, self.colors(view, index)
         if with_features and "features" in raw:
             channels = torch.cat([channels, raw["features"][index]], 1)
         gaussians = (self.means[index], self.quats[index], self.scales[index], self.opacities[index])

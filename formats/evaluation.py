@@ -25,6 +25,7 @@ Share = Annotated[float, Ge(0), Le(1)]
 
 class Image(TypedDict):
     psnr: float
+    psnr_fit: NotRequired[float]
     ssim: float
     per_view: dict[str, list[float]]
 
@@ -51,6 +52,7 @@ class Figures(TypedDict):
 
     names: list[str]
     image: Image
+    image_aligned: NotRequired[Image]
     n_gaussians: Count
     bytes: dict[str, Count]
     frames_per_second: dict[str, float]
@@ -104,7 +106,8 @@ def read_figures(path: Path, manifest: Manifest) -> dict[str, Any]:
     figures: dict[str, Any] = read_document(path, manifest, "figures.json", Figures)
     file, remedy = path / "figures.json", remedy_of(path)
     check_names(figures["names"], "names", file, remedy)
-    for name, values in figures["image"]["per_view"].items():
-        if len(values) != len(figures["names"]):
-            raise InputError(f"{file}: {len(values)} {name} of {len(figures['names'])} views; {remedy}")
+    for image in (figures["image"], figures.get("image_aligned", {"per_view": {}})):
+        for name, values in image["per_view"].items():
+            if len(values) != len(figures["names"]):
+                raise InputError(f"{file}: {len(values)} {name} of {len(figures['names'])} views; {remedy}")
     return figures

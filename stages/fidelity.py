@@ -23,18 +23,22 @@ def image_figures(
 ) -> dict[str, Any]:
     """PSNR, SSIM and LPIPS of 8-bit images, by view and in the mean; `lpips` is None where not measured.
 
-    Choices: masked pixels do not count; for SSIM and LPIPS they take the true colour.
+    Choices: masked pixels do not count; for SSIM and LPIPS they take the true colour. `psnr_fit` is the PSNR after an
+      affine fit of a render's colours to its photo: what exposure and white balance of the test photos do not spoil.
     """
     import numpy as np
 
-    from chebsplat.evaluation.metrics import psnr
+    from chebsplat.evaluation.metrics import color_fitted, psnr
     from chebsplat.training.losses import ssim
 
-    per_view: dict[str, list[float]] = {name: [] for name in ("psnr", "ssim", *(["lpips"] if lpips else []))}
+    names = ("psnr", "psnr_fit", "ssim", *(["lpips"] if lpips else []))
+    per_view: dict[str, list[float]] = {name: [] for name in names}
     for k, (render, true) in enumerate(zip(renders, truth, strict=True)):
         counted = np.ones(true.shape[:2], bool) if masks is None else masks[k]
         filled = np.where(counted[..., None], render, true)
-        per_view["psnr"].append(min(psnr(render[counted], true[counted]), 100.0))
+        pixels, wanted = render[counted], true[counted]
+        per_view["psnr"].append(min(psnr(pixels, wanted), 100.0))
+        per_view["psnr_fit"].append(min(psnr(color_fitted(pixels, wanted), wanted), 100.0))
         per_view["ssim"].append(ssim(filled, true))
         if lpips is not None:
             per_view["lpips"].append(lpips.distance(filled, true))

@@ -156,9 +156,12 @@ def summary_rows(figures: dict[str, Any], by_degree: list[int] | None, trained: 
     rows = [
         ["figure", "scene", "2D teacher"],
         ["PSNR, dB (8-bit, mean over views)", f"{image['psnr']:.2f}", ""],
+        ["PSNR after a colour fit by view, dB", shown(image.get("psnr_fit"), "{:.2f}"), ""],
         ["SSIM (window 11, σ 1.5)", f"{image['ssim']:.4f}", ""],
         ["LPIPS (vgg, images in [0, 1])", shown(figures["lpips"], "{:.3f}"), ""],
     ]
+    if "image_aligned" in figures:
+        rows.insert(3, ["PSNR at poses refined on the test photos, dB", f"{figures['image_aligned']['psnr']:.2f}", ""])
     segmentation = figures.get("segmentation") or {}
     names = {"miou": "mIoU", "macc": "mAcc", "oa": "OA", "boundary_miou": "mIoU in the boundary band",
              "point_miou": "mIoU of 3D points"}  # fmt: skip

@@ -187,6 +187,9 @@ class CksSection(Section):
 class EvaluateSection(Section):
     boundary: int = number(5, "pixels, half width of the boundary band", 1, 100)
     timing_repeats: int = number(3, "of every frame; 0: no timing; studies then evaluate in parallel", 0, 1000)
+    poses: Literal["given", "refined"] = setting(
+        "given", "of test views; refined: aligned to the scene by their photos, for figures of their own beside"
+    )
     lpips_weights: Text | None = setting(
         None, ".safetensors or .pth with VGG-16 and LPIPS' taps; default: LPIPS is not measured"
     )

@@ -88,7 +88,7 @@ def measured_depth(capture: Capture, rows: list[int]) -> Callable[[int, int], Te
 
     def at(index: int, factor: int) -> Tensor:
         height, width = (side // factor * factor for side in capture.size[::-1])
-        return read(index)[: height : factor, : width : factor]
+        return read(index)[:height:factor, :width:factor]
 
     return at
 

@@ -29,6 +29,17 @@ def psnr(image: np.ndarray, truth: np.ndarray) -> float:
     return float(10 * np.log10(255**2 / error)) if error > 0 else float("inf")
 
 
+def color_fitted(image: np.ndarray, truth: np.ndarray) -> np.ndarray:
+    """The image u8 [..., 3] in the affine map of its colours that is nearest to the truth u8 [..., 3], u8.
+
+    Choices: least squares over all pixels, 12 numbers; then rounded and cut off to 8 bits, as any picture.
+    """
+    colors = np.concatenate([image.reshape(-1, 3) / 255, np.ones((image.size // 3, 1))], 1)
+    weights = np.linalg.lstsq(colors.T @ colors, colors.T @ (truth.reshape(-1, 3) / 255), rcond=1e-9)[0]
+    fitted: np.ndarray = (255 * colors @ weights).round().clip(0, 255).astype(np.uint8).reshape(image.shape)
+    return fitted
+
+
 def confusion(labels: np.ndarray, truth: np.ndarray, n_classes: int) -> np.ndarray:
     """[L, L] counts, rows by truth; pixels whose truth is IGNORE do not count.
 

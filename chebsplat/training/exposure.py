@@ -17,7 +17,7 @@ CELL, MOST_POINTS, LEAST_POINTS = 8, 4000, 30  # of `exposure_spread`: pixels; p
 
 
 class Exposure:
-    """colour' = (I + A_v) colour + b_v of V views; [A_v | b_v] [3, 4] starts at zero, and its mean over views stays zero.
+    """colour' = (I + A_v) colour + b_v of V views; [A_v | b_v] [3, 4] starts at zero, and so stays its mean over views.
 
     Args: rate: of Adam, in colours from 0 to 1, at the start; weight: of the pull towards the identity.
     Choices: the mean over views is held at the identity, since otherwise all maps and the scene's colours could drift

@@ -82,13 +82,15 @@ class Poses:
     """Poses of V training views that follow the gradient of what is rendered with them.
 
     Args: viewmats [V, 4, 4] and Ks [V, 3, 3] as given; size: width, height; points [N, 3] of the scene; rate: pixels
-      that a view may move by in its first step.
+      that a view may move by in its first step; free: nothing ties the views to each other.
     Choices: the mean of all corrections, as motions of the world, stays zero to first order: no photo sees a motion of
       all cameras and the scene together, and test views would.
     """
 
-    def __init__(self, viewmats: Tensor, Ks: Tensor, size: tuple[int, int], points: Tensor, rate: float):
-        self.rate, self.given = rate, viewmats.double()
+    def __init__(
+        self, viewmats: Tensor, Ks: Tensor, size: tuple[int, int], points: Tensor, rate: float, free: bool = False
+    ):
+        self.rate, self.given, self.free = rate, viewmats.double(), free
         self.viewmats = self.given.clone()
         pairs = zip(Ks, self.given, strict=True)
         self.scales = torch.stack([preconditioner(points, K, viewmat, size) for K, viewmat in pairs])
@@ -109,6 +111,8 @@ class Poses:
         scale = self.scales[view]
         change = scale @ self.optimizer.change(view, scale.T @ self.twist.grad.double(), self.rate * 0.03**share)
         self.viewmats[view] = motion(change) @ self.viewmats[view]
+        if self.free:
+            return
         drift = small_twist(torch.linalg.inv(self.given) @ self.viewmats).mean(0)
         self.viewmats = self.viewmats @ motion(-drift)
 
