@@ -1,0 +1,220 @@
+"""What a training learns of each photo beside the scene: exposures and poses; and depth that a capture brings."""
+
+import chebsplat  # noqa: F401  # isort: skip
+import numpy as np
+import pytest
+import torch
+from shared import ROOT
+
+from chebsplat.cameras import centers
+from chebsplat.evaluation.metrics import color_fitted
+from chebsplat.rasterize import rasterize
+from chebsplat.stages.sources.disturbed import displaced, recolored
+from chebsplat.training.camera_models import CameraModels
+from chebsplat.training.exposure import Exposure, exposure_spread
+from chebsplat.training.losses import depth_distance
+from chebsplat.training.poses import Poses, motion, moved, preconditioner, small_twist
+from chebsplat.training.row_adam import RowAdam
+from chebsplat.views import View
+
+K = torch.tensor([[40.0, 0, 24], [0, 40, 20], [0, 0, 1]])
+AWAY = torch.eye(4)
+AWAY[2, 3] = 5.0
+
+
+@pytest.fixture
+def tiny_trainer(monkeypatch):
+    monkeypatch.syspath_prepend(str(ROOT))
+    from benchmarks.stability.training import tiny_trainer
+
+    return tiny_trainer
+
+
+def cloud(n=30):
+    g = torch.Generator().manual_seed(0)
+    return [torch.randn(n, 3, generator=g), torch.randn(n, 4, generator=g), 0.05 + 0.3 * torch.rand(n, 3, generator=g),
+            0.1 + 0.8 * torch.rand(n, generator=g), torch.rand(n, 3, generator=g)]  # fmt: skip
+
+
+def test_gaussians_moved_by_no_twist_are_the_same_and_give_the_pose_its_gradient():
+    """Against the reference, which differentiates the camera itself."""
+    means, quats, *others = cloud()
+    pose = motion(torch.tensor([0.3, 0.2, -0.4, 0.1, 0.2, 5.0]))
+    target = torch.rand(40, 48, 3, generator=torch.Generator().manual_seed(1))
+    twist = torch.zeros(6, requires_grad=True)
+    shifted, turned = moved(means, quats, View(K, pose, 48, 40, twist))
+    assert torch.equal(shifted, means) and torch.equal(turned, quats)
+    image = rasterize(shifted, turned, *others, pose[None], K[None], 48, 40)[0][0]
+    (image - target).square().sum().backward()
+    exact = torch.zeros(6, dtype=torch.float64, requires_grad=True)
+    doubles = [part.double() for part in (means, quats, *others)]
+    frame = (motion(exact) @ pose.double())[None], K[None].double(), 48, 40
+    image = rasterize(*doubles, *frame, backend="reference")[0][0]
+    (image - target.double()).square().sum().backward()
+    torch.testing.assert_close(twist.grad.double(), exact.grad, rtol=1e-4, atol=1e-3)
+
+
+def test_a_preconditioned_step_moves_the_picture_by_a_pixel():
+    points = torch.randn(2000, 3, generator=torch.Generator().manual_seed(2)).double() * torch.tensor([2.0, 2, 1])
+    scale = preconditioner(points, K, AWAY, (48, 40))
+
+    def pixels(pose):
+        camera = points @ pose[:3, :3].T + pose[:3, 3]
+        return (camera / camera[:, 2:] @ K.double().T)[:, :2]
+
+    before = pixels(AWAY.double())
+    inside = ((before >= 0) & (before < torch.tensor([48, 40]))).all(1)
+    for axis in range(6):
+        change = pixels(motion(1e-3 * scale[:, axis]) @ AWAY.double()) - before
+        moved_by = change[inside].square().sum(1).mean().sqrt() / 1e-3
+        assert 0.5 < moved_by < 1.01, axis  # less where damping holds back what hardly shows
+    assert not preconditioner(points[:3], K, AWAY, (48, 40)).any()
+
+
+def test_poses_that_are_refined_keep_their_mean_and_undo_a_disturbance():
+    """Six cameras about a coloured cloud, photos from the true poses: most of the disturbance goes."""
+    means, quats, scales, opacities, colors = cloud(60)
+    true = torch.stack([motion(torch.tensor([0.0, a, 0.1 * a, 0, 0, 0])) for a in torch.linspace(-0.6, 0.6, 6)]).double()
+    true[:, 2, 3] = 6
+    given = torch.from_numpy(displaced(true.numpy(), np.zeros(6, bool), 1.5, 0.05, seed=0))
+
+    def image(view):
+        parts = means, quats
+        if view.twist is not None:
+            parts = moved(*parts, view)
+        return rasterize(*parts, scales, opacities, colors, view.viewmat[None], K[None], 48, 40)[0][0]
+
+    photos = [image(View(K, pose.float(), 48, 40)) for pose in true]
+    poses = Poses(given, K.expand(6, 3, 3), (48, 40), means, rate=0.5)
+    for step in range(300):
+        view = step % 6
+        (image(poses.camera(View(K, given[view].float(), 48, 40), view)) - photos[view]).square().sum().backward()
+        poses.step(view, step / 300)
+
+    def error(found):
+        return float(small_twist(torch.linalg.inv(true) @ found).norm(dim=1).mean())
+
+    assert error(poses.viewmats) < 0.2 * error(given)
+    assert small_twist(torch.linalg.inv(given) @ poses.viewmats).mean(0).abs().max() < 1e-3
+    turned = poses.viewmats[:, :3, :3]
+    off = (turned @ turned.mT - torch.eye(3)).abs().max()
+    assert off < 1e-5  # the given ones were float32
+
+
+def test_exposures_that_are_learned_keep_their_mean_at_the_identity():
+    model, g = Exposure(4, 2e-2, 0.0), torch.Generator().manual_seed(3)
+    image = torch.rand(8, 8, 3, generator=g)
+    gains = torch.tensor([[1.2, 1.1, 1.0], [0.8, 0.9, 1.0], [1.1, 0.9, 1.05], [0.9, 1.1, 0.95]])
+    for step in range(800):
+        view = step % 4
+        (model.apply(image, view) - image * gains[view]).abs().mean().backward()
+        model.step(view, step / 800)
+    for view in range(4):
+        assert (model.apply(image, view) - image * gains[view]).abs().mean() < 0.01
+    assert model.maps.mean(0).abs().max() < 1e-12
+
+
+def test_a_row_is_not_moved_by_what_it_remembers():
+    adam = RowAdam(2, 3)
+    assert torch.allclose(adam.change(0, torch.tensor([1.0, -2.0, 0.0]), 0.1), torch.tensor([-0.1, 0.1, 0]).double())
+    assert not adam.change(0, torch.tensor([1.0, float("nan"), 0]), 0.1).any()
+    assert adam.counts.tolist() == [1, 0] and not adam.moments[:, 1].any()
+
+
+def test_spread_of_exposures_is_that_of_the_gains_and_none_of_photos_alike():
+    g = np.random.default_rng(0)
+    poses = np.tile(np.eye(4), (5, 1, 1))
+    poses[:, 2, 3] = 5
+    points, image = g.normal(size=(2000, 3)), np.full((40, 48, 3), 100, np.uint8)
+    gains = np.array([0.8, 0.9, 1.0, 1.1, 1.2])
+    images = np.stack([(image * gain).astype(np.uint8) for gain in gains])
+    Ks = np.tile(K.double().numpy(), (5, 1, 1))
+    assert exposure_spread(images, Ks, poses, points) == pytest.approx(np.log(gains).std(), rel=0.1)
+    assert exposure_spread(images[[2] * 5], Ks, poses, points) == 0
+    assert exposure_spread(images, Ks, poses, points, np.zeros((2000, 5), bool)) == 0
+
+
+def trained(made):
+    for _ in made.steps():
+        pass
+    return made.finish()
+
+
+@pytest.mark.parametrize("learned", [False, True])
+def test_a_training_whose_photos_are_alike_and_posed_exactly_is_the_same_to_the_bit(tiny_trainer, learned):
+    """Models at rate 0 but for the rounding of the identity: without them not a bit changes."""
+    plain, other = tiny_trainer(), tiny_trainer()
+    if learned:
+        other.cameras = CameraModels(Exposure(4, 5e-3, 1e-2), poses_of(other))
+    before, after = trained(plain), trained(other)
+    same = [before[name].tobytes() == after[name].tobytes() for name in ("means", "sh0", "quats")]
+    assert all(same) != learned and any(same) != learned
+
+
+def poses_of(made):
+    views = made.views
+    return Poses(views.viewmats, views.Ks, (48, 40), made.model.raw["means"].detach(), rate=1.0)
+
+
+def test_a_resumed_training_goes_on_with_its_exposures_and_poses(tiny_trainer, tmp_path):
+    def made():
+        one = tiny_trainer(steps=12)
+        one.cameras = CameraModels(Exposure(4, 5e-3, 1e-2), poses_of(one))
+        return one
+
+    whole, resumed = made(), made()
+    for _ in whole.steps():
+        if whole.step == 7:
+            torch.save(whole.state_dict(), tmp_path / "7.pt")
+    resumed.load_state_dict(torch.load(tmp_path / "7.pt", weights_only=True))
+    for _ in resumed.steps():
+        pass
+    assert torch.equal(resumed.cameras.poses.viewmats, whole.cameras.poses.viewmats)
+    assert torch.equal(resumed.cameras.exposure.maps, whole.cameras.exposure.maps)
+    wanted, found = whole.finish(), resumed.finish()
+    assert all(np.array_equal(found[name], wanted[name]) for name in wanted)
+
+
+def test_depth_is_a_channel_that_changes_no_colour(tiny_trainer):
+    made = tiny_trainer()
+    view = made.views.camera(0, 1)
+    with_depth, without = (made.model.render(view, 3, depth=wanted) for wanted in (True, False))
+    torch.testing.assert_close(with_depth.rgb, without.rgb, rtol=0, atol=1e-6)
+    assert without.depth is None
+    covered = with_depth.alpha[..., 0] > 0.5
+    near = (with_depth.depth / with_depth.alpha[..., 0])[covered]
+    assert covered.any() and near.min() > 2.5 and near.max() < 5.5  # a unit sphere four units away
+
+
+def test_depth_distance_counts_what_is_known_alone():
+    truth = torch.full((4, 4), 2.0)
+    truth[0, 0], truth[0, 1] = float("nan"), 0.0
+    depth = torch.full((4, 4), 2.2, requires_grad=True)
+    distance = depth_distance(depth, torch.ones(4, 4, 1), truth, None)
+    distance.backward()
+    assert distance.item() == pytest.approx(0.1) and not depth.grad[0, :2].any() and (depth.grad[1:] > 0).all()
+    assert depth_distance(depth, torch.ones(4, 4, 1), truth * float("nan"), None) == 0
+
+
+def test_a_colour_fit_undoes_an_affine_map():
+    g = np.random.default_rng(1)
+    truth = g.integers(60, 200, (20, 30, 3), np.uint8)
+    image = (truth @ np.array([[0.7, 0.1, 0], [0, 0.8, 0.1], [0.1, 0, 0.9]]) + 10).round().astype(np.uint8)
+    assert np.abs(color_fitted(image, truth).astype(int) - truth).max() <= 2  # of rounding to 8 bits, twice
+    assert color_fitted(np.full_like(truth, 7), truth).std() < 60  # one colour fits as a constant
+
+
+def test_disturbances_leave_test_views_and_the_mean_alone():
+    poses = np.tile(np.eye(4), (9, 1, 1))
+    poses[:, :3, 3] = np.random.default_rng(2).normal(size=(9, 3))
+    is_test = np.arange(9) % 3 == 0
+    changed = displaced(poses, is_test, 0.5, 0.01, seed=1)
+    assert np.array_equal(changed[is_test], poses[is_test])
+    motions = torch.from_numpy(np.linalg.inv(poses[~is_test]) @ changed[~is_test])
+    assert small_twist(motions).mean(0).abs().max() < 1e-4
+    turns = np.degrees(np.linalg.norm(small_twist(motions)[:, :3], axis=1))
+    shifts = np.linalg.norm(centers(changed) - centers(poses), axis=1)[~is_test]
+    assert 0.3 < turns.mean() < 0.7 and 0.005 < shifts.mean() < 0.015
+    images = np.full((9, 4, 4, 3), 128, np.uint8)
+    other = recolored(images, is_test, 0.5, seed=1)
+    assert np.array_equal(other[is_test], images[is_test]) and other[~is_test].std() > 10
