@@ -105,9 +105,12 @@ def overrides(text: str) -> dict[str, Any]:
     return values
 
 
+OFF_IS_CHOICE = ("train.encoder", "train.densify", "train.exposure", "refine.smooth")
+
+
 def parsed(key: str, value: str) -> Any:
     """A value as TOML reads it, text where it does not; `on` and `off` are switches, where `off` is no choice."""
-    if value in ("on", "off") and key in ("train.encoder", "train.densify", "refine.smooth"):
+    if value in ("on", "off") and key in OFF_IS_CHOICE:
         return value
     try:
         return tomllib.loads(f"v = {value}")["v"]
