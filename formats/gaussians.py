@@ -13,7 +13,7 @@ from annotated_types import Ge, Le
 
 from chebsplat.errors import InputError
 from chebsplat.formats import artifact
-from chebsplat.formats.cameras import Cameras, check_cameras, read_cameras, write_cameras
+from chebsplat.formats.cameras import POSES, Cameras, check_cameras, read_cameras, write_cameras
 from chebsplat.formats.documents import Count, NotRequired, TypedDict, conform, read_document, write_document
 from chebsplat.formats.files import read_text
 from chebsplat.formats.manifest import Manifest, remedy_of
@@ -125,10 +125,12 @@ def read_gaussians(path: Path) -> Gaussians:
     parameters["shN"] = np.concatenate([shN, np.zeros((n, 15 - shN.shape[1], 3), np.float32)], 1)
     optional = {
         name: read_tensors(path, manifest, f"{name}.safetensors") if f"{name}.safetensors" in manifest.files else {}
-        for name in ("modules", "optimizer", "given")
+        for name in ("modules", "optimizer")
     }
-    cameras, given = read_cameras(path, manifest), optional["given"].get("cam_from_world")
-    if given is not None:
+    cameras, given = read_cameras(path, manifest), None
+    if "given.safetensors" in manifest.files:
+        specs = {"cam_from_world": POSES["cam_from_world"]}
+        given = read_tensors(path, manifest, "given.safetensors", specs)["cam_from_world"]
         check_cameras(cameras.names, cameras.Ks, given, path / "given.safetensors", remedy)
     return Gaussians(
         parameters,

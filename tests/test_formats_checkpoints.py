@@ -54,6 +54,18 @@ def test_checkpoint_round_trip_is_exact(tmp_path, n):
     assert found.optimizer == {}
 
 
+def test_poses_that_were_given_lie_beside_those_that_were_reached(tmp_path):
+    poses = CAMERAS.cam_from_world + 0.0
+    poses[:, 0, 3] += 0.25
+    found = read_gaussians(publish_gaussians(tmp_path / "g", Gaussians(example(), CAMERAS, given_poses=poses)))
+    np.testing.assert_array_equal(found.given_poses, poses)
+    np.testing.assert_array_equal(found.cameras.cam_from_world, CAMERAS.cam_from_world)
+    assert read_gaussians(publish_gaussians(tmp_path / "h", Gaussians(example(), CAMERAS))).given_poses is None
+    poses[:, 0, 0] = 2
+    with pytest.raises(InputError, match=r"given.safetensors: the pose of .* is not a rotation"):
+        read_gaussians(publish_gaussians(tmp_path / "i", Gaussians(example(), CAMERAS, given_poses=poses)))
+
+
 def test_bands_that_nobody_keeps_are_not_in_the_file(tmp_path):
     given = Gaussians(example(50, top=1), CAMERAS)
     path = publish_gaussians(tmp_path / "g", given)

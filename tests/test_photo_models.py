@@ -74,7 +74,9 @@ def test_a_preconditioned_step_moves_the_picture_by_a_pixel():
 def test_poses_that_are_refined_keep_their_mean_and_undo_a_disturbance():
     """Six cameras about a coloured cloud, photos from the true poses: most of the disturbance goes."""
     means, quats, scales, opacities, colors = cloud(60)
-    true = torch.stack([motion(torch.tensor([0.0, a, 0.1 * a, 0, 0, 0])) for a in torch.linspace(-0.6, 0.6, 6)]).double()
+    true = torch.stack(
+        [motion(torch.tensor([0.0, a, 0.1 * a, 0, 0, 0])) for a in torch.linspace(-0.6, 0.6, 6)]
+    ).double()
     true[:, 2, 3] = 6
     given = torch.from_numpy(displaced(true.numpy(), np.zeros(6, bool), 1.5, 0.05, seed=0))
 
