@@ -73,9 +73,10 @@ def training_views(capture: Capture, points: Points, features: Features | None, 
     )
 
 
-def measured_depth(capture: Capture, rows: list[int]) -> Callable[[int, int], Tensor] | None:
-    """z-depth of the views with these rows in the capture, every so many pixels; None where there is none, or where its
-    unit is not the scene's, as poses are not the capture's own.
+def measured_depth(capture: Capture, rows: list[int]) -> Callable[[int, int], Tensor]:
+    """z-depth of the views with these rows in the capture, every so many pixels.
+
+    Raises: ConfigError where there is none, or where its unit is not the scene's, as poses are not the capture's own.
     """
     import torch
 
@@ -83,7 +84,9 @@ def measured_depth(capture: Capture, rows: list[int]) -> Callable[[int, int], Te
 
     depth = capture.depth
     if depth is None or capture.cam_from_world is None:
-        return None
+        raise ConfigError(
+            "train.weight_depth needs a capture with poses and depth, and this one has no depth; set it to 0"
+        )
     read = remembered(lambda index: torch.from_numpy(depth[rows[index]]), DEPTH_BYTES)
 
     def at(index: int, factor: int) -> Tensor:

@@ -7,9 +7,17 @@ import torch
 from shared import ROOT
 
 from chebsplat.cameras import centers
-from chebsplat.evaluation.metrics import color_fitted
+from chebsplat.errors import ConfigError
+from chebsplat.evaluation.metrics import color_fitted, psnr
+from chebsplat.formats.capture import Capture
+from chebsplat.formats.points import Points
 from chebsplat.rasterize import rasterize
+from chebsplat.render import SceneRenderer
+from chebsplat.stages import config, photo_models
+from chebsplat.stages.alignment import aligned_renders
+from chebsplat.stages.command import Job
 from chebsplat.stages.sources.disturbed import displaced, recolored
+from chebsplat.stages.train_inputs import training_views
 from chebsplat.training.camera_models import CameraModels
 from chebsplat.training.exposure import Exposure, exposure_spread
 from chebsplat.training.losses import depth_distance
@@ -220,3 +228,85 @@ def test_disturbances_leave_test_views_and_the_mean_alone():
     images = np.full((9, 4, 4, 3), 128, np.uint8)
     other = recolored(images, is_test, 0.5, seed=1)
     assert np.array_equal(other[is_test], images[is_test]) and other[~is_test].std() > 10
+
+
+def photographed(kind, gains):
+    """A capture of one wall, a view for each gain, and points on it."""
+    g, n = np.random.default_rng(0), len(gains)
+    poses = np.tile(np.eye(4), (n, 1, 1))
+    poses[:, 2, 3] = 5
+    images = np.stack([np.full((40, 48, 3), 100 * gain, np.uint8) for gain in gains])
+    Ks, names = np.tile(K.double().numpy(), (n, 1, 1)), [f"v{k}" for k in range(n)]
+    capture = Capture(names, images, Ks, poses, np.zeros(n, bool), source={"kind": kind})
+    means = g.normal(size=(2000, 3))
+    flat = np.zeros((2000, 3), np.float32)
+    colors, shapes = np.full((2000, 3), 100, np.uint8), np.tile(np.eye(3, dtype=np.float32), (2000, 1, 1))
+    points = Points(names, Ks, poses, means, colors, flat, shapes, np.zeros((0, 2), np.int32))
+    return capture, points
+
+
+@pytest.mark.parametrize(
+    ("kind", "gains", "chosen", "wanted", "why"),
+    [
+        ("generated", [0.5, 1, 1.5, 2], "auto", False, "generated"),
+        ("colmap", [0.8, 1, 1.2, 1.4], "auto", True, "differ by"),
+        ("colmap", [1, 1, 1, 1], "auto", False, "differ by 0.0%"),
+        ("colmap", [1, 1, 1, 1], "on", True, "train.exposure is on"),
+        ("colmap", [0.8, 1, 1.2, 1.4], "off", False, "train.exposure is off"),
+    ],
+)
+def test_exposures_are_learned_where_photos_of_the_same_points_differ(tmp_path, kind, gains, chosen, wanted, why):
+    job = Job({}, config.build({"train": {"exposure": chosen}}, "test"), tmp_path, tmp_path)
+    capture, points = photographed(kind, gains)
+    found, reason = photo_models.wants_exposure(job, capture, points)
+    assert found == wanted and why in reason
+    assert ("exposure_spread" in job.facts) == (chosen == "auto" and kind != "generated")
+
+
+def test_what_is_not_learned_of_photos_is_left_out_with_its_reason(tmp_path):
+    capture, points = photographed("generated", [1, 1, 1])
+    job = Job({}, config.build({"train": {"poses": "given"}}, "test"), tmp_path, tmp_path)
+    models = photo_models.camera_models(job, capture, points, training_views(capture, points, None))
+    assert models == CameraModels(None, None) and photo_models.facts(models) == {}
+    assert job.facts["left_out"]["exposure by photo"] == "views are generated, all alike"
+    assert job.facts["left_out"]["pose refinement"] == "train.poses is given"
+    found = photo_models.reached(models, training_views(capture, points, None), points)
+    assert np.array_equal(found, capture.cam_from_world)
+
+
+def test_refined_poses_are_those_of_training_views_and_test_views_keep_theirs(tmp_path):
+    capture, points = photographed("colmap", [1, 1, 1, 1])
+    capture.is_test[1] = True
+    job = Job({}, config.build({"train": {"poses": "refined", "exposure": "off"}}, "test"), tmp_path, tmp_path)
+    views = training_views(capture, points, None)
+    models = photo_models.camera_models(job, capture, points, views)
+    models.poses.viewmats[1] = motion(torch.tensor([0.01, 0, 0, 0, 0, 0.1]).double()) @ models.poses.viewmats[1]
+    found = photo_models.reached(models, views, points)
+    changed = [not np.array_equal(a, b) for a, b in zip(found, points.cam_from_world, strict=True)]
+    assert changed == [False, False, True, False]
+    assert photo_models.facts(models)["poses"]["degrees"] == pytest.approx(np.degrees(0.01) / 3, rel=1e-3)
+    with pytest.raises(ConfigError, match="no depth"):
+        training_views(capture, points, None, with_depth=True)
+
+
+def test_depth_of_a_view_is_thinned_like_its_picture():
+    capture, points = photographed("colmap", [1, 1, 1])
+    capture.depth = np.arange(3 * 40 * 48, dtype=np.float32).reshape(3, 40, 48)
+    views = training_views(capture, points, None, with_depth=True)
+    for factor in (1, 2, 3):
+        target, _ = views.target(2, factor)
+        assert views.depth(2, factor).shape == target.shape[:2]
+    assert views.depth(2, 2)[1, 3] == capture.depth[2, 2, 6]
+    assert training_views(capture, points, None).depth is None
+
+
+def test_a_test_view_that_is_aligned_finds_its_pose_again(tmp_path):
+    means, quats, scales, opacities, colors = cloud(60)
+    parameters = {"means": means, "quats": quats, "log_scales": scales.log(), "logit_opacities": opacities.logit(),
+                  "sh0": (colors[:, None] - 0.5) / 0.28209479177387814, "shN": torch.zeros(60, 15, 3)}  # fmt: skip
+    arrays = {name: value.numpy() for name, value in parameters.items()} | {"degrees": np.zeros(60, np.uint8)}
+    renderer, job = SceneRenderer(arrays), Job({}, config.Config(), tmp_path, tmp_path)
+    truth = renderer.render(View(K, AWAY, 48, 40))[0]
+    off = View(K, motion(torch.tensor([0.01, -0.01, 0.01, 0.02, 0.02, 0])) @ AWAY, 48, 40)
+    found = aligned_renders(job, renderer, [off], truth[None], None)[0]
+    assert psnr(found, truth) > psnr(renderer.render(off)[0], truth) + 6

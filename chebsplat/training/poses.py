@@ -16,6 +16,7 @@ from torch import Tensor
 from chebsplat.training.row_adam import RowAdam
 from chebsplat.views import View
 
+DECAYS = 0.7, 0.95  # of the moments: a view is seen a dozen times in a short training, too seldom for Adam's own
 DAMPING = 1e-3  # of the least eigenvalues of a preconditioner, relative to their mean
 
 
@@ -31,7 +32,8 @@ def motion(twists: Tensor) -> Tensor:
     """Rigid motions exp(ξ) [..., 4, 4] of twists [..., 6]."""
     generator = torch.zeros(*twists.shape[:-1], 4, 4, dtype=twists.dtype)
     generator[..., :3, :3], generator[..., :3, 3] = hat(twists[..., :3]), twists[..., 3:]
-    return torch.linalg.matrix_exp(generator)
+    motions: Tensor = torch.linalg.matrix_exp(generator)
+    return motions
 
 
 def small_twist(motions: Tensor) -> Tensor:
@@ -75,7 +77,8 @@ def preconditioner(points: Tensor, K: Tensor, viewmat: Tensor, size: tuple[int, 
     jacobian = torch.cat([onto @ -hat(camera), onto * depth], -1).flatten(0, 1)  # shifts in units of the depth
     values, axes = torch.linalg.eigh(jacobian.T @ jacobian / len(camera))
     scale = torch.tensor([1.0, 1, 1, depth, depth, depth], dtype=torch.float64)
-    return scale[:, None] * (axes * (values + DAMPING * values.mean()).rsqrt()) @ axes.T
+    twists: Tensor = scale[:, None] * (axes * (values + DAMPING * values.mean()).rsqrt()) @ axes.T
+    return twists
 
 
 class Poses:
@@ -94,7 +97,7 @@ class Poses:
         self.viewmats = self.given.clone()
         pairs = zip(Ks, self.given, strict=True)
         self.scales = torch.stack([preconditioner(points, K, viewmat, size) for K, viewmat in pairs])
-        self.optimizer = RowAdam(len(viewmats), 6)
+        self.optimizer = RowAdam(len(viewmats), 6, DECAYS, joint=True)
         self.twist = torch.zeros(6)
 
     def camera(self, camera: View, view: int, learning: bool = True) -> View:

@@ -5,17 +5,18 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-DECAYS = 0.9, 0.99  # of the mean gradient, and of the mean square
-
 
 class RowAdam:
     """Every row of a table [V, K] has its own moments and its own count of steps.
 
+    Args: decays: of the mean gradient, and of the mean square; joint: one mean square for a row, so that its steps keep
+      the gradient's direction and are about `rate` long at first, where by default each value's are.
     Choices: Adam over the whole table would move each view on by what it remembers while others are trained, and its
       first steps would be √V too long.
     """
 
-    def __init__(self, n_rows: int, size: int):
+    def __init__(self, n_rows: int, size: int, decays: tuple[float, float] = (0.9, 0.99), joint: bool = False):
+        self.decays, self.joint = decays, joint
         self.moments = torch.zeros(2, n_rows, size, dtype=torch.float64)
         self.counts = torch.zeros(n_rows, dtype=torch.int64)
 
@@ -26,11 +27,12 @@ class RowAdam:
             return torch.zeros_like(gradient)
         self.counts[row] += 1
         mean, square = self.moments[:, row]
-        mean.lerp_(gradient, 1 - DECAYS[0])
-        square.lerp_(gradient**2, 1 - DECAYS[1])
+        mean.lerp_(gradient, 1 - self.decays[0])
+        square.lerp_((gradient**2).sum().expand_as(square) if self.joint else gradient**2, 1 - self.decays[1])
         count = int(self.counts[row])
-        corrected = [moment / (1 - decay**count) for moment, decay in zip((mean, square), DECAYS, strict=True)]
-        return -rate * corrected[0] / (corrected[1].sqrt() + 1e-15)
+        corrected = [moment / (1 - decay**count) for moment, decay in zip((mean, square), self.decays, strict=True)]
+        change: Tensor = -rate * corrected[0] / (corrected[1].sqrt() + 1e-15)
+        return change
 
     def state_dict(self) -> dict[str, Tensor]:
         return {"moments": self.moments, "counts": self.counts}
