@@ -118,8 +118,8 @@ class TrainSection(Section):
     exposure: Literal["auto", "on", "off"] = setting(
         "auto", "learn an affine map of colours for each photo; auto: where photos of the same points differ"
     )
-    poses: Literal["auto", "refined", "given"] = setting(
-        "auto", "of photos; refined: corrected while the scene is trained; auto: where they are estimates"
+    poses: Literal["given", "refined"] = setting(
+        "given", "of photos, as they are; refined: corrected while the scene is trained"
     )
     # sizes
     sh_degree: int = number(3, "of colour, at most", 0, 3)

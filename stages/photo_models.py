@@ -31,14 +31,13 @@ def camera_models(job: Job, capture: Capture, points: Points, views: Views) -> C
         exposure = Exposure(len(views.names), train.lr_exposure, train.weight_exposure)
     else:
         job.left_out("exposure by photo", why)
-    wanted, why = wants_poses(job, capture)
-    if wanted:
+    if train.poses == "refined":
         size = capture.size
         row = {name: k for k, name in enumerate(points.names)}
         given = torch.from_numpy(points.cam_from_world[[row[name] for name in views.names]])
         poses = Poses(given, views.Ks, size, torch.from_numpy(points.means), train.lr_poses)
     else:
-        job.left_out("pose refinement", why)
+        job.left_out("pose refinement", "train.poses is given")
     return CameraModels(exposure, poses)
 
 
@@ -73,14 +72,6 @@ def measured_spread(capture: Capture, points: Points) -> float:
         seen = seen[:, used]
     images = capture.images[:][[row[points.names[k]] for k in used]]
     return exposure_spread(images, points.Ks[used], points.cam_from_world[used], points.means, seen)
-
-
-def wants_poses(job: Job, capture: Capture) -> tuple[bool, str]:
-    """Whether poses are refined, and why not."""
-    chosen = job.config.train.poses
-    if chosen != "auto":
-        return chosen == "refined", f"train.poses is {chosen}"
-    return False, "poses are taken as they are"
 
 
 def reached(models: CameraModels, views: Views, points: Points) -> np.ndarray:
