@@ -38,7 +38,8 @@ class Capture:
     cam_from_world: f64 [V, 4, 4] OpenCV axes, or None where poses are unknown.
     is_test:        bool [V]; test views are never trained on.
     depth, labels, pseudo_labels, confidence, loss_mask: as in OPTIONAL, or None. class_names[labels] names a pixel.
-    points:         f32 [N, 3] in the world, where the source has its own, with point_colors u8 [N, 3] or None.
+    points:         f32 [N, 3] in the world, where the source has its own, with point_colors u8 [N, 3] or None, and
+                    tracks i32 [T, 2] (point, view), who sees them, or None.
     source:         which source, and notes about what was dropped or changed; protocol: name and parameters.
     """
 
@@ -57,6 +58,7 @@ class Capture:
     point_colors: np.ndarray | None = None
     pseudo_labels: Stack | None = None
     confidence: Stack | None = None
+    tracks: np.ndarray | None = None
 
     @property
     def size(self) -> tuple[int, int]:
@@ -84,8 +86,9 @@ def write_capture(out: Path, capture: Capture) -> None:
         cameras["cam_from_world"] = capture.cam_from_world
     write_tensors(out / "cameras.safetensors", cameras)
     if capture.points is not None:
-        colors = {} if capture.point_colors is None else {"colors": capture.point_colors}
-        write_tensors(out / "points.safetensors", {"points": capture.points} | colors)
+        beside = {"colors": capture.point_colors, "tracks": capture.tracks}
+        given = {name: values for name, values in beside.items() if values is not None}
+        write_tensors(out / "points.safetensors", {"points": capture.points} | given)
     write_document(
         out / "capture.json",
         {
@@ -127,6 +130,7 @@ def read_capture(path: Path) -> Capture:
         class_names=document["class_names"],
         points=cloud.get("points"),
         point_colors=cloud.get("colors"),
+        tracks=cloud.get("tracks"),
         source=document["source"],
         protocol=document["protocol"],
     )
@@ -155,3 +159,8 @@ def _check(capture: Capture, where: str, remedy: str) -> None:
     points, colors = capture.points, capture.point_colors
     if points is not None and colors is not None and (colors.shape != points.shape or colors.dtype != np.uint8):
         raise InputError(f"{where}: points {points.shape} with colours {colors.dtype} {colors.shape}; {remedy}")
+    tracks = capture.tracks
+    if points is not None and tracks is not None:
+        fits = tracks.ndim == 2 and tracks.shape[1] == 2 and tracks.dtype == np.int32
+        if not fits or (len(tracks) and (tracks.min() < 0 or (tracks.max(0) >= (len(points), n)).any())):
+            raise InputError(f"{where}: tracks {tracks.dtype} {tracks.shape} of {len(points)} points; {remedy}")

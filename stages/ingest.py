@@ -102,6 +102,10 @@ def thinned(fields: dict[str, Any], max_train_views: int | None) -> dict[str, An
     kept = np.union1d(np.flatnonzero(fields["is_test"]), chosen)
     held = {name: fields.get(name) for name in ("images", "Ks", "cam_from_world", "is_test", *OPTIONAL)}
     views = {name: np.asarray(values[:])[kept] for name, values in held.items() if values is not None}
+    if fields.get("tracks") is not None:
+        point, row = fields["tracks"].T
+        stays = np.isin(row, kept)
+        views["tracks"] = np.stack([point[stays], np.searchsorted(kept, row[stays])], 1).astype(np.int32)
     return views | {"names": [fields["names"][row] for row in kept]}
 
 

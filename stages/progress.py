@@ -36,6 +36,18 @@ class Progress:
         if self._log is not None:
             self._log.write(json.dumps(values) + "\n")
 
+    def ticker(self, total: int, what: str) -> Callable[[], None]:
+        """A function to call after each of `total` things that a library counts, not a loop of ours; further calls
+        than that show nothing.
+        """
+        steps = self.track(range(total), total, what)
+        next(steps, None)
+
+        def tick() -> None:
+            next(steps, None)
+
+        return tick
+
     def track(
         self, items: Iterable[T], total: int | Callable[[], int], what: str, start: int = 0
     ) -> Iterator[tuple[T, dict[str, Any]]]:

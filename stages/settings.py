@@ -65,6 +65,12 @@ class SfmSection(Section):
     max_points: int = number(20_000, "initial Gaussians, at most", 16, 2_000_000)
     n_neighbors: int = number(16, "neighbours that give a point its normal and covariance", 4, 64)
     peak_threshold: float = number(0.001, "of SIFT: lower finds more features, and worse ones", 1e-6, 1)
+    max_features: int = number(8192, "of a view: the largest are kept; matching takes their square", 64, 100_000)
+    matching: Literal["auto", "exhaustive", "posed", "sequential"] = setting(
+        "auto",
+        "which views: all, those with near poses, or those next in order and alike; auto: by poses and count",
+    )
+    n_matched: int = number(10, "views that each is matched with, where not all are: nearest, or most alike", 2, 1000)
     min_registered: float = number(0.5, "fraction of the views that a reconstruction must register", 1e-3, 1)
     seed: int = seed("of the choice among points, and of the reconstruction")
 

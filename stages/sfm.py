@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 from typing import TYPE_CHECKING, Any
 
 from chebsplat.errors import DataFailure
@@ -14,11 +15,14 @@ if TYPE_CHECKING:
     from chebsplat.stages.settings import SfmSection
 
 
+log = logging.getLogger("chebsplat")
+
+
 def run(job: Job) -> None:
     """Cameras, and points with the covariance and normal of their neighbours (docs/method.md, section 1).
 
     Reads `capture`. Writes `points`. Poses, points and depth that the capture holds are taken; what it lacks is
-    computed by feature matching and triangulation.
+    computed by feature matching and triangulation, as is everything where `sfm.matching` names a way to match.
     """
     import numpy as np
 
@@ -28,10 +32,11 @@ def run(job: Job) -> None:
     from chebsplat.splats.gaussians import local_shape
 
     settings, capture = job.config.sfm, read_capture(job.inputs["capture"])
-    if capture.cam_from_world is not None and capture.points is not None:
+    given = capture.cam_from_world is not None and settings.matching == "auto"
+    if given and capture.points is not None:
         job.left_out("feature matching", "poses are given, and points by the source")
         cloud = from_source(capture, settings)
-    elif capture.cam_from_world is not None and capture.depth is not None:
+    elif given and capture.depth is not None:
         job.left_out("feature matching", "poses and depth are given: points come from depth")
         cloud = from_depth(job, capture, settings)
     else:
@@ -121,11 +126,14 @@ def from_source(capture: Capture, settings: SfmSection) -> dict[str, Any]:
     points, (width, height) = capture.points[kept].astype(np.float64), capture.size
     distance, seen = np.full(len(points), np.inf), np.full(len(points), -1)
     colors = np.zeros((len(points), 3), np.uint8)
+    tracks = tracks_of(capture, kept)
     for view in np.flatnonzero(~capture.is_test):
         pose = capture.cam_from_world[view]
         camera = points @ pose[:3, :3].T + pose[:3, 3]
         u, v = ((camera / np.maximum(camera[:, 2:], 1e-6)) @ capture.Ks[view].T)[:, :2].T
         away = np.linalg.norm(points - centers(pose[None])[0], axis=1)
+        if len(tracks):
+            away = np.where(np.isin(np.arange(len(points)), tracks[tracks[:, 1] == view, 0]), away, np.inf)
         nearer = (camera[:, 2] > 0.01) & (u >= 0) & (u < width) & (v >= 0) & (v < height) & (away < distance)
         distance[nearer], seen[nearer] = away[nearer], view
         if capture.point_colors is None:
@@ -133,6 +141,8 @@ def from_source(capture: Capture, settings: SfmSection) -> dict[str, Any]:
     if capture.point_colors is not None:
         colors = capture.point_colors[kept]
     inside = seen >= 0
+    tracks = tracks_of(capture, kept[inside])
+    log.info("%d of the source's %d points are used; nothing is matched", inside.sum(), len(capture.points))
     return {
         "names": list(capture.names),
         "Ks": capture.Ks,
@@ -140,9 +150,21 @@ def from_source(capture: Capture, settings: SfmSection) -> dict[str, Any]:
         "means": capture.points[kept][inside],
         "colors": colors[inside],
         "seen_from": seen[inside],
-        "tracks": np.zeros((0, 2), np.int32),
+        "tracks": tracks,
         "notes": {"how": "source", "n_candidates": len(capture.points), "n_unseen": int((~inside).sum())},
     }
+
+
+def tracks_of(capture: Capture, kept: np.ndarray) -> np.ndarray:
+    """The source's tracks i32 [T, 2] (point, view) of some of its points, which are counted anew; none without any."""
+    import numpy as np
+
+    if capture.points is None or capture.tracks is None:
+        return np.zeros((0, 2), np.int32)
+    place = np.full(len(capture.points), -1)
+    place[kept] = np.arange(len(kept))
+    tracks = np.stack([place[capture.tracks[:, 0]], capture.tracks[:, 1]], 1)
+    return tracks[tracks[:, 0] >= 0].astype(np.int32)
 
 
 def thin(points: np.ndarray, count: int) -> np.ndarray:

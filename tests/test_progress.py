@@ -34,3 +34,11 @@ def test_records_become_lines_of_json(tmp_path):
     lines = (tmp_path / "log.jsonl").read_text().splitlines()
     assert [json.loads(line)["loss"] for line in lines] == [0.5, 0.25]
     progress.record(step=3)
+
+
+def test_a_ticker_shows_what_a_library_counts_and_nothing_beyond_its_total(capsys):
+    tick = Progress(show=True).ticker(3, "poses")
+    for _ in range(5):
+        tick()
+    error = capsys.readouterr().err
+    assert "poses 3/3" in error and "4/3" not in error and error.count("\n") == 1

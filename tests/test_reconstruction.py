@@ -5,13 +5,15 @@ import pytest
 from shared import data, run_stage
 
 from chebsplat.cameras import centers
+from chebsplat.formats import artifact
 from chebsplat.formats.points import read_points
 
 pytestmark = [pytest.mark.data, pytest.mark.xdist_group("sfm")]
 
 
-def points_of(tmp_path, kind, folder, views):
+def points_of(tmp_path, kind, folder, views, **sfm):
     config = {
+        "sfm": sfm,
         "scene": {"name": "fox"},
         "source": {"kind": kind, "path": str(folder)},
         "ingest": {"max_side": 400, "max_views": views},
@@ -71,3 +73,33 @@ def test_too_few_registered_views_are_a_failure_that_counts_them(tmp_path):
     config = {"source": {"kind": "photos", "path": str(tmp_path)}}
     assert run_stage("ingest", tmp_path / "out/capture", config=config) == 0
     assert run_stage("sfm", tmp_path / "out/points", {"capture": tmp_path / "out/capture"}, config) == 4
+
+
+def test_few_neighbours_by_pose_are_enough_and_counted(triangulated, tmp_path):
+    found = points_of(tmp_path, "transforms", data("fox"), 12, n_matched=3)
+    facts = artifact.read_manifest(tmp_path / "transforms-points").facts
+    assert 18 <= facts["n_pairs"] <= 36 < 66
+    assert len(found.means) > 0.6 * len(triangulated.means)
+    assert found.notes["reprojection_error_px"] < 1
+
+
+def test_points_and_tracks_of_a_colmap_model_are_taken_and_nothing_is_matched(tmp_path):
+    found = points_of(tmp_path, "colmap", data("statue_colmap") / "dense/0", 23)
+    facts = artifact.read_manifest(tmp_path / "colmap-points").facts
+    assert facts["how"] == "source" and "feature matching" in facts["left_out"] and "n_pairs" not in facts
+    assert len(found.means) > 1000
+    assert np.bincount(found.tracks[:, 0], minlength=len(found.means)).min() >= 1
+    point, view = found.tracks.T
+    pose = found.cam_from_world[view]
+    camera = np.einsum("nij,nj->ni", pose[:, :3, :3], found.means[point]) + pose[:, :3, 3]
+    assert (camera[:, 2] > 0).all()
+
+
+def test_pairs_by_pose_need_poses(tmp_path):
+    from source_folders import image
+
+    for k in range(3):
+        image(tmp_path / f"a {k}.jpg")
+    config = {"source": {"kind": "photos", "path": str(tmp_path)}, "sfm": {"matching": "posed"}}
+    assert run_stage("ingest", tmp_path / "out/capture", config=config) == 0
+    assert run_stage("sfm", tmp_path / "out/points", {"capture": tmp_path / "out/capture"}, config) == 2

@@ -51,11 +51,43 @@ def test_models_that_colmap_writes_today_read(tmp_path, suffix):
     assert {view.name: view.pose[:3].tolist() for view in found.images} == {
         view.name: view.cam_from_world().matrix().tolist() for view in model.images.values()
     }
+    points = {tuple(point.xyz): point for point in model.points3D.values()}
+    assert len(found.cloud.means) == 20
+    for row, (mean, color) in enumerate(zip(found.cloud.means, found.cloud.colors, strict=True)):
+        point = points[tuple(mean)]
+        assert color.tolist() == point.color.tolist()
+        seen = found.cloud.tracks[found.cloud.tracks[:, 0] == row, 1]
+        observers = {model.images[element.image_id].name for element in point.track.elements}
+        assert {found.images[view].name for view in seen} == observers
     fields = colmap.read(tmp_path, IngestSection(max_side=64))
     expected = {common.stem(v.name): v.cam_from_world().matrix() for v in model.images.values()}
     assert set(fields["names"]) == set(expected) and len(expected) == 6
     for name, pose in zip(fields["names"], fields["cam_from_world"], strict=True):
         assert np.allclose(pose[:3], expected[name])
+
+
+def cloud_of(rng, n, n_views, length):
+    """A model's cloud of points near the origin, each seen by `length` of its images."""
+    views = np.concatenate([rng.choice(n_views, length, replace=False) for _ in range(n)]) if length else []
+    tracks = np.stack([np.repeat(np.arange(n), length), views], 1).astype(int)
+    return colmap_model.Cloud(rng.normal(size=(n, 3)), np.zeros((n, 3), np.uint8), np.ones(n), tracks)
+
+
+@pytest.mark.parametrize(("length", "n_kept"), [(0, 150), (2, 0), (4, 150)])
+def test_points_that_enough_images_see_are_taken_and_those_without_any_tracks(length, n_kept):
+    cloud = cloud_of(np.random.default_rng(0), 150, 6, length)
+    images = [colmap_model.Image(f"{name}.png", 1, np.eye(4)) for name in "fedcba"]
+    notes = []
+    fields = colmap._points(colmap_model.Model(None, {}, images, cloud), list("abcd"), notes)
+    assert len(fields.get("points", ())) == n_kept
+    if length == 4:
+        point, view = fields["tracks"].T
+        expected = {(p, "abcdef"[5 - v]) for p, v in cloud.tracks.tolist() if 5 - v < 4}
+        assert {(p, "abcd"[v]) for p, v in zip(point.tolist(), view.tolist(), strict=True)} == expected
+        cloud.errors[:20] = 9
+        few = colmap._points(colmap_model.Model(None, {}, images, cloud), list("abcd"), notes)
+        assert len(few["points"]) == 130 and notes[0].startswith("20 of the model's 150 points are left out")
+        assert few["tracks"][:, 0].max() < 130
 
 
 def test_images_that_model_and_disk_do_not_share_are_counted(tmp_path):

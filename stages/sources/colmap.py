@@ -5,25 +5,34 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from chebsplat.errors import InputError
 from chebsplat.stages.sources import assembly, cameras, common, texts
-from chebsplat.stages.sources.colmap_model import read_model
+from chebsplat.stages.sources.colmap_model import Model, read_model
 from chebsplat.stages.sources.common import Frame, Listing
 from chebsplat.stages.sources.label_images import names_by_id
 
 HELP = "correct source.path; a COLMAP source holds images/ and sparse/0/{cameras,images,points3D}.bin or .txt"
 COMPANIONS = {"depth": "depth", "semantic": "labels"}  # folder: what its PNGs are
 FEW = 10**6  # more than any test_every
+MIN_TRACK = 3  # images that see a point: two can agree by chance
+MAX_ERROR = 4.0  # pixels, of a point's mean reprojection error
+LEAST = 100  # good points; a model with fewer is one whose points somebody has taken away
 
 
 def read(folder: Path, settings: Any, class_names: tuple[str, ...] | None = None) -> dict[str, Any]:
     """The fields of a capture; `is_test` too, if scene.json says which views are.
 
     Choices: scene.json's split counts all of its frames, so `max_views` never moves a view from one side to the
-      other; if it leaves one side empty, the split is not given and a note says so.
+      other; if it leaves one side empty, the split is not given and a note says so. The model's points are taken
+      unless there is depth, which gives more; of those with tracks the ones that fewer than MIN_TRACK images see, or
+      that lie farther than MAX_ERROR pixels off on average, are left out.
     """
-    listing = _listing(folder)
+    listing, model = _listing(folder)
     fields = assembly.assemble(listing, settings, class_names)
+    if "depth" not in fields:
+        fields |= _points(model, fields["names"], fields["source"]["notes"])
     split = _split(folder, [frame.name for frame in listing.frames])
     if split is not None:
         assembly.give_split(fields, split, "scene.json")
@@ -92,7 +101,32 @@ def _label_names(folder: Path) -> dict[int, str] | None:
     return names_by_id(path, table.items())
 
 
-def _listing(folder: Path) -> Listing:
+def _points(model: Model, names: list[str], notes: list[str]) -> dict[str, Any]:
+    """points, point_colors and tracks (point, view) of a capture with views of these names; nothing of few points."""
+    cloud = model.cloud
+    good = np.abs(cloud.means).max(1, initial=0) < cameras.FARTHEST
+    if len(cloud.tracks):
+        length = np.bincount(cloud.tracks[:, 0], minlength=len(good))
+        good &= (length >= MIN_TRACK) & (cloud.errors <= MAX_ERROR)
+    if good.sum() < LEAST:
+        return {}
+    if not good.all():
+        notes.append(
+            f"{len(good) - good.sum()} of the model's {len(good)} points are left out: fewer than {MIN_TRACK} images "
+            f"see them, or they lie more than {MAX_ERROR:g} pixels off."
+        )
+    view = {name: row for row, name in enumerate(names)}
+    of_image = np.array([view.get(common.stem(image.name), -1) for image in model.images])
+    of_point = np.where(good, np.cumsum(good) - 1, -1)
+    tracks = np.stack([of_point[cloud.tracks[:, 0]], of_image[cloud.tracks[:, 1]]], 1)
+    return {
+        "points": cloud.means[good].astype(np.float32),
+        "point_colors": cloud.colors[good],
+        "tracks": tracks[(tracks >= 0).all(1)].astype(np.int32),
+    }
+
+
+def _listing(folder: Path) -> tuple[Listing, Model]:
     place, images = _model_folder(folder), folder / "images"
     if not images.is_dir() and (undistorted := sorted(path.parent for path in folder.glob("dense/**/images"))):
         raise InputError(f"{images} is missing; {undistorted[0]} holds undistorted images and their model: name that")
@@ -128,4 +162,4 @@ def _listing(folder: Path) -> Listing:
     others = sum(path.is_dir() for path in (folder / "sparse").iterdir()) - 1
     if place.name == "0" and others > 0:
         notes.append(f"{others} further models beside sparse/0 are left out.")
-    return Listing("colmap", frames, _label_names(folder), notes=notes)
+    return Listing("colmap", frames, _label_names(folder), notes=notes), model

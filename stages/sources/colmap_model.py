@@ -1,7 +1,7 @@
-"""COLMAP's models, binary and text: cameras and posed images, read by their documented layout.
+"""COLMAP's models, binary and text: cameras, posed images and points, read by their documented layout.
 
 They are read here and not by pycolmap, which loops for ever over a file that is cut in the middle of a record, and
-takes all memory for a name without an end. Points are walked over, since a cut file means a copy that went wrong.
+takes all memory for a name without an end.
 """
 
 from __future__ import annotations
@@ -37,13 +37,26 @@ class Image:
     pose: np.ndarray
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
+class Cloud:
+    """A model's points: means f64 [N, 3], colors u8 [N, 3], errors f64 [N] pixels; tracks i64 [T, 2]: (point's row,
+    position in the model's images).
+    """
+
+    means: np.ndarray
+    colors: np.ndarray
+    errors: np.ndarray
+    tracks: np.ndarray
+
+
+@dataclass(frozen=True, eq=False)
 class Model:
     """origin: the cameras' file; cameras: (model, parameters, width, height) by id; images in the file's order."""
 
     origin: Path
     cameras: dict[int, tuple[str, tuple[float, ...], int, int]]
     images: list[Image]
+    cloud: Cloud
 
 
 def read_model(place: Path) -> Model:
@@ -52,23 +65,39 @@ def read_model(place: Path) -> Model:
     paths = [place / f"{name}.{end}" for name in ("cameras", "images", "points3D")]
     for path in paths:
         regular(path, "a model has cameras, images and points3D")
-    read: Any = (_binary_cameras, _binary_images) if end == "bin" else (_text_cameras, _text_images)
+    read: Any = (_text_cameras, _text_images, _text_points)
+    if end == "bin":
+        read = (_binary_cameras, _binary_images, _binary_points)
     found: list[list[Any]] = []
-    for path, entries in zip(paths, read, strict=False):
+    for path, entries in zip(paths, read, strict=True):
         try:
             found.append(list(entries(path)))
-        except (ValueError, IndexError, struct.error) as error:
+        except (ValueError, IndexError, OverflowError, struct.error) as error:
             raise InputError(f"{path} is cut or no COLMAP model ({str(error)[:LONGEST]}); {AGAIN}") from None
-    if end == "bin":
-        _walk_points(paths[2])
     known = dict(found[0])
     images = []
-    for name, camera, quaternion, translation in found[1]:
+    for _, name, camera, quaternion, translation in found[1]:
         if camera not in known:
             raise InputError(f"{paths[1]}: {name[:LONGEST]!r} is of camera {camera}, which is not listed; {AGAIN}")
         images.append(Image(name, camera, _pose(paths[1], name, quaternion, translation)))
     cameras.near(paths[1], np.array([image.pose[:3, 3] for image in images]).reshape(-1, 3), [i.name for i in images])
-    return Model(paths[0], known, images)
+    position = {key: row for row, (key, *_) in enumerate(found[1])}
+    return Model(paths[0], known, images, _cloud(paths[2], found[2], position))
+
+
+def _cloud(path: Path, entries: list[Any], position: dict[int, int]) -> Cloud:
+    """Points from (x, y, z, red, green, blue, error) and the ids of the images that see each.
+
+    Choices: an image that is not listed is passed over: scripts that thin out a model leave its points as they are.
+    """
+    values = np.array([entry[0] for entry in entries], float).reshape(-1, 7)
+    seen = [np.asarray(entry[1], np.int64) for entry in entries]
+    ids, row = np.concatenate([*seen, np.zeros(0, np.int64)]), np.repeat(np.arange(len(seen)), [*map(len, seen)])
+    if not np.isfinite(values[:, :6]).all() or ((values[:, 3:6] < 0) | (values[:, 3:6] > 255)).any():
+        raise InputError(f"{path}: a point's place or colour is no such; {AGAIN}")
+    views = np.array([position.get(key, -1) for key in ids.tolist()], np.int64)
+    tracks = np.unique(np.stack([row, views], 1)[views >= 0], axis=0)
+    return Cloud(values[:, :3], values[:, 3:6].astype(np.uint8), values[:, 6], tracks)
 
 
 def _pose(path: Path, name: str, quaternion: Any, translation: Any) -> np.ndarray:
@@ -141,24 +170,24 @@ def _binary_cameras(path: Path) -> Iterator[tuple[int, tuple[str, tuple[float, .
     data.end()
 
 
-def _binary_images(path: Path) -> Iterator[tuple[str, int, tuple[float, ...], tuple[float, ...]]]:
+def _binary_images(path: Path) -> Iterator[tuple[int, str, int, tuple[float, ...], tuple[float, ...]]]:
     data = _Bytes(path)
     for _ in data.count(_IMAGE.size):
         values = data.take(_IMAGE)
         name = data.word()
         data.skip(24 * len(data.count(24)))  # its keypoints
-        yield name, values[8], values[1:5], values[5:8]
+        yield values[0], name, values[8], values[1:5], values[5:8]
     data.end()
 
 
-def _walk_points(path: Path) -> None:
-    try:
-        data = _Bytes(path)
-        for _ in data.count(_POINT.size):
-            data.skip(8 * data.take(_POINT)[-1])
-        data.end()
-    except (ValueError, struct.error) as error:
-        raise InputError(f"{path} is cut or no COLMAP model ({str(error)[:LONGEST]}); {AGAIN}") from None
+def _binary_points(path: Path) -> Iterator[tuple[tuple[float, ...], np.ndarray]]:
+    data = _Bytes(path)
+    for _ in data.count(_POINT.size):
+        _, *values, length = data.take(_POINT)
+        start = data.at
+        data.skip(8 * length)
+        yield tuple(values), np.frombuffer(data.data, "<u4", 2 * length, start)[::2]
+    data.end()
 
 
 def _lines(path: Path) -> list[str]:
@@ -172,12 +201,20 @@ def _text_cameras(path: Path) -> Iterator[tuple[int, tuple[str, tuple[float, ...
             yield int(words[0]), (words[1], tuple(map(float, words[4:])), int(words[2]), int(words[3]))
 
 
-def _text_images(path: Path) -> Iterator[tuple[str, int, list[float], list[float]]]:
+def _text_images(path: Path) -> Iterator[tuple[int, str, int, list[float], list[float]]]:
     """Every second line lists keypoints, and may be empty."""
     lines = iter(_lines(path))
     for line in lines:
         if line.strip():
             words = line.split(maxsplit=9)
             values = [float(v) for v in words[1:8]]
-            yield words[9].strip(), int(words[8]), values[:4], values[4:]
+            yield int(words[0]), words[9].strip(), int(words[8]), values[:4], values[4:]
             next(lines, "")
+
+
+def _text_points(path: Path) -> Iterator[tuple[list[float], np.ndarray]]:
+    for line in _lines(path):
+        if words := line.split():
+            if len(words) < 8:
+                raise ValueError(f"a point of {len(words)} words")
+            yield [float(v) for v in words[1:8]], np.array([int(v) for v in words[8::2]], np.uint32)
