@@ -16,6 +16,14 @@ if TYPE_CHECKING:
     from chebsplat.formats.teacher_model import TeacherModel
 
 MAX_CHANNELS = 64  # that can be rendered
+IN_ROOMS = (  # what rooms commonly hold: asked for where neither the source nor the user names classes
+    "wall", "floor", "ceiling", "window", "door", "curtain", "blind", "rug", "table", "desk", "chair", "armchair",
+    "sofa", "stool", "bed", "cabinet", "wardrobe", "chest of drawers", "shelf", "bookcase", "counter", "lamp",
+    "picture", "mirror", "clock", "plant", "vase", "cushion", "pillow", "blanket", "towel", "basket", "bin", "box",
+    "book", "paper", "bottle", "cup", "bowl", "plate", "monitor", "television", "keyboard", "computer", "sink",
+    "toilet", "bathtub", "shower", "oven", "refrigerator", "microwave", "radiator", "stairs", "person",
+)  # fmt: skip
+LEAST = 12  # of these words that a teacher knows, or else all of its own are asked for
 
 
 @dataclass
@@ -28,8 +36,12 @@ class LabelSpace:
 
 
 def label_set(teacher: TeacherModel, file: str | None, class_names: list[str] | None) -> dict[str, list[str]]:
-    """Names in order with the words that mean them: of the file asked for, else of the capture, else the teacher's."""
+    """Names in order with the words that mean them: of the file asked for, else of the capture, else IN_ROOMS.
+
+    Choices: of IN_ROOMS those in the teacher's table, which may have thousands of nouns; all of a table with few.
+    """
     from chebsplat.formats.teacher_model import read_label_set, read_label_table
+    from chebsplat.stages.text import folded
 
     if file:
         return read_label_set(Path(file))
@@ -40,7 +52,10 @@ def label_set(teacher: TeacherModel, file: str | None, class_names: list[str] | 
             f"no labels to ask for: the capture names no classes and {teacher.settings} has no `labels`; "
             "give teacher.labels, a text file with one name a line"
         )
-    return {name: [name] for name in read_label_table(teacher.labels)[0]}
+    table = read_label_table(teacher.labels)[0]
+    known = {folded(name) for name in table}
+    common = [name for name in IN_ROOMS if folded(name) in known]
+    return {name: [name] for name in (common if len(common) >= LEAST else table)}
 
 
 def open_vocabulary(

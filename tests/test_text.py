@@ -157,3 +157,14 @@ def test_label_sets_keep_the_order_that_their_protocols_count_by():
         1: "wall", 4: "floor", 15: "door", 29: "rug", 40: "cushion", 58: "pillow", 90: "television", 150: "flag"
     }  # fmt: skip
     assert (scannet[0], scannet[10], scannet[11], len(scannet)) == ("other", "shelves", "counter", 21)
+
+
+def test_what_rooms_hold_is_asked_for_where_nobody_names_classes(teacher):
+    from chebsplat.formats.teacher_model import EMBEDDED, read_teacher
+    from chebsplat.stages.label_space import IN_ROOMS, label_set
+
+    asked = label_set(read_teacher(EMBEDDED), None, None)
+    assert list(asked) == list(IN_ROOMS)  # of 3104 nouns
+    assert 24 <= len(asked) <= 60
+    assert list(label_set(teacher, None, None)) == NAMES  # a teacher that knows few of them
+    assert list(label_set(read_teacher(EMBEDDED), None, ["zebra"])) == ["zebra"]
