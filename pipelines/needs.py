@@ -60,9 +60,10 @@ def left_out_stages(config: Any, kind: str, why: str, probe: dict[str, bool]) ->
         left_out |= {"describe": POINTS, "onnx": f"{POINTS}: it comes with the knowledge, in ONNX, too"}
     elif not config.train.albo:
         left_out |= {"describe": "train.albo is false: tokens hold no descriptor"}
-    if probe["poses"] and probe["depth"]:
+    adjusted = config.sfm.adjusts(config.source.kind)
+    if probe["poses"] and probe["depth"] and not adjusted:
         left_out["sfm: matching"] = "poses and depth are given"
-    elif probe["poses"]:
+    elif probe["poses"] and not adjusted:
         left_out["sfm: pose estimation"] = "poses are given"
     return left_out
 

@@ -28,6 +28,7 @@ def reconstruct(job: Job, capture: Capture, settings: SfmSection) -> dict[str, A
       triangulation reproducible; mapping is reproducible at one thread only, which it gets. Test views take part in
       posing, never in colouring.
     """
+    import numpy as np
     import pycolmap
 
     posed = capture.cam_from_world is not None
@@ -37,6 +38,12 @@ def reconstruct(job: Job, capture: Capture, settings: SfmSection) -> dict[str, A
     pycolmap.logging.minloglevel = pycolmap.logging.ERROR.value if hasattr(pycolmap.logging, "ERROR") else 2
     database = match(job, capture, settings)
     model = _triangulate(job, capture, database) if posed else _map(job, len(capture.names), database, settings)
+    moved: dict[str, Any] = {}
+    if posed and settings.adjusts(str(capture.source.get("kind"))):
+        from chebsplat.stages.adjustment import adjust
+
+        names = [file_of(view) for view in range(len(capture.names))]
+        model, moved = adjust(job, model, database, names, np.asarray(capture.cam_from_world))
     registered = {image.name: image for image in model.images.values() if image.has_pose}
     views = [view for view in range(len(capture.names)) if file_of(view) in registered]
     if len(views) < max(settings.min_registered * len(capture.names), 2):
@@ -46,7 +53,7 @@ def reconstruct(job: Job, capture: Capture, settings: SfmSection) -> dict[str, A
         )
     for view in sorted(set(range(len(capture.names))) - set(views)):
         log.warning("view %s did not register and is left out", capture.names[view])
-    notes = _notes(model, posed) | {"n_registered": len(views), "n_given": len(capture.names)}
+    notes = _notes(model, posed) | moved | {"n_registered": len(views), "n_given": len(capture.names)}
     log.info(
         "%d of %d registered, %.2f px, %d points in %.1f views each",
         len(views), len(capture.names), notes["reprojection_error_px"], model.num_points3D(), notes["track_length"],

@@ -32,7 +32,9 @@ def run(job: Job) -> None:
     from chebsplat.splats.gaussians import local_shape
 
     settings, capture = job.config.sfm, read_capture(job.inputs["capture"])
-    given = capture.cam_from_world is not None and settings.matching == "auto"
+    posed = capture.cam_from_world is not None
+    adjusted = posed and settings.adjusts(str(capture.source.get("kind")))
+    given = posed and settings.matching == "auto" and not adjusted
     if given and capture.points is not None:
         job.left_out("feature matching", "poses are given, and points by the source")
         cloud = from_source(capture, settings)
@@ -42,9 +44,11 @@ def run(job: Job) -> None:
     else:
         from chebsplat.stages import reconstruction
 
-        if capture.cam_from_world is not None:
+        if posed and not adjusted:
             job.left_out("pose estimation", "poses are given: points are triangulated")
         cloud = reconstruction.reconstruct(job, capture, settings)
+        if adjusted and capture.depth is not None:
+            cloud = filled(cloud, from_depth(job, capture, settings, cloud["cam_from_world"]), settings.max_points)
     means = cloud["means"]
     if len(means) < 16:
         raise DataFailure(f"only {len(means)} points were found, at least 16 are needed; add views with more overlap")
@@ -69,9 +73,28 @@ def run(job: Job) -> None:
     )
 
 
-def from_depth(job: Job, capture: Capture, settings: SfmSection) -> dict[str, Any]:
+def filled(cloud: dict[str, Any], more: dict[str, Any], count: int) -> dict[str, Any]:
+    """A cloud with the points of another one of the same views between its own, at most `count`, one a voxel.
+
+    Choices: triangulated points show where the photos have texture, those of depth what lies between; a voxel with both
+      keeps the triangulated one.
+    """
+    import numpy as np
+
+    kept = thin(np.concatenate([cloud["means"], more["means"]]), count)
+    row = np.full(len(cloud["means"]), -1)
+    own = kept[kept < len(row)]
+    row[own] = np.arange(len(own))
+    tracks = cloud["tracks"][row[cloud["tracks"][:, 0]] >= 0]
+    both = {name: np.concatenate([cloud[name], more[name]])[kept] for name in ("means", "colors", "seen_from")}
+    notes = cloud["notes"] | {"n_from_depth": len(kept) - len(own)}
+    return cloud | both | {"tracks": np.stack([row[tracks[:, 0]], tracks[:, 1]], 1), "notes": notes}
+
+
+def from_depth(job: Job, capture: Capture, settings: SfmSection, poses: np.ndarray | None = None) -> dict[str, Any]:
     """Points back-projected from the depth of training views, thinned to one a voxel.
 
+    Args: poses [V, 4, 4]: of the capture's views where they were adjusted; their depth goes with them.
     Choices: test views give no points; pixels are drawn evenly over views, and the voxel is chosen by bisection so
     that about `max_points` remain; each voxel keeps its first point.
     """
@@ -80,7 +103,7 @@ def from_depth(job: Job, capture: Capture, settings: SfmSection) -> dict[str, An
     from chebsplat.cameras import unproject
 
     assert capture.cam_from_world is not None and capture.depth is not None
-    rng = np.random.default_rng(settings.seed)
+    rng, poses = np.random.default_rng(settings.seed), capture.cam_from_world if poses is None else poses
     used = np.flatnonzero(~capture.is_test)
     per_view = max(4 * settings.max_points // max(len(used), 1), 16)
     means, colors, seen = [], [], []
@@ -91,7 +114,7 @@ def from_depth(job: Job, capture: Capture, settings: SfmSection) -> dict[str, An
             valid &= capture.loss_mask[view]
         pixels = np.argwhere(valid)
         pixels = pixels[rng.choice(len(pixels), min(per_view, len(pixels)), replace=False)]
-        means.append(unproject(depth, capture.Ks[view], capture.cam_from_world[view], pixels))
+        means.append(unproject(depth, capture.Ks[view], poses[view], pixels))
         colors.append(image[pixels[:, 0], pixels[:, 1]])
         seen.append(np.full(len(pixels), view))
         status["points"] = sum(map(len, means))
@@ -102,7 +125,7 @@ def from_depth(job: Job, capture: Capture, settings: SfmSection) -> dict[str, An
     return {
         "names": list(capture.names),
         "Ks": capture.Ks,
-        "cam_from_world": capture.cam_from_world,
+        "cam_from_world": poses,
         "means": points[kept],
         "colors": np.concatenate(colors)[kept],
         "seen_from": np.concatenate(seen)[kept],
