@@ -16,6 +16,7 @@ if TYPE_CHECKING:
 
     from chebsplat.formats.scene import Scene
     from chebsplat.render import SceneRenderer
+    from chebsplat.stages.query import Query
     from chebsplat.views import View
 
 COVERED = 0.5  # of a pixel, below which it has no label
@@ -72,13 +73,13 @@ class OpenedScene:
     """N Gaussians with their colours and, where there is a teacher, what they mean.
 
     parameters: raw, as `formats.scene.Scene` holds them; `features` f32 [N, C], `labels` i32 [N] (-1: none) and
-    `label_names` are None without semantics; `cameras`: of the capture, in its order.
+    `label_names` and `label_embeddings` f32 [L, C] are None without semantics; `cameras`: of the capture, in its order.
     """
 
     def __init__(self, scene: Scene, source: Path, teacher: Path | None = None):
         self.source, self._scene, self._teacher = source, scene, teacher
         self.parameters, self.labels, self.label_names = scene.parameters, scene.labels, scene.label_names
-        held = scene.cameras
+        self.label_embeddings, held = scene.label_embeddings, scene.cameras
         views = zip(held.names, held.Ks, held.cam_from_world, strict=True)
         self.cameras = [Camera(name, K, pose, held.width, held.height) for name, K, pose in views]
 
@@ -94,7 +95,8 @@ class OpenedScene:
         return self.parameters.get("features")
 
     @cached_property
-    def _renderer(self) -> SceneRenderer:
+    def renderer(self) -> SceneRenderer:
+        """Renders all Gaussians; made on first use."""
         from chebsplat.render import SceneRenderer
 
         return SceneRenderer(self.parameters)
@@ -116,11 +118,11 @@ class OpenedScene:
         from chebsplat.labels.decode import decode_labels
 
         view = camera.view()
-        depth, alpha = self._renderer.render_depth(view)
-        color, features = self._renderer.render(view, with_features=True)
-        if features is None or self._scene.label_embeddings is None:
+        depth, alpha = self.renderer.render_depth(view)
+        color, features = self.renderer.render(view, with_features=True)
+        if features is None or self.label_embeddings is None:
             return Picture(color, depth, alpha, features)
-        labels = decode_labels(features, self._scene.label_embeddings).astype(np.int32)
+        labels = decode_labels(features, self.label_embeddings).astype(np.int32)
         return Picture(color, depth, alpha, features, np.where(alpha < COVERED, -1, labels))
 
     def query(self, text: str, against: Sequence[str] = ()) -> np.ndarray:
@@ -130,14 +132,20 @@ class OpenedScene:
         Raises: ConfigError without semantics, or on words that the scene's teacher cannot know.
         """
         from chebsplat.labels.relevancy import relevancy
+
+        asked = self.understood(text, against)
+        assert self.features is not None
+        return relevancy(self.features, asked.embedding, asked.against)
+
+    def understood(self, text: str, against: Sequence[str] = ()) -> Query:
+        """Words in the scene's own channels. Args and errors as of `query`."""
         from chebsplat.stages.query import understood
 
         if self.features is None:
             raise ConfigError(f"{self.source} has no semantics; train the scene with a teacher")
         if self._teacher is None:
             raise ConfigError(f"{self.source} is an artifact alone, without its teacher's; open the scene's folder")
-        asked = understood(self._teacher, text, list(against))
-        return relevancy(self.features, asked.embedding, asked.against)
+        return understood(self._teacher, text, list(against))
 
     def select(
         self,

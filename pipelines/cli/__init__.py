@@ -6,7 +6,7 @@ from typing import Any
 
 import click
 
-from chebsplat.pipelines.cli import about, runs, upkeep, uses
+from chebsplat.pipelines.cli import about, renders, runs, upkeep, uses
 from chebsplat.pipelines.cli.basis import basis
 from chebsplat.pipelines.cli.group import Guarded
 from chebsplat.stages.registry import STAGES
@@ -37,5 +37,5 @@ def main() -> None:
     """Semantic 3D Gaussian Splatting that understands shape."""
 
 
-for _command in (*runs.COMMANDS, *about.COMMANDS, *upkeep.COMMANDS, *uses.COMMANDS, basis):
+for _command in (*runs.COMMANDS, *about.COMMANDS, *upkeep.COMMANDS, *uses.COMMANDS, *renders.COMMANDS, basis):
     main.add_command(_command)

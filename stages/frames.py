@@ -1,0 +1,178 @@
+"""render: a finished scene as frames: colour, labels, depth, relevancy. A frame that is there and whole is kept."""
+
+from __future__ import annotations
+
+import json
+import logging
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from chebsplat.errors import ConfigError, InputError
+from chebsplat.formats.files import atomic_path, atomic_write, parse_json
+from chebsplat.stages.opened import COVERED, Camera, OpenedScene
+
+if TYPE_CHECKING:
+    from chebsplat.stages.progress import Progress
+    from chebsplat.stages.query import Query
+
+log = logging.getLogger("chebsplat")
+
+KINDS = ("color", "labels", "depth", "relevancy")
+SEMANTIC = ("labels", "relevancy")
+REQUEST = "frames.json"
+PNG_END = b"\0\0\0\0IEND\xaeB`\x82"  # the last chunk
+
+
+@dataclass(frozen=True)
+class Shot:
+    """What is rendered of every camera: kinds of KINDS; identity: of the scene, so that frames of another are told
+    apart; query: where relevancy is among the kinds.
+    """
+
+    kinds: tuple[str, ...]
+    identity: str
+    query: Query | None = None
+
+
+def kinds_of(text: str, scene: OpenedScene, asked: bool) -> tuple[str, ...]:
+    """The kinds in "color,depth". Raises ConfigError on one that is none, or that the scene or the query cannot give.
+
+    Args: asked: whether there is a query.
+    """
+    kinds = tuple(dict.fromkeys(word.strip() for word in text.split(",") if word.strip()))
+    if not kinds or set(kinds) - set(KINDS):
+        raise ConfigError(f"--what {text}: one or more of {','.join(KINDS)} are needed")
+    if "relevancy" in kinds and not asked:
+        raise ConfigError("--what relevancy needs --query TEXT")
+    if asked and "relevancy" not in kinds:
+        raise ConfigError("--query is of relevancy; add relevancy to --what")
+    if scene.labels is None and (missing := [kind for kind in kinds if kind in SEMANTIC]):
+        raise ConfigError(f"{scene.source} has no semantics, so no {missing[0]}; render color,depth")
+    return kinds
+
+
+def render_frames(
+    scene: OpenedScene, cameras: Sequence[Camera], shot: Shot, out: Path, progress: Progress
+) -> dict[str, list[Path]]:
+    """Render every camera's frames into OUT/<kind>/<view>.png (depth: .npy); those that are there are kept.
+
+    Returns: the files of each kind, in the cameras' order.
+    Raises:  ConfigError where `out` holds something else than frames of this request.
+    Choices: colour is 8-bit RGB, as `evaluate` measures it. Labels are a palette PNG whose values are row of
+      label_names + 1, 0 where a pixel is less than half covered; 16-bit grey without palette beyond 255 labels.
+      Depth is float32 .npy, scene units along the camera's axis, nan where nothing is: units are the source's own, and
+      16 bits of thousandths would cut or coarsen what is no metre. Relevancy is the render under its heat.
+    """
+    from chebsplat.stages.query import file_names
+
+    names = file_names([f"{camera.name}.png" for camera in cameras])
+    claim(out, cameras, shot, scene)
+    files = {kind: [out / kind / f"{name}{ending(kind)}" for name in names] for kind in shot.kinds}
+    missing = []
+    for k, camera in enumerate(cameras):
+        absent = tuple(kind for kind in shot.kinds if not whole(files[kind][k], camera))
+        missing += [(k, absent)] if absent else []
+    done = len(cameras) - len(missing)
+    if done:
+        log.info("%d of %d frames are there and kept", done, len(cameras))
+    for (k, absent), _ in progress.track(missing, len(cameras), "render", start=done):
+        for kind, values in pictures(scene, cameras[k], shot, absent).items():
+            with atomic_path(files[kind][k]) as temporary:
+                save(kind, values, temporary, len(scene.label_names or []))
+    return files
+
+
+def ending(kind: str) -> str:
+    """Of the files of a kind."""
+    return ".npy" if kind == "depth" else ".png"
+
+
+def claim(out: Path, cameras: Sequence[Camera], shot: Shot, scene: OpenedScene) -> None:
+    """Write down what the frames of `out` are of, or check that those that are there are of the same."""
+    from chebsplat.stages.camera_files import gs_cameras
+
+    request = {"scene": shot.identity, "labels": scene.label_names, "cameras": gs_cameras(cameras)}
+    request |= {"query": None if shot.query is None else [shot.query.text, *shot.query.phrases]}
+    path = out / REQUEST
+    if path.exists():
+        if parse_json(path) != json.loads(json.dumps(request)):
+            raise ConfigError(f"{out} holds frames of another scene, path, size or query; remove it, or choose --out")
+    elif out.exists() and any(out.iterdir()):
+        raise ConfigError(f"{out} holds something else than frames; choose another --out")
+    else:
+        atomic_write(path, json.dumps(request, indent=1))
+
+
+def whole(path: Path, camera: Camera) -> bool:
+    """Whether a frame is there, readable to its last byte, and of the camera's size."""
+    from chebsplat.formats.images import opened
+
+    if not path.is_file():
+        return False
+    size = camera.width, camera.height
+    try:
+        if path.suffix == ".npy":
+            return bool(np.load(path, allow_pickle=False).shape == size[::-1])
+        with opened(path) as image:
+            return bool(image.size == size) and path.read_bytes().endswith(PNG_END)  # its reader needs no end
+    except (InputError, ValueError, OSError, EOFError) as error:
+        log.warning("%s is rendered again: %s", path, error)
+        return False
+
+
+def pictures(scene: OpenedScene, camera: Camera, shot: Shot, kinds: Sequence[str]) -> dict[str, np.ndarray]:
+    """The arrays of these kinds: color and relevancy u8 [H, W, 3], labels i32 [H, W], depth f32 [H, W]."""
+    from chebsplat.labels.decode import decode_labels
+    from chebsplat.labels.relevancy import relevancy
+    from chebsplat.stages.pages.pictures import heat
+
+    view, renderer = camera.view(), scene.renderer
+    found: dict[str, np.ndarray] = {}
+    features = None
+    if set(kinds) != {"depth"}:
+        found["color"], features = renderer.render(view, with_features=bool(set(kinds) & set(SEMANTIC)))
+    if "depth" in kinds or "labels" in kinds:
+        found["depth"], alpha = renderer.render_depth(view)
+        if "labels" in kinds and features is not None and scene.label_embeddings is not None:
+            found["labels"] = np.where(alpha < COVERED, -1, decode_labels(features, scene.label_embeddings))
+    if "relevancy" in kinds and features is not None and shot.query is not None:
+        scores = relevancy(features, shot.query.embedding, shot.query.against)
+        found["relevancy"] = heat(found["color"], scores)
+    return {kind: found[kind] for kind in kinds}
+
+
+def save(kind: str, values: np.ndarray, path: Path, n_labels: int) -> None:
+    """Write one frame in its kind's form."""
+    from PIL import Image
+
+    from chebsplat.stages.pages.pictures import palette, png
+
+    if kind == "depth":
+        with path.open("wb") as handle:
+            np.save(handle, values, allow_pickle=False)
+    elif kind != "labels":
+        png(values, path)
+    elif n_labels > 255:
+        Image.fromarray((values + 1).astype(np.uint16)).save(path, "PNG")
+    else:
+        image = Image.fromarray((values + 1).astype(np.uint8)).convert("L")
+        image = Image.frombytes("P", image.size, image.tobytes())
+        image.putpalette([0, 0, 0, *palette(n_labels).ravel().tolist()])
+        image.save(path, "PNG")
+
+
+def shown(kind: str, path: Path, far: float) -> np.ndarray:
+    """A frame as a picture u8 [H, W, 3] for people; far: scene units, where depth is darkest."""
+    from matplotlib import colormaps
+
+    from chebsplat.formats.images import read_rgb
+
+    if kind != "depth":
+        return read_rgb(path)
+    depth: Any = np.load(path)
+    colors = colormaps["turbo"](1 - (np.nan_to_num(depth, nan=far) / far).clip(0, 1))[..., :3]
+    return np.where(np.isnan(depth)[..., None], 0, np.round(255 * colors)).astype(np.uint8)

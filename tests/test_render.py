@@ -1,0 +1,255 @@
+"""`chebsplat render` and `chebsplat cameras`: frames are those that are evaluated, kept, and of the asked cameras."""
+
+import json
+import logging
+import os
+import signal
+import subprocess
+import sys
+import time
+
+import numpy as np
+import pytest
+from click.testing import CliRunner
+from PIL import Image
+
+import chebsplat
+from chebsplat.errors import ConfigError, InputError
+from chebsplat.formats.evaluation import read_evaluation
+from chebsplat.pipelines.cli import main
+from chebsplat.stages import camera_files, camera_paths, video
+from chebsplat.stages.frames import kinds_of
+from chebsplat.stages.opened import Camera
+from chebsplat.stages.sources.colmap_model import read_model
+
+TOLERANCE = 1e-12  # of text with all of a double's digits, through an inverse
+
+
+@pytest.fixture(autouse=True)
+def _release_logging():
+    yield
+    logging.getLogger().handlers.clear()
+
+
+@pytest.fixture(scope="module")
+def folder(toy, tmp_path_factory):
+    """A scene's folder of links."""
+    made = tmp_path_factory.mktemp("scene")
+    for stage in ("ingest", "export", "teacher"):
+        (made / stage).symlink_to(toy[stage])
+    return made
+
+
+@pytest.fixture(scope="module")
+def scene(folder):
+    return chebsplat.load(folder)
+
+
+def run(*arguments, code=0):
+    done = CliRunner().invoke(main, [str(argument) for argument in arguments])
+    assert done.exit_code == code, done.stderr
+    return done
+
+
+def picture(path):
+    return np.asarray(Image.open(path))
+
+
+@pytest.mark.xdist_group("toy")
+def test_frames_are_what_is_evaluated_and_what_python_renders(scene, folder, toy, tmp_path):
+    word = scene.label_names[0]
+    run("render", folder, "--what", "color,labels,depth,relevancy", "--query", word, "--out", tmp_path / "frames")
+    figures = read_evaluation(toy["evaluate"])
+    for name, render in zip(figures.figures["names"], figures.pictures["renders"], strict=True):
+        np.testing.assert_array_equal(picture(tmp_path / f"frames/color/{name}.png"), render)
+    camera = scene.cameras[1]
+    shown = scene.render(camera)
+    np.testing.assert_array_equal(np.load(tmp_path / f"frames/depth/{camera.name}.npy"), shown.depth)
+    np.testing.assert_array_equal(picture(tmp_path / f"frames/labels/{camera.name}.png").astype(int) - 1, shown.labels)
+    assert picture(tmp_path / f"frames/relevancy/{camera.name}.png").shape == shown.color.shape
+    assert len(list((tmp_path / "frames/color").iterdir())) == len(scene.cameras)
+
+
+@pytest.mark.xdist_group("toy")
+def test_frames_that_are_there_and_whole_are_kept(folder, tmp_path):
+    command = ("render", folder, "--path", "orbit", "--frames", 5, "--size", "40x30", "--out", tmp_path / "frames")
+    run(*command)
+    frames = sorted((tmp_path / "frames/color").iterdir())
+    before = [(path.read_bytes(), path.stat().st_mtime_ns) for path in frames]
+    assert len(frames) == 5
+    frames[1].unlink()
+    frames[2].write_bytes(before[2][0][:-20])
+    run(*command)
+    assert [path.read_bytes() for path in frames] == [content for content, _ in before]
+    kept = [path.stat().st_mtime_ns == stamp for path, (_, stamp) in zip(frames, before, strict=True)]
+    assert kept == [True, False, False, True, True]
+    refused = run(*command[:3], "capture", *command[4:], code=2)
+    assert "frames of another scene, path, size or query" in refused.stderr
+
+
+def killed_and_resumed(folder, out, cameras, size, after):
+    """Files of frames that were begun, killed when `after` of them were there, and finished by the same command."""
+    command = [sys.executable, "-m", "chebsplat.pipelines.cli", "render", str(folder), "--path", str(cameras)]
+    command += ["--size", size, "--out", str(out)]
+    process = subprocess.Popen(command, stderr=subprocess.DEVNULL)
+    while process.poll() is None and len(list(out.glob("color/view*"))) < after:
+        time.sleep(0.005)
+    os.kill(process.pid, signal.SIGKILL)
+    process.wait()
+    there = {path: path.stat().st_mtime_ns for path in out.glob("color/view*")}
+    done = subprocess.run(command, capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr
+    assert f"{len(there)} of 100 frames are there and kept" in done.stderr
+    assert {path: path.stat().st_mtime_ns for path in there} == there
+    return there
+
+
+def hundred(scene, path):
+    """A cameras.json of a hundred views: the capture's, over and over, each moved a little."""
+    rows = camera_files.gs_cameras(scene.cameras)
+    rows = [rows[k % len(rows)] | {"id": k, "img_name": f"view{k:03d}"} for k in range(100)]
+    rows = [row | {"position": [p + 0.001 * k for p in row["position"]]} for k, row in enumerate(rows)]
+    path.write_text(json.dumps(rows))
+    return path
+
+
+@pytest.mark.xdist_group("toy")
+@pytest.mark.parametrize("size", ["96x72", pytest.param("640x480", marks=pytest.mark.slow)])
+def test_a_hundred_frames_outlive_a_kill_and_equal_evaluates_renders(scene, folder, tmp_path, size):
+    import torch
+
+    from chebsplat.render import SceneRenderer
+    from chebsplat.views import View
+
+    file = hundred(scene, tmp_path / "cameras.json")
+    there = killed_and_resumed(folder, tmp_path / "frames", file, size, 7)
+    assert 7 <= len(there) < 100
+    renderer, (width, height) = SceneRenderer(scene.parameters), map(int, size.split("x"))
+    for k, row in enumerate(json.loads(file.read_text())):
+        rotation = np.array(row["rotation"]).T
+        pose = np.eye(4)
+        pose[:3, :3], pose[:3, 3] = rotation, -rotation @ row["position"]
+        zoom = width / row["width"]
+        K = np.array([[row["fx"] * zoom, 0, row["cx"] * zoom], [0, row["fy"] * zoom, row["cy"] * zoom], [0, 0, 1]])
+        view = View(torch.from_numpy(K).float(), torch.from_numpy(pose).float(), width, height)
+        image, _ = renderer.render(view, with_features=True)
+        frame = picture(tmp_path / f"frames/color/view{k:03d}.png")
+        # A pose goes through text and an SVD: float32 of it may differ in the last bit, a pixel's rounding then by one.
+        differing = np.abs(frame.astype(int) - image)
+        assert differing.max() <= 1 and differing.mean() / 255 < 1e-6
+
+
+@pytest.mark.parametrize("read", ["cameras.json", "transforms.json", "colmap"])
+def test_written_cameras_are_read_back(tmp_path, read):
+    rng = np.random.default_rng(0)
+    cameras = []
+    for k in range(5):
+        rotation = np.linalg.qr(rng.normal(size=(3, 3)))[0]
+        rotation *= np.sign(np.linalg.det(rotation))
+        pose = np.eye(4)
+        pose[:3, :3], pose[:3, 3] = rotation, rng.normal(size=3) * 10
+        K = np.array([[300.0 + k, 0, 155], [0, 310, 117.5], [0, 0, 1]])
+        cameras.append(Camera(f"room/view {k}.a", K, pose, 320, 240))
+    camera_files.write_cameras(tmp_path, cameras)
+    if read == "colmap":
+        model = read_model(tmp_path / "sparse/0")
+        for camera, image in zip(cameras, model.images, strict=True):
+            np.testing.assert_allclose(image.pose, camera.cam_from_world, atol=TOLERANCE)
+            assert model.cameras[image.camera] == ("PINHOLE", camera_files.intrinsics(camera), 320, 240)
+            assert image.name == f"{camera.name}.png"
+    else:
+        for camera, found in zip(cameras, camera_files.read_cameras(tmp_path / read), strict=True):
+            np.testing.assert_allclose(found.cam_from_world, camera.cam_from_world, atol=TOLERANCE * 10)
+            np.testing.assert_array_equal(found.K, camera.K)
+            assert (found.name, found.width, found.height) == (camera.name, 320, 240)
+    with pytest.raises(ConfigError, match="exists"):
+        camera_files.write_cameras(tmp_path, cameras)
+
+
+@pytest.mark.parametrize(
+    ("content", "message"),
+    [
+        ("{}", "neither a transforms.json"),
+        ("[]", "lists no cameras"),
+        ('[{"rotation": [[1, 0, 0], [0, 1, 0], [0, 0, 1]]}]', "'position' is missing"),
+        ('{"frames": [{"file_path": "a.png", "w": 4, "h": 3, "fl_x": 4, "transform_matrix": [1]}]}', "not usable"),
+        (
+            '[{"rotation": [[2, 0, 0], [0, 2, 0], [0, 0, 2]], "position": [0, 0, 0], "width": 8, "height": 8, '
+            '"fx": 8, "fy": 8}]',
+            "not a rotation",
+        ),
+    ],
+)
+def test_a_file_of_no_cameras_is_said(tmp_path, content, message):
+    (tmp_path / "path.json").write_text(content)
+    with pytest.raises(InputError, match=message):
+        camera_files.read_cameras(tmp_path / "path.json")
+
+
+def ring(n=12, tilt=0.3):
+    """Cameras on a circle of radius 3 about (1, 2, 0), which look at its middle from above; z is up."""
+    K = np.array([[100.0, 0, 50], [0, 100, 40], [0, 0, 1]])
+    for angle in np.arange(n) * 2 * np.pi / n:
+        eye = np.array([1 + 3 * np.cos(angle), 2 + 3 * np.sin(angle), 3 * tilt])
+        pose = camera_paths.looking(eye, np.array([1.0, 2, 0]), np.array([0, 0, 1.0]))
+        yield Camera(f"{angle:.2f}", K, pose, 100, 80)
+
+
+def test_an_orbit_goes_round_what_the_cameras_look_at():
+    frames = camera_paths.orbit(list(ring()), 8)
+    for frame in frames:
+        np.testing.assert_allclose(frame.cam_from_world @ [1, 2, 0, 1], [0, 0, np.hypot(3, 0.9), 1], atol=1e-9)
+        assert frame.cam_from_world[1, 2] < 0  # its top points up
+    places = np.stack([frame.position for frame in frames])
+    np.testing.assert_allclose(places[:, 2], 0.9)
+    np.testing.assert_allclose(np.linalg.norm(np.diff(places, axis=0), axis=1), 6 * np.sin(np.pi / 8), rtol=1e-6)
+    assert len(camera_paths.orbit([next(ring())] * 2, 3)) == 3  # in one place, looking one way
+
+
+def test_another_size_shows_all_of_the_view_in_square_pixels():
+    camera = next(ring())
+    wide = camera_paths.fitted(camera, (400, 160))
+    np.testing.assert_allclose(wide.K, [[200, 0, 200], [0, 200, 80], [0, 0, 1]])
+    same = camera_paths.fitted(camera, (200, 160))
+    np.testing.assert_allclose(same.K, camera.resized(200, 160).K)
+    for wrong in ("12", "0x5", "axb", "99999x9"):
+        with pytest.raises(ConfigError, match="--size"):
+            camera_paths.size_of(wrong)
+
+
+@pytest.mark.xdist_group("toy")
+def test_what_cannot_be_rendered_is_said(scene, folder, toy, tmp_path):
+    for text, asked, message in (
+        ("colour", False, "are needed"),
+        ("relevancy", False, "needs --query"),
+        ("color", True, "add relevancy"),
+    ):
+        with pytest.raises(ConfigError, match=message):
+            kinds_of(text, scene, asked)
+    assert "orbit, capture or a .json" in run("render", folder, "--path", "walk", "--out", tmp_path, code=2).stderr
+    (tmp_path / "x").mkdir()
+    (tmp_path / "x/notes.txt").write_text("mine")
+    assert "something else than frames" in run("render", folder, "--out", tmp_path / "x", code=2).stderr
+
+
+@pytest.mark.xdist_group("toy")
+def test_a_video_has_a_frame_for_every_camera(folder, tmp_path):
+    av = pytest.importorskip("av")
+    out = tmp_path / "orbit.mp4"
+    run("render", folder, "--path", "orbit", "--frames", 6, "--what", "depth", "--size", "64x48", "--out", out)
+    with av.open(str(out)) as container:
+        frames = [frame.to_ndarray(format="rgb24") for frame in container.decode(video=0)]
+    assert len(frames) == 6 and frames[0].shape == (48, 64, 3)
+    assert os.listdir(tmp_path) == ["orbit.mp4"]  # the frames are gone with the work
+    assert "exists" in run("render", folder, "--out", out, code=2).stderr
+    assert "even" in run("render", folder, "--size", "63x48", "--out", tmp_path / "odd.mp4", code=2).stderr
+    both = run("render", folder, "--what", "color,depth", "--out", tmp_path / "two.mp4", code=2)
+    assert "a video shows one of color,depth" in both.stderr
+
+
+@pytest.mark.xdist_group("toy")
+def test_a_video_without_its_package_is_one_line(folder, tmp_path, monkeypatch):
+    monkeypatch.setitem(sys.modules, "av", None)
+    refused = run("render", folder, "--out", tmp_path / "room.mp4", code=2)
+    assert refused.stderr.strip().count("\n") == 0
+    assert video.INSTALL in refused.stderr
