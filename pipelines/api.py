@@ -6,11 +6,10 @@ import json
 import os
 import re
 from collections.abc import Mapping
-from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
-from chebsplat.errors import ChebsplatError, ConfigError, InputError
+from chebsplat.errors import ChebsplatError, ConfigError
 from chebsplat.stages.opened import Camera, OpenedScene, Picture
 
 __all__ = ["Camera", "OpenedScene", "Picture", "load", "run_stage", "train"]
@@ -23,13 +22,9 @@ def load(scene: str | Path) -> OpenedScene:
     Raises: ConfigError or InputError, which name what is missing and the remedy.
     """
     from chebsplat.formats.scene import read_scene
-    from chebsplat.pipelines.finished import artifact_of, is_artifact, scene_folder
+    from chebsplat.pipelines.finished import artifact_of, teacher_of
 
-    path = artifact_of(str(scene), "export")
-    teacher = None
-    with suppress(ConfigError, InputError):  # an artifact alone, of no scene in `work`
-        teacher = scene_folder(str(scene)) / "teacher"
-    return OpenedScene(read_scene(path), Path(scene), teacher if teacher and is_artifact(teacher) else None)
+    return OpenedScene(read_scene(artifact_of(str(scene), "export")), Path(scene), teacher_of(str(scene)))
 
 
 def train(

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+from contextlib import suppress
 from pathlib import Path
 
 from chebsplat.errors import ConfigError, InputError
@@ -96,6 +97,14 @@ def artifact_of(scene: str, stage: str) -> Path:
         run = f"run it to its end: make scene={shown(folder.name.partition('@')[0])}"
         raise ConfigError(f"{folder} has no {stage}: it is not finished, or leaves that out; {run}")
     return folder / stage
+
+
+def teacher_of(scene: str) -> Path | None:
+    """A scene's `features` artifact; None without semantics, and for an artifact of no scene in `work`."""
+    with suppress(ConfigError, InputError):
+        path = scene_folder(scene) / "teacher"
+        return path if is_artifact(path) else None
+    return None
 
 
 def artifacts(scene: str) -> list[Path]:

@@ -59,17 +59,26 @@ def run(folder: Path, text: str, phrases: list[str], out: Path, n_rows: int) -> 
     draw(scene, test_views(folder / "ingest", scene), query, out)
 
 
-def understood(path: Path, text: str, phrases: list[str]) -> Query:
-    """The words as vectors of the scene's channels, by the teacher that the scene was trained from."""
+def taught(path: Path) -> tuple[Features, str | None]:
+    """A scene's `features` artifact, and the model that it was made with; None: the embedded one."""
     from types import NoneType
 
     from chebsplat.formats.artifact import read_manifest, stated
     from chebsplat.formats.features import read_features
 
-    features = read_features(path)
-    if features.convention["kind"] in ("labels", "given") or features.convention.get("output") == "logits":
+    return read_features(path), stated(path, read_manifest(path), "config", "teacher", "model", kind=(str, NoneType))
+
+
+def is_closed(features: Features) -> bool:
+    """Whether the teacher knows its labels and no other words."""
+    return features.convention["kind"] in ("labels", "given") or features.convention.get("output") == "logits"
+
+
+def understood(path: Path, text: str, phrases: list[str]) -> Query:
+    """The words as vectors of the scene's channels, by the teacher that the scene was trained from."""
+    features, model = taught(path)
+    if is_closed(features):
         return among_labels(features, text, phrases)
-    model = stated(path, read_manifest(path), "config", "teacher", "model", kind=(str, NoneType))
     try:
         vectors = embedded([text, *(phrases or CANONICAL)], features, model)
     except InputError as error:

@@ -28,6 +28,8 @@ def test_a_wheel_mounts_every_layer_under_chebsplat(tmp_path):
         "chebsplat/stages/pages/report.html",
         "chebsplat/stages/pages/style.css",
         "chebsplat/stages/pages/viewer.js",
+        "chebsplat/stages/pages/scene/page.html",
+        "chebsplat/stages/pages/scene/splats.js",
         "chebsplat/teachers/embedded.onnx",
         "chebsplat/teachers/embedded.toml",
         "chebsplat/teachers/embedded.npz",

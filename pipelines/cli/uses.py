@@ -1,4 +1,4 @@
-"""What is done with a finished scene, or before one: query, extract, encode, lift, label, check-teacher,
+"""What is done with a finished scene, or before one: query, page, extract, encode, lift, label, check-teacher,
 get-teacher, knowledge.
 """
 
@@ -184,4 +184,31 @@ def label(ply: Path, words: str | None, up: str, unit: float | None, knowledge: 
     print(out)
 
 
-COMMANDS = (query, check_teacher, get_teacher, extract, encode, lift, label, knowledge)
+@click.command()
+@click.argument("scene")
+@click.option("--out", type=click.Path(path_type=Path), required=True, help="the .html to write")
+@click.option("--sh", type=click.IntRange(0, 1), default=0, show_default=True, help="SH degree of the colours")
+@click.option("--words", type=click.Path(path_type=Path), help="text file of more words to ask for, one a line")
+@click.option("--against", default="", help="phrases that words are weighed against, as of query")
+def page(scene: str, out: Path, sh: int, words: Path | None, against: str) -> None:
+    """Write a finished SCENE (or a .ply) as one HTML page to fly through and ask in words: no server, no network."""
+    import logging
+
+    from chebsplat.formats.scene import read_scene
+    from chebsplat.formats.teacher_model import read_label_set
+    from chebsplat.pipelines.finished import artifact_of, teacher_of
+    from chebsplat.stages.page import foreign, write_page
+
+    logging.basicConfig(stream=sys.stderr, format="page: %(message)s", level="WARNING", force=True)
+    logging.getLogger("chebsplat").setLevel("INFO")
+    source = Path(scene)
+    opened = foreign(source) if scene.endswith(".ply") else read_scene(artifact_of(scene, "export"))
+    teacher = None if scene.endswith(".ply") else teacher_of(scene)
+    phrases = [word.strip() for word in against.split(",") if word.strip()]
+    name = source.stem if scene.endswith(".ply") else Path(os.path.abspath(scene)).name
+    counts = write_page(opened, name, teacher, out, sh, phrases, list(read_label_set(words)) if words else [])
+    print(", ".join(f"{name} {number:,}" for name, number in counts.items()), file=sys.stderr)
+    print(out)
+
+
+COMMANDS = (query, check_teacher, get_teacher, extract, encode, lift, label, knowledge, page)

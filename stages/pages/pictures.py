@@ -34,7 +34,7 @@ def heat(image: np.ndarray, relevancy: np.ndarray) -> np.ndarray:
     grey = image.mean(-1, keepdims=True)
     warmth = (2 * relevancy - 1).clip(0, 1)[..., None]
     opacity = np.where(warmth > 0, 0.5 + 0.4 * warmth, 0)
-    return np.round((1 - opacity) * 0.8 * grey + opacity * (0.7 + 0.3 * grey / 255) * _warm(warmth)).astype(np.uint8)
+    return np.round((1 - opacity) * 0.8 * grey + opacity * (0.7 + 0.3 * grey / 255) * warm(warmth)).astype(np.uint8)
 
 
 def heat_scale(title: str, width: int) -> np.ndarray:
@@ -43,7 +43,7 @@ def heat_scale(title: str, width: int) -> np.ndarray:
 
     strip = np.full((28, width, 3), 255, np.uint8)
     left, right = round(0.82 * width), round(0.97 * width)
-    strip[9:19, left:right] = _warm(np.linspace(0, 1, right - left)[None, :, None]).round()
+    strip[9:19, left:right] = warm(np.linspace(0, 1, right - left)[None, :, None]).round()
     picture = Image.fromarray(strip)
     draw, room = ImageDraw.Draw(picture), max(left - 40, 0) // 6  # letters of the built-in font
     draw.text((8, 8), title if len(title) <= room else f"{title[: max(room - 3, 0)]}...", fill="black")
@@ -52,7 +52,7 @@ def heat_scale(title: str, width: int) -> np.ndarray:
     return np.asarray(picture)
 
 
-def _warm(warmth: np.ndarray) -> np.ndarray:
+def warm(warmth: np.ndarray) -> np.ndarray:
     """Colours [..., 3] up to 255 of warmth [..., 1] in [0, 1], from the warmer part of turbo."""
     from matplotlib import colormaps
 

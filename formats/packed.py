@@ -1,0 +1,152 @@
+"""Gaussians in 20 bytes each, for pages that a browser opens: quantised, in planes of bytes that compress well.
+
+`stages/pages/scene/splats.js` reads what this module writes. Planes are u8 [..., N], one Gaussian a column; numbers of
+more than one byte lie lowest byte first. A value is its integer times `step` plus `low`.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+
+BYTES = {"means": 9, "log_scales": 3, "quats": 4, "opacities": 1, "colors": 3}  # of a Gaussian
+C0 = 0.28209479177387814  # of SH band 0, from coefficients to colours
+SPAN = 10.2  # of ln scale below the largest: e⁻¹⁰ of it is below every pixel
+COLORS = (-1.0, 3.0)  # of SH degree 0 in training's [0, 1]; beyond it no pixel can tell
+
+
+@dataclass
+class Packed:
+    """Arrays by name, and for each quantised one its `low` and `step`, lists of a number for each axis or channel.
+
+    means:      u8 [3, 3, N], axis and byte; `low` and `step` in the scene's frame and units.
+    log_scales: u8 [3, N]; quats: u8 [4, N], of u32: the largest entry's place in the 2 upper bits, the others in order
+                (wxyz, the largest positive) as 10 bits each over ±1/√2.
+    opacities:  u8 [N] of [0, 1]; colors: u8 [3, N], of SH degree 0, 1 is white.
+    sh1:        i8 [9, N], coefficients of band 1, coefficient-major; only where asked for.
+    features:   i8 [C, N]; only where given.
+    """
+
+    arrays: dict[str, np.ndarray]
+    ranges: dict[str, dict[str, list[float]]] = field(default_factory=dict)
+
+
+def pack(parameters: dict[str, np.ndarray], sh_degree: int = 0) -> Packed:
+    """Quantise raw parameters (`formats.scene.Scene.parameters`). Raises ValueError on a degree that is not 0 or 1.
+
+    Choices: 24 bits a coordinate, so that a stray Gaussian far off costs the others nothing that shows; scales to 2 %,
+      over e^10 below the largest; activated opacities, since logits would spend their bits where nothing changes.
+    """
+    if sh_degree not in (0, 1):
+        raise ValueError(f"a page holds SH degree 0 or 1, not {sh_degree}")
+    arrays: dict[str, np.ndarray] = {}
+    ranges: dict[str, dict[str, list[float]]] = {}
+
+    def levels(name: str, values: np.ndarray, top: int) -> np.ndarray:
+        low, high = values.min(0), values.max(0)
+        step = np.where(high > low, (high - low) / top, 1.0)
+        ranges[name] = {"low": low.tolist(), "step": step.tolist()}
+        integers: np.ndarray = np.round((values - low) / step).T
+        return integers
+
+    means = levels("means", parameters["means"].astype(np.float64), (1 << 24) - 1).astype(np.uint32)
+    arrays["means"] = np.stack([means >> shift & 255 for shift in (0, 8, 16)], 1).astype(np.uint8)
+    largest = parameters["log_scales"].max()
+    log_scales = parameters["log_scales"].astype(np.float64).clip(largest - SPAN)
+    arrays["log_scales"] = levels("log_scales", log_scales, 255).astype(np.uint8)
+    words = smallest_three(parameters["quats"])
+    arrays["quats"] = np.stack([words >> shift & 255 for shift in (0, 8, 16, 24)]).astype(np.uint8)
+    opacities = 1 / (1 + np.exp(-parameters["logit_opacities"].astype(np.float64)))
+    arrays["opacities"] = np.round(255 * opacities).astype(np.uint8)
+    colors = (parameters["sh0"][:, 0].astype(np.float64) * C0 + 0.5).clip(*COLORS)
+    arrays["colors"] = levels("colors", colors, 255).astype(np.uint8)
+    if sh_degree:
+        arrays["sh1"], ranges["sh1"] = signed(parameters["shN"][:, :3].reshape(len(colors), 9))
+    if "features" in parameters:
+        arrays["features"], ranges["features"] = signed(parameters["features"])
+    return Packed(arrays, ranges)
+
+
+def unpack(packed: Packed) -> dict[str, np.ndarray]:
+    """Parameters as given to `pack`, float32, quaternions unit; opacities of 0 and 1 as logits of ±20."""
+    arrays = packed.arrays
+
+    def values(name: str, integers: np.ndarray) -> np.ndarray:
+        stated = packed.ranges[name]
+        found: np.ndarray = integers.T * np.array(stated["step"]) + np.array(stated.get("low", 0.0))
+        return found
+
+    bytes_of = arrays["means"].astype(np.uint32)
+    means = values("means", bytes_of[:, 0] | bytes_of[:, 1] << 8 | bytes_of[:, 2] << 16)
+    opacities = arrays["opacities"] / 255
+    with np.errstate(divide="ignore"):
+        logits = np.log(opacities / (1 - opacities)).clip(-20, 20)
+    found = {
+        "means": means,
+        "log_scales": values("log_scales", arrays["log_scales"]),
+        "quats": from_smallest_three(arrays["quats"].astype(np.uint32)),
+        "logit_opacities": logits,
+        "sh0": (values("colors", arrays["colors"])[:, None] - 0.5) / C0,
+        "shN": np.zeros((len(means), 15, 3)),
+    }
+    if "sh1" in arrays:
+        found["shN"][:, :3] = values("sh1", arrays["sh1"]).reshape(-1, 3, 3)
+    if "features" in arrays:
+        found["features"] = values("features", arrays["features"])
+    return {name: value.astype(np.float32) for name, value in found.items()}
+
+
+def signed(rows: np.ndarray) -> tuple[np.ndarray, dict[str, list[float]]]:
+    """Rows [N, C] as i8 [C, N], and the step of each channel, the same above and below zero."""
+    step = np.abs(rows.astype(np.float64)).max(0, initial=0) / 127
+    step = np.where(step > 0, step, 1.0)
+    return np.round(rows / step).astype(np.int8).T, {"step": step.tolist()}
+
+
+def smallest_three(quats: np.ndarray) -> np.ndarray:
+    """Quaternions [N, 4] of any length as u32 [N]."""
+    unit = quats.astype(np.float64)
+    unit /= np.linalg.norm(unit, axis=1, keepdims=True).clip(1e-12)
+    place = np.abs(unit).argmax(1)
+    rows = np.arange(len(unit))
+    unit *= np.where(unit[rows, place] < 0, -1, 1)[:, None]
+    others = unit[rows[:, None], OTHERS[place]]
+    steps = np.round((others * np.sqrt(0.5) + 0.5) * 1023).clip(0, 1023).astype(np.uint32)
+    words: np.ndarray = place.astype(np.uint32) << 30 | steps[:, 0] << 20 | steps[:, 1] << 10 | steps[:, 2]
+    return words
+
+
+def from_smallest_three(planes: np.ndarray) -> np.ndarray:
+    """Bytes u32 [4, N] to unit quaternions [N, 4]."""
+    words = planes[0] | planes[1] << 8 | planes[2] << 16 | planes[3] << 24
+    place = words >> 30
+    others = (np.stack([words >> 20 & 1023, words >> 10 & 1023, words & 1023], 1) / 1023 - 0.5) / np.sqrt(0.5)
+    quats = np.empty((len(words), 4))
+    rows = np.arange(len(words))
+    quats[rows[:, None], OTHERS[place]] = others
+    quats[rows, place] = np.sqrt((1 - (others**2).sum(1)).clip(0))
+    unit: np.ndarray = quats / np.linalg.norm(quats, axis=1, keepdims=True)
+    return unit
+
+
+OTHERS = np.array([[1, 2, 3], [0, 2, 3], [0, 1, 3], [0, 1, 2]])  # places beside the largest
+
+
+def to_bytes(arrays: dict[str, np.ndarray]) -> tuple[bytes, dict[str, Any]]:
+    """Arrays one after the other, each from a multiple of 4 on, and where each lies: dtype, shape, offset."""
+    blob, places = bytearray(), {}
+    for name, array in arrays.items():
+        blob += bytes(-len(blob) % 4)
+        places[name] = {"dtype": array.dtype.name, "shape": list(array.shape), "offset": len(blob)}
+        blob += np.ascontiguousarray(array, array.dtype.newbyteorder("<")).tobytes()
+    return bytes(blob), places
+
+
+def from_bytes(blob: bytes, places: dict[str, Any]) -> dict[str, np.ndarray]:
+    """What `to_bytes` was given."""
+    return {
+        name: np.frombuffer(blob, at["dtype"], int(np.prod(at["shape"])), at["offset"]).reshape(at["shape"])
+        for name, at in places.items()
+    }

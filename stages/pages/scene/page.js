@@ -1,0 +1,300 @@
+const get = id => document.getElementById(id), canvas = get("scene"), tip = get("tip");
+const about = JSON.parse(get("about").textContent), semantic = !!about.labels;
+const TEMPERATURE = 0.1, DIMMED = 0.06, FRAME = 1000 / 24, SMALLEST = 0.25; // of cosines; of what is not brought out; ms; of the pixels a side
+let splats, drawing, sorter, order = new Uint32Array(0), strength, features, views, lists; // lists: Gaussians by label
+let camera, moving = 0, scale = 1, dirty = true, frames = 0, asked = null, mode = "color", picked = -1;
+const hidden = new Set(), held = new Set(), pointers = new Map();
+
+// -- vectors and cameras: { turn: rows of the rotation from world to camera, eye, view: whose lens it has, pivot: how far ahead }
+const times = (m, v) => [0, 3, 6].map(r => m[r] * v[0] + m[r + 1] * v[1] + m[r + 2] * v[2]);
+const back = (m, v) => [0, 1, 2].map(c => m[c] * v[0] + m[c + 3] * v[1] + m[c + 6] * v[2]);
+const product = (a, b) => [0, 3, 6].flatMap(r => [0, 1, 2].map(c => a[r] * b[c] + a[r + 1] * b[c + 3] + a[r + 2] * b[c + 6]));
+const plus = (a, b, by = 1) => a.map((value, i) => value + by * b[i]);
+function about_axis([x, y, z], angle) {
+  const c = Math.cos(angle), s = Math.sin(angle), t = 1 - c;
+  return [t * x * x + c, t * x * y - s * z, t * x * z + s * y, t * x * y + s * z, t * y * y + c, t * y * z - s * x,
+    t * x * z - s * y, t * y * z + s * x, t * z * z + c];
+}
+function unrounded(m) { // rows unit and square again after many turns
+  const unit = v => v.map(x => x / Math.hypot(...v)), z = unit(m.slice(6)), along = m[0] * z[0] + m[1] * z[1] + m[2] * z[2];
+  const x = unit([m[0] - along * z[0], m[1] - along * z[1], m[2] - along * z[2]]);
+  return [...x, z[1] * x[2] - z[2] * x[1], z[2] * x[0] - z[0] * x[2], z[0] * x[1] - z[1] * x[0], ...z];
+}
+function lens(view, width, height) { // the capture's picture as large as it fits, in the middle
+  const [fx, fy, cx, cy] = views.subarray(16 * view + 12, 16 * view + 16), by = Math.min(width / about.width, height / about.height);
+  return [fx * by, fy * by, width / 2 + (cx - about.width / 2) * by, height / 2 + (cy - about.height / 2) * by];
+}
+function seen({ turn, eye, view }, width = canvas.width, height = canvas.height) {
+  return { turn, eye, shift: times(turn, eye).map(x => -x), lens: lens(view, width, height), size: [width, height] };
+}
+function sortable({ turn, shift, lens: [fx, fy, cx, cy], size: [width, height] }) {
+  return { turn, shift, slopes: [Math.max(cx, width - cx) / fx, Math.max(cy, height - cy) / fy] };
+}
+const shown = () => seen(camera, canvas.clientWidth, canvas.clientHeight); // pointers count in the page's own pixels
+function at_view(view) {
+  const pose = views.subarray(16 * view, 16 * view + 12), turn = [0, 1, 2, 4, 5, 6, 8, 9, 10].map(i => pose[i]);
+  return { turn, eye: back(turn, [3, 7, 11].map(i => -pose[i])), view, pivot: about.extent / 3 };
+}
+
+// -- what the Gaussians show
+const channel = hex => [1, 3, 5].map(i => parseInt(hex.slice(i, i + 2), 16) / 255);
+function retint() {
+  const { n, colors } = splats, tints = new Float32Array(4 * n), palette = semantic ? about.labels.map(label => channel(label.color)) : [];
+  const of = semantic ? splats.labels : null, warm = about.warm ?? [[0, 0, 0]];
+  const force = palette.map((_, label) => hidden.has(label) ? 0 : picked >= 0 && picked != label ? DIMMED : 1);
+  for (let k = 0; k < n; k++) {
+    const label = of ? of[k] - 1 : -1, grey = (colors[3 * k] + colors[3 * k + 1] + colors[3 * k + 2]) / 3;
+    const heat = mode == "relevancy" && asked ? Math.min(Math.max(2 * asked.scores[k] - 1, 0), 1) : 0;
+    const over = heat > 0 ? 0.5 + 0.4 * heat : 0, hot = warm[Math.round(heat * (warm.length - 1))];
+    for (let c = 0; c < 3; c++) tints[4 * k + c] = mode == "color" ? colors[3 * k + c]
+      : mode == "labels" ? (label < 0 ? 0.25 : 0.8 * palette[label][c]) + 0.2 * grey
+      : (1 - over) * 0.8 * grey + over * (0.7 + 0.3 * grey) * hot[c];
+    strength[k] = tints[4 * k + 3] = force[label] ?? (picked >= 0 ? DIMMED : 1);
+  }
+  drawing.tint(tints); dirty = true;
+}
+function show(next) {
+  if (next == "relevancy" && !asked) { get("word").focus(); get("answer").textContent = "Type a word first."; return; }
+  mode = next;
+  for (const button of document.querySelectorAll("[data-mode]")) button.setAttribute("aria-pressed", button.dataset.mode == mode);
+  get("scale").hidden = mode != "relevancy"; retint();
+}
+function pick(label) {
+  picked = label == picked ? -1 : label; if (picked >= 0) hidden.delete(picked);
+  legend(); retint();
+}
+function legend() {
+  for (const item of get("legend").children) {
+    const label = +item.dataset.label;
+    item.querySelector("button").setAttribute("aria-pressed", label == picked); item.querySelector("input").checked = !hidden.has(label);
+  }
+}
+
+// -- words: LERF's relevancy, as chebsplat/labels/relevancy.py computes it, and labels, as chebsplat/labels/decode.py
+function unit_features(arrays) {
+  const { n } = splats, C = about.ranges.features.step.length, rows = new Float32Array(n * C), lengths = new Float32Array(n);
+  for (let c = 0; c < C; c++) for (let k = 0; k < n; k++) rows[k * C + c] = arrays.features[c * n + k] * about.ranges.features.step[c];
+  for (let k = 0; k < n; k++) {
+    let sum = 0; for (let i = k * C; i < (k + 1) * C; i++) sum += rows[i] * rows[i];
+    lengths[k] = Math.sqrt(sum); for (let i = k * C; i < (k + 1) * C; i++) rows[i] /= Math.max(lengths[k], 1e-6);
+  }
+  return { C, rows, lengths };
+}
+function dots(rows, C, vector) {
+  const found = new Float32Array(rows.length / C);
+  for (let k = 0, i = 0; k < found.length; k++) { let sum = 0; for (let c = 0; c < C; c++) sum += rows[i++] * vector[c]; found[k] = sum; }
+  return found;
+}
+const embedding = word => Float32Array.from({ length: features.C }, (_, c) => lists.words[word * features.C + c] * about.word_step[c]);
+/** Of unit rows [n, C]: the largest inner product with a phrase, the second largest, and whose the largest is. */
+function strongest(rows) {
+  const { C } = features, n = rows.length / C, best = new Float32Array(n).fill(-Infinity), second = best.slice(), whose = new Int32Array(n);
+  for (let phrase = 0; phrase * C < lists.against.length; phrase++) {
+    const found = dots(rows, C, lists.against.subarray(phrase * C, (phrase + 1) * C));
+    for (let k = 0; k < n; k++) if (found[k] > best[k]) { second[k] = best[k]; best[k] = found[k]; whose[k] = phrase; }
+      else if (found[k] > second[k]) second[k] = found[k];
+  }
+  return { best, second, whose };
+}
+/** Margin of a word over the strongest phrase (where words are labels: over the strongest other one), in [0, 1]. */
+function relevancy(rows, lengths, word, { best, second, whose }) {
+  const apart = !about.against;
+  return dots(rows, features.C, embedding(word)).map((value, k) => {
+    const phrase = apart && whose[k] == word ? second[k] : best[k];
+    return lengths[k] > 0 ? 1 / (1 + Math.exp((phrase - value) / TEMPERATURE)) : 0;
+  });
+}
+function ask(text) {
+  const folded = text.toLowerCase().replace(/[_-]/g, " ").trim().split(/\s+/).join(" "), word = about.words.findIndex(known => known.toLowerCase() == folded);
+  if (word < 0) {
+    const near = about.words.filter(known => folded.length > 1 && (known.includes(folded) || folded.includes(known))).slice(0, 5);
+    get("answer").textContent = `This page has no "${text}"${near.length ? `; near: ${near.join(", ")}` : ""}.`; return null;
+  }
+  const began = performance.now(), scores = relevancy(features.rows, features.lengths, word, features.against), most = scores.reduce((a, b) => Math.max(a, b), 0);
+  asked = { text, word, scores }; tip.hidden = true; show("relevancy");
+  const above = scores.reduce((count, score) => count + (score > 0.5), 0), ms = performance.now() - began;
+  get("answer").textContent = `${about.words[word]}: ${above.toLocaleString("en")} Gaussians above 0.5, the highest ${most.toFixed(2)} (${Math.round(ms)} ms)`;
+  return { above, ms };
+}
+/** Label, its share and, where a word was asked, relevancy, of the features that a pixel shows; null where nothing is. */
+function meaning(x, y) {
+  const hit = under(splats, order, shown(), x, y, strength);
+  if (!semantic || hit.covered < 0.5) return { hit };
+  const { C, rows, lengths } = features, mean = new Float32Array(C);
+  for (const [k, weight] of hit.found) for (let c = 0; c < C; c++) mean[c] += weight * lengths[k] * rows[k * C + c];
+  const length = Math.hypot(...mean), direction = mean.map(value => value / Math.max(length, 1e-6));
+  const cosines = dots(lists.label_embeddings, C, direction), label = cosines.indexOf(cosines.reduce((a, b) => Math.max(a, b)));
+  const share = 1 / cosines.reduce((sum, value) => sum + Math.exp((value - cosines[label]) / TEMPERATURE), 0);
+  return { hit, label, share, relevant: mode == "relevancy" ? relevancy(direction, [length], asked.word, strongest(direction))[0] : null };
+}
+
+// -- the loop: pictures are drawn when something changed, smaller while that is slow, whole again at rest
+let last = 0, slow = FRAME, drawn = false, wanted = "", second = [0, 0, ""]; // of the count: when it began, frames then, what it said
+function frame(now) {
+  requestAnimationFrame(frame);
+  const passed = now - last; last = now;
+  fly(Math.min(passed, 100) / 1000);
+  const busy = now - moving < 250;
+  if (busy && drawn) { // of a frame that drew, not of the first after rest
+    slow += 0.3 * (Math.min(passed, 10 * FRAME) - slow);
+    if (slow > 1.2 * FRAME) { scale = Math.max(scale * Math.max(Math.sqrt(FRAME / slow), 0.6), SMALLEST); slow = FRAME; }
+    else if (slow < 0.6 * FRAME) { scale = Math.min(scale * 1.1, 1); slow = FRAME; }
+  }
+  drawn = busy;
+  const by = (busy ? scale : 1) * Math.min(devicePixelRatio, 2), width = Math.max(Math.round(canvas.clientWidth * by), 1);
+  const height = Math.max(Math.round(canvas.clientHeight * by), 1);
+  if (canvas.width != width || canvas.height != height) { canvas.width = width; canvas.height = height; dirty = true; }
+  if (dirty) {
+    const what = seen(camera), text = JSON.stringify([what.turn, what.shift, canvas.clientWidth, canvas.clientHeight]);
+    if (text != wanted) { wanted = text; sorter.ask(sortable(what)); }
+    drawing.draw(what, mode == "color" && !!splats.sh1);
+    dirty = false; frames++;
+  }
+  if (now - second[0] > 1000) second = [now, frames, `${Math.round(1000 * (frames - second[1]) / (now - second[0]))} frames/s`];
+  get("status").textContent = !busy ? "" : scale < 0.99 ? `${second[2]}, ${Math.round(100 * scale)} % of the pixels a side while moving` : second[2];
+}
+function moved() { dirty = true; moving = performance.now(); tip.hidden = true; }
+function fly(seconds) {
+  const key = name => held.has(name) ? 1 : 0, by = seconds * about.extent * (key("shift") ? 0.6 : 0.2);
+  const step = [key("d") - key("a"), key("q") - key("e"), key("w") - key("s")];
+  const yaw = key("arrowright") - key("arrowleft"), pitch = key("arrowup") - key("arrowdown");
+  if (!step.some(Boolean) && !yaw && !pitch) return;
+  camera.eye = plus(camera.eye, back(camera.turn, step), by);
+  turned(seconds * yaw, seconds * pitch, camera.eye); moved();
+}
+/** Turn about a point: yaw about the capture's up, pitch about the picture's x axis. */
+function turned(yaw, pitch, pivot) {
+  const from = times(camera.turn, plus(camera.eye, pivot, -1));
+  camera.turn = unrounded(product(about_axis([1, 0, 0], -pitch), product(camera.turn, about_axis(about.up, yaw))));
+  camera.eye = plus(back(camera.turn, from), pivot);
+}
+function ahead(x, y, depth) { // the point at a depth behind a pixel
+  const { lens: [fx, fy, cx, cy] } = shown();
+  return plus(back(camera.turn, [(x - cx) / fx * depth, (y - cy) / fy * depth, depth]), camera.eye);
+}
+const pixel = event => { const box = canvas.getBoundingClientRect(); return [event.clientX - box.left, event.clientY - box.top]; };
+function jump(view) {
+  const n = about.views.length; view = (view + n) % n;
+  camera = at_view(view); get("view").value = view; moved();
+}
+
+// -- pointers: one orbits, two shift and zoom
+let grip = null, travelled = 0;
+function grasp() {
+  const all = [...pointers.values()], middle = [0, 1].map(i => all.reduce((sum, p) => sum + p[i], 0) / all.length);
+  const spread = all.length > 1 ? Math.hypot(all[0][0] - all[1][0], all[0][1] - all[1][1]) : 0;
+  return { middle, spread };
+}
+function drag(now, shifting) {
+  const [dx, dy] = [0, 1].map(i => now.middle[i] - grip.middle[i]);
+  if (shifting) {
+    const { lens: [fx, fy] } = shown(), d = camera.pivot;
+    camera.eye = plus(camera.eye, back(camera.turn, [-dx * d / fx, -dy * d / fy, 0]));
+  } else turned(dx * Math.PI / canvas.clientWidth, -dy * Math.PI / canvas.clientWidth, grip.pivot);
+  if (now.spread && grip.spread) closer(now.spread / grip.spread, ...now.middle);
+  Object.assign(grip, now); moved();
+}
+function closer(by, x, y) { // come as much closer to what lies behind a pixel
+  const target = ahead(x, y, camera.pivot), keep = 1 / by;
+  camera.eye = plus(plus(camera.eye, target, -1).map(value => value * keep), target); camera.pivot = Math.max(camera.pivot * keep, about.extent / 500); moved();
+}
+function aim(x, y) { // orbit and zoom about what lies under a pixel
+  const { covered, depth } = under(splats, order, shown(), x, y, strength);
+  if (covered > 0.5) camera.pivot = depth;
+  return ahead(x, y, camera.pivot);
+}
+function listen() {
+  canvas.onpointerdown = event => {
+    canvas.setPointerCapture(event.pointerId); pointers.set(event.pointerId, pixel(event)); canvas.focus({ preventScroll: true });
+    grip = grasp(); grip.pivot = aim(...grip.middle); travelled = 0; tip.hidden = true;
+  };
+  canvas.onpointermove = event => {
+    if (!pointers.has(event.pointerId)) { if (event.pointerType == "mouse") hover(event); return; }
+    const before = pointers.get(event.pointerId), at = pixel(event);
+    travelled += Math.hypot(at[0] - before[0], at[1] - before[1]);
+    pointers.set(event.pointerId, at); drag(grasp(), pointers.size > 1 || event.shiftKey || event.buttons & 6);
+  };
+  canvas.onpointerup = canvas.onpointercancel = event => {
+    if (!pointers.delete(event.pointerId)) return;
+    if (pointers.size) { grip = grasp(); grip.pivot = aim(...grip.middle); return; }
+    if (travelled > 4 || event.type == "pointercancel") return;
+    hover(event); if (semantic && event.pointerType == "mouse" && event.button == 0) { const { label } = meaning(...pixel(event)); if (label !== undefined) pick(label); }
+  };
+  canvas.onpointerleave = () => { tip.hidden = true; };
+  canvas.oncontextmenu = event => event.preventDefault();
+  canvas.addEventListener("wheel", event => {
+    event.preventDefault(); const at = pixel(event); aim(...at); closer(Math.exp(-Math.max(-200, Math.min(200, event.deltaY * (event.deltaMode ? 30 : 1))) / 500), ...at);
+  }, { passive: false });
+  addEventListener("keydown", event => {
+    if (event.ctrlKey || event.metaKey || event.altKey || event.target.closest("input:not([type=checkbox]), select")) return;
+    const key = event.key.toLowerCase();
+    if (["w", "a", "s", "d", "q", "e", "shift"].includes(key) || key.startsWith("arrow")) { held.add(key); if (key.startsWith("arrow")) event.preventDefault(); }
+    else if (key == "n") jump(camera.view + 1); else if (key == "p") jump(camera.view - 1); else if (key == "escape" && picked >= 0) pick(picked);
+  });
+  addEventListener("keyup", event => held.delete(event.key.toLowerCase())); addEventListener("blur", () => held.clear());
+  addEventListener("resize", () => { dirty = true; });
+  get("before").onclick = () => jump(camera.view - 1); get("after").onclick = () => jump(camera.view + 1);
+  get("view").onchange = event => jump(+event.target.value);
+  get("save").onclick = () => { drawing.draw(seen(camera), mode == "color" && !!splats.sh1); canvas.toBlob(blob => {
+    const link = document.createElement("a"); link.href = URL.createObjectURL(blob); link.download = `${about.name}.png`; link.click(); URL.revokeObjectURL(link.href); }); };
+  canvas.addEventListener("webglcontextlost", event => { event.preventDefault(); trouble("The graphics context was lost; load the page again."); });
+  if (!semantic) return;
+  for (const button of document.querySelectorAll("[data-mode]")) button.onclick = () => show(button.dataset.mode);
+  get("ask").onsubmit = event => { event.preventDefault(); if (get("word").value.trim()) ask(get("word").value); };
+  get("word").oninput = event => { if (event.inputType == "insertReplacementText" || !event.inputType) ask(event.target.value); };
+  get("all").onclick = () => { hidden.clear(); picked = -1; legend(); retint(); };
+}
+let hovering = 0;
+function hover(event) { // once a frame at most
+  const at = pixel(event), { clientX, clientY } = event; cancelAnimationFrame(hovering);
+  hovering = requestAnimationFrame(() => {
+    const { label, share, relevant } = meaning(...at); tip.hidden = label === undefined; if (tip.hidden) return;
+    const swatch = document.createElement("i"); swatch.style.background = about.labels[label].color;
+    tip.replaceChildren(swatch, `${about.labels[label].name} ${Math.round(100 * share)} %${relevant === null ? "" : `, relevancy ${relevant.toFixed(2)}`}`);
+    tip.style.left = `${Math.min(clientX, innerWidth - tip.offsetWidth - 20)}px`; tip.style.top = `${Math.min(clientY, innerHeight - 50)}px`;
+  });
+}
+function trouble(text) { get("trouble").textContent = text; get("trouble").hidden = false; }
+
+function furnish() { // what the panel lists
+  if (innerWidth < 700) get("panel").open = false;
+  get("view").append(...about.views.map((name, k) => new Option(name, k)));
+  if (!semantic) return;
+  get("words").append(...about.words.map(word => new Option(word)));
+  get("scale").querySelector("i").style.background = `linear-gradient(90deg, ${about.warm.map(color => `rgb(${color.map(v => Math.round(255 * v))})`)})`;
+  const counts = about.labels.map(() => 0); for (const label of splats.labels) if (label) counts[label - 1]++;
+  const labels = counts.map((count, label) => ({ count, label })).filter(({ count }) => count).sort((a, b) => b.count - a.count);
+  get("legend").append(...labels.map(({ count, label }) => {
+    const { name, color } = about.labels[label], item = document.createElement("li"), box = document.createElement("input"), button = document.createElement("button");
+    item.dataset.label = label; box.type = "checkbox"; box.checked = true; box.ariaLabel = `show ${name}`;
+    box.onchange = () => { if (box.checked) hidden.delete(label); else hidden.add(label); if (picked == label) picked = -1; legend(); retint(); };
+    button.type = "button"; button.setAttribute("aria-pressed", false); button.title = `bring out ${name}`; button.onclick = () => pick(label);
+    for (const [tag, text] of [["i", ""], ["span", name], ["small", count.toLocaleString("en")]]) {
+      const part = document.createElement(tag); part.textContent = text; if (tag == "i") part.style.background = color; button.append(part);
+    }
+    item.append(box, button); return item;
+  }));
+}
+async function open() {
+  const arrays = await unpacked(get("data").textContent, about.places); get("data").textContent = "";
+  splats = decoded(arrays, about.ranges, about.center); views = arrays.views; lists = arrays; strength = new Float32Array(splats.n).fill(1);
+  if (semantic) { splats.labels = arrays.labels; features = unit_features(arrays); features.against = strongest(features.rows); }
+  drawing = new Drawing(canvas, splats); camera = at_view(0);
+  sorter = new Sorter(splats, found => { order = found; drawing.order(order); dirty = true; });
+  order = sorted(splats.means, splats.reach, sortable(seen(camera))); drawing.order(order);
+  furnish(); listen(); retint(); requestAnimationFrame(now => { last = now; frame(now); });
+}
+/** For scripts and tests: `await scene.ready`, then the capture's views as pictures, words, and what a pixel means. */
+const scene = {
+  ready: open().catch(error => { trouble(`This page cannot show its scene: ${error.message}`); throw error; }),
+  get frames() { return frames; },
+  look: view => jump(view),
+  ask, show, meaning,
+  /** RGBA bytes of a view in the capture's own pixels. */
+  picture(view) {
+    const what = seen(at_view(view), canvas.width = about.width, canvas.height = about.height);
+    drawing.order(sorted(splats.means, splats.reach, sortable(what))); drawing.draw(what, mode == "color" && !!splats.sh1);
+    const pixels = drawing.pixels(); drawing.order(order); dirty = true;
+    return pixels;
+  },
+};
