@@ -1,4 +1,4 @@
-"""Images from outside: the one door to Pillow's readers. PNG and JPEG, recognised by content, of bounded size.
+"""Images from outside: the one door to Pillow's readers. PNG, JPEG and HEIC, recognised by content, of bounded size.
 
 Pillow would read forty more formats, whatever a file is called; one of its readers starts Ghostscript.
 """
@@ -22,7 +22,8 @@ if TYPE_CHECKING:
     import numpy as np
 
 FORMATS = ("PNG", "JPEG")
-SUFFIXES = (".jpg", ".jpeg", ".png")
+SUFFIXES = (".jpg", ".jpeg", ".png", ".heic", ".heif")
+HEIC_BRANDS = {b"heic", b"heix", b"heim", b"heis", b"hevc", b"hevx", b"mif1", b"msf1"}  # ISO/IEC 23008-12
 MAX_PIXELS = 64_000_000  # of one image, and of all that are being decoded: that takes up to 12 bytes a pixel
 MAX_SIDE = 65_535  # what JPEG can hold
 INCOMPLETE = "the source is incomplete"
@@ -35,8 +36,29 @@ ON_ITS_SIDE = (5, 6, 7, 8)  # orientations that swap width and height
 
 
 def is_image(name: str) -> bool:
-    """Whether a file's name is that of a PNG or JPEG image; hidden files are none."""
+    """Whether a file's name is that of a PNG, JPEG or HEIC image; hidden files are none."""
     return os.path.splitext(name)[1].lower() in SUFFIXES and not name.startswith(".")
+
+
+def is_heic(path: Path) -> bool:
+    """Whether a file is a HEIC image by its first bytes. Raises InputError if it cannot be read."""
+    regular(path, INCOMPLETE)
+    with Path(path).open("rb") as handle:
+        start = handle.read(12)
+    return start[4:8] == b"ftyp" and start[8:] in HEIC_BRANDS
+
+
+def require_heic(path: Path) -> None:
+    """Raises InputError with the command that installs the reader of HEIC, if it is missing."""
+    from importlib import import_module
+
+    try:
+        import_module("pillow_heif")
+    except ImportError:
+        raise InputError(
+            f"{path} is a HEIC photo, which the package pillow_heif reads: .venv/bin/pip install -e '.[heic]' installs "
+            "it"
+        ) from None
 
 
 @contextmanager
@@ -100,6 +122,21 @@ def _exif(image: Any) -> Any:
     return Image.Image.getexif(image)
 
 
+def _formats(path: Path) -> tuple[str, ...]:
+    """Pillow's readers for a file: that of HEIC for such a file alone.
+
+    Choices: the camera's own rotation of a HEIC is applied by its reader, which also clears the EXIF orientation that
+      repeats it.
+    """
+    if not is_heic(path):
+        return FORMATS
+    require_heic(path)
+    import pillow_heif
+
+    pillow_heif.register_heif_opener(thumbnails=False)
+    return ("HEIF",)
+
+
 def _opened(path: Path, inspect: Callable[[Any], None], remedy: str) -> Any:
     from PIL import Image, UnidentifiedImageError
 
@@ -107,7 +144,7 @@ def _opened(path: Path, inspect: Callable[[Any], None], remedy: str) -> Any:
     warnings.simplefilter("error", Image.DecompressionBombWarning)  # Pillow's own limit lies above ours
     try:
         with Path(path).open("rb") as handle:
-            image = Image.open(handle, formats=FORMATS)
+            image = Image.open(handle, formats=_formats(path))
             if image.width * image.height > MAX_PIXELS or max(image.size) > MAX_SIDE:
                 raise Image.DecompressionBombError(f"{image.width}x{image.height}")
             inspect(image)
@@ -117,7 +154,7 @@ def _opened(path: Path, inspect: Callable[[Any], None], remedy: str) -> Any:
             "reduce it"
         ) from None
     except UnidentifiedImageError:
-        raise InputError(f"{path} is no PNG or JPEG image, whatever its name; convert it") from None
+        raise InputError(f"{path} is no PNG, JPEG or HEIC image, whatever its name; convert it") from None
     except DAMAGE as error:
         raise InputError(f"{path} is not a readable image ({error}); copy it again") from None
     return image

@@ -30,7 +30,13 @@ PLUMBING = {f"stages.{name}" for name in ("config", "settings", "registry", "com
 PLUMBING |= {"chebsplat.settings"}
 TEMPLATES = {".html", ".css", ".js"}  # of a package: what its modules fill
 LAYERS = ("formats", "stages", "pipelines", "teachers")
-OPTIONAL = {"gsplat", "tokenizers", "transformers"}  # of extras: their versions count only where a scene uses them
+OPTIONAL = {
+    "av",
+    "gsplat",
+    "pillow_heif",
+    "tokenizers",
+    "transformers",
+}  # of extras: their versions count only where a scene uses them
 
 
 class Code:

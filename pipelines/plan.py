@@ -20,13 +20,14 @@ from chebsplat.pipelines.needs import (
     left_out_channels,
     left_out_knowledge,
     left_out_stages,
+    media_packages,
     source_sentence,
     teacher_kind,
     text_packages,
     unread_inputs,
 )
 from chebsplat.pipelines.raw import Hashes, content_hash, hashes, raw_files
-from chebsplat.pipelines.scenes import absent, expanded, folder_of, read_toml, scene_values
+from chebsplat.pipelines.scenes import absent, expanded, folder_of, is_source, read_toml, scene_values
 from chebsplat.stages.registry import STAGES, Stage
 
 if TYPE_CHECKING:
@@ -213,9 +214,10 @@ class Planner:
         self, stage: Stage, config: Any, inputs: dict[str, Path], keys: dict[str, str], used: tuple[str, ...] = ()
     ) -> Step:
         """A stage's step; keys: of its inputs, by role; used: packages of extras that this configuration uses."""
-        sections, code = config.sections(stage.sections), self.code.stage(stage.name, used)
+        sections = config.sections(stage.sections)
         root, files = raw_files(stage.name, sections)
         raw = hashes(files, self.file_memo.values)
+        code = self.code.stage(stage.name, (*used, *media_packages(files)))
         key = step_key(stage, sections, keys, code, content_hash(raw, root) if raw or stage.name == "ingest" else None)
         return Step(stage.name, key, store.artifact_path(stage.name, key), inputs, sections, code, raw)
 
@@ -226,6 +228,6 @@ class Planner:
         from importlib import import_module
 
         folder = Path(source.path)
-        if not folder.is_dir():
+        if not is_source(folder):
             raise absent(scene, folder)
         return import_module(f"chebsplat.stages.sources.{source.kind}").probe(folder)  # type: ignore[no-any-return]

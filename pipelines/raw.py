@@ -25,10 +25,12 @@ def raw_files(stage: str, sections: dict[str, Any]) -> tuple[Path | None, list[P
     Raises: InputError if there are none where there must be.
     """
     if stage == "ingest" and sections["source"]["kind"] != "generated":
-        folder = Path(sections["source"]["path"])
+        folder, kind = Path(sections["source"]["path"]), sections["source"]["kind"]
+        if kind == "video" and not folder.is_dir():
+            return folder.parent, [folder]
         if not folder.is_dir():
             raise InputError(f"{folder} is not a folder; correct source.path")
-        return folder, import_module(f"chebsplat.stages.sources.{sections['source']['kind']}").files(folder)
+        return folder, import_module(f"chebsplat.stages.sources.{kind}").files(folder)
     if stage == "channels" and sections["channels"]["model"]:
         return None, _of_channels(sections["channels"])
     if stage == "teacher" and sections["teacher"]["model"]:

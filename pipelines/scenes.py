@@ -10,6 +10,7 @@ from typing import Any
 
 from chebsplat.errors import ConfigError, InputError
 from chebsplat.formats.names import suggest
+from chebsplat.formats.videos import is_video
 
 CONFIGS = Path(__file__).parent / "configs"
 ONE = {"scenes": "scene", "ablations": "ablation", "sequences": "sequence", "studies": "study"}
@@ -40,19 +41,24 @@ def expanded(text: str) -> str:
 
 
 def folder_of(scene: str) -> Path | None:
-    """The folder that `scene` is, absolute; None of a scene of ours. Raises InputError if there is no such folder."""
+    """The folder or video that `scene` is, absolute; None of a scene of ours. Raises InputError if there is none."""
     if not scene:
         raise ConfigError("scene= is empty; name a scene or a folder")
     folder = Path(os.path.expanduser(scene))
-    if "/" not in scene and scene not in (".", "..") and (scene in names("scenes") or not os.path.isdir(folder)):
+    if "/" not in scene and scene not in (".", "..") and (scene in names("scenes") or not is_source(folder)):
         return None
-    if not os.path.isdir(folder):
+    if not is_source(folder):
         raise InputError(f"{shown(scene)} is not a folder; correct scene=")
     return Path(os.path.realpath(folder))
 
 
+def is_source(path: Path) -> bool:
+    """Whether there is a folder, or the file of a video."""
+    return path.is_dir() or (is_video(path.name) and path.is_file())
+
+
 def scene_values(scene: str) -> tuple[str, dict[str, Any]]:
-    """(name, config values) of a named scene, or of a folder of photos, a COLMAP model or a transforms.json.
+    """(name, config values) of a named scene, or of a folder of photos, a COLMAP model, a video and so on.
 
     The name is part of what is computed, and the same wherever a folder lies; its links' may be longer (`folders`).
     """
@@ -68,8 +74,8 @@ def scene_values(scene: str) -> tuple[str, dict[str, Any]]:
 
 
 def folder_name(folder: Path, more: int = 0) -> str:
-    """A folder's name as that of links: its last part, those above it up to one with a letter, and `more` parts."""
-    parts = folder.parts[1:]
+    """A source's name as that of links: its last part, those above it up to one with a letter, and `more` parts."""
+    parts = (folder.with_suffix("") if is_video(folder.name) else folder).parts[1:]
     words = next((k for k in range(1, len(parts)) if re.search(r"[a-zA-Z]", parts[-k])), 1)  # "dense/0" is no "0"
     name = re.sub(r"[^\w.-]+", "-", "-".join(parts[-words - more :])).lstrip(".") or "scene"
     return name + ("-scene" if name == "store" else "")  # links lie beside the store

@@ -9,9 +9,12 @@ from typing import Any
 
 from chebsplat.errors import ConfigError, DataFailure, InputError
 from chebsplat.stages.command import Job, command
+from chebsplat.stages.progress import Progress
 from chebsplat.stages.settings import IngestSection, SourceSection
 
 log = logging.getLogger("chebsplat")
+
+NAMED = 20  # blurred views in a message
 
 
 def resolve(name: str, source: SourceSection) -> SourceSection:
@@ -30,7 +33,7 @@ def resolve(name: str, source: SourceSection) -> SourceSection:
     return source
 
 
-def read(name: str, source: SourceSection, settings: IngestSection) -> dict[str, Any]:
+def read(name: str, source: SourceSection, settings: IngestSection, progress: Progress | None = None) -> dict[str, Any]:
     """The fields of a capture, as its source gives them. Raises InputError if the source's folder is absent."""
     if source.kind == "generated":
         from chebsplat.stages.sources import generated
@@ -39,6 +42,10 @@ def read(name: str, source: SourceSection, settings: IngestSection) -> dict[str,
     from chebsplat.stages.sources import colmap, common, photos, replica, scannet, seven_scenes, transforms
 
     folder = Path(str(source.path)).expanduser()
+    if source.kind == "video":
+        from chebsplat.stages.sources import video
+
+        return video.read(folder, settings, progress)
     if not folder.is_dir():
         raise InputError(f"{folder} is not a folder; correct source.path")
     modules = {
@@ -53,6 +60,22 @@ def read(name: str, source: SourceSection, settings: IngestSection) -> dict[str,
     if unread := common.unread(folder):
         fields["source"]["notes"].append(f"{unread[0].upper()}{unread[1:]}.")
     return fields
+
+
+def blur_note(fields: dict[str, Any]) -> str:
+    """Which views are far less sharp than the others, in one sentence; nothing where none is."""
+    import numpy as np
+
+    from chebsplat.photos.sharpness import blurred, detail
+
+    images = fields["images"]
+    luma = np.array([0.299, 0.587, 0.114], np.float32)
+    names = [fields["names"][k] for k in np.flatnonzero(blurred(np.array([detail(image @ luma) for image in images])))]
+    if not names:
+        return ""
+    more = f" and {len(names) - NAMED} more" if len(names) > NAMED else ""
+    shown = ", ".join(names[:NAMED])
+    return f"{len(names)} of {len(images)} views look blurred: {shown}{more}; they are used as they are."
 
 
 def split(names: list[str], own: Any, settings: IngestSection) -> tuple[Any, dict[str, Any]]:
@@ -137,10 +160,13 @@ def run(job: Job) -> None:
 
     name, settings = job.config.scene.name, job.config.ingest
     source = resolve(name, job.config.source)
-    fields = read(name, source, settings)
+    fields = read(name, source, settings, job.progress)
     fields["source"] = {"name": name} | fields["source"]
     for note in fields["source"].get("notes", []):
         log.info("%s", note)
+    if source.kind != "generated" and (blur := blur_note(fields)):
+        log.warning("%s", blur)
+        fields["source"]["notes"].append(blur)
     n_views = len(fields["names"])
     fields["is_test"], protocol = split(fields["names"], fields.pop("is_test", None), settings)
     fields |= thinned(fields, settings.max_train_views)

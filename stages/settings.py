@@ -31,10 +31,10 @@ class SceneSection(Section):
 class SourceSection(Section):
     """Where the photos come from. `named` is Replica's scene when REPLICA_ROOT has it, else the generated one."""
 
-    kind: Literal["named", "generated", "colmap", "transforms", "photos", "replica", "scannet", "seven_scenes"] = (
-        setting("named", "how the source is read; of a folder it is detected")
-    )
-    path: Text | None = setting(None, "the source's folder")
+    kind: Literal[
+        "named", "generated", "colmap", "transforms", "photos", "replica", "scannet", "seven_scenes", "video"
+    ] = setting("named", "how the source is read; of a folder it is detected")
+    path: Text | None = setting(None, "the source's folder, or its video")
     seed: int = seed("of a generated scene")
     preset: Literal["office", "room", "shuffled", "toy"] = setting("office", "what a generated scene is furnished as")
 
@@ -46,7 +46,9 @@ class IngestSection(Section):
     test_every: int | None = number(None, "every so many views one is tested; default: the protocol's own", 2, 10_000)
     test_offset: int | None = number(None, "the first view that is tested; default: the protocol's own", 0, 10_000)
     max_side: int = number(640, "pixels; images are reduced to this, never enlarged", 16, 8192)
-    max_views: int | None = number(None, "at most so many views, evenly chosen; default: all", 2, 100_000)
+    max_views: int | None = number(
+        None, "at most so many views, evenly chosen; default: all, of a video 150", 2, 100_000
+    )
     max_train_views: int | None = number(
         None, "at most so many that are trained on, evenly chosen; all test views stay", 2, 100_000
     )

@@ -21,6 +21,7 @@ PACKAGES = {
     "settings": set(),
     "synthetic": set(),
     "labels": set(),
+    "photos": set(),
     "splats": {"kernels"},
     "views": set(),
     "rasterize": {"kernels", "splats"},

@@ -35,7 +35,7 @@ def test_an_image_that_is_a_program_is_never_run(tmp_path, monkeypatch, how):
         "channels": lambda: list(channels.photos([folder / "b.png"])),
         "check-teacher": lambda: teacher_check.shown(folder / "b.png"),
     }[how]
-    with pytest.raises(InputError, match=r"b\.png is no PNG or JPEG"):
+    with pytest.raises(InputError, match=r"b\.png is no PNG, JPEG or HEIC"):
         read()
     assert not ran.exists()
 

@@ -1,4 +1,4 @@
-"""What lies beside photos and is not read is counted, with the command that converts it."""
+"""What lies beside photos and is not read is counted, with what to do about it."""
 
 import pytest
 from source_folders import image
@@ -10,22 +10,27 @@ from chebsplat.stages.settings import IngestSection, SourceSection
 from chebsplat.stages.sources import common
 
 
-def test_heic_and_video_beside_photos_are_counted_in_notes_and_plan(tmp_path):
+def test_raw_photos_and_videos_beside_photos_are_counted_in_notes_and_plan(tmp_path):
     for k in range(3):
         image(tmp_path / f"{k}.jpg")
-    for name in ("IMG_1.HEIC", "IMG_2.heic", "walk.MP4", ".hidden.mp4", "notes.txt"):
+    for name in ("IMG_1.CR2", "IMG_2.cr2", "walk.MP4", ".hidden.mp4", "notes.txt"):
         (tmp_path / name).write_bytes(b"\0")
     source = SourceSection(kind="photos", path=str(tmp_path))
     note = ingest.read("scene", source, IngestSection(min_views=2))["source"]["notes"][-1]
-    assert note.startswith("2 .heic, 1 .mp4 not read; convert to JPEG, for example with `heif-convert a.heic a.jpg`")
-    assert "`ffmpeg -i a.mp4" in note
+    assert note.startswith("2 .cr2, 1 .mp4 not read; convert to JPEG, for example with `darktable-cli a.cr2 a.jpg`")
+    assert "a video is read by itself" in note
     assert f"({note[:-1]})" in source_sentence("scene", source, source)
     assert common.unread(tmp_path / "absent") == ""
 
 
-@pytest.mark.parametrize("name", ["a.mov", "a.HEIC", "images/a.mp4"])
-def test_a_folder_of_video_or_heic_alone_says_what_to_do(tmp_path, name):
-    (tmp_path / name).parent.mkdir(exist_ok=True)
-    (tmp_path / name).write_bytes(b"\0")
-    with pytest.raises(InputError, match=r"1 \.\w+ not read; convert to JPEG, for example with `"):
+@pytest.mark.parametrize(("names", "remedy"), [
+    (["a.webp"], "convert to JPEG, for example with `"),
+    (["a.mov", "b.mp4"], "a video is read by itself"),
+    (["images/a.mp4"], "a video is read by itself"),
+])  # fmt: skip
+def test_a_folder_of_what_is_not_read_says_what_to_do(tmp_path, names, remedy):
+    for name in names:
+        (tmp_path / name).parent.mkdir(exist_ok=True)
+        (tmp_path / name).write_bytes(b"\0")
+    with pytest.raises(InputError, match=f"not read; {remedy}"):
         common.detect(tmp_path)

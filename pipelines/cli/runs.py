@@ -57,7 +57,7 @@ def checked_stage(stage: str | None, chosen: list[Any]) -> str | None:
 
 
 OPTIONS = [
-    click.option("--scene", help="a name from `chebsplat scenes`, or a folder"),
+    click.option("--scene", help="a name from `chebsplat scenes`, a folder, or a video"),
     click.option("--sequence", help="scenes in order, each starting from the knowledge of those before"),
     click.option("--set", "settings", default="", help="section.key=value,..."),
     click.option("--ablation", default="", help="a named set of settings"),

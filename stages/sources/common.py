@@ -14,14 +14,13 @@ from chebsplat.errors import InputError
 from chebsplat.evaluation.protocols.split import natural
 from chebsplat.formats.images import SUFFIXES, is_image
 from chebsplat.formats.names import unprintable
+from chebsplat.formats.videos import SUFFIXES as VIDEOS
+from chebsplat.formats.videos import is_video
 from chebsplat.stages.sources.cameras import Camera
 
-# What phones and cameras leave beside JPEGs, or instead of them, and what makes JPEGs of it.
+# What cameras leave beside photos, or instead of them, and what makes JPEGs of it.
 UNREAD = (
-    dict.fromkeys((".heic", ".heif"), "heif-convert a{0} a.jpg")
-    | dict.fromkeys((".mp4", ".mov", ".avi", ".mkv", ".m4v", ".webm", ".mts", ".3gp"),
-                    "ffmpeg -i a{0} -vf fps=2 -q:v 2 a_%04d.jpg")
-    | dict.fromkeys((".dng", ".cr2", ".cr3", ".nef", ".arw", ".raf", ".orf", ".rw2"), "darktable-cli a{0} a.jpg")
+    dict.fromkeys((".dng", ".cr2", ".cr3", ".nef", ".arw", ".raf", ".orf", ".rw2"), "darktable-cli a{0} a.jpg")
     | dict.fromkeys((".avif", ".webp", ".tif", ".tiff", ".bmp", ".gif", ".jp2", ".jxl", ".exr", ".psd"),
                     "magick a{0} a.jpg")
 )  # fmt: skip
@@ -91,7 +90,7 @@ def nearest_file(folder: Path, name: str) -> Path | None:
 
 
 def detect(folder: Path) -> str:
-    """The kind of source a folder is. Raises InputError naming what was looked for."""
+    """The kind of source that a folder, or a file of video, is. Raises InputError naming what was looked for."""
     if present(folder / "transforms.json"):
         return "transforms"
     if any(present(folder / part) for part in ("traj.txt", "Sequence_1", "results")):
@@ -104,13 +103,17 @@ def detect(folder: Path) -> str:
         return "seven_scenes"
     if folder.is_dir() and any(is_image(name) for name in os.listdir(folder)):
         return "photos"
+    if is_video(folder.name) and folder.is_file():
+        return "video"
+    if folder.is_dir() and sum(is_video(name) for name in os.listdir(folder)) == 1:
+        return "video"
     if others := unread(folder):
-        raise InputError(f"{folder} holds no .jpg or .png photo: {others}")
+        raise InputError(f"{folder} holds no .jpg, .png or .heic photo: {others}")
     hint = f"; {folder / 'images'} may be meant" if (folder / "images").is_dir() else ""
     raise InputError(
         f"{folder} is no source: it holds neither transforms.json, traj.txt, results/, Sequence_1/, "
         f"color/ with pose/ and intrinsic/, frame-*.color.jpg or .png, sparse/0/cameras.bin or .txt, "
-        f"nor a .jpg or .png photo{hint}"
+        f"nor a .jpg, .png or .heic photo, nor one video{hint}"
     )
 
 
@@ -118,12 +121,14 @@ def unread(folder: Path) -> str:
     """What else a folder and its images/ hold that may be taken for photos, counted by suffix; nothing of none."""
     places = [place for place in (folder, folder / "images") if place.is_dir()]
     ends = [os.path.splitext(name)[1].lower() for place in places for name in os.listdir(place) if name[0] != "."]
-    counts = {end: n for end, n in sorted(Counter(ends).items()) if end in UNREAD}
+    counts = {end: n for end, n in sorted(Counter(ends).items()) if end in UNREAD or end in VIDEOS}
     if not counts:
         return ""
-    how = dict.fromkeys(UNREAD[end].format(end) for end in counts)
-    others = ", ".join(f"{n} {end}" for end, n in counts.items())
-    return f"{others} not read; convert to JPEG, for example with {' and '.join(f'`{line}`' for line in how)}"
+    how = dict.fromkeys(f"`{UNREAD[end].format(end)}`" for end in counts if end in UNREAD)
+    remedies = [f"convert to JPEG, for example with {' and '.join(how)}"] if how else []
+    if any(end in VIDEOS for end in counts):
+        remedies.append("a video is read by itself, as scene=FOLDER/VIDEO")
+    return f"{', '.join(f'{n} {end}' for end, n in counts.items())} not read; {'; '.join(remedies)}"
 
 
 def names_below(folder: Path) -> Iterator[str]:
@@ -151,5 +156,5 @@ def images_in(folder: Path) -> list[str]:
         raise InputError(f"{folder} is missing; the source needs its images there")
     found = sorted(names_below(folder), key=natural)
     if not found:
-        raise InputError(f"{folder} holds no .jpg or .png image; correct source.path")
+        raise InputError(f"{folder} holds no .jpg, .png or .heic image; correct source.path")
     return found

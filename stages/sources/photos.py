@@ -32,7 +32,7 @@ def files(folder: Path) -> list[Path]:
     except OSError as error:
         raise InputError(f"{folder}: {error.strerror}; correct source.path") from None
     if not names:
-        raise InputError(f"{folder} holds no .jpg or .png image; correct source.path")
+        raise InputError(f"{folder} holds no .jpg, .png or .heic image; correct source.path")
     return sorted(folder / name for name in common.printable(folder, names))
 
 

@@ -1,0 +1,131 @@
+"""A video as a scene: frames that are sharp, evenly apart in what they see, named by their time."""
+
+import sys
+
+import numpy as np
+import pytest
+from scipy.ndimage import gaussian_filter, uniform_filter1d, zoom
+
+from chebsplat.errors import DataFailure, InputError
+from chebsplat.formats import videos
+from chebsplat.photos.frames import STEP, choose, progress, shifts
+from chebsplat.pipelines import scenes
+from chebsplat.pipelines.needs import media_packages
+from chebsplat.pipelines.raw import raw_files
+from chebsplat.stages.progress import Progress
+from chebsplat.stages.settings import IngestSection
+from chebsplat.stages.sources import common, video
+
+RATE, SPEED = 30, 2  # frames/s, pixels a frame
+
+
+def panorama():
+    rng = np.random.default_rng(1)
+    rough = zoom(rng.uniform(0, 255, (16, 80)), 8, order=1)
+    return gaussian_filter(rough + rng.uniform(-60, 60, rough.shape), 0.7).clip(0, 255).astype(np.uint8)
+
+
+def film(path, n=120, size=(192, 128), turn=0, blur=()):
+    """A camera that pans to the right by SPEED pixels a frame."""
+    av = pytest.importorskip("av", reason="the extra video is not installed")
+    wide, (width, height) = panorama(), size
+    with av.open(str(path), "w") as out:
+        stream = out.add_stream("mpeg4", rate=RATE)
+        stream.width, stream.height, stream.pix_fmt, stream.bit_rate = width, height, "yuv420p", 8_000_000
+        if turn:
+            stream.set_display_rotation(turn)
+        for k in range(n):
+            grey = wide[:height, SPEED * k : SPEED * k + width].astype(float)
+            grey = uniform_filter1d(grey, 9, axis=1) if k in blur else grey
+            frame = np.repeat(grey.astype(np.uint8)[..., None], 3, -1)
+            frame[: height // 4, : width // 4] = 255, 0, 0
+            out.mux(stream.encode(av.VideoFrame.from_ndarray(frame, "rgb24")))
+        out.mux(stream.encode())
+    return path
+
+
+def test_shifts_are_those_of_the_picture():
+    wide = panorama()
+    assert (shifts(wide[:128, 20:212], wide[:128, 13:205]) == [7, 0]).all()
+    assert (shifts(np.zeros((64, 64)), np.zeros((64, 64))) == 0).all()
+
+
+def test_trembling_is_no_progress_and_going_forward_is():
+    shake = np.zeros((100, 9, 2))
+    shake[1:, :, 0] = 0.02 * (-1.0) ** np.arange(99)[:, None]
+    assert progress(shake)[-1] < 1
+    y, x = np.mgrid[-1:2, -1:2].reshape(2, -1)
+    outward = np.tile(0.01 * np.stack([x, y], 1), (100, 1, 1))  # the middle stays
+    assert progress(outward)[-1] > 10
+    assert (np.diff(progress(outward)) >= 0).all()
+
+
+def test_of_each_step_the_sharpest_is_taken_and_never_too_many():
+    steps, sharpness = np.arange(100) / 10, np.zeros(100)
+    sharpness[[4, 16, 20]] = 1  # the last one lies at the edge of its step
+    taken = choose(steps, sharpness, 50)
+    assert len(taken) == 10 and list(taken[:2]) == [4, 16] and taken[2] != 20
+    assert (np.diff(taken) > 0).all()
+    assert len(choose(steps, sharpness, 4)) == 4
+
+
+def test_frames_are_apart_sharp_in_order_and_the_same_again(tmp_path, capfd):
+    blur = {k for k in range(120) if k % 4 != 1}
+    file = film(tmp_path / "walk.mp4", blur=blur)
+    assert common.detect(tmp_path) == common.detect(file) == "video"
+    settings = IngestSection(max_side=96)
+    fields, again = video.read(tmp_path, settings, Progress(show=True)), video.read(file, settings)
+    assert "frames 120/120" in capfd.readouterr().err
+    assert (fields["images"] == again["images"]).all() and fields["names"] == again["names"]
+    assert fields["images"].shape[1:] == (64, 96, 3)
+    at = np.array([float(name) for name in fields["names"]]) * RATE
+    assert not {round(k) for k in at} & blur
+    assert (np.diff(at) * SPEED / 192 < 2 * STEP).all() and len(at) > 120 * SPEED / 192 / STEP - 3  # pixels are whole
+    assert fields["names"] == sorted(fields["names"]) and fields["cam_from_world"] is None
+    assert len(video.read(file, IngestSection(max_views=5))["names"]) == 5
+    assert media_packages([file]) == ("av",)
+
+
+@pytest.mark.parametrize(("turn", "row", "column"), [(-90, 10, -10), (90, -10, 10), (180, -10, -10)])
+def test_a_video_is_turned_as_its_phone_was_held(tmp_path, turn, row, column):
+    file = film(tmp_path / "a.mov", n=40, turn=turn)
+    images = video.read(file, IngestSection(min_views=2))["images"]
+    assert images.shape[1:3] == ((128, 192) if turn == 180 else (192, 128))
+    red = images[0].astype(int)[row, column]
+    assert red[0] > 150 > 80 > red[2]
+
+
+def test_a_video_that_hardly_moves_says_so(tmp_path):
+    with pytest.raises(DataFailure, match=r"ingest\.min_views is 3: walk around"):
+        video.read(film(tmp_path / "a.mp4", n=5), IngestSection())
+
+
+@pytest.mark.parametrize("content", [b"", b"text", bytes(64), b"ffconcat version 1.0\nfile b.mp4\n", None])
+def test_what_is_no_video_is_named_and_no_playlist_is_followed(tmp_path, content):
+    whole = film(tmp_path / "b.mp4", n=5).read_bytes()
+    (tmp_path / "a.mp4").write_bytes(whole[: len(whole) // 2] if content is None else content)
+    with pytest.raises(InputError, match=r"a\.mp4 is not a readable video"):
+        video.read(tmp_path / "a.mp4", IngestSection())
+
+
+def test_without_the_extra_a_video_is_one_line_that_installs_it(tmp_path, monkeypatch):
+    monkeypatch.setitem(sys.modules, "av", None)
+    (tmp_path / "a.mp4").write_bytes(b"\0")
+    for read in (videos.describe, lambda path: media_packages([path])):
+        with pytest.raises(InputError, match=r"a\.mp4 is a video.*pip install -e '\.\[video\]'") as raised:
+            read(tmp_path / "a.mp4")
+        assert raised.value.exit_code == 3 and "\n" not in str(raised.value)
+
+
+def test_a_file_names_a_scene_and_is_its_raw_input(tmp_path, monkeypatch):
+    file = tmp_path / "my walk.MP4"
+    file.write_bytes(b"\0")
+    monkeypatch.chdir(tmp_path)
+    for given in (str(file), "my walk.MP4"):
+        name, values = scenes.scene_values(given)
+        assert (name, values["source"]) == ("my-walk", {"kind": "video", "path": str(file)})
+    for path in (file, tmp_path):
+        assert raw_files("ingest", {"source": {"kind": "video", "path": str(path)}}) == (tmp_path, [file])
+    (tmp_path / "b.mp4").write_bytes(b"\0")
+    with pytest.raises(InputError, match="2 videos"):
+        video.files(tmp_path)
