@@ -1,6 +1,7 @@
 """Semantic 3D Gaussian Splatting that understands shape."""
 
 import os
+from importlib import import_module
 from typing import Any
 
 # Idle OpenMP threads must sleep: spinning ones cost an order of magnitude on a busy machine. But not at once: a few
@@ -22,10 +23,8 @@ API = ("load", "run_stage", "train")
 
 def __getattr__(name: str) -> Any:
     """`chebsplat.load`, `train` and `run_stage`, which are imported when first asked for: most commands need none."""
-    if name in API:
-        from chebsplat.pipelines import api
-
-        return getattr(api, name)
+    if name in API:  # not an import statement: no stage depends on what the API imports
+        return getattr(import_module("chebsplat.pipelines.api"), name)
     raise AttributeError(f"module 'chebsplat' has no attribute {name!r}")
 
 

@@ -46,8 +46,6 @@ def imported_modules(path):
 @pytest.mark.parametrize("path", SOURCES, ids=lambda p: p.relative_to(ROOT).as_posix())
 def test_imports_run_one_way(path):
     layer = path.relative_to(ROOT).parts[0]
-    if path == ROOT / "chebsplat/__init__.py":
-        layer = "pipelines"  # the package's face: `chebsplat.load` and its like, imported when first asked for
     for name in imported_modules(path):
         first, _, rest = name.partition(".")
         assert first not in LAYERS[1:], f"{path}: bare import of {name}"

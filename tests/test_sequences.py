@@ -9,7 +9,7 @@ from chebsplat.pipelines.plan import Planner
 from chebsplat.pipelines.run import wanted_steps
 from chebsplat.pipelines.sequences import chain, scenes_of
 
-BEFORE_TRAIN = {"ingest", "sfm", "teacher", "describe"}
+BEFORE_TRAIN = {"ingest", "sfm", "teacher", "agree", "describe"}
 LABELS = "teacher.kind=labels"
 
 

@@ -162,6 +162,11 @@ def only_test_views_to_lift(toy, tmp):
     return inputs_of(toy, "lift") | {"capture": inputs["capture"]}, config
 
 
+def only_test_views_to_agree(toy, tmp):
+    inputs, config = only_test_views(toy, tmp)
+    return inputs_of(toy, "agree") | {"capture": inputs["capture"]}, config
+
+
 def without_gaussians(toy, tmp):
     record = read_gaussians(toy["train"])
     record.parameters = {name: values[:0] for name, values in record.parameters.items()}
@@ -203,6 +208,7 @@ FAILURES = {
     "sfm": without_depth,
     "channels": teacher_of_nothing,
     "teacher": without_labels,
+    "agree": only_test_views_to_agree,
     "teach": photos_apart,
     "describe": without_points,
     "train": only_test_views,
