@@ -403,7 +403,7 @@ train = {{ sh_degree = 2 }}
     command = [sys.executable, "-m", "chebsplat.pipelines.cli", "study", str(tmp_path / "mine.toml")]
     command += ["--cores", "2", "--threads", "1", "--out", str(tmp_path / "out")]
     for to_run in (
-        "1 ingest, 1 sfm, 1 teacher, 1 describe, 1 agree, 2 train, 2 export, 2 evaluate",
+        "1 ingest, 1 sfm, 1 teacher, 1 agree, 1 describe, 2 train, 2 lift, 2 refine, 2 export, 2 evaluate",
         "1 evaluate",
     ):
         done = subprocess.run(command, capture_output=True, text=True, cwd=ROOT, env=os.environ)
