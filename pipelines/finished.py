@@ -50,7 +50,7 @@ def scene_folder(scene: str) -> Path:
         raise InputError(f"{path} belongs to no scene in {store.work()}; name the scene")
     if links(path):
         return path
-    name = folders.known(Path(os.path.realpath(path))) if is_source(path) else scene
+    name = folders.known(Path(os.path.realpath(path))) if is_source(os.path.expanduser(scene)) else scene
     runs = [title for title in titles() if title.partition("@")[0] == name]
     if len(runs) == 1 or name in runs:
         return store.work() / (name if name in runs else runs[0])
@@ -73,7 +73,7 @@ def holder(artifact: Path) -> Path | None:
 def unknown(scene: str, name: str | None) -> ConfigError | InputError:
     """The error for a scene that is not there, with the nearest names."""
     where = f"no finished scene in {store.work()}"
-    if is_source(Path(os.path.expanduser(scene))):
+    if is_source(os.path.expanduser(scene)):
         return InputError(f"{shown(scene)} is {where}, nor the folder of one; run it first: make scene={shown(scene)}")
     if "/" in scene:
         return InputError(f"{shown(scene)} is missing: neither a scene, its folder nor an artifact; correct the path")

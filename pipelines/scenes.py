@@ -52,9 +52,9 @@ def folder_of(scene: str) -> Path | None:
     return Path(os.path.realpath(folder))
 
 
-def is_source(path: Path) -> bool:
-    """Whether there is a folder, or the file of a video."""
-    return path.is_dir() or (is_video(path.name) and path.is_file())
+def is_source(path: str | Path) -> bool:
+    """Whether there is a folder, or the file of a video; no path is too long to be asked about."""
+    return os.path.isdir(path) or (is_video(os.path.basename(path)) and os.path.isfile(path))
 
 
 def scene_values(scene: str) -> tuple[str, dict[str, Any]]:
@@ -95,4 +95,5 @@ def absent(scene: str, folder: Path) -> InputError:
     if needed is None or needed[1] != folder:
         return InputError(f"{folder} is not a folder; correct source.path")
     lack = f"{scene} needs data that is no part of chebsplat: {folder} is not a folder"
-    return InputError(f"{lack}; set {needed[0]} to the folder that holds {folder.name}")
+    below = read_toml("scenes", scene)["source"]["path"].partition("}/")[2] or folder.name
+    return InputError(f"{lack}; set {needed[0]} to the folder that holds {below}")

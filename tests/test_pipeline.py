@@ -321,7 +321,7 @@ def test_every_config_of_ours_can_be_planned(kind, tmp_path, monkeypatch):
         elif kind == "sequences":
             assert set(read_toml(kind, name)["scenes"]) <= set(names("scenes"))
         elif "path" in read_toml(kind, name)["source"]:
-            folder = read_toml(kind, name)["source"]["path"].rpartition("/")[2]
+            folder = read_toml(kind, name)["source"]["path"].partition("}/")[2]
             with pytest.raises(InputError, match=str(tmp_path / folder)):
                 Planner().plan(name)
         else:
