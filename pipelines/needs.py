@@ -69,11 +69,10 @@ def left_out_stages(config: Any, kind: str, why: str, probe: dict[str, bool]) ->
         left_out |= {"describe": POINTS, "onnx": f"{POINTS}: it comes with the knowledge, in ONNX, too"}
     elif not config.train.albo:
         left_out |= {"describe": "train.albo is false: tokens hold no descriptor"}
-    adjusted = config.sfm.adjusts(config.source.kind)
-    if probe["poses"] and probe["depth"] and not adjusted:
-        left_out["sfm: matching"] = "poses and depth are given"
-    elif probe["poses"] and not adjusted:
-        left_out["sfm: pose estimation"] = "poses are given"
+    if probe["poses"] and config.sfm.poses != "adjusted":
+        tested = config.sfm.poses == "auto" and config.source.kind != "generated"
+        what, given = ("matching", "poses and depth") if probe["depth"] else ("pose estimation", "poses")
+        left_out[f"sfm: {what}"] = f"{given} are given" + (", and kept if they fit the photos" if tested else "")
     return left_out
 
 

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 from chebsplat.stages.command import Job, n_threads
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator
+    from collections.abc import Iterable, Iterator
 
     import numpy as np
 
@@ -25,14 +25,18 @@ def file_of(view: int) -> str:
     return f"{view:06d}.png"
 
 
-def match(job: Job, capture: Capture, settings: SfmSection) -> Path:
-    """Extract SIFT from the capture's own pixels, choose pairs of views and match them."""
+def match(job: Job, capture: Capture, settings: SfmSection, pairs: np.ndarray | None = None) -> Path:
+    """Extract SIFT from the capture's own pixels and match pairs of views: those that are chosen, or given [P, 2].
+
+    Choices: of given pairs, which are few, views that occur in none have no features either.
+    """
     import pycolmap
 
-    folder, database = _write_images(job, capture), job.scratch / "database.db"
+    views = range(len(capture.names)) if pairs is None else sorted(set(pairs.ravel().tolist()))
+    folder, database = _write_images(job, capture, views), job.scratch / "database.db"
     database.unlink(missing_ok=True)
     pycolmap.Database.open(database).close()  # creates it
-    files = [file_of(view) for view in range(len(capture.names))]
+    files = [file_of(view) for view in views]
     reader = pycolmap.ImageReaderOptions()
     reader.camera_model = "PINHOLE"
     if capture.loss_mask is not None:
@@ -48,8 +52,9 @@ def match(job: Job, capture: Capture, settings: SfmSection) -> Path:
     extraction.use_gpu, extraction.num_threads = False, n_threads()
     for some in _in_blocks(job, files, 2 * n_threads(), "features"):
         pycolmap.extract_features(database, folder, some, mode, reader, extraction)
-    pairs = _pairs(database, capture, settings)
-    job.facts["n_pairs"] = len(pairs)
+    if pairs is None:
+        pairs = _pairs(database, capture, settings)
+        job.facts["n_pairs"] = len(pairs)
     matching, verification = pycolmap.FeatureMatchingOptions(), pycolmap.TwoViewGeometryOptions()
     matching.use_gpu, matching.num_threads = False, n_threads()
     verification.ransac.random_seed = settings.seed
@@ -95,15 +100,15 @@ def _largest_descriptors(database: Path, n_views: int) -> list[np.ndarray]:
     return found
 
 
-def _write_images(job: Job, capture: Capture) -> Path:
-    """The capture's images, and where it has them its masks, as pycolmap reads them."""
+def _write_images(job: Job, capture: Capture, views: Iterable[int]) -> Path:
+    """The images of some of the capture's views, and where it has them their masks, as pycolmap reads them."""
     import numpy as np
     from PIL import Image
 
     folder, masks = job.scratch / "images", job.scratch / "masks"
     folder.mkdir(exist_ok=True)
     masks.mkdir(exist_ok=True)
-    for view in range(len(capture.names)):
+    for view in views:
         Image.fromarray(capture.images[view]).save(folder / file_of(view), compress_level=1)
         if capture.loss_mask is not None:
             mask = np.where(capture.loss_mask[view], 255, 0).astype(np.uint8)

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any
 from chebsplat.errors import ConfigError, DataFailure
 from chebsplat.stages.command import Job
 from chebsplat.stages.matching import file_of, match
+from chebsplat.stages.pose_check import wants_adjustment
 
 if TYPE_CHECKING:
     import pycolmap
@@ -19,9 +20,10 @@ if TYPE_CHECKING:
 log = logging.getLogger("chebsplat")
 
 
-def reconstruct(job: Job, capture: Capture, settings: SfmSection) -> dict[str, Any]:
+def reconstruct(job: Job, capture: Capture, settings: SfmSection, adjusted: bool | None = None) -> dict[str, Any]:
     """Match views, then triangulate (poses given) or map incrementally (none given).
 
+    Args:    adjusted: whether given poses are adjusted to the photos; None: as the matches say.
     Returns: names, Ks, cam_from_world of the registered views; means, colors, seen_from, tracks; notes.
     Raises:  DataFailure if too few views register; ConfigError where pairs by pose are asked for without poses.
     Choices: images are imported in the order of their names before extraction, which makes extraction, matching and
@@ -39,11 +41,13 @@ def reconstruct(job: Job, capture: Capture, settings: SfmSection) -> dict[str, A
     database = match(job, capture, settings)
     model = _triangulate(job, capture, database) if posed else _map(job, len(capture.names), database, settings)
     moved: dict[str, Any] = {}
-    if posed and settings.adjusts(str(capture.source.get("kind"))):
+    if wants_adjustment(job, capture, settings, database) if adjusted is None else adjusted:
         from chebsplat.stages.adjustment import adjust
 
         names = [file_of(view) for view in range(len(capture.names))]
         model, moved = adjust(job, model, database, names, np.asarray(capture.cam_from_world))
+    elif posed:
+        job.left_out("pose estimation", "poses are given: points are triangulated")
     registered = {image.name: image for image in model.images.values() if image.has_pose}
     views = [view for view in range(len(capture.names)) if file_of(view) in registered]
     if len(views) < max(settings.min_registered * len(capture.names), 2):

@@ -63,9 +63,6 @@ class IngestSection(Section):
     min_views: int = number(3, "fewer usable views are an error", 1, 100_000)
 
 
-TRACKED = ("seven_scenes",)  # sources whose poses are a depth camera's, tracked in its depth: not the photos'
-
-
 class SfmSection(Section):
     max_points: int = number(20_000, "initial Gaussians, at most", 16, 2_000_000)
     n_neighbors: int = number(16, "neighbours that give a point its normal and covariance", 4, 64)
@@ -77,14 +74,10 @@ class SfmSection(Section):
     )
     n_matched: int = number(10, "views that each is matched with, where not all are: nearest, or most alike", 2, 1000)
     poses: Literal["auto", "given", "adjusted"] = setting(
-        "auto", "that the source brings: kept, or adjusted to the photos; auto: adjusted where a sensor tracked them"
+        "auto", "that the source brings: kept, or adjusted to the photos; auto: adjusted where matches miss them"
     )
     min_registered: float = number(0.5, "fraction of the views that a reconstruction must register", 1e-3, 1)
     seed: int = seed("of the choice among points, and of the reconstruction")
-
-    def adjusts(self, kind: str) -> bool:
-        """Whether poses that a source of this kind brings are adjusted to its photos."""
-        return self.poses == "adjusted" or (self.poses == "auto" and kind in TRACKED)
 
 
 class TeacherSection(Section):

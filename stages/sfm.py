@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, Any
 
 from chebsplat.errors import DataFailure
 from chebsplat.stages.command import Job, command
+from chebsplat.stages.pose_check import wants_adjustment
 
 if TYPE_CHECKING:
     import numpy as np
@@ -32,22 +33,21 @@ def run(job: Job) -> None:
     from chebsplat.splats.gaussians import local_shape
 
     settings, capture = job.config.sfm, read_capture(job.inputs["capture"])
-    posed = capture.cam_from_world is not None
-    adjusted = posed and settings.adjusts(str(capture.source.get("kind")))
-    given = posed and settings.matching == "auto" and not adjusted
+    spares = capture.points is not None or capture.depth is not None
+    given = capture.cam_from_world is not None and settings.matching == "auto" and spares
+    adjusted = wants_adjustment(job, capture, settings) if given else None  # otherwise all matches tell
+    given = given and not adjusted
     if given and capture.points is not None:
         job.left_out("feature matching", "poses are given, and points by the source")
         cloud = from_source(capture, settings)
-    elif given and capture.depth is not None:
+    elif given:
         job.left_out("feature matching", "poses and depth are given: points come from depth")
         cloud = from_depth(job, capture, settings)
     else:
         from chebsplat.stages import reconstruction
 
-        if posed and not adjusted:
-            job.left_out("pose estimation", "poses are given: points are triangulated")
-        cloud = reconstruction.reconstruct(job, capture, settings)
-        if adjusted and capture.depth is not None:
+        cloud = reconstruction.reconstruct(job, capture, settings, adjusted)
+        if "poses_kept" in cloud["notes"] and capture.depth is not None:
             cloud = filled(cloud, from_depth(job, capture, settings, cloud["cam_from_world"]), settings.max_points)
     means = cloud["means"]
     if len(means) < 16:

@@ -9,7 +9,6 @@ from chebsplat.cameras import centers
 from chebsplat.stages.adjustment import adjust, alignment
 from chebsplat.stages.command import Job
 from chebsplat.stages.config import Config
-from chebsplat.stages.settings import SfmSection
 from chebsplat.stages.sfm import filled
 
 
@@ -40,13 +39,6 @@ def test_alignment_of_views_from_one_place_keeps_units():
     assert scale == 1
     np.testing.assert_allclose(rotation, np.eye(3), atol=1e-9)
     np.testing.assert_allclose(shift, 0, atol=1e-9)
-
-
-def test_poses_are_adjusted_where_a_sensor_tracked_them_or_it_is_asked_for():
-    assert SfmSection().adjusts("seven_scenes")
-    assert not SfmSection().adjusts("colmap")
-    assert SfmSection(poses="adjusted").adjusts("transforms")
-    assert not SfmSection(poses="given").adjusts("seven_scenes")
 
 
 def test_points_of_depth_fill_what_triangulation_leaves():

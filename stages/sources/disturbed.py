@@ -63,5 +63,7 @@ def disturbed(fields: dict[str, Any], colors: float, degrees: float, shift: floa
         notes.append(f"Exposures of the training views are disturbed by {colors:g} stops (ingest.disturb_colors).")
     if degrees > 0 or shift > 0:
         changed["cam_from_world"] = displaced(fields["cam_from_world"], is_test, degrees, shift, seed)
+        changed["tracks"] = None  # they tell of the poses as they were
         notes.append(f"Poses of the training views are disturbed by {degrees:g}° and {shift:g} scene units.")
-    return changed | {"source": fields["source"] | {"notes": notes}}
+    strengths = {"colors": colors, "degrees": degrees, "shift": shift}
+    return changed | {"source": fields["source"] | {"notes": notes, "disturbed": strengths}}
