@@ -57,7 +57,8 @@ def displaced(poses: np.ndarray, is_test: np.ndarray, degrees: float, shift: flo
 
 def disturbed(fields: dict[str, Any], colors: float, degrees: float, shift: float, seed: int) -> dict[str, Any]:
     """Those fields of a capture that change, and a note of it. Poses that are None stay so."""
-    is_test, notes, changed = fields["is_test"], list(fields["source"].get("notes", [])), {}
+    changed: dict[str, Any] = {}
+    is_test, notes = fields["is_test"], list(fields["source"].get("notes", []))
     if colors > 0:
         changed["images"] = recolored(np.asarray(fields["images"][:]), is_test, colors, seed)
         notes.append(f"Exposures of the training views are disturbed by {colors:g} stops (ingest.disturb_colors).")
