@@ -32,6 +32,8 @@ def match(job: Job, capture: Capture, settings: SfmSection, pairs: np.ndarray | 
     """
     import pycolmap
 
+    job.scratch.mkdir(parents=True, exist_ok=True)
+    pycolmap.logging.minloglevel = pycolmap.logging.ERROR.value if hasattr(pycolmap.logging, "ERROR") else 2
     views = range(len(capture.names)) if pairs is None else sorted(set(pairs.ravel().tolist()))
     folder, database = _write_images(job, capture, views), job.scratch / "database.db"
     database.unlink(missing_ok=True)

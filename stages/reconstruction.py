@@ -31,13 +31,10 @@ def reconstruct(job: Job, capture: Capture, settings: SfmSection, adjusted: bool
       posing, never in colouring.
     """
     import numpy as np
-    import pycolmap
 
     posed = capture.cam_from_world is not None
     if settings.matching == "posed" and not posed:
         raise ConfigError("sfm.matching is posed, but the source has no poses; use sfm.matching=auto")
-    job.scratch.mkdir(parents=True, exist_ok=True)
-    pycolmap.logging.minloglevel = pycolmap.logging.ERROR.value if hasattr(pycolmap.logging, "ERROR") else 2
     database = match(job, capture, settings)
     model = _triangulate(job, capture, database) if posed else _map(job, len(capture.names), database, settings)
     moved: dict[str, Any] = {}
