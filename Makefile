@@ -17,7 +17,7 @@ CHOICE := $(if $(scene),--scene '$(scene)') $(if $(sequence),--sequence '$(seque
 
 # `make scene=office0` needs no target: naming a scene, a sequence, a study or a benchmark means running it.
 .DEFAULT_GOAL := $(if $(study),study,$(if $(bench),bench-$(bench),$(if $(scene)$(sequence),run,help)))
-.PHONY: help run study plan verify clean-stale setup test test-all malformed soak stability bench text-model nouns knowledge teacher teacher-quality lint lock
+.PHONY: help run study plan verify clean-stale setup test test-all malformed soak stability bench text-model nouns knowledge calibration teacher teacher-quality lint lock
 
 run: $(READY)  ## make scene=NAME|FOLDER [stage=] [set=a.b=c,...] [ablation=] [basis=NAME@REVISION|none] [cores=] [device=]; or sequence=NAME
 	@$(CHEBSPLAT) run $(CHOICE) $(if $(stage),--stage '$(stage)') $(if $(cores),--cores '$(cores)') $(if $(device),--device '$(device)')
@@ -71,6 +71,9 @@ nouns: text-model  ## teachers/embedded.npz from teachers/nouns.txt, by the sent
 
 knowledge: $(READY)  ## teach knowledge of shape over generated rooms for the embedded teacher (teacher=MODEL.onnx, out=FOLDER)
 	@$(CHEBSPLAT) knowledge $(if $(teacher),--teacher '$(teacher)') $(if $(out),--out '$(out)')
+
+calibration: $(READY)  ## calibrate queries of the embedded teacher on generated rooms (teacher=MODEL.onnx): *.relevancy.json
+	@$(CHEBSPLAT) calibrate --force $(if $(teacher),'$(teacher)')
 
 teacher: text-model  ## train, export and measure the embedded teacher: seeds fixed; about half an hour on 4 cores
 	@OMP_WAIT_POLICY=PASSIVE $(PY) -m chebsplat.teachers.train $(args)
