@@ -127,7 +127,6 @@ def whole(path: Path, camera: Camera) -> bool:
 def pictures(scene: OpenedScene, camera: Camera, shot: Shot, kinds: Sequence[str]) -> dict[str, np.ndarray]:
     """The arrays of these kinds: color and relevancy u8 [H, W, 3], labels i32 [H, W], depth f32 [H, W]."""
     from chebsplat.labels.decode import decode_labels
-    from chebsplat.labels.relevancy import relevancy
     from chebsplat.stages.pages.pictures import heat
 
     view, renderer = camera.view(), scene.renderer
@@ -140,8 +139,7 @@ def pictures(scene: OpenedScene, camera: Camera, shot: Shot, kinds: Sequence[str
         if "labels" in kinds and features is not None and scene.label_embeddings is not None:
             found["labels"] = np.where(alpha < COVERED, -1, decode_labels(features, scene.label_embeddings))
     if "relevancy" in kinds and features is not None and shot.query is not None:
-        scores = relevancy(features, shot.query.embedding, shot.query.against)
-        found["relevancy"] = heat(found["color"], scores)
+        found["relevancy"] = heat(found["color"], shot.query.scores(features))
     return {kind: found[kind] for kind in kinds}
 
 

@@ -167,7 +167,7 @@ def vocabulary(scene: Scene, teacher: Path | None, phrases: list[str], more: lis
         return Words(names, rows, None, rows)
     known = {folded(name) for name in names}
     others = [word for word in dict.fromkeys([*more, *table_words(model)]) if folded(word) not in known]
-    weighed = understood(teacher, others[0], phrases)
+    weighed = understood(teacher, others[0], phrases, calibrated=False)
     found = embedded(others, features, model)
     order = sorted(range(len(names) + len(others)), key=[*names, *others].__getitem__)
     every = [*names, *others]

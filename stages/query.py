@@ -7,7 +7,7 @@ import logging
 import re
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from chebsplat.errors import ConfigError, DataFailure, InputError
 
@@ -16,6 +16,8 @@ if TYPE_CHECKING:
 
     from chebsplat.formats.features import Features
     from chebsplat.formats.scene import Scene
+    from chebsplat.formats.teacher_model import TeacherModel
+    from chebsplat.labels.calibration import Calibration
 
 log = logging.getLogger("chebsplat")
 
@@ -25,12 +27,79 @@ N_SHEET = 6  # views on the contact sheet
 
 @dataclass
 class Query:
-    """A query in a scene's own channels: what is asked for [C], and what it is weighed against [K, C]."""
+    """A query in a scene's own channels: what is asked for [C], and what it is weighed against [K, C].
+
+    rivals, calibration: f32 [R, C] and coefficients of the teacher, where its relevancy is calibrated and the text is a
+    word of it; None: scores are LERF's relevancy. closed: the scene knows its labels alone, and this is one of them.
+    """
 
     text: str
     embedding: np.ndarray
     phrases: list[str]
     against: np.ndarray
+    rivals: np.ndarray | None = None
+    calibration: Calibration | None = None
+    closed: bool = False
+
+    def scores(self, features: np.ndarray) -> np.ndarray:
+        """f32 [...] in [0, 1] of features [..., C]: how likely each is what the words mean, or its relevancy."""
+        from chebsplat.labels.calibration import probability
+        from chebsplat.labels.relevancy import relevancy
+
+        if self.calibration is None or self.rivals is None:
+            return relevancy(features, self.embedding, self.against)
+        return probability(features, self.embedding, self.rivals, self.calibration)
+
+    def answer(self, features: np.ndarray) -> Relevancy:
+        """What a whole scene's features [N, C] say."""
+        from chebsplat.labels.calibration import CUT, presence
+
+        scores = self.scores(features)
+        if self.calibration is not None:
+            return Relevancy(self.text, scores, True, presence(scores, self.calibration))
+        return Relevancy(self.text, scores, False, float((scores > CUT).any()) if self.closed else None)
+
+
+@dataclass(frozen=True, eq=False)
+class Relevancy:
+    """How a scene answers to a query.
+
+    scores:     f32 [N] in [0, 1] of every Gaussian: how likely it is what the words mean, where that is calibrated;
+                otherwise LERF's relevancy, above 0.5 where the words fit better than all that they are weighed against.
+    calibrated: whether scores are probabilities.
+    presence:   how likely the scene has it at all, in [0, 1]; None where nobody has calibrated that.
+    """
+
+    text: str
+    scores: np.ndarray
+    calibrated: bool
+    presence: float | None
+
+    @property
+    def cut(self) -> float:
+        """The suggested one: what scores above it is selected."""
+        from chebsplat.labels.calibration import CUT
+
+        return CUT
+
+    @property
+    def selected(self) -> np.ndarray:
+        """Bool [N]: which Gaussians score above the cut."""
+        chosen: np.ndarray = self.scores > self.cut
+        return chosen
+
+    @property
+    def present(self) -> bool | None:
+        """Whether the scene likely has it; None where nobody has calibrated that."""
+        return None if self.presence is None else self.presence > 0.5
+
+    def __str__(self) -> str:
+        count = int(self.selected.sum())
+        what = f"are likelier than not {self.text!r}" if self.calibrated else f"have a relevancy above {self.cut}"
+        text = f"{count} of {len(self.scores)} Gaussians {what}"
+        if self.presence is None:
+            return f"{text}; uncalibrated: there may be none in the scene"
+        return text if self.present else f"{text}; {self.text!r} is probably not here ({self.presence:.0%})"
 
 
 def run(folder: Path, text: str, phrases: list[str], out: Path, n_rows: int) -> None:
@@ -42,7 +111,6 @@ def run(folder: Path, text: str, phrases: list[str], out: Path, n_rows: int) -> 
     import numpy as np
 
     from chebsplat.formats.scene import read_scene
-    from chebsplat.labels.relevancy import relevancy
 
     for name in ("ingest", "export", "teacher"):
         if not (folder / name).is_dir():
@@ -51,10 +119,13 @@ def run(folder: Path, text: str, phrases: list[str], out: Path, n_rows: int) -> 
     if scene.labels is None or scene.label_names is None:
         raise InputError(f"{folder / 'export'} has no semantics; train the scene with a teacher")
     query = understood(folder / "teacher", text, phrases)
-    scores = relevancy(scene.parameters["features"], query.embedding, query.against)
+    answer = query.answer(scene.parameters["features"])
     out.mkdir(parents=True, exist_ok=True)
-    np.savez_compressed(out / "relevancy.npz", relevancy=scores, query=np.array(text), against=np.array(query.phrases))
-    for line in table(scores, scene.labels, scene.label_names, n_rows):
+    held: dict[str, Any] = {"query": text, "against": query.phrases, "calibrated": answer.calibrated}
+    held |= {"relevancy": answer.scores, "selected": answer.selected}
+    held["presence"] = np.nan if answer.presence is None else answer.presence
+    np.savez_compressed(out / "relevancy.npz", **held)
+    for line in [str(answer), *table(answer, scene.labels, scene.label_names, n_rows)]:
         log.info("%s", line)
     draw(scene, test_views(folder / "ingest", scene), query, out)
 
@@ -74,11 +145,24 @@ def is_closed(features: Features) -> bool:
     return features.convention["kind"] in ("labels", "given") or features.convention.get("output") == "logits"
 
 
-def understood(path: Path, text: str, phrases: list[str]) -> Query:
-    """The words as vectors of the scene's channels, by the teacher that the scene was trained from."""
+def understood(path: Path, text: str, phrases: list[str], calibrated: bool = True) -> Query:
+    """The words as vectors of the scene's channels, by the teacher that the scene was trained from.
+
+    Args: calibrated: whether the calibration of the teacher is taken where there is one.
+    Choices: what `phrases` say is weighed against these, by LERF's relevancy; so is a phrase that is no word of the
+      teacher's table, for which no calibration speaks, against LERF's phrases.
+    """
+    from chebsplat.formats.calibration import calibration_of
+    from chebsplat.labels.calibration import Calibration
+
     features, model = taught(path)
     if is_closed(features):
         return among_labels(features, text, phrases)
+    teacher = teacher_of(features, model)
+    found = calibration_of(teacher.path) if calibrated and not phrases and is_word(text, teacher) else None
+    if found is not None:
+        vectors = embedded([text, *found.rivals], features, model)
+        return Query(text, vectors[0], found.rivals, vectors[1:], vectors[1:], Calibration(**found.calibration))
     try:
         vectors = embedded([text, *(phrases or CANONICAL)], features, model)
     except InputError as error:
@@ -88,18 +172,32 @@ def understood(path: Path, text: str, phrases: list[str]) -> Query:
     return Query(text, vectors[0], phrases or list(CANONICAL), vectors[1:])
 
 
-def embedded(words: list[str], features: Features, model: str | None) -> np.ndarray:
-    """Words [L] -> f32 [L, C] by the text space of the ONNX teacher. Raises InputError if it is no longer the same."""
-    import numpy as np
-
+def teacher_of(features: Features, model: str | None) -> TeacherModel:
+    """The ONNX teacher of a scene's features. Raises InputError if it is no longer the same."""
     from chebsplat.formats.artifact import sha256_file
     from chebsplat.formats.teacher_model import EMBEDDED, read_teacher
-    from chebsplat.stages.text import text_embeddings
 
     teacher = read_teacher(Path(model) if model else EMBEDDED)
     if sha256_file(teacher.path) != features.convention["sha256"]:
         raise InputError(f"{teacher.path} is not the model that this scene was trained from; run the scene again")
-    vectors = text_embeddings(words, teacher)
+    return teacher
+
+
+def is_word(text: str, teacher: TeacherModel) -> bool:
+    """Whether a text is one of the words that a calibration speaks for: those of the teacher's table, if it has one."""
+    from chebsplat.formats.teacher_model import read_label_table
+    from chebsplat.stages.text import found
+
+    return teacher.labels is None or found([text], read_label_table(teacher.labels)[0]) != [-1]
+
+
+def embedded(words: list[str], features: Features, model: str | None) -> np.ndarray:
+    """Words [L] -> f32 [L, C] by the text space of the ONNX teacher. Raises InputError if it is no longer the same."""
+    import numpy as np
+
+    from chebsplat.stages.text import text_embeddings
+
+    vectors = text_embeddings(words, teacher_of(features, model))
     if features.channels is not None:
         vectors = features.channels.embed(vectors)
         kept = float(np.linalg.norm(vectors[0]))
@@ -126,20 +224,22 @@ def among_labels(features: Features, text: str, phrases: list[str]) -> Query:
     others = [row[folded(word)] for word in phrases] or [k for k in range(len(names)) if k != asked]
     if not others:
         raise ConfigError(f"{text!r} is the scene's only label: there is nothing to weigh it against")
-    return Query(text, features.label_embeddings[asked], [names[k] for k in others], features.label_embeddings[others])
+    return Query(text, features.label_embeddings[asked], [names[k] for k in others], features.label_embeddings[others],
+                 closed=not phrases)  # fmt: skip
 
 
-def table(scores: np.ndarray, labels: np.ndarray, names: list[str], n_rows: int) -> list[str]:
-    """Lines: how many Gaussians are relevant, then the labels of the highest mean relevancy."""
+def table(answer: Relevancy, labels: np.ndarray, names: list[str], n_rows: int) -> list[str]:
+    """Lines: the labels of the highest mean score."""
     import numpy as np
 
-    lines = [f"{np.sum(scores > 0.5)} of {len(scores)} Gaussians have a relevancy above 0.5"]
-    rows = [(float(scores[labels == k].mean()), k) for k in np.unique(labels) if k >= 0]
+    rows = [(float(answer.scores[labels == k].mean()), k) for k in np.unique(labels) if k >= 0]
     width = max([len(name) for name in names] + [5])
-    lines.append(f"{'label':{width}s}  mean relevancy  Gaussians  above 0.5")
-    for mean, k in sorted(rows, reverse=True)[:n_rows]:
-        mine = scores[labels == k]
-        lines.append(f"{names[k]:{width}s}  {mean:14.3f}  {len(mine):9d}  {np.sum(mine > 0.5):9d}")
+    mean = "mean probability" if answer.calibrated else "mean relevancy"
+    lines = [f"{'label':{width}s}  {mean}  Gaussians  above {answer.cut}"]
+    for score, k in sorted(rows, reverse=True)[:n_rows]:
+        mine = labels == k
+        count = int(answer.selected[mine].sum())
+        lines.append(f"{names[k]:{width}s}  {score:{len(mean)}.3f}  {mine.sum():9d}  {count:9d}")
     return lines
 
 
@@ -159,7 +259,6 @@ def draw(scene: Scene, views: list[int], query: Query, out: Path) -> None:
     """`heat/<view>.png` of every view, and `sheet.png` of renders beside heat maps."""
     import numpy as np
 
-    from chebsplat.labels.relevancy import relevancy
     from chebsplat.render import SceneRenderer
     from chebsplat.stages.evaluate import camera
     from chebsplat.stages.pages.pictures import heat, heat_scale, png
@@ -171,11 +270,12 @@ def draw(scene: Scene, views: list[int], query: Query, out: Path) -> None:
     for k in views:
         image, features = renderer.render(camera(scene, k), with_features=True)
         assert features is not None
-        warm = heat(image, relevancy(features, query.embedding, query.against))
+        warm = heat(image, query.scores(features))
         png(warm, out / "heat" / f"{files[k]}.png")
         if k in shown:
             rows.append(np.concatenate([image, warm], 1))
-    title = heat_scale(f"{query.text}  (against {', '.join(query.phrases)})", rows[0].shape[1])
+    against = "probability" if query.calibration else f"against {', '.join(query.phrases)}"
+    title = heat_scale(f"{query.text}  ({against})", rows[0].shape[1])
     png(np.concatenate([title, *rows]), out / "sheet.png")
 
 

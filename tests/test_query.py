@@ -119,6 +119,7 @@ def test_a_word_is_found_in_the_scene_and_in_its_test_views(folder):
     assert held["relevancy"].dtype == np.float32
     assert held["relevancy"].shape == (3 * N,)
     assert (str(held["query"]), held["against"].tolist()) == ("seat", CANONICAL)
+    assert not held["calibrated"] and np.isnan(held["presence"])
     assert held["relevancy"][: 2 * N].min() > 0.9
     assert held["relevancy"][2 * N :].max() < 0.1
     assert [path.name for path in (out / "heat").iterdir()] == ["b.png"]  # a.png is of training
