@@ -1,4 +1,4 @@
-"""Part of a finished scene as one 3DGS PLY: chosen by label, opacity and box."""
+"""Part of a finished scene as one 3DGS PLY: chosen by words, label, opacity and box."""
 
 from __future__ import annotations
 
@@ -15,12 +15,18 @@ if TYPE_CHECKING:
     import numpy as np
 
     from chebsplat.formats.scene import Scene
+    from chebsplat.stages.query import Query
 
 CONVERT = "npx @playcanvas/splat-transform@2.7.1 scene.ply scene.compressed.ply"  # or scene.spz --spz-version 3
 
 
 def extract(
-    path: Path, out: Path, labels: tuple[str, ...], min_opacity: float, box: tuple[float, ...] | None
+    path: Path,
+    out: Path,
+    labels: tuple[str, ...],
+    min_opacity: float,
+    box: tuple[float, ...] | None,
+    query: Query | None = None,
 ) -> dict[str, int]:
     """Write the Gaussians that pass every filter, trimmed to the highest SH degree among them.
 
@@ -29,6 +35,7 @@ def extract(
       out:         the PLY to write; never overwritten.
       labels:      names to keep; all where there are none.
       min_opacity: activated, in [0, 1]; box: x0, y0, z0, x1, y1, z1 of centres, scene units.
+      query:       what its cut selects, in the parts that hang together; None: all.
     Returns: how many Gaussians were kept, and how many each filter alone would leave out.
     Raises:  ConfigError on a filter that the scene cannot answer, DataFailure if nothing is left.
     """
@@ -43,6 +50,8 @@ def extract(
         raise ConfigError(f"{out} exists; remove it, or choose another --out")
     scene = read_scene(path)
     filters = passing(scene, path, labels, min_opacity, box)
+    if query is not None:
+        filters["query"] = asked_for(scene, query)
     n = len(scene.parameters["means"])
     left_out = {name: int(n - keep.sum()) for name, keep in filters.items()}
     kept = np.logical_and.reduce([np.ones(n, bool), *filters.values()])
@@ -72,6 +81,18 @@ def passing(
         means = scene.parameters["means"]
         filters["box"] = np.all((means >= list(box[:3])) & (means <= list(box[3:])), axis=1)
     return filters
+
+
+def asked_for(scene: Scene, query: Query) -> np.ndarray:
+    """Which Gaussians the query selects, bool [N], crumbs apart. Raises DataFailure where it is probably not here."""
+    import numpy as np
+
+    from chebsplat.splats.parts import substantial
+
+    answer = query.answer(scene.parameters["features"])
+    if answer.present is False or not answer.selected.any():
+        raise DataFailure(f"{answer}; ask for something else, or name a label with --keep-label")
+    return substantial(scene.parameters["means"], np.exp(scene.parameters["log_scales"]), answer.selected)
 
 
 def has_label(scene: Scene, path: Path, names: tuple[str, ...]) -> np.ndarray:
