@@ -1,4 +1,4 @@
-"""A splat that someone else trained, in a capture's frame: what the 2D teacher says of its Gaussians, as a scene."""
+"""A splat that someone else trained, as a scene: as it is, or with what the 2D teacher says by a capture's photos."""
 
 from __future__ import annotations
 
@@ -29,28 +29,11 @@ def lift_ply(
     Raises:  ConfigError if `out` exists, InputError on what cannot be read, DataFailure if no view sees a Gaussian.
     """
     from chebsplat.formats.features import read_features
-    from chebsplat.formats.gaussians import SCHEMA, Gaussians, write_gaussians
-    from chebsplat.formats.manifest import Manifest
-    from chebsplat.formats.ply import read_ply
     from chebsplat.stages import export, lift
 
-    if out.exists():
-        raise ConfigError(f"{out} exists; remove it, or choose another --out")
-    parameters, degree, _ = read_ply(ply)
-    if not len(parameters["means"]):
-        raise InputError(f"{ply} holds no Gaussians; choose another")
-    if "degrees" not in parameters:
-        import numpy as np
-
-        parameters["degrees"] = np.full(len(parameters["means"]), degree, np.uint8)
-    cameras = cameras_of(capture, points)
-    out.mkdir(parents=True)
+    taken_over(ply, cameras_of(capture, points), out)
     config = out / "settings.json"
     config.write_text(json.dumps({"train": {"features": "lifted"}}))
-    given = {"path": ply.name, "sha256": artifact.sha256_file(ply)}
-    manifest = Manifest(SCHEMA, artifact.digest(given), "train", facts={"source": given})
-    with artifact.publish(out / "gaussians", manifest) as tmp:
-        write_gaussians(tmp, Gaussians(parameters, cameras, notes={"left_out": {"training": "the splat was given"}}))
     if features is None:
         features = taught(capture, model, out)
     inputs = {"capture": capture, "gaussians": out / "gaussians", "features": features}
@@ -63,6 +46,43 @@ def lift_ply(
     facts = artifact.read_manifest(out / "lift").facts
     return {"gaussians": facts["n_gaussians"], "seen by no view": facts["n_unseen"], "views": facts["n_views"],
             "labels": len(read_features(features).label_names)}  # fmt: skip
+
+
+def import_ply(ply: Path, out: Path) -> dict[str, Any]:
+    """A PLY as a scene without semantics, of `gaussians` and `export` below `out`; one camera sees its middle half.
+
+    Returns: counts. Raises: ConfigError if `out` exists, InputError on what cannot be read.
+    """
+    from chebsplat.stages import export
+    from chebsplat.stages.page import foreign
+
+    taken_over(ply, foreign(ply).cameras, out)
+    config = out / "settings.json"
+    config.write_text(json.dumps({}))
+    publish("export", export.run, out / "export", {"gaussians": out / "gaussians"}, config)
+    return {"gaussians": artifact.read_manifest(out / "export").facts["n_gaussians"]}
+
+
+def taken_over(ply: Path, cameras: Cameras, out: Path) -> None:
+    """Make the folder `out`, and in it `gaussians` of a PLY. Raises ConfigError if `out` exists, InputError."""
+    from chebsplat.formats.gaussians import SCHEMA, Gaussians, write_gaussians
+    from chebsplat.formats.manifest import Manifest
+    from chebsplat.formats.ply import read_ply
+
+    if out.exists():
+        raise ConfigError(f"{out} exists; remove it, or choose another --out")
+    parameters, degree, _ = read_ply(ply)
+    if not len(parameters["means"]):
+        raise InputError(f"{ply} holds no Gaussians; choose another")
+    if "degrees" not in parameters:
+        import numpy as np
+
+        parameters["degrees"] = np.full(len(parameters["means"]), degree, np.uint8)
+    out.mkdir(parents=True)
+    given = {"path": ply.name, "sha256": artifact.sha256_file(ply)}
+    manifest = Manifest(SCHEMA, artifact.digest(given), "train", facts={"source": given})
+    with artifact.publish(out / "gaussians", manifest) as tmp:
+        write_gaussians(tmp, Gaussians(parameters, cameras, notes={"left_out": {"training": "the splat was given"}}))
 
 
 def cameras_of(capture: Path, points: Path | None) -> Cameras:
