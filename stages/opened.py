@@ -16,7 +16,7 @@ if TYPE_CHECKING:
 
     from chebsplat.formats.scene import Scene
     from chebsplat.render import SceneRenderer
-    from chebsplat.stages.query import Query
+    from chebsplat.stages.query import Query, Relevancy
     from chebsplat.views import View
 
 COVERED = 0.5  # of a pixel, below which it has no label
@@ -126,16 +126,19 @@ class OpenedScene:
         return Picture(color, depth, alpha, features, np.where(alpha < COVERED, -1, labels))
 
     def query(self, text: str, against: Sequence[str] = ()) -> np.ndarray:
-        """Relevancy f32 [N] in [0, 1] of every Gaussian to words; above 0.5: they fit better than all of `against`.
+        """How likely each Gaussian is what the words mean, f32 [N] in [0, 1]: the scores of `ask`."""
+        return self.ask(text, against).scores
 
-        Args: against: what the words are weighed against; default: LERF's phrases, or all other labels.
+    def ask(self, text: str, against: Sequence[str] = ()) -> Relevancy:
+        """What the scene answers to words: scores, a cut, what is selected, and whether the scene has it at all.
+
+        Args: against: what the words are weighed against, by LERF's relevancy; default: the calibration of the scene's
+              teacher; where it has none, or the words are a phrase, LERF's phrases; or all other labels.
         Raises: ConfigError without semantics, or on words that the scene's teacher cannot know.
         """
-        from chebsplat.labels.relevancy import relevancy
-
         asked = self.understood(text, against)
         assert self.features is not None
-        return relevancy(self.features, asked.embedding, asked.against)
+        return asked.answer(self.features)
 
     def understood(self, text: str, against: Sequence[str] = ()) -> Query:
         """Words in the scene's own channels. Args and errors as of `query`."""

@@ -1,5 +1,5 @@
-"""What is done with a finished scene, or before one: query, page, extract, encode, lift, label, check-teacher,
-get-teacher, knowledge.
+"""What is done with a finished scene, or before one: query, page, extract, encode, lift, import_, label, check-teacher,
+get-teacher, knowledge, calibrate, import.
 """
 
 from __future__ import annotations
@@ -70,13 +70,22 @@ def get_teacher(name: str, out: Path | None, graph: str) -> None:
 @click.option("--keep-label", "labels", multiple=True, help="a name of labels.json; may be given again")
 @click.option("--min-opacity", type=click.FloatRange(0, 1), default=0.0, help="activated")
 @click.option("--box", help="x0,y0,z0,x1,y1,z1 that centres lie in, scene units")
-def extract(scene: str, out: Path, labels: tuple[str, ...], min_opacity: float, box: str | None) -> None:
-    """Write part of a finished scene as one PLY: by label, opacity, box."""
+@click.option("--query", "text", help="words: what is likelier than not these, in parts that hang together")
+@click.option("--against", default="", help="phrases that the words are weighed against, as of query")
+def extract(
+    scene: str, out: Path, labels: tuple[str, ...], min_opacity: float, box: str | None, text: str | None, against: str
+) -> None:
+    """Write part of a finished scene as one PLY: by words, label, opacity, box."""
+    from chebsplat.pipelines.api import load
     from chebsplat.pipelines.finished import artifact_of
     from chebsplat.stages.extract import corners
     from chebsplat.stages.extract import extract as write
 
-    counts = write(artifact_of(scene, "export"), out, labels, min_opacity, corners(box))
+    phrases = [word.strip() for word in against.split(",") if word.strip()]
+    if phrases and text is None:
+        raise ConfigError("--against is of a query; add --query TEXT")
+    asked = None if text is None else load(scene).understood(text, phrases)
+    counts = write(artifact_of(scene, "export"), out, labels, min_opacity, corners(box), asked)
     print(", ".join(f"{name} {number:,}" for name, number in counts.items()), file=sys.stderr)
     print(out)
 
@@ -125,6 +134,26 @@ def lift(ply: Path, capture: str, teacher: Path | None, out: Path) -> None:
     print(out)
 
 
+@click.command("import")
+@click.argument("ply", type=click.Path(path_type=Path))
+@click.option("--capture", help="a finished scene of the same photos, or an ingest artifact: gives features and labels")
+@click.option("--teacher", type=click.Path(path_type=Path), help=".onnx, with --capture; default: the scene's own")
+@click.option("--out", type=click.Path(path_type=Path), required=True, help="the folder to make")
+@click.pass_context
+def import_(context: click.Context, ply: Path, capture: str | None, teacher: Path | None, out: Path) -> None:
+    """Make a scene of any 3DGS .PLY: to render, page and extract from; with --capture to query, too (as `lift`)."""
+    from chebsplat.stages.lift_ply import import_ply
+
+    if capture is not None:
+        context.invoke(lift, ply=ply, capture=capture, teacher=teacher, out=out)
+        return
+    if teacher is not None:
+        raise ConfigError("--teacher looks at photos; add --capture, or label by shape alone: chebsplat label")
+    figures = import_ply(ply, out)
+    print(", ".join(f"{name} {value:,}" for name, value in figures.items()), file=sys.stderr)
+    print(out)
+
+
 @click.command()
 @click.option("--teacher", type=click.Path(path_type=Path), help=".onnx; default: the embedded teacher")
 @click.option("--set", "settings", default="", help="section.key=value,... of knowledge and channels")
@@ -152,6 +181,31 @@ def knowledge(teacher: Path | None, settings: str, out: Path | None, cores: int)
         artifact.copy(made, out, artifact.verify(made))
         print(out.absolute())
     return code
+
+
+@click.command()
+@click.argument("model", type=click.Path(path_type=Path), required=False)
+@click.option("--rooms", type=int, default=12, show_default=True, help="generated rooms")
+@click.option("--force", is_flag=True, help="replace the calibration that is there")
+def calibrate(model: Path | None, rooms: int, force: bool) -> None:
+    """Find out on generated rooms what the relevancy of a teacher MODEL (.onnx) means; kept beside it, for `query`."""
+    import logging
+
+    from chebsplat.formats.calibration import beside, write_calibration
+    from chebsplat.formats.teacher_model import EMBEDDED
+    from chebsplat.stages.calibration import calibrate as measure
+    from chebsplat.stages.progress import Progress
+
+    logging.basicConfig(stream=sys.stderr, format="calibrate: %(message)s", level="WARNING", force=True)
+    logging.getLogger("chebsplat").setLevel("INFO")
+    path = beside(model or EMBEDDED)
+    if path.exists() and not force:
+        raise ConfigError(f"{path} exists; remove it, or add --force")
+    found = measure(model or EMBEDDED, rooms, Progress())
+    write_calibration(path, found)
+    for name, value in found.made["on_rooms_left_out"].items():
+        print(f"{name.replace('_', ' '):16s}{value:6.1%}", file=sys.stderr)
+    print(path)
 
 
 @click.command()
@@ -211,4 +265,4 @@ def page(scene: str, out: Path, sh: int, words: Path | None, against: str) -> No
     print(out)
 
 
-COMMANDS = (query, check_teacher, get_teacher, extract, encode, lift, label, knowledge, page)
+COMMANDS = (query, calibrate, check_teacher, get_teacher, extract, encode, lift, import_, label, knowledge, page)
