@@ -50,6 +50,7 @@ BENCHMARKS = {
     ),
     "trust": Benchmark("trust", "whether views' agreement ranks 2D teachers as their true mIoU does; no training"),
     "teaching": Benchmark("teaching", "what the encoder of points owes to rooms, radii, descriptor, size"),
+    "query": Benchmark("query", "asking at the suggested cut: precision, recall, absent words refused; trains 5 rooms"),
     "layouts": Benchmark("layouts", "the exported layouts: bytes, and images beside the checkpoint's", ("export",)),
     "store": Benchmark("store", "the feature store: bytes, error, label decisions, bandwidth, memory"),
     "stability": Benchmark("stability.main", "every extreme case of the maths, naive and ours; fails if one does"),
