@@ -1,0 +1,107 @@
+"""Every export lies in the frame and units of the poses that were given, however large, far off and tilted they are."""
+
+from copy import deepcopy
+
+import numpy as np
+import pytest
+from click.testing import CliRunner
+from shared import KEY
+from test_page import held_in
+
+from chebsplat.formats import artifact
+from chebsplat.formats.gaussians import write_gaussians
+from chebsplat.formats.manifest import Manifest
+from chebsplat.formats.packed import Packed, unpack
+from chebsplat.formats.ply import read_ply
+from chebsplat.formats.scene import read_scene
+from chebsplat.pipelines.cli import main
+
+SCALE, SHIFT = 3.7, np.array([120.0, -45.0, 18.0])
+TURN = np.linalg.qr(np.random.default_rng(4).normal(size=(3, 3)))[0]
+TURN *= np.linalg.det(TURN)  # a rotation
+
+
+@pytest.fixture(scope="module")
+def moved(mixed, tmp_path_factory):
+    """A checkpoint with every SH degree whose poses are of another model of COLMAP's; means [N, 3]; its export."""
+    from chebsplat.pipelines.api import run_stage
+
+    root, checkpoint = tmp_path_factory.mktemp("frames"), deepcopy(mixed[0])
+    for values in ("fused", "features"):
+        checkpoint.parameters.pop(values, None)
+    means = SCALE * checkpoint.parameters["means"].astype(np.float64) @ TURN.T + SHIFT
+    checkpoint.parameters["means"] = means.astype(np.float32)
+    checkpoint.parameters["log_scales"] = checkpoint.parameters["log_scales"] + np.float32(np.log(SCALE))
+    checkpoint.modules, checkpoint.optimizer = {}, {}
+    poses = checkpoint.cameras.cam_from_world
+    poses[:, :3, 3] = SCALE * poses[:, :3, 3] - poses[:, :3, :3] @ TURN.T @ SHIFT
+    poses[:, :3, :3] = poses[:, :3, :3] @ TURN.T
+    with artifact.publish(root / "gaussians", Manifest("chebsplat.gaussians/1", KEY, "train")) as tmp:
+        write_gaussians(tmp, checkpoint)
+    return checkpoint, run_stage("export", root / "scene/export", {"gaussians": root / "gaussians"})
+
+
+def close(found, wanted, within):
+    """Whether two sets of points are one, by nearest neighbours both ways."""
+    from scipy.spatial import cKDTree
+
+    assert len(found) == len(wanted)
+    for a, b in ((found, wanted), (wanted, found)):
+        assert cKDTree(b).query(a)[0].max() <= within
+
+
+def test_layouts_lie_where_the_checkpoint_does(moved):
+    checkpoint, export = moved
+    wanted = checkpoint.parameters["means"]
+    scene = read_scene(export)
+    close(scene.parameters["means"], wanted, 0)  # ragged arrays
+    close(read_ply(export / "scene.ply")[0]["means"], wanted, 0)
+    split = [read_ply(path)[0]["means"] for path in sorted(export.glob("scene_d*.ply"))]
+    assert len(split) == 4
+    close(np.concatenate(split), wanted, 0)
+    np.testing.assert_array_equal(scene.cameras.cam_from_world, checkpoint.cameras.cam_from_world)
+    sizes = np.exp(scene.parameters["log_scales"][np.argsort(scene.order)])
+    np.testing.assert_allclose(sizes, np.exp(checkpoint.parameters["log_scales"]), rtol=1e-6)
+
+
+def test_parts_pages_and_cameras_lie_there_too(moved, tmp_path):
+    import chebsplat
+
+    checkpoint, export = moved
+    wanted = checkpoint.parameters["means"]
+    scene = chebsplat.load(export)
+    close(read_ply(scene.to_ply(tmp_path / "python.ply"))[0]["means"], wanted, 0)
+    for arguments in (["extract", export, "--out", tmp_path / "part.ply"],
+                      ["page", export, "--out", tmp_path / "page.html"],
+                      ["cameras", export, "--out", tmp_path / "cameras"]):  # fmt: skip
+        done = CliRunner().invoke(main, list(map(str, arguments)))
+        assert done.exit_code == 0, done.output
+    close(read_ply(tmp_path / "part.ply")[0]["means"], wanted, 0)
+    about, arrays = held_in(tmp_path / "page.html")
+    held = unpack(Packed({name: arrays[name] for name in arrays if name != "views"}, about["ranges"]))
+    close(held["means"], wanted, 1e-4)  # of extents of about 20: 24 bits a coordinate, then float32 at 120
+    rows = (tmp_path / "cameras/sparse/0/images.txt").read_text().splitlines()[1::2]
+    shift = np.array([float(text) for text in rows[0].split()[5:8]])
+    np.testing.assert_allclose(shift, checkpoint.cameras.cam_from_world[0, :3, 3], rtol=1e-12)
+
+
+def test_an_imported_splat_stays_where_it_was(moved, tmp_path):
+    import chebsplat
+
+    checkpoint, export = moved
+    done = CliRunner().invoke(main, ["import", str(export / "scene.ply"), "--out", str(tmp_path / "theirs")])
+    assert done.exit_code == 0, done.output
+    scene = chebsplat.load(tmp_path / "theirs")
+    close(scene.parameters["means"], checkpoint.parameters["means"], 0)
+    assert scene.features is None
+    shown = scene.render(scene.cameras[0])
+    assert (shown.alpha > 0.5).mean() > 0.05
+    for arguments in (["verify", tmp_path / "theirs"], ["extract", tmp_path / "theirs", "--min-opacity", "0.1",
+                      "--out", tmp_path / "part.ply"], ["page", tmp_path / "theirs", "--out", tmp_path / "page.html"],
+                      ["import", export / "scene.ply", "--out", tmp_path / "again"]):  # fmt: skip
+        done = CliRunner().invoke(main, list(map(str, arguments)))
+        assert done.exit_code == 0, done.output
+    for arguments, said in ((["--out", tmp_path / "theirs"], "exists"),
+                            (["--teacher", "x.onnx", "--out", tmp_path / "x"], "add --capture")):  # fmt: skip
+        done = CliRunner().invoke(main, ["import", str(export / "scene.ply"), *map(str, arguments)])
+        assert (done.exit_code, said in done.output) == (2, True)
