@@ -1,0 +1,54 @@
+"""The examples run as they stand: both scripts, and the notebook cell by cell, without Jupyter."""
+
+import json
+import os
+import runpy
+import subprocess
+import sys
+
+import pytest
+from shared import ROOT
+
+from chebsplat.formats.ply import read_ply
+
+EXAMPLES = ROOT / "examples"
+
+
+def test_asking_and_taking_writes_what_is_selected(toy, tmp_path, capsys):
+    import chebsplat
+
+    folder = str(toy["export"].parent)
+    scene = chebsplat.load(folder)
+    word = scene.label_names[0]
+    main = runpy.run_path(str(EXAMPLES / "ask_and_take.py"))["main"]
+    main(folder, word, str(tmp_path / "part.ply"))
+    parameters, _, _ = read_ply(tmp_path / "part.ply")
+    assert len(parameters["means"]) == scene.ask(word).selected.sum() > 0
+    assert "Gaussians" in capsys.readouterr().out
+
+
+def test_the_notebook_runs_cell_by_cell(toy, monkeypatch, capsys):
+    import matplotlib
+
+    monkeypatch.setenv("CHEBSPLAT_EXAMPLE", str(toy["export"].parent))
+    matplotlib.use("agg")
+    import matplotlib.pyplot as plt
+
+    notebook = json.loads((EXAMPLES / "look_around.ipynb").read_text())
+    assert not any(cell.get("outputs") for cell in notebook["cells"])  # kept without, so that none is stale
+    names: dict = {}
+    for number, cell in enumerate(cell for cell in notebook["cells"] if cell["cell_type"] == "code"):
+        exec(compile("".join(cell["source"]), f"look_around.ipynb, cell {number}", "exec"), names)
+    assert names["answer"].selected.sum() > 0
+    assert len(plt.get_fignums()) == 2
+    plt.close("all")
+
+
+@pytest.mark.slow
+def test_photos_become_a_picture(tmp_path):
+    command = [sys.executable, EXAMPLES / "photos_to_picture.py", "toy", tmp_path / "toy.png", "30"]
+    done = subprocess.run(
+        command, cwd=tmp_path, env=os.environ | {"CHEBSPLAT_WORK": str(tmp_path / "work")}, capture_output=True
+    )
+    assert done.returncode == 0, done.stderr.decode()
+    assert (tmp_path / "toy.png").stat().st_size > 1000
