@@ -17,13 +17,17 @@ CHOICE := $(if $(scene),--scene '$(scene)') $(if $(sequence),--sequence '$(seque
 
 # `make scene=office0` needs no target: naming a scene, a sequence, a study or a benchmark means running it.
 .DEFAULT_GOAL := $(if $(study),study,$(if $(bench),bench-$(bench),$(if $(scene)$(sequence),run,help)))
-.PHONY: help run study plan verify clean-stale setup test test-all malformed soak stability bench text-model nouns knowledge calibration teacher teacher-quality lint lock
+.PHONY: help run study view plan verify clean-stale setup test test-all malformed soak stability bench text-model nouns knowledge calibration teacher teacher-quality lint lock
 
 run: $(READY)  ## make scene=NAME|FOLDER [stage=] [set=a.b=c,...] [ablation=] [basis=NAME@REVISION|none] [cores=] [device=]; or sequence=NAME
 	@$(CHEBSPLAT) run $(CHOICE) $(if $(stage),--stage '$(stage)') $(if $(cores),--cores '$(cores)') $(if $(device),--device '$(device)')
 
 study: $(READY)  ## make study=NAME [cores=] [threads=] [args=--no-run]: its runs, then table, figure, page in build/studies
 	@$(CHEBSPLAT) study '$(study)' $(if $(cores),--cores '$(cores)') $(if $(threads),--threads '$(threads)') $(if $(device),--device '$(device)') $(args)
+
+view: $(READY)  ## make view scene=NAME|FOLDER|FILE.ply [port=8080]: look at a finished scene in a browser, live
+	@$(PY) -c 'import viser' 2>/dev/null || $(PY) -m uv pip install --quiet --python $(PY) --editable '.[view]'
+	@$(CHEBSPLAT) view '$(scene)' $(if $(port),--port '$(port)')
 
 plan: $(READY)  ## make plan scene=NAME (or study=NAME): what would run, what is fresh, what is left out, and why
 	@$(CHEBSPLAT) $(if $(study),study '$(study)' --plan,plan $(CHOICE))

@@ -58,6 +58,30 @@ def orbit(cameras: list[Camera], n_frames: int) -> list[Camera]:
     ]
 
 
+def between(keys: list[Camera], n_frames: int) -> list[Camera]:
+    """A path through cameras of one lens and size, `n_frames` in all, at an even pace from each to the next.
+
+    Choices: centres lie on the piecewise cubic through the keys that does not overshoot (PCHIP), rotations turn by the
+      shortest arc from key to key.
+    Raises: ConfigError on fewer than two keys or frames.
+    """
+    from scipy.interpolate import PchipInterpolator
+    from scipy.spatial.transform import Rotation, Slerp
+
+    if len(keys) < 2 or n_frames < 2:
+        raise ConfigError("a path needs two cameras and two frames at least")
+    poses, times = np.stack([camera.cam_from_world for camera in keys]), np.arange(len(keys))
+    at = np.linspace(0, len(keys) - 1, n_frames)
+    turns = Slerp(times, Rotation.from_matrix(poses[:, :3, :3]))(at).as_matrix()
+    eyes = PchipInterpolator(times, centers(poses))(at)
+    path = []
+    for k in range(n_frames):
+        pose = np.eye(4)
+        pose[:3, :3], pose[:3, 3] = turns[k], -turns[k] @ eyes[k]
+        path.append(replace(keys[0], name=f"path_{k:04d}", cam_from_world=pose))
+    return path
+
+
 def focus(eyes: np.ndarray, ahead: np.ndarray) -> np.ndarray:
     """The point [3] nearest to lines from `eyes` [V, 3] along `ahead` [V, 3] (unit), in least squares."""
     across = np.eye(3) - ahead[:, :, None] * ahead[:, None, :]

@@ -7,7 +7,7 @@ import logging
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -165,12 +165,14 @@ def save(kind: str, values: np.ndarray, path: Path, n_labels: int) -> None:
 
 def shown(kind: str, path: Path, far: float) -> np.ndarray:
     """A frame as a picture u8 [H, W, 3] for people; far: scene units, where depth is darkest."""
-    from matplotlib import colormaps
-
     from chebsplat.formats.images import read_rgb
 
-    if kind != "depth":
-        return read_rgb(path)
-    depth: Any = np.load(path)
+    return read_rgb(path) if kind != "depth" else depth_colors(np.load(path), far)
+
+
+def depth_colors(depth: np.ndarray, far: float) -> np.ndarray:
+    """Depth [H, W], nan where nothing is, as u8 [H, W, 3]: turbo, red is near; far: scene units, the darkest."""
+    from matplotlib import colormaps
+
     colors = colormaps["turbo"](1 - (np.nan_to_num(depth, nan=far) / far).clip(0, 1))[..., :3]
     return np.where(np.isnan(depth)[..., None], 0, np.round(255 * colors)).astype(np.uint8)

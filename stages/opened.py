@@ -77,7 +77,7 @@ class OpenedScene:
     """
 
     def __init__(self, scene: Scene, source: Path, teacher: Path | None = None):
-        self.source, self._scene, self._teacher = source, scene, teacher
+        self.source, self.exported, self._teacher = source, scene, teacher
         self.parameters, self.labels, self.label_names = scene.parameters, scene.labels, scene.label_names
         self.label_embeddings, held = scene.label_embeddings, scene.cameras
         views = zip(held.names, held.Ks, held.cam_from_world, strict=True)
@@ -171,14 +171,14 @@ class OpenedScene:
         kept = np.ones(len(self), bool) if mask is None else np.asarray(mask)
         if kept.shape != (len(self),) or kept.dtype != bool:
             raise ConfigError(f"a mask bool [{len(self)}] is needed, not {kept.dtype} {list(kept.shape)}")
-        kept = np.logical_and.reduce([kept, *passing(self._scene, self.source, names, min_opacity, box).values()])
+        kept = np.logical_and.reduce([kept, *passing(self.exported, self.source, names, min_opacity, box).values()])
         if not kept.any():
             raise ConfigError(f"no Gaussian of {len(self)} is left; choose wider filters")
         parameters = {name: values[kept] for name, values in self.parameters.items()}
         part = replace(
-            self._scene,
+            self.exported,
             parameters=parameters,
-            order=np.argsort(np.argsort(self._scene.order[kept], kind="stable"), kind="stable"),
+            order=np.argsort(np.argsort(self.exported.order[kept], kind="stable"), kind="stable"),
             labels=None if self.labels is None else self.labels[kept],
         )
         return OpenedScene(part, self.source, self._teacher)

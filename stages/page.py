@@ -114,15 +114,18 @@ def foreign(ply: Path) -> Scene:
     from chebsplat.formats.ply import read_ply
     from chebsplat.formats.scene import Scene
 
-    parameters, _, _ = read_ply(ply)
-    means = parameters["means"]
-    if not len(means):
+    parameters, degree, _ = read_ply(ply)
+    if not len(parameters["means"]):
         raise InputError(f"{ply} holds no Gaussians; choose another")
+    degrees = parameters.setdefault("degrees", np.full(len(parameters["means"]), degree, np.uint8))
+    order = np.argsort(degrees, kind="stable")  # as renderers take them
+    parameters = {name: values[order] for name, values in parameters.items()}
+    means = parameters["means"]
     low, high = np.quantile(means.astype(np.float64), (0.25, 0.75), axis=0)
     pose = np.eye(4)
     pose[:3, 3] = [0, 0, 2 * max(float((high - low).max()), 1e-3)] - (low + high) / 2
     K = np.array([[554.0, 0, 320], [0, 554, 240], [0, 0, 1]])  # 60 degrees across
-    return Scene(parameters, Cameras(["start"], K[None], pose[None], 640, 480), np.arange(len(means)))
+    return Scene(parameters, Cameras(["start"], K[None], pose[None], 640, 480), order)
 
 
 def camera_rows(scene: Scene, center: np.ndarray) -> np.ndarray:

@@ -14,7 +14,7 @@ from browser import BROWSER
 
 FLAGS = ("--headless=new", "--no-sandbox", "--no-first-run", "--hide-scrollbars", "--remote-debugging-pipe",
          "--use-angle=swiftshader", "--enable-unsafe-swiftshader", "--ignore-gpu-blocklist",
-         "--host-resolver-rules=MAP * ~NOTFOUND")  # fmt: skip
+         "--host-resolver-rules=MAP * ~NOTFOUND, EXCLUDE 127.0.0.1")  # fmt: skip
 
 
 class Driven:
@@ -64,7 +64,8 @@ class Driven:
             self._loaded = True
         return answer
 
-    def open(self, path, width, height, dark=False):
+    def open(self, page, width, height, dark=False):
+        """A file's path, or a URL of this machine."""
         target = self.call("Target.createTarget", url="about:blank")["targetId"]
         self._session = self.call("Target.attachToTarget", targetId=target, flatten=True)["sessionId"]
         for domain in ("Page", "Runtime", "Log", "Network"):
@@ -72,7 +73,7 @@ class Driven:
         self.size(width, height)
         theme = {"name": "prefers-color-scheme", "value": "dark" if dark else "light"}
         self.call("Emulation.setEmulatedMedia", features=[theme])
-        self.call("Page.navigate", url=path.as_uri())
+        self.call("Page.navigate", url=page if isinstance(page, str) else page.as_uri())
         until = time.monotonic() + 60
         while not self._loaded:
             self._next(until)

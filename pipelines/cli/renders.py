@@ -1,12 +1,16 @@
-"""A finished scene from other cameras: render, cameras."""
+"""A finished scene from other cameras: render, cameras, view."""
 
 from __future__ import annotations
 
 import logging
 import sys
+import time
+from contextlib import suppress
 from pathlib import Path
 
 import click
+
+from chebsplat.errors import ConfigError, InputError
 
 PATH = click.option(
     "--path", default="capture", show_default=True, help="orbit, capture, or a cameras.json or transforms.json"
@@ -79,4 +83,42 @@ def cameras(scene: str, path: str, frames: int, size: str | None, out: Path) -> 
         print(file.absolute())
 
 
-COMMANDS = (render, cameras)
+@click.command()
+@click.argument("scene")
+@click.option(
+    "--port", type=click.IntRange(0, 65535), default=8080, show_default=True, help="the next free one from it"
+)
+@click.option("--host", default="127.0.0.1", show_default=True, help="0.0.0.0: whoever reaches this machine may look")
+@click.option("--frames", type=click.Path(path_type=Path), help="where camera paths go; default: frames-of-SCENE, here")
+def view(scene: str, port: int, host: str, frames: Path | None) -> None:
+    """Look at a finished SCENE (or a .ply) in a browser, live: fly, point at things, ask for words. Ctrl-C ends it."""
+    import os
+
+    from chebsplat.pipelines.api import load
+    from chebsplat.pipelines.finished import links, scene_folder
+    from chebsplat.stages.opened import OpenedScene
+    from chebsplat.stages.page import foreign
+    from chebsplat.stages.view import Viewer, library, photos_of
+    from chebsplat.stages.viewing import Viewing
+
+    logging.basicConfig(stream=sys.stderr, format="view: %(message)s", level="WARNING", force=True)
+    library()
+    photos = None
+    if scene.endswith(".ply"):
+        opened, name = OpenedScene(foreign(Path(scene)), Path(scene)), Path(scene).stem
+    else:
+        opened, name = load(scene), Path(os.path.abspath(scene)).name.partition("@")[0]
+        with suppress(ConfigError, InputError):  # an artifact alone has no photos
+            photos = photos_of(links(scene_folder(scene))["ingest"])
+    viewer = Viewer(Viewing(opened, photos), name, host, port, (frames or Path(f"frames-of-{name}")).absolute())
+    print(f"http://{'localhost' if host == '0.0.0.0' else host}:{viewer.port}", flush=True)
+    if viewer.port != port:
+        print(f"port {port} is taken; this is the next free one", file=sys.stderr)
+    try:
+        while True:
+            time.sleep(3600)
+    finally:
+        viewer.end()
+
+
+COMMANDS = (render, cameras, view)
