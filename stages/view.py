@@ -68,11 +68,11 @@ class Visit:
         self.budget, self.pace = float(MOVING), 0.0
         self.tasks: list[Callable[[], None]] = []
         self.panel: Panel | None = None
-        self.image: np.ndarray | None = None
 
     def change(self, **controls: Any) -> None:
-        """Other controls."""
+        """Other controls; labels stay where they are if only what is shown of the same Gaussians changes."""
         self.shown = replace(self.shown, **controls)
+        self.named = self.named and set(controls) <= {"mode", "query", "selected"}
         self.asked += 1
         self.wake()
 
@@ -81,7 +81,7 @@ class Visit:
         now = time.monotonic()
         if self.at is not None and now - self.jumped > ARRIVAL and not near(self.camera(), self.at, self.viewing.far):
             self.at = None
-        self.moved = now
+        self.moved, self.named = now, False
         self.asked += 1
         self.wake()
 
@@ -141,9 +141,9 @@ class Visit:
                 self.say(str(error))
         elif self.asked != self.drawn or not self.whole:
             self.draw(moving=time.monotonic() - self.moved < REST)
-        else:
+        elif self.panel is not None:
             self.named = True
-            self.panel.put_beneath(coded(self.viewing.beneath(self.looked(FULL), self.shown)))  # type: ignore[union-attr]
+            self.panel.put_beneath(coded(self.viewing.beneath(self.looked(FULL), self.shown)))
 
     def draw(self, moving: bool) -> None:
         """Send a picture of what is wanted now."""
@@ -153,9 +153,9 @@ class Visit:
         taken = time.monotonic() - start
         self.client.scene.set_background_image(image, format="jpeg", jpeg_quality=75 if moving else 95)
         self.client.flush()
-        if self.named and self.panel is not None:
+        if not self.named and self.panel is not None:
             self.panel.put_beneath(None)
-        self.drawn, self.whole, self.named, self.image = wanted, not moving, False, image
+        self.drawn, self.whole = wanted, not moving
         size = f"{image.shape[1]} × {image.shape[0]}"
         if moving:
             self.pace = taken if not self.pace else 0.7 * self.pace + 0.3 * taken
@@ -189,27 +189,34 @@ def near(camera: Camera, view: Camera, far: float) -> bool:
 
 
 class Viewer:
-    """A server of pages, and the thread that draws for them."""
+    """A server of pages, and the thread that draws for them.
 
-    def __init__(self, viewing: Viewing, name: str, host: str, port: int, frames: Path):
-        self.viewing, self.name, self.frames = viewing, name, frames
-        self.visits: dict[int, Visit] = {}
-        self._woken, self._ended = threading.Event(), False
+    Served at once, so that a page loads while the scene does; `show` fills those that are open, and all later ones.
+    """
+
+    def __init__(self, name: str, host: str, port: int):
         viser = library()
+        self.name, self.visits = name, dict[int, Visit]()
+        self._woken, self._ended = threading.Event(), False
+        self._thread = threading.Thread(target=self.draw, name="drawing", daemon=True)
         with redirect_stdout(io.StringIO()):  # its banner; the command prints the address alone
             self.server = viser.ViserServer(host=host, port=port, label=f"chebsplat: {name}", verbose=False)
         self.port = self.server.get_port()
+        self.server.scene.configure_environment_map(None)  # light of meshes; there are none
+        self.server.gui.configure_theme(dark_mode=True, show_logo=False, show_share_button=False)
+
+    def show(self, viewing: Viewing, frames: Path) -> None:
+        """Show a scene. Args: frames: the folder that camera paths are written below."""
+        self.viewing, self.frames = viewing, frames
         first = viewing.scene.cameras[0]
         camera, pose = self.server.initial_camera, first.cam_from_world
         self.server.scene.set_up_direction(tuple(upwards(viewing.scene)))
         camera.position, camera.look_at = first.position, first.position + 0.3 * viewing.far * pose[2, :3]
         camera.fov = 2 * np.arctan(first.height / 2 / first.K[1, 1])
         camera.near, camera.far = 1e-3 * viewing.far, 100 * viewing.far
-        self.server.scene.configure_environment_map(None)  # light of meshes; there are none
-        self.server.gui.configure_theme(dark_mode=True, show_logo=False, show_share_button=False)
-        self.server.on_client_connect(self.welcome)
+        viewing.picture(first.resized(16, 12), Shown())  # what the first picture would wait for
         self.server.on_client_disconnect(lambda client: self.visits.pop(client.client_id, None) and None)
-        self._thread = threading.Thread(target=self.draw, name="drawing", daemon=True)
+        self.server.on_client_connect(self.welcome)
         self._thread.start()
 
     def welcome(self, client: Any) -> None:
@@ -224,8 +231,10 @@ class Viewer:
 
     def draw(self) -> None:
         """Until the end: what each page wants, page by page."""
-        while not self._ended:
-            self._woken.clear()
+        while True:
+            self._woken.clear()  # before what is asked of it: nothing is missed
+            if self._ended:
+                return
             now, waits = time.monotonic(), []
             for visit in list(self.visits.values()):
                 due = visit.due(now)
@@ -245,7 +254,8 @@ class Viewer:
         """Stop serving and drawing."""
         self._ended = True
         self._woken.set()
-        self._thread.join()
+        if self._thread.is_alive():
+            self._thread.join(10)
         self.server.stop()
 
 

@@ -30,7 +30,7 @@ class Panel:
     def __init__(self, visit: Visit, name: str, frames: Path):
         self.visit, self.name, self.frames = visit, name, frames
         self.gui, self.scene, self.viewing = visit.client.gui, visit.viewing.scene, visit.viewing
-        self._said = 0.0
+        self._said, self._named = 0.0, False
         self.path: list[Camera] = []
         self.status = self.gui.add_markdown("loading")
         self._modes()
@@ -50,6 +50,9 @@ class Panel:
         """Give the page the labels under its picture, u8 [H, W, 3] of `viewing.coded`; None: they are out of date."""
         from chebsplat.stages.pages.pictures import png
 
+        if self.scene.labels is None or (codes is None and not self._named):
+            return
+        self._named = codes is not None
         buffer = io.BytesIO()
         png(np.zeros((1, 1, 3), np.uint8) if codes is None else codes, buffer)
         names = html.escape(json.dumps(self.scene.label_names))
@@ -121,9 +124,9 @@ class Panel:
         if taken is None:
             self._choose(None, "nothing is there")
         else:
-            label, mask = taken
-            name = (self.scene.label_names or [])[label]
-            self._choose(mask, f"{name}: {int(mask.sum()):,} Gaussians, connected")
+            name = (self.scene.label_names or [])[taken.label]
+            place = ", ".join(f"{x:.3f}" for x in taken.place)
+            self._choose(taken.mask, f"{name} at {place}: {int(taken.mask.sum()):,} connected Gaussians")
 
     def _choose(self, mask: np.ndarray | None, text: str) -> None:
         self.chosen.content = text or "click on something"

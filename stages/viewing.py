@@ -42,6 +42,15 @@ class Shown:
 
 
 @dataclass(frozen=True, eq=False)
+class Touched:
+    """A click: the label under it, the place [3] on the surface, scene units, and the Gaussians taken, bool [N]."""
+
+    label: int
+    place: np.ndarray
+    mask: np.ndarray
+
+
+@dataclass(frozen=True, eq=False)
 class Beneath:
     """What is under each pixel: labels i32 [H, W], rows of `label_names`, -1 where nothing is; their probability f32
     [H, W].
@@ -92,11 +101,12 @@ class Viewing:
 
     def kept(self, shown: Shown) -> np.ndarray:
         """Rows of the Gaussians that the controls leave, i64 [M], ascending."""
-        from chebsplat.stages.extract import passing
-
         keep = np.ones(len(self.scene), bool)
-        for filter_ in passing(self.scene.exported, self.scene.source, (), shown.min_opacity, shown.box).values():
-            keep &= filter_
+        if shown.min_opacity > 0 or shown.box is not None:
+            from chebsplat.stages.extract import passing  # which imports what takes a second
+
+            filters = passing(self.scene.exported, self.scene.source, (), shown.min_opacity, shown.box)
+            keep = np.logical_and.reduce([keep, *filters.values()])
         if shown.hidden and self.scene.labels is not None:
             keep &= ~np.isin(self.scene.labels, list(shown.hidden))
         return np.flatnonzero(keep)
@@ -189,8 +199,8 @@ class Viewing:
         covered = found[..., -1] >= COVERED
         return Beneath(np.where(covered, labels, -1).astype(np.int32), np.where(covered, probability, 0))
 
-    def touched(self, camera: Camera, shown: Shown, x: int, y: int) -> tuple[int, np.ndarray] | None:
-        """What a click on pixel (x, y) takes: its label and, bool [N], the Gaussians of that label that are connected.
+    def touched(self, camera: Camera, shown: Shown, x: int, y: int) -> Touched | None:
+        """What a click on pixel (x, y) takes: its label, and the Gaussians of that label that are connected.
 
         Returns: None where nothing is under the pixel, or no Gaussian bears its label.
         Choices: the click's Gaussian is the nearest of the pixel's label to the surface under it.
@@ -212,7 +222,7 @@ class Viewing:
         means = self.scene.parameters["means"]
         away = np.where(among, np.linalg.norm(means - place, axis=1), np.inf)
         scales = np.exp(self.scene.parameters["log_scales"])
-        return label, connected_to(int(away.argmin()), means, scales, among)
+        return Touched(label, place, connected_to(int(away.argmin()), means, scales, among))
 
 
 def pixel_of(camera: Camera, x: int, y: int) -> Camera:

@@ -95,8 +95,10 @@ def test_a_click_takes_what_is_connected_and_of_its_label(scene, viewing):
     opened = scene[2]
     labels = viewing.beneath(opened.cameras[1], Shown()).labels
     y, x = np.argwhere(labels == SOFA)[len(np.argwhere(labels == SOFA)) // 2].tolist()
-    label, mask = viewing.touched(opened.cameras[1], Shown(), x, y)
-    assert label == SOFA
+    touched = viewing.touched(opened.cameras[1], Shown(), x, y)
+    mask = touched.mask
+    assert touched.label == SOFA
+    assert np.linalg.norm(opened.parameters["means"][mask] - touched.place, axis=1).min() < 0.1
     assert (opened.labels[mask] == SOFA).all()
     assert mask.sum() > 0.9 * (opened.labels == SOFA).sum()
     shown = viewing.picture(opened.cameras[1], Shown(selected=mask)).astype(int)

@@ -93,28 +93,32 @@ def cameras(scene: str, path: str, frames: int, size: str | None, out: Path) -> 
 def view(scene: str, port: int, host: str, frames: Path | None) -> None:
     """Look at a finished SCENE (or a .ply) in a browser, live: fly, point at things, ask for words. Ctrl-C ends it."""
     import os
+    import warnings
 
-    from chebsplat.pipelines.api import load
-    from chebsplat.pipelines.finished import links, scene_folder
-    from chebsplat.stages.opened import OpenedScene
-    from chebsplat.stages.page import foreign
-    from chebsplat.stages.view import Viewer, library, photos_of
-    from chebsplat.stages.viewing import Viewing
+    from chebsplat.pipelines.finished import artifact_of, links, scene_folder
+    from chebsplat.stages.view import Viewer, photos_of
 
     logging.basicConfig(stream=sys.stderr, format="view: %(message)s", level="WARNING", force=True)
-    library()
-    photos = None
-    if scene.endswith(".ply"):
-        opened, name = OpenedScene(foreign(Path(scene)), Path(scene)), Path(scene).stem
-    else:
-        opened, name = load(scene), Path(os.path.abspath(scene)).name.partition("@")[0]
-        with suppress(ConfigError, InputError):  # an artifact alone has no photos
-            photos = photos_of(links(scene_folder(scene))["ingest"])
-    viewer = Viewer(Viewing(opened, photos), name, host, port, (frames or Path(f"frames-of-{name}")).absolute())
-    print(f"http://{'localhost' if host == '0.0.0.0' else host}:{viewer.port}", flush=True)
-    if viewer.port != port:
-        print(f"port {port} is taken; this is the next free one", file=sys.stderr)
+    warnings.filterwarnings("ignore", "Queued a .* closed connection", UserWarning)  # a page was closed; all is well
+    theirs = scene.endswith(".ply")
+    source = Path(os.path.expanduser(scene)) if theirs else artifact_of(scene, "export")
+    if theirs and not source.is_file():
+        raise InputError(f"{source} is missing; correct the path")
+    name = (source.stem if theirs else Path(os.path.abspath(scene)).name).partition("@")[0]
+    viewer = Viewer(name, host, port)
     try:
+        print(f"http://{'localhost' if host == '0.0.0.0' else host}:{viewer.port}", flush=True)
+        if viewer.port != port:
+            print(f"port {port} is taken; this is the next free one", file=sys.stderr)
+        from chebsplat.pipelines.api import load
+        from chebsplat.stages.opened import OpenedScene
+        from chebsplat.stages.page import foreign
+        from chebsplat.stages.viewing import Viewing
+
+        opened, photos = OpenedScene(foreign(source), source) if theirs else load(scene), None
+        with suppress(ConfigError, InputError, KeyError):  # a .ply or an artifact alone has no photos
+            photos = None if theirs else photos_of(links(scene_folder(scene))["ingest"])
+        viewer.show(Viewing(opened, photos), (frames or Path(f"frames-of-{name}")).absolute())
         while True:
             time.sleep(3600)
     finally:

@@ -25,7 +25,11 @@
       tip.style.top = `${at.y + 14}px`;
       tip.style.display = "block";
     };
-    addEventListener("pointermove", event => { held.at = { x: event.clientX, y: event.clientY }; held.show(); }, true);
+    // window's: what a handler in an attribute calls is otherwise the image's own
+    window.addEventListener("pointermove", event => {
+      held.at = { x: event.clientX, y: event.clientY };
+      held.show();
+    }, true);
   }
   held.names = names;
   held.codes = null;
