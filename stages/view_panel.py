@@ -109,6 +109,7 @@ class Panel:
 
         text = self.words.value.strip()
         if not text:
+            self.chosen.content = "type some words first"
             return
         query = self.scene.understood(text, [word.strip() for word in self.against.value.split(",") if word.strip()])
         assert self.scene.features is not None
