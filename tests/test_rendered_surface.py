@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from chebsplat.cameras import centers, common_up, upright
-from chebsplat.lifting.surface import EDGE, LEAST, fused, lookouts, surface
+from chebsplat.lifting.surface import EDGE, fused, lookouts, surface
 from chebsplat.splats.planes import inverse_depths
 from chebsplat.synthetic.path import intrinsics, look_at
 
@@ -73,8 +73,8 @@ def test_lookouts_see_a_room_from_within_whichever_way_is_up():
 
 
 def test_cubes_of_few_pixels_and_empty_views_give_no_points():
-    points = np.array([[0, 0, 0.01]] * LEAST + [[1.0, 1, 1]] * (LEAST - 1))
-    found = fused(points, points + 1, EDGE)
+    points = np.array([[0, 0, 0.01]] * 4 + [[1.0, 1, 1]] * 3)
+    found = fused(points, points + 1, EDGE, 4)
     np.testing.assert_allclose(found.means, [[0, 0, 0.01]])
     np.testing.assert_allclose(found.eyes, [[1, 1, 1.01]])
     raw, _ = tiles((0, 0, 1.0), (0, 0, 0))

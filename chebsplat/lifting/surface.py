@@ -13,14 +13,14 @@ import numpy as np
 import torch
 
 from chebsplat.cameras import upright
-from chebsplat.rasterize import rasterize
+from chebsplat.rasterize.depths import depths
 from chebsplat.splats.gaussians import activated, surface_of
 from chebsplat.splats.planes import inverse_depths
 
-OPAQUE = 0.8  # least coverage of a pixel whose depth counts
+OPAQUE = 0.9  # least coverage of a pixel whose depth counts
 NEAREST = 0.05  # metres
-EDGE = 0.04  # metres, of the cubes that one point stands for
-LEAST = 3  # pixels in such a cube
+EDGE = 0.06  # metres, of the cubes that one point stands for
+N_PIXELS, LEAST = 600_000, 10  # that are looked at, and how many of them a cube must hold: what floats holds fewer
 LOOKOUT_SIZE, LOOKOUT_ANGLE = (192, 144), 1.4  # pixels; rad, across
 
 
@@ -37,36 +37,32 @@ def surface(
     Ks: np.ndarray,
     size: tuple[int, int],
     unit: float = 1.0,
-    n_pixels: int = 300_000,
+    n_pixels: int = N_PIXELS,
 ) -> Surface:
     """Points of the surface, at most one in a cube of edge EDGE.
 
     Args: parameters: raw, of N Gaussians; cam_from_world [V, 4, 4] and Ks [V, 3, 3] of views of `size` (width, height);
-          unit: scene units of a metre; n_pixels: that are looked at, of all views alike, drawn.
-    Choices: a Gaussian is a plane through its centre across its shortest axis, whose inverse depth is linear in pixels,
-      so that it can be rendered as three channels: 1/z = q · (u, v, 1), q = K⁻ᵀ n / (n · μ). Inverse depth is averaged
-      by α T, points by cube.
+          unit: scene units of a metre; n_pixels: that are looked at, of all views alike, drawn. A cube needs LEAST of
+          N_PIXELS, and as many fewer as fewer are looked at, but three.
+    Choices: a Gaussian is a plane through its centre across its shortest axis; depth as `rasterize.depths` has it;
+      points averaged by cube.
     """
     raw = {name: torch.from_numpy(np.ascontiguousarray(values, np.float32)) for name, values in parameters.items()}
-    shapes, normals = activated(raw), surface_of(parameters)[0].astype(np.float64)
-    means, rng = parameters["means"].astype(np.float64), np.random.default_rng(0)
+    gaussians = tuple(part.numpy() for part in activated(raw))
+    normals, means = surface_of(parameters)[0].astype(np.float64), parameters["means"].astype(np.float64)
     width, height = size
-    count = min(max(n_pixels // max(len(Ks), 1), 1), width * height)
+    rng, count = np.random.default_rng(0), min(max(n_pixels // max(len(Ks), 1), 1), width * height)
     seen, eyes = [np.zeros((0, 3))], [np.zeros((0, 3))]
     for pose, K in zip(cam_from_world, Ks, strict=True):
         planes = inverse_depths(means @ pose[:3, :3].T + pose[:3, 3], normals @ pose[:3, :3].T, K, NEAREST * unit)
-        camera = torch.from_numpy(pose).float()[None], torch.from_numpy(K).float()[None]
-        with torch.no_grad():
-            rendered, covered, _ = rasterize(*shapes, torch.from_numpy(planes.astype(np.float32)), *camera, *size)
+        depth, covered = (image.ravel() for image in depths(gaussians, pose, K, size, planes))
         pixels = rng.choice(width * height, count, replace=False)
-        rays = np.stack([pixels % width + 0.5, pixels // width + 0.5, np.ones(count)], 1)
-        opaque = covered.numpy().reshape(-1)[pixels].astype(np.float64)
-        inverse = np.einsum("pk,pk->p", rendered.numpy().reshape(-1, 3)[pixels], rays) / np.maximum(opaque, 1e-6)
-        used = (opaque > OPAQUE) & (inverse > 0) & (inverse * NEAREST * unit < 1)
-        points = rays[used] @ np.linalg.inv(K).T / inverse[used, None]
-        seen.append((points - pose[:3, 3]) @ pose[:3, :3])
-        eyes.append(np.tile(-pose[:3, :3].T @ pose[:3, 3], (int(used.sum()), 1)))
-    return fused(np.concatenate(seen), np.concatenate(eyes), EDGE * unit)
+        pixels = pixels[(covered[pixels] > OPAQUE) & (depth[pixels] > NEAREST * unit) & np.isfinite(depth[pixels])]
+        rays = np.stack([pixels % width + 0.5, pixels // width + 0.5, np.ones(len(pixels))], 1) @ np.linalg.inv(K).T
+        seen.append((rays * depth[pixels, None] - pose[:3, 3]) @ pose[:3, :3])
+        eyes.append(np.tile(-pose[:3, :3].T @ pose[:3, 3], (len(pixels), 1)))
+    least = max(3, round(LEAST * count * len(Ks) / N_PIXELS))
+    return fused(np.concatenate(seen), np.concatenate(eyes), EDGE * unit, least)
 
 
 def lookouts(means: np.ndarray, opacities: np.ndarray, up: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -94,8 +90,8 @@ def lookouts(means: np.ndarray, opacities: np.ndarray, up: np.ndarray) -> tuple[
     return np.stack(poses), np.tile(K, (len(poses), 1, 1))
 
 
-def fused(points: np.ndarray, eyes: np.ndarray, edge: float) -> Surface:
-    """The mean of the points in each cube of this edge that holds LEAST of them, and of their eyes."""
+def fused(points: np.ndarray, eyes: np.ndarray, edge: float, least: int) -> Surface:
+    """The mean of the points in each cube of this edge that holds the least number of them, and of their eyes."""
     if len(points) == 0:
         return Surface(points, eyes)
     cells = np.floor((points - points.min(0)) / edge).astype(np.int64)
@@ -103,5 +99,5 @@ def fused(points: np.ndarray, eyes: np.ndarray, edge: float) -> Surface:
     sums = np.zeros((2, len(count), 3))
     np.add.at(sums[0], cell.ravel(), points)
     np.add.at(sums[1], cell.ravel(), eyes)
-    kept = count >= LEAST
+    kept = count >= least
     return Surface(*(total[kept] / count[kept, None] for total in sums))

@@ -96,6 +96,23 @@ def _lift(splats, shown, tile_starts, ranks, pair, pair_starts, values, counts, 
     return sums
 
 
+def binned(
+    gaussians: tuple[np.ndarray, ...],
+    viewmat: np.ndarray,
+    K: np.ndarray,
+    size: tuple[int, int],
+    channels: np.ndarray | None = None,
+) -> tuple[binning.Bins, np.ndarray]:
+    """The Gaussians that a view shows, by tile, and packed with their channels f32 [N, C]; arguments as of `lift`."""
+    means, quats, scales, opacities = gaussians
+    camera = (np.ascontiguousarray(matrix, np.float64) for matrix in (viewmat, K))
+    projected = ellipses.project(means, quats, scales, *camera, *size, NEAR, FAR, EPS2D)
+    means2d, covariances, whitening, _, depths, radii, _ = projected
+    none = np.zeros((len(means), 0), np.float32)
+    bins = binning.bin_gaussians(means2d, covariances, depths, radii, opacities, none, none, *size)
+    return bins, tiles.pack(bins.order, means2d, whitening, opacities, none if channels is None else channels, none)
+
+
 def lift(
     gaussians: tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray],
     viewmat: np.ndarray,
@@ -119,7 +136,6 @@ def lift(
     Choices: w as `reference.rasterize` composites by default. The gate compares within each pixel: that of a whole
       cell would hand a pixel at an edge to the larger side. Bitwise equal for any number of threads.
     """
-    means, quats, scales, opacities = gaussians
     width, height = size
     shape = (height + 3) // 4, (width + 3) // 4
     if values.shape[:2] != shape or counts.shape != shape:
@@ -131,12 +147,7 @@ def lift(
     said[counted, n_channels] = counts[counted]
     if not (np.isfinite(said).all() and np.isfinite(counts).all()):
         raise ValueError("a cell that counts holds a value that is not finite")
-    camera = (np.ascontiguousarray(matrix, np.float64) for matrix in (viewmat, K))
-    projected = ellipses.project(means, quats, scales, *camera, width, height, NEAR, FAR, EPS2D)
-    means2d, covariances, whitening, _, depths, radii, _ = projected
-    none = np.zeros((len(means), 0), np.float32)
-    bins = binning.bin_gaussians(means2d, covariances, depths, radii, opacities, none, none, width, height)
-    splats = tiles.pack(bins.order, means2d, whitening, opacities, none, none)
+    bins, splats = binned(gaussians, viewmat, K, size)
     sums = _lift(
         splats, len(bins.order), bins.tile_starts, bins.rank, bins.pair, bins.pair_starts,
         said.reshape(-1, said.shape[2]), counted.astype(np.float32), width, height, np.float32(gate),
