@@ -71,7 +71,8 @@ def left_out_stages(config: Any, kind: str, why: str, probe: dict[str, bool]) ->
         left_out |= {"describe": "train.albo is false: tokens hold no descriptor"}
     if probe["poses"] and config.sfm.poses != "adjusted":
         tested = config.sfm.poses == "auto" and config.source.kind != "generated"
-        what, given = ("matching", "poses and depth") if probe["depth"] else ("pose estimation", "poses")
+        has_depth = probe["depth"] and config.ingest.depth == "auto"
+        what, given = ("matching", "poses and depth") if has_depth else ("pose estimation", "poses")
         left_out[f"sfm: {what}"] = f"{given} are given" + (", and kept if they fit the photos" if tested else "")
     return left_out
 

@@ -179,11 +179,14 @@ def run(job: Job) -> None:
         fields |= disturbed(fields, *strengths, settings.disturb_seed)
     if settings.classes is not None:
         fields |= renamed(fields, settings.classes)
+    without = {what: f"the {source.kind} source has none" for what in ("depth", "labels") if fields.get(what) is None}
+    if settings.depth == "off" and "depth" not in without:
+        without["depth"] = "ingest.depth is off"
+        del fields["depth"]
+    for what, why in without.items():
+        job.left_out(what, why)
     optional: dict[str, Any] = {"depth": None, "labels": None, "loss_mask": None, "class_names": None}
     capture = Capture(**(optional | fields), protocol=protocol)
-    for what in ("depth", "labels"):
-        if fields.get(what) is None:
-            job.left_out(what, f"the {source.kind} source has none")
     if len(capture.names) < n_views:
         job.left_out("views", f"{n_views - len(capture.names)} that ingest.max_train_views spares the training")
     job.facts |= {"source": capture.source, "n_views": len(capture.names), "n_test": int(np.sum(capture.is_test))}

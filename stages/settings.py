@@ -52,6 +52,7 @@ class IngestSection(Section):
     max_train_views: int | None = number(
         None, "at most so many that are trained on, evenly chosen; all test views stay", 2, 100_000
     )
+    depth: Literal["auto", "off"] = setting("auto", "that the source brings: taken, or left out as if it brought none")
     classes: dict[Text, list[Text]] | None = setting(
         None, "names, each with the source's classes that it stands for; what stands for none is not counted"
     )

@@ -262,6 +262,10 @@ def test_a_scannet_folder_is_planned_without_the_stages_it_does_not_need(tmp_pat
     plan = Planner().plan("./scene0000_00", "ingest.protocol=scannet-closed")
     assert plan.steps[0].sections["source"]["kind"] == "scannet"
     assert "sfm: matching" in plan.left_out
+    assert (
+        "sfm: matching"
+        not in Planner().plan("./scene0000_00", "ingest.protocol=scannet-closed,ingest.depth=off").left_out
+    )
     (tmp_path / "scene0000_00/splits.json").write_text('{"train": ["0"], "test": ["10"]}')
     again = Planner().plan("./scene0000_00", "ingest.protocol=scannet-closed")
     assert plan.steps[0].key != again.steps[0].key

@@ -6,6 +6,7 @@ import shutil
 import numpy as np
 import pytest
 from PIL import Image
+from shared import run_stage
 from source_folders import SETTINGS, image, save, write_colmap
 
 from chebsplat.errors import DataFailure, InputError
@@ -284,3 +285,18 @@ def test_images_are_reduced_but_never_enlarged(tmp_path):
     assert fields["images"].shape == (3, 80, 160, 3)
     assert fields["Ks"][0][0, 0] == pytest.approx(1.2 * 160)
     assert photos.read(tmp_path, IngestSection(max_side=8192))["images"].shape == (3, 160, 320, 3)
+
+
+def test_depth_that_is_not_wanted_is_left_out_and_nothing_else(tmp_path):
+    from chebsplat.formats.artifact import read_manifest
+    from chebsplat.formats.capture import read_capture
+
+    write_colmap(tmp_path / "source")
+    made = []
+    for depth in ("auto", "off"):
+        config = {"source": {"kind": "colmap", "path": str(tmp_path / "source")}, "ingest": {"depth": depth}}
+        assert run_stage("ingest", tmp_path / depth, config=config) == 0
+        made.append(read_capture(tmp_path / depth))
+    assert made[0].depth is not None and made[1].depth is None
+    np.testing.assert_array_equal(made[0].images[:], made[1].images[:])
+    assert read_manifest(tmp_path / "off").facts["left_out"]["depth"] == "ingest.depth is off"
