@@ -49,6 +49,9 @@ BENCHMARKS = {
         "lift", "features lifted to a finished scene: seconds, error", ("train", "teacher"), "train.features=lifted"
     ),
     "trust": Benchmark("trust", "whether views' agreement ranks 2D teachers as their true mIoU does; no training"),
+    "label": Benchmark(
+        "label", "which Gaussians of a PLY are named right by shape alone; trains its scenes for colour"
+    ),
     "teaching": Benchmark("teaching", "what the encoder of points owes to rooms, radii, descriptor, size"),
     "query": Benchmark("query", "asking at the suggested cut: precision, recall, absent words refused; trains 5 rooms"),
     "layouts": Benchmark("layouts", "the exported layouts: bytes, and images beside the checkpoint's", ("export",)),
