@@ -49,6 +49,7 @@ BENCHMARKS = {
         "lift", "features lifted to a finished scene: seconds, error", ("train", "teacher"), "train.features=lifted"
     ),
     "trust": Benchmark("trust", "whether views' agreement ranks 2D teachers as their true mIoU does; no training"),
+    "mesh": Benchmark("mesh", "the mesh against exact depth: F-score, labels, seconds by voxel", ("report",)),
     "label": Benchmark(
         "label", "which Gaussians of a PLY are named right by shape alone; trains its scenes for colour"
     ),

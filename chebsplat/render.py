@@ -7,6 +7,7 @@ import torch
 from torch import Tensor
 
 from chebsplat.rasterize import rasterize
+from chebsplat.rasterize.depths import depths
 from chebsplat.splats.gaussians import activated, surface_of
 from chebsplat.splats.planes import inverse_depths
 from chebsplat.splats.sh import eval_sh
@@ -62,18 +63,13 @@ class SceneRenderer:
 
         Args: nearest: scene units; what is nearer has no depth.
         Returns: depth is nan where nothing is covered.
-        Choices: Gaussians are planes, whose inverse depths are averaged by α T (`splats.planes.inverse_depths`).
+        Choices: Gaussians are planes (`splats.planes.inverse_depths`), whose depth `rasterize.depths` takes where most
+          of a pixel's light has been gathered: their mean lies in front of walls.
         """
         index = in_frustum(self.means, view, self.reach)
         K, pose = (matrix.numpy().astype(np.float64) for matrix in (view.K, view.viewmat))
         means = self.means[index].numpy().astype(np.float64) @ pose[:3, :3].T + pose[:3, 3]
         planes = inverse_depths(means, self.normals[index.numpy()] @ pose[:3, :3].T, K, nearest)
-        gaussians = (self.means[index], self.quats[index], self.scales[index], self.opacities[index])
-        camera = (view.viewmat[None], view.K[None], view.width, view.height)
-        render, alpha, _ = rasterize(*gaussians, torch.from_numpy(planes.astype(np.float32)), *camera)
-        u, v = np.meshgrid(np.arange(view.width) + 0.5, np.arange(view.height) + 0.5)
-        covered, q = alpha[0, ..., 0].numpy(), render[0].numpy()
-        inverse = q[..., 0] * u + q[..., 1] * v + q[..., 2]
-        seen = (covered > 1e-3) & (inverse > 0) & (inverse * nearest < covered)
-        depth = np.divide(covered, inverse, out=np.full(covered.shape, np.nan), where=seen)
-        return depth.astype(np.float32), covered
+        gaussians = tuple(part[index].numpy() for part in (self.means, self.quats, self.scales, self.opacities))
+        depth, covered = depths(gaussians, pose, K, (view.width, view.height), planes)
+        return np.where((covered > 1e-3) & (depth > nearest) & np.isfinite(depth), depth, np.float32(np.nan)), covered

@@ -30,7 +30,8 @@ def test_the_depth_of_a_view_equals_the_transcription(part):
     weights = lift_reference.pixel_weights(gaussians, viewmat, K, size)
     order = ordered(gaussians, viewmat)
     passed = weights[..., order].cumsum(-1)
-    within = np.clip(passed, *part) - np.clip(passed - weights[..., order], *part)
+    low, high = (bound * passed[..., -1:] for bound in part)
+    within = np.clip(passed, low, high) - np.clip(passed - weights[..., order], low, high)
     y, x = np.indices(found.shape) + 0.5
     inverse = np.stack([x, y, np.ones_like(x)], -1) @ planes[order].T.astype(np.float64)
     total, summed = within.sum(-1), (within * inverse).sum(-1)

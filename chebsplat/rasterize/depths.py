@@ -38,16 +38,19 @@ def _depth_tile(splats, ranks, start, stop, left, top, low, high, depth, covered
             if x >= width or y >= height:
                 continue
             u, v = np.float32(x + 0.5), np.float32(y + 0.5)
+            total = ZERO
+            for m in range(count):
+                total += weights[m, lane]
             passed, part, inverse = ZERO, ZERO, ZERO
             for m in range(count):
                 after = passed + weights[m, lane]
-                within = min(after, high) - max(passed, low)
+                within = min(after, high * total) - max(passed, low * total)
                 passed = after
                 if within > ZERO:
                     i = ranks[start + rows[m]]
                     plane = splats[i, SHAPE] * u + splats[i, SHAPE + 1] * v + splats[i, SHAPE + 2]
                     inverse, part = inverse + within * plane, part + within
-            covered[y, x] = passed
+            covered[y, x] = total
             if part > ZERO and inverse > ZERO:
                 depth[y, x] = part / inverse
 
@@ -81,7 +84,7 @@ def depths(
       gaussians: means [N, 3], quats [N, 4], scales [N, 3], opacities [N], activated, float32.
       viewmat:   [4, 4] world to camera, OpenCV axes; K [3, 3] pixels; size: width and height, pixels.
       planes:    q [N, 3] of each Gaussian, 1 / z = q · (u, v, 1) (`splats.planes.inverse_depths`).
-      part:      of what covers a pixel, from where to where its Σ α T tells the depth; (0, 1) is the mean.
+      part:      of Σ α T of a pixel, front to back, which tells its depth; (0, 1) is the mean.
     Choices: inverse depth is averaged within the part. On two finished rooms whose Gaussians have a median opacity of
       .25 the mean lies 3 to 7 cm in front of the surface; between .7 and .9 the median error is 1.4 cm.
     """

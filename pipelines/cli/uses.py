@@ -1,4 +1,4 @@
-"""What is done with a finished scene, or before one: query, page, extract, encode, lift, import_, label, check-teacher,
+"""What is done with a finished scene, or before one: query, page, mesh, extract, encode, lift, label, check-teacher,
 get-teacher, knowledge, calibrate, import.
 """
 
@@ -265,4 +265,25 @@ def page(scene: str, out: Path, sh: int, words: Path | None, against: str) -> No
     print(out)
 
 
-COMMANDS = (query, calibrate, check_teacher, get_teacher, extract, encode, lift, import_, label, knowledge, page)
+@click.command()
+@click.argument("scene")
+@click.option("--out", type=click.Path(path_type=Path), required=True, help="the .ply or .glb to write")
+@click.option("--voxel", type=click.FloatRange(0, min_open=True), help="edge, scene units; default: 1/250 of the room")
+@click.option("--triangles", type=click.IntRange(4), default=200_000, show_default=True, help="at most")
+@click.option("--raw", is_flag=True, help="as it was fused: nothing removed, closed or decimated")
+def mesh(scene: str, out: Path, voxel: float | None, triangles: int, raw: bool) -> None:
+    """Write the surface of a finished SCENE as triangles with colours and labels, in the scene's frame."""
+    import logging
+
+    from chebsplat.pipelines.api import load
+    from chebsplat.stages.mesh import write
+
+    logging.basicConfig(stream=sys.stderr, format="mesh: %(message)s", level="WARNING", force=True)
+    logging.getLogger("chebsplat").setLevel("INFO")
+    facts = write(load(scene), out, voxel, triangles, raw)
+    print("voxels of {voxel:.3g}: {n_fused:,} triangles, {n_triangles:,} of them written, {n_vertices:,} vertices"
+          .format(**facts), file=sys.stderr)  # fmt: skip
+    print(out)
+
+
+COMMANDS = (query, calibrate, check_teacher, get_teacher, extract, encode, lift, import_, label, knowledge, page, mesh)

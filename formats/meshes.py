@@ -1,0 +1,176 @@
+"""Meshes: fused from depth by open3d, cleaned by pymeshlab, written as PLY and GLB."""
+
+from __future__ import annotations
+
+import json
+import struct
+from collections.abc import Iterable
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from chebsplat.errors import ConfigError
+from chebsplat.formats.files import atomic_path
+
+BLOCK = 16  # voxels along a block of the grid
+N_BLOCKS = 20_000  # that the grid begins with; it grows
+TRUNCATED = 4.0  # voxels, where the signed distance ends
+LEAST_WEIGHT = 3.0  # views that a voxel of the surface was seen by
+GLTF_FLOAT, GLTF_UINT, GLTF_UBYTE, GLTF_VERTICES, GLTF_INDICES = 5126, 5125, 5121, 34962, 34963
+
+
+class Mesh(NamedTuple):
+    """vertices f32 [V, 3] scene units; triangles i32 [T, 3]; colors u8 [V, 3]; labels i32 [V], -1: none, or None."""
+
+    vertices: np.ndarray
+    triangles: np.ndarray
+    colors: np.ndarray
+    labels: np.ndarray | None = None
+
+
+class Frame(NamedTuple):
+    """depth f32 [H, W] scene units along the camera's axis, 0 where unknown; color u8 [H, W, 3]; K [3, 3]; pose [4, 4]
+    world to camera.
+    """
+
+    depth: np.ndarray
+    color: np.ndarray
+    K: np.ndarray
+    pose: np.ndarray
+
+
+def fused(frames: Iterable[Frame], voxel: float, farthest: float) -> Mesh:
+    """The surface that depth images show, by a truncated signed distance on voxels of this edge, scene units.
+
+    Args: farthest: depth beyond it is not looked at.
+    Choices: truncated at four voxels; a voxel counts that LEAST_WEIGHT views saw. open3d takes the pixel that a point
+      falls into, so that the centre of the first one is at 0.5, as ours is.
+    """
+    import open3d as o3d
+
+    core: Any = o3d.core  # its stubs know no NumPy
+    new_grid: Any = o3d.t.geometry.VoxelBlockGrid
+    names, widths = ("tsdf", "weight", "color"), ((1,), (1,), (3,))
+    grid = new_grid(names, (core.float32,) * 3, widths, voxel, BLOCK, N_BLOCKS, core.Device("CPU:0"))
+    n_seen = 0
+    for frame in frames:
+        if not (frame.depth > 0).any():
+            continue
+        depth = o3d.t.geometry.Image(core.Tensor(np.ascontiguousarray(frame.depth, np.float32)))
+        color = o3d.t.geometry.Image(core.Tensor(np.ascontiguousarray(frame.color, np.float32) / 255))
+        K, pose = (core.Tensor(np.ascontiguousarray(matrix, np.float64)) for matrix in (frame.K, frame.pose))
+        blocks = grid.compute_unique_block_coordinates(depth, K, pose, 1.0, farthest, TRUNCATED)
+        grid.integrate(blocks, depth, color, K, pose, 1.0, farthest, TRUNCATED)
+        n_seen += 1
+    found = grid.extract_triangle_mesh(LEAST_WEIGHT) if n_seen else None
+    if found is None or not len(found.vertex.positions):
+        empty = np.zeros((0, 3))
+        return Mesh(empty.astype(np.float32), empty.astype(np.int32), empty.astype(np.uint8))
+    colors = (found.vertex.colors.numpy() * 255).round().clip(0, 255).astype(np.uint8)
+    return Mesh(found.vertex.positions.numpy(), found.triangle.indices.numpy().astype(np.int32), colors)
+
+
+def cleaned(mesh: Mesh, n_triangles: int, least_diagonal: float, longest_hole: int) -> Mesh:
+    """The mesh without what floats, its small holes closed, in at most so many triangles. Labels are dropped.
+
+    Args: least_diagonal: of a connected part that stays, scene units; longest_hole: edges of a hole that is closed.
+    Raises: ConfigError where pymeshlab, or a library of the system that it needs, is missing.
+    Choices: a vertex takes the colour of the nearest one before.
+    """
+    from scipy.spatial import cKDTree
+
+    try:
+        import pymeshlab
+    except ImportError as error:  # of the package, or of a library that it is linked to
+        raise ConfigError(
+            f"cleaning a mesh needs pymeshlab ({error}); install the extra: pip install 'chebsplat[mesh]', and where a "
+            "library of the system is named, that one; or ask for the mesh as it is: --raw"
+        ) from None
+    meshes = pymeshlab.MeshSet(verbose=False)
+    meshes.add_mesh(pymeshlab.Mesh(mesh.vertices.astype(np.float64), mesh.triangles))
+    meshes.meshing_remove_connected_component_by_diameter(mincomponentdiag=pymeshlab.PureValue(least_diagonal))
+    meshes.meshing_repair_non_manifold_edges()
+    meshes.meshing_close_holes(maxholesize=longest_hole, newfaceselected=False)  # a selection alone would be decimated
+    if meshes.current_mesh().face_number() > n_triangles:
+        meshes.meshing_decimation_quadric_edge_collapse(
+            targetfacenum=n_triangles, preserveboundary=True, preservenormal=True
+        )
+    meshes.meshing_remove_unreferenced_vertices()
+    kept = meshes.current_mesh()
+    vertices, triangles = kept.vertex_matrix().astype(np.float32), kept.face_matrix().astype(np.int32)
+    if not len(vertices):
+        return Mesh(vertices.reshape(0, 3), triangles.reshape(0, 3), np.zeros((0, 3), np.uint8))
+    return Mesh(vertices, triangles, mesh.colors[cKDTree(mesh.vertices).query(vertices)[1]])
+
+
+def write_mesh(path: Path, mesh: Mesh, names: list[str] | None = None) -> None:
+    """Write the mesh as .ply or .glb, by the file's name; labels with it, and what they are called.
+
+    Raises: ConfigError on another suffix.
+    Choices: PLY has an int property `label`, -1 for none, and comments `label ID NAME`. GLB has `_LABEL` as a float
+      attribute, 255 values and more without loss, and the names in the mesh's extras; its axes are the scene's.
+    """
+    writers = {".ply": _ply, ".glb": _glb}
+    if path.suffix.lower() not in writers:
+        raise ConfigError(f"{path}: a mesh is written as .ply or .glb")
+    with atomic_path(path) as temporary:
+        writers[path.suffix.lower()](temporary, mesh, names or [])
+
+
+def _ply(path: Path, mesh: Mesh, names: list[str]) -> None:
+    from plyfile import PlyData, PlyElement
+
+    kinds = [(axis, "f4") for axis in "xyz"] + [(channel, "u1") for channel in ("red", "green", "blue")]
+    vertices = np.zeros(len(mesh.vertices), kinds + ([("label", "i4")] if mesh.labels is not None else []))
+    for column, axis in enumerate("xyz"):
+        vertices[axis] = mesh.vertices[:, column]
+    for column, channel in enumerate(("red", "green", "blue")):
+        vertices[channel] = mesh.colors[:, column]
+    if mesh.labels is not None:
+        vertices["label"] = mesh.labels
+    faces = np.zeros(len(mesh.triangles), [("vertex_indices", "i4", (3,))])
+    faces["vertex_indices"] = mesh.triangles
+    comments = [f"label {k} {name.encode('ascii', 'backslashreplace').decode()}" for k, name in enumerate(names)]
+    elements = [PlyElement.describe(vertices, "vertex"), PlyElement.describe(faces, "face")]
+    PlyData(elements, byte_order="<", comments=comments).write(str(path))
+
+
+def _glb(path: Path, mesh: Mesh, names: list[str]) -> None:
+    opaque = np.concatenate([mesh.colors, np.full((len(mesh.colors), 1), 255, np.uint8)], 1)
+    parts = [
+        ("POSITION", np.ascontiguousarray(mesh.vertices, np.float32), GLTF_FLOAT, "VEC3"),
+        ("COLOR_0", opaque, GLTF_UBYTE, "VEC4"),
+    ]
+    if mesh.labels is not None:
+        parts.append(("_LABEL", mesh.labels.astype(np.float32), GLTF_FLOAT, "SCALAR"))
+    parts.append(("indices", mesh.triangles.astype(np.uint32).ravel(), GLTF_UINT, "SCALAR"))
+    views, accessors, offset = [], [], 0
+    for k, (name, values, kind, shape) in enumerate(parts):
+        target = GLTF_INDICES if name == "indices" else GLTF_VERTICES
+        views.append({"buffer": 0, "byteOffset": offset, "byteLength": values.nbytes, "target": target})
+        accessor = {"bufferView": k, "componentType": kind, "count": len(values), "type": shape}
+        if name == "POSITION":
+            accessor |= {"min": values.min(0).tolist(), "max": values.max(0).tolist()}
+        accessors.append(accessor | ({"normalized": True} if name == "COLOR_0" else {}))
+        offset += values.nbytes
+    attributes = {name: k for k, (name, *_) in enumerate(parts) if name != "indices"}
+    primitive = {"attributes": attributes, "indices": len(parts) - 1}
+    document = {
+        "asset": {"version": "2.0", "generator": "chebsplat"},
+        "scene": 0,
+        "scenes": [{"nodes": [0]}],
+        "nodes": [{"mesh": 0}],
+        "meshes": [{"primitives": [primitive], "extras": {"label_names": names}}],
+        "buffers": [{"byteLength": offset}],
+        "bufferViews": views,
+        "accessors": accessors,
+    }
+    text = json.dumps(document).encode()
+    text += b" " * (-len(text) % 4)
+    with path.open("wb") as stream:
+        stream.write(struct.pack("<4sII", b"glTF", 2, 12 + 8 + len(text) + 8 + offset))
+        stream.write(struct.pack("<I4s", len(text), b"JSON") + text)
+        stream.write(struct.pack("<I4s", offset, b"BIN\0"))
+        for _, values, _, _ in parts:
+            stream.write(values.tobytes())

@@ -1,0 +1,116 @@
+"""mesh: the surface of a finished scene as triangles with colours and labels."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from chebsplat.errors import ConfigError, DataFailure
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator
+
+    import numpy as np
+
+    from chebsplat.formats.meshes import Frame, Mesh
+    from chebsplat.stages.opened import Camera, OpenedScene
+    from chebsplat.stages.progress import Progress
+
+N_VOXELS = 250  # along the longest side of what the cameras see, where no voxel is asked for
+OPAQUE = 0.6  # least coverage of a pixel whose depth counts
+STEP = 0.05  # of its depth, by which a neighbouring pixel may lie deeper: beyond, a pixel is on an edge
+LONGEST_HOLE = 60  # edges
+LEAST_PART = 12.0  # voxels across a connected part that stays
+
+
+def mesh_of(
+    scene: OpenedScene, voxel: float | None, n_triangles: int, progress: Progress, raw: bool = False
+) -> tuple[Mesh, dict[str, Any]]:
+    """The mesh of a scene in its own frame and units, and facts: voxel, and how many triangles before and after.
+
+    Args: voxel: edge, scene units; None: the 250th part of the room; n_triangles: at most; raw: nothing is cleaned.
+    Raises: ConfigError on a scene without cameras; DataFailure where its Gaussians show no surface.
+    Choices: depth is that of `render_depth`, from every view of the capture; a pixel on an edge of depth has none. A
+      vertex means what the Gaussians around it mean (`evaluation.surface.features_at`).
+    """
+    from chebsplat.formats.meshes import cleaned, fused
+
+    if not scene.cameras:
+        raise ConfigError(f"{scene.source} has no cameras to see its surface from; open a scene that was trained")
+    extent = room_extent(scene)
+    edge = extent / N_VOXELS if voxel is None else voxel
+    made = fused(frames(scene, scene.cameras, progress), edge, 2 * extent)
+    if not len(made.triangles):
+        raise DataFailure(f"{scene.source} shows no surface of voxels of {edge:.3g}; choose larger ones: --voxel")
+    facts = {"voxel": edge, "n_fused": len(made.triangles)}
+    if not raw:
+        made = cleaned(made, n_triangles, LEAST_PART * edge, LONGEST_HOLE)
+    if not len(made.triangles):
+        raise DataFailure(f"nothing of the surface is larger than {LEAST_PART:g} voxels of {edge:.3g}; take --raw")
+    if scene.features is not None and scene.label_embeddings is not None:
+        made = made._replace(labels=labels_at(scene, made.vertices))
+    return made, facts | {"n_triangles": len(made.triangles), "n_vertices": len(made.vertices)}
+
+
+def frames(scene: OpenedScene, cameras: list[Camera], progress: Progress) -> Iterator[Frame]:
+    """Depth of the surface and colour from each camera."""
+    from chebsplat.formats.meshes import Frame
+
+    for camera, _ in progress.track(cameras, len(cameras), "views"):
+        view = camera.view()
+        depth, covered = scene.renderer.render_depth(view)
+        depth[covered < OPAQUE] = 0
+        color, _ = scene.renderer.render(view)
+        yield Frame(without_edges(depth), color, camera.K, camera.cam_from_world)
+
+
+def without_edges(depth: np.ndarray) -> np.ndarray:
+    """Depth [H, W], 0 or nan where unknown, as f32 with 0 there, and where a neighbour is deeper or nearer by STEP."""
+    import numpy as np
+
+    logarithm = np.log(np.where(depth > 0, depth, np.nan))
+    on_edge = np.zeros(depth.shape, bool)
+    for axis in (0, 1):
+        far = np.abs(np.diff(logarithm, axis=axis, append=np.nan)) > STEP  # nan is no edge
+        on_edge |= far | np.roll(far, 1, axis)
+    return np.where(on_edge | np.isnan(logarithm), 0, depth).astype(np.float32)
+
+
+def room_extent(scene: OpenedScene) -> float:
+    """The longest side of the box that holds 98 % of the opaque Gaussians along each axis, scene units."""
+    import numpy as np
+
+    means, logits = scene.parameters["means"], scene.parameters["logit_opacities"]
+    solid = means[logits > 0] if (logits > 0).any() else means
+    low, high = np.quantile(solid, (0.01, 0.99), axis=0)
+    return max(float((high - low).max()), 1e-9)
+
+
+def labels_at(scene: OpenedScene, points: np.ndarray) -> np.ndarray:
+    """The label of each point i32 [M], of what the Gaussians around it mean; -1 where there is none."""
+    import numpy as np
+    import torch
+
+    from chebsplat.evaluation.surface import features_at
+    from chebsplat.labels.decode import decode_labels
+    from chebsplat.splats.gaussians import activated
+
+    raw = {name: torch.from_numpy(np.ascontiguousarray(values)) for name, values in scene.parameters.items()}
+    means, quats, scales, opacities = (part.numpy() for part in activated(raw))
+    assert scene.features is not None and scene.label_embeddings is not None
+    features, weights = features_at(points, means, quats, scales, opacities, scene.features)
+    return np.where(weights > 0, decode_labels(features, scene.label_embeddings), -1).astype(np.int32)
+
+
+def write(scene: OpenedScene, out: Path, voxel: float | None, n_triangles: int, raw: bool) -> dict[str, Any]:
+    """Make and write the mesh of a scene; returns the facts. Raises ConfigError where `out` exists."""
+    from chebsplat.formats.meshes import write_mesh
+    from chebsplat.stages.progress import Progress
+
+    if out.suffix.lower() not in (".ply", ".glb"):
+        raise ConfigError(f"--out {out}: a mesh is written as .ply or .glb")
+    if out.exists():
+        raise ConfigError(f"{out} exists; remove it, or choose another --out")
+    mesh, facts = mesh_of(scene, voxel, n_triangles, Progress(), raw)
+    write_mesh(out, mesh, scene.label_names)
+    return facts

@@ -1,0 +1,119 @@
+"""A scene's mesh lies on its surface, in its frame; what floats goes, holes close, and both files say the same."""
+
+import json
+import struct
+import sys
+
+import numpy as np
+import pytest
+
+from chebsplat.errors import ConfigError
+from chebsplat.formats.meshes import Frame, Mesh, cleaned, fused, write_mesh
+from chebsplat.stages.mesh import STEP, without_edges
+from chebsplat.synthetic.path import intrinsics, look_at
+
+SIZE = 96, 72
+K = intrinsics(*SIZE)
+
+
+def of_a_ball(radius=0.5):
+    """Depth and colour of a ball at the origin from all around, by its equation."""
+    u, v = np.meshgrid(np.arange(SIZE[0]) + 0.5, np.arange(SIZE[1]) + 0.5)
+    rays = np.stack([u, v, np.ones_like(u)], -1) @ np.linalg.inv(K).T
+    for yaw in np.linspace(0, 2 * np.pi, 12, endpoint=False):
+        for height in (-1.2, 0.1, 1.2):
+            pose = look_at(np.array([1.5 * np.cos(yaw), 1.5 * np.sin(yaw), height]), np.zeros(3))
+            center = pose[:3, 3]
+            squared, along = (rays**2).sum(-1), rays @ center
+            root = along**2 - squared * (center @ center - radius**2)
+            depth = np.where(root > 0, (along - np.sqrt(np.maximum(root, 0))) / squared, 0).astype(np.float32)
+            yield Frame(depth, np.full((*depth.shape, 3), (200, 40, 90), np.uint8), K, pose)
+
+
+@pytest.fixture(scope="module")
+def ball():
+    return fused(of_a_ball(), 0.02, 5.0)
+
+
+def test_a_fused_mesh_lies_on_the_surface_in_the_cameras_world_and_bears_its_colour(ball):
+    radii = np.linalg.norm(ball.vertices, axis=1)
+    assert len(ball.triangles) > 1000
+    assert np.quantile(np.abs(radii - 0.5), 0.9) < 0.012  # half a voxel; distances along rays grow at the ball's rim
+    assert np.abs(ball.vertices.mean(0)).max() < 0.005
+    assert np.abs(ball.colors.astype(int) - (200, 40, 90)).max() <= 1
+
+
+def test_views_without_depth_make_an_empty_mesh():
+    frame = next(of_a_ball())
+    empty = fused([frame._replace(depth=np.zeros_like(frame.depth))], 0.02, 5.0)
+    assert [len(part) for part in (empty.vertices, empty.triangles, empty.colors)] == [0, 0, 0]
+
+
+def test_cleaning_removes_what_floats_closes_holes_and_keeps_to_the_number_of_triangles(ball):
+    pytest.importorskip("pymeshlab", reason="the extra mesh is not installed")
+    holed = ball.triangles[np.linalg.norm(ball.vertices[ball.triangles].mean(1) - (0, 0.5, 0), axis=1) > 0.05]
+    speck = np.array([[2, 2, 2], [2.02, 2, 2], [2, 2.02, 2]], np.float32)
+    mesh = Mesh(
+        np.concatenate([ball.vertices, speck]),
+        np.concatenate([holed, len(ball.vertices) + np.arange(3)[None]]).astype(np.int32),
+        np.concatenate([ball.colors, np.zeros((3, 3), np.uint8)]),
+    )
+    whole = cleaned(mesh, 10**6, 0.2, 100)
+    assert np.linalg.norm(whole.vertices, axis=1).max() < 0.6
+    edges = np.sort(whole.triangles[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2), axis=1)
+    assert (np.unique(edges, axis=0, return_counts=True)[1] == 2).all()
+    fewer = cleaned(mesh, 500, 0.2, 100)
+    assert len(fewer.triangles) <= 500
+    assert np.abs(np.linalg.norm(fewer.vertices, axis=1) - 0.5).max() < 0.04
+    assert len(fewer.colors) == len(fewer.vertices)
+
+
+def test_a_missing_pymeshlab_is_named_with_what_helps(ball, monkeypatch):
+    monkeypatch.setitem(sys.modules, "pymeshlab", None)
+    with pytest.raises(ConfigError, match=r"chebsplat\[mesh\].*--raw"):
+        cleaned(ball, 100, 0.1, 10)
+
+
+def test_pixels_at_a_step_of_depth_and_without_depth_are_left_out():
+    depth = np.full((6, 8), 2.0, np.float32)
+    depth[:, 4:] *= 1 + 2 * STEP
+    depth[2, 1] = np.nan
+    found = without_edges(depth)
+    assert (found[:, 3:5] == 0).all()
+    assert found[2, 1] == 0
+    assert (np.delete(found, (3, 4), axis=1) > 0).sum() == 6 * 6 - 1
+
+
+def test_both_files_hold_the_same_mesh(ball, tmp_path):
+    from plyfile import PlyData
+
+    labels = np.where(ball.vertices[:, 2] > 0, 1, -1).astype(np.int32)
+    mesh, names = ball._replace(labels=labels), ["table", "café"]
+    write_mesh(tmp_path / "a.ply", mesh, names)
+    write_mesh(tmp_path / "a.glb", mesh, names)
+    read = PlyData.read(tmp_path / "a.ply")
+    np.testing.assert_array_equal(np.stack([read["vertex"][axis] for axis in "xyz"], 1), mesh.vertices)
+    np.testing.assert_array_equal(np.stack(read["face"]["vertex_indices"]), mesh.triangles)
+    np.testing.assert_array_equal(read["vertex"]["label"], labels)
+    assert read.comments == ["label 0 table", r"label 1 caf\xe9"]
+    raw = (tmp_path / "a.glb").read_bytes()
+    magic, version, length, size = struct.unpack("<4sIII", raw[:16])
+    assert (magic, version, length) == (b"glTF", 2, len(raw))
+    document = json.loads(raw[20 : 20 + size])
+    binary = raw[28 + size :]
+    found = []
+    for accessor, view in zip(document["accessors"], document["bufferViews"], strict=True):
+        kind = {5126: "<f4", 5125: "<u4", 5121: "u1"}[accessor["componentType"]]
+        part = binary[view["byteOffset"] : view["byteOffset"] + view["byteLength"]]
+        found.append(np.frombuffer(part, kind))
+        assert view["byteOffset"] % 4 == 0
+    np.testing.assert_array_equal(found[0].reshape(-1, 3), mesh.vertices)
+    np.testing.assert_array_equal(found[1].reshape(-1, 4)[:, :3], mesh.colors)
+    np.testing.assert_array_equal(found[2], labels)
+    np.testing.assert_array_equal(found[3].reshape(-1, 3), mesh.triangles)
+    assert document["meshes"][0]["extras"]["label_names"] == names
+
+
+def test_other_files_than_ply_and_glb_are_refused(ball, tmp_path):
+    with pytest.raises(ConfigError, match=r"\.ply or \.glb"):
+        write_mesh(tmp_path / "a.obj", ball)
