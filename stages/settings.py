@@ -53,6 +53,9 @@ class IngestSection(Section):
         None, "at most so many that are trained on, evenly chosen; all test views stay", 2, 100_000
     )
     depth: Literal["auto", "off"] = setting("auto", "that the source brings: taken, or left out as if it brought none")
+    lens: Literal["estimated", "straight"] = setting(
+        "estimated", "of plain photos: distortion estimated from them, and undone; or none assumed"
+    )
     classes: dict[Text, list[Text]] | None = setting(
         None, "names, each with the source's classes that it stands for; what stands for none is not counted"
     )
@@ -76,6 +79,10 @@ class SfmSection(Section):
     n_matched: int = number(10, "views that each is matched with, where not all are: nearest, or most alike", 2, 1000)
     poses: Literal["auto", "given", "adjusted"] = setting(
         "auto", "that the source brings: kept, or adjusted to the photos; auto: adjusted where matches miss them"
+    )
+    dense: Literal["auto", "on", "off"] = setting(
+        "auto",
+        "add points of a plane sweep of the photos; auto: where half their cells hold no point, and no depth is given",
     )
     min_registered: float = number(0.5, "fraction of the views that a reconstruction must register", 1e-3, 1)
     seed: int = seed("of the choice among points, and of the reconstruction")

@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, Any
 
 from chebsplat.errors import DataFailure
 from chebsplat.stages.command import Job, command
+from chebsplat.stages.dense import MOST, swept, wants_more
 from chebsplat.stages.pose_check import wants_adjustment
 
 if TYPE_CHECKING:
@@ -49,6 +50,8 @@ def run(job: Job) -> None:
         cloud = reconstruction.reconstruct(job, capture, settings, adjusted)
         if "poses_kept" in cloud["notes"] and capture.depth is not None:
             cloud = filled(cloud, from_depth(job, capture, settings, cloud["cam_from_world"]), settings.max_points)
+    if len(cloud["means"]) >= 16 and wants_more(job, capture, cloud, settings):
+        cloud = filled(cloud, swept(job, capture, cloud), min(MOST, settings.max_points), "n_swept")
     means = cloud["means"]
     if len(means) < 16:
         raise DataFailure(f"only {len(means)} points were found, at least 16 are needed; add views with more overlap")
@@ -73,9 +76,10 @@ def run(job: Job) -> None:
     )
 
 
-def filled(cloud: dict[str, Any], more: dict[str, Any], count: int) -> dict[str, Any]:
+def filled(cloud: dict[str, Any], more: dict[str, Any], count: int, name: str = "n_from_depth") -> dict[str, Any]:
     """A cloud with the points of another one of the same views between its own, at most `count`, one a voxel.
 
+    Args:    name: of the note that counts those that were added.
     Choices: triangulated points show where the photos have texture, those of depth what lies between; a voxel with both
       keeps the triangulated one.
     """
@@ -87,7 +91,7 @@ def filled(cloud: dict[str, Any], more: dict[str, Any], count: int) -> dict[str,
     row[own] = np.arange(len(own))
     tracks = cloud["tracks"][row[cloud["tracks"][:, 0]] >= 0]
     both = {name: np.concatenate([cloud[name], more[name]])[kept] for name in ("means", "colors", "seen_from")}
-    notes = cloud["notes"] | {"n_from_depth": len(kept) - len(own)}
+    notes = cloud["notes"] | {name: len(kept) - len(own)}
     return cloud | both | {"tracks": np.stack([row[tracks[:, 0]], tracks[:, 1]], 1), "notes": notes}
 
 

@@ -40,11 +40,18 @@ def posed(cam_from_world: np.ndarray, n_neighbors: int) -> np.ndarray:
       photos with poses (fox) 10 neighbours are a quarter of the pairs and leave 98 % of the points; frusta at guessed
       depths choose no better.
     """
+    return nearest(apart(cam_from_world), n_neighbors)
+
+
+def apart(cam_from_world: np.ndarray) -> np.ndarray:
+    """How far two views lie apart [V, V], in median distances and TURNs; infinite beyond APART and with itself."""
     eye, forward = centers(cam_from_world), cam_from_world[:, 2, :3]
     distance = np.linalg.norm(eye[:, None] - eye[None], axis=-1)
     angle = np.degrees(np.arccos(np.clip(forward @ forward.T, -1, 1)))
     usual = float(np.median(distance[np.triu_indices(len(eye), 1)])) or 1.0
-    return nearest(np.where(angle > APART, np.inf, distance / usual + angle / TURN), n_neighbors)
+    cost = np.where(angle > APART, np.inf, distance / usual + angle / TURN)
+    np.fill_diagonal(cost, np.inf)
+    return cost
 
 
 def sequential(descriptors: list[np.ndarray], n_neighbors: int) -> np.ndarray:

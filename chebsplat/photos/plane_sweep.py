@@ -1,0 +1,90 @@
+"""Depth of posed photos by a plane sweep: how well views agree at each of many depths (Collins 1996; MVSNet's volumes).
+
+Images are grey f32 [V, H, W] in [0, 1], reduced; cameras K [V, 3, 3] in their pixels (centres at half integers) and
+cam_from_world [V, 4, 4]; depth is z in scene units.
+"""
+
+from __future__ import annotations
+
+import torch
+import torch.nn.functional as F
+from torch import Tensor
+
+WINDOW, SMOOTH = 2, 2  # half widths in pixels: of the patches that are compared, and of the mean over their costs
+FLAT = 1e-4  # variance that patches are given: two without texture are alike
+BRIGHT = 0.3  # weight of a difference in brightness, as a logarithm, beside 1 - correlation
+OUTSIDE = 4.0  # cost of a pixel that the other view does not see
+BEST = 2  # views that must agree, of the neighbours: others may be covered
+
+
+def box_mean(values: Tensor, half: int) -> Tensor:
+    """Mean over a square window of each pixel of [..., H, W], the border repeated."""
+    padded = F.pad(values.reshape(-1, 1, *values.shape[-2:]), (half,) * 4, mode="replicate")
+    return F.avg_pool2d(padded, 2 * half + 1, 1).reshape(values.shape)
+
+
+def rays(K: Tensor, height: int, width: int) -> Tensor:
+    """Directions [3, H W] of a camera's pixels, with z = 1."""
+    y, x = torch.meshgrid(torch.arange(height) + 0.5, torch.arange(width) + 0.5, indexing="ij")
+    pixels: Tensor = torch.stack([x, y, torch.ones_like(x)]).reshape(3, -1)
+    directions: Tensor = torch.linalg.inv(K) @ pixels
+    return directions
+
+
+def swept_depth(
+    grey: Tensor, valid: Tensor, Ks: Tensor, poses: Tensor, view: int, neighbors: list[int], depths: Tensor
+) -> tuple[Tensor, Tensor]:
+    """The depth [H, W] of a view, among `depths` [D], at which its neighbours look most like it, and its cost [H, W].
+
+    Args:    valid f32 [V, H, W]: 1 where a pixel counts.
+    Choices: the cost is one minus the correlation of patches, which no exposure changes, and a little of the difference
+      in brightness, without which flat patches are alike at any depth; of the neighbours the best two count.
+    """
+    height, width = grey.shape[1:]
+    mean, spread = _moments(grey[view])
+    costs = []
+    for other in neighbors:
+        between = poses[other] @ torch.linalg.inv(poses[view])
+        at = Ks[other] @ between[:3, :3] @ rays(Ks[view], height, width) * depths[:, None, None]
+        x, y, z = (at + Ks[other] @ between[:3, 3:]).unbind(1)  # each [D, H W]
+        z = torch.where(z > 1e-6, z, torch.nan)
+        place = torch.stack([x / z / width * 2 - 1, y / z / height * 2 - 1], -1).nan_to_num(nan=-9.0)
+        seen = F.grid_sample(
+            torch.stack([grey[other], valid[other]])[None].expand(len(depths), -1, -1, -1),
+            place.reshape(len(depths), height, width, 2),
+            align_corners=False,
+        )
+        warped, counts = seen[:, 0], seen[:, 1] > 0.9
+        their_mean, their_spread = _moments(warped)
+        covariance = box_mean(warped * grey[view], WINDOW) - their_mean * mean
+        correlation = ((covariance + FLAT) / (their_spread * spread + FLAT)).clamp(-1, 1)
+        brighter = (their_mean.clamp_min(1e-3) / mean.clamp_min(1e-3)).log().abs().clamp_max(1)
+        cost = torch.where(counts, 1 - correlation + BRIGHT * brighter, OUTSIDE)
+        costs.append(box_mean(cost, SMOOTH))
+    best = torch.stack(costs).sort(0).values[:BEST].mean(0).min(0)
+    return depths[best.indices], best.values
+
+
+def n_agreeing(depth: Tensor, Ks: Tensor, poses: Tensor, view: int, neighbors: list[int], tolerance: float) -> Tensor:
+    """How many neighbours have, where they see a pixel's point, its depth within a relative tolerance: [H, W].
+
+    Args: depth: [V, H, W] of all views.
+    """
+    height, width = depth.shape[1:]
+    count = torch.zeros(height * width)
+    points = rays(Ks[view], height, width) * depth[view].reshape(-1)
+    for other in neighbors:
+        between = poses[other] @ torch.linalg.inv(poses[view])
+        x, y, z = Ks[other] @ (between[:3, :3] @ points + between[:3, 3:])
+        column, row = (x / z).floor(), (y / z).floor()
+        inside = (z > 0) & (column >= 0) & (column < width) & (row >= 0) & (row < height)
+        theirs = torch.full_like(z, torch.nan)
+        theirs[inside] = depth[other][row[inside].long(), column[inside].long()]
+        count += (theirs / z - 1).abs() < tolerance
+    return count.reshape(height, width)
+
+
+def _moments(values: Tensor) -> tuple[Tensor, Tensor]:
+    """Mean and standard deviation of the patch about each pixel of [..., H, W]."""
+    mean = box_mean(values, WINDOW)
+    return mean, (box_mean(values.square(), WINDOW) - mean.square()).clamp_min(0).sqrt()

@@ -1,0 +1,119 @@
+"""Points between matched ones come from depth on which several photos agree."""
+
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+import torch
+
+from chebsplat.photos import plane_sweep
+from chebsplat.stages import dense
+from chebsplat.stages.command import Job
+from chebsplat.stages.config import Config
+from chebsplat.stages.settings import SfmSection
+
+FOCAL, SIZE = 160.0, (160, 120)
+
+
+@pytest.fixture(scope="module")
+def wall():
+    """Five photos of a textured wall at z = 4 behind a nearer square at z = 2.5, from places along x; depth of each."""
+    rng = np.random.default_rng(0)
+    coarse = torch.from_numpy(rng.random((2, 1, 60, 80))).float()
+    textures = torch.nn.functional.interpolate(coarse, scale_factor=4, mode="bilinear").numpy()[:, 0]
+    K = np.array([[FOCAL, 0, SIZE[0] / 2], [0, FOCAL, SIZE[1] / 2], [0, 0, 1]])
+    y, x = np.mgrid[: SIZE[1], : SIZE[0]] + 0.5
+    rays = np.stack([(x - SIZE[0] / 2) / FOCAL, (y - SIZE[1] / 2) / FOCAL], -1)
+    images, depths, poses = [], [], []
+    for place in np.linspace(-0.4, 0.4, 5):
+        near, far = (rays * z + [place, 0] for z in (2.5, 4.0))
+        front = (np.abs(near) < 0.35).all(-1)
+        at = np.where(front[..., None], near, far)
+        pick = [((at[..., side] + 2) * 40).clip(0, limit - 1).astype(int) for side, limit in ((1, 240), (0, 320))]
+        images.append(np.where(front, textures[0][tuple(pick)], textures[1][tuple(pick)]))
+        depths.append(np.where(front, 2.5, 4.0))
+        pose = np.eye(4)
+        pose[0, 3] = -place
+        poses.append(pose)
+    pixels = (255 * np.stack(images)[..., None].repeat(3, -1)).astype(np.uint8)
+    return pixels, np.tile(K, (5, 1, 1)), np.stack(poses), np.stack(depths)
+
+
+def cloud_of(wall):
+    _, Ks, poses, _ = wall
+    means = np.random.default_rng(1).uniform([-0.3, -0.3, 2.5], [0.3, 0.3, 4.0], (20, 3))
+    return {
+        "names": [str(k) for k in range(5)], "Ks": Ks, "cam_from_world": poses, "means": means,
+        "colors": np.zeros((20, 3), np.uint8), "seen_from": np.zeros(20, int), "tracks": np.zeros((0, 2), np.int32),
+        "notes": {},
+    }  # fmt: skip
+
+
+def capture_of(wall, **more):
+    fields = {"names": [str(k) for k in range(5)], "images": wall[0], "size": SIZE, "loss_mask": None, "depth": None}
+    return SimpleNamespace(**(fields | {"is_test": np.array([False, False, True, False, False])} | more))
+
+
+def test_a_sweep_finds_depth_up_to_its_step(wall):
+    images, Ks, poses, depths = wall
+    grey = torch.from_numpy(images[..., 0]).float() / 255
+    tried = 1 / torch.linspace(1 / 1.5, 1 / 12, 48)
+    found, cost = plane_sweep.swept_depth(
+        grey,
+        torch.ones_like(grey),
+        torch.from_numpy(Ks).float(),
+        torch.from_numpy(poses).float(),
+        2,
+        [0, 1, 3, 4],
+        tried,
+    )
+    inner = np.s_[15:-15, 30:-30]
+    right = np.abs(found.numpy()[inner] / depths[2][inner] - 1) < 0.06
+    assert right.mean() > 0.85  # not along the square's edge, which windows blur
+    assert np.median(cost.numpy()[inner]) < 0.2
+
+
+def test_views_agree_on_true_depth_and_not_on_another(wall):
+    _, Ks, poses, depths = wall
+    K, pose = torch.from_numpy(Ks).float(), torch.from_numpy(poses).float()
+    true = torch.from_numpy(depths).float()
+    agree = plane_sweep.n_agreeing(true, K, pose, 2, [0, 1, 3, 4], 0.02)
+    assert (agree >= 2).float().mean() > 0.95
+    wrong = true.clone()
+    wrong[2] *= 1.2
+    assert (plane_sweep.n_agreeing(wrong, K, pose, 2, [0, 1, 3, 4], 0.02) >= 2).float().mean() < 0.05
+
+
+def test_swept_points_lie_on_the_surfaces_and_come_from_training_views(wall, tmp_path):
+    job = Job({}, Config(), tmp_path / "out", tmp_path)
+    found = dense.swept(job, capture_of(wall), cloud_of(wall))
+    z = found["means"][:, 2]
+    off = np.minimum(np.abs(z / 2.5 - 1), np.abs(z / 4 - 1))
+    assert len(z) > 20_000
+    assert np.quantile(off, 0.9) < 0.06
+    assert set(found["seen_from"].tolist()) == {0, 1, 3, 4}
+    assert found["colors"].shape == found["means"].shape
+
+
+def test_masked_pixels_give_no_points(wall, tmp_path):
+    job = Job({}, Config(), tmp_path / "out", tmp_path)
+    mask = np.ones(wall[0].shape[:3], bool)
+    mask[:, :, :80] = False
+    found = dense.swept(job, capture_of(wall, loss_mask=mask), cloud_of(wall))
+    place = found["means"] + [0.4, 0, 0]  # of the first view's camera
+    first = found["seen_from"] == 0
+    assert (place[first, 0] / place[first, 2] * FOCAL + 80 > 80).all()
+
+
+def test_points_are_added_where_most_cells_are_empty_and_never_beside_depth(wall):
+    cloud, settings = cloud_of(wall), SfmSection()
+    job = SimpleNamespace(facts={})
+    assert dense.wants_more(job, capture_of(wall), cloud, settings)
+    assert job.facts["covered"] < 0.2
+    assert not dense.wants_more(job, capture_of(wall, depth=np.ones(1)), cloud, settings)
+    assert not dense.wants_more(job, capture_of(wall), cloud, SfmSection(dense="off"))
+    y, x = np.mgrid[-3:3:0.05, -3:3:0.05]
+    full = cloud | {"means": np.stack([x.ravel(), y.ravel(), np.full(x.size, 4.0)], 1)}
+    assert not dense.wants_more(job, capture_of(wall), full, settings)
+    assert job.facts["covered"] > 0.9
+    assert dense.wants_more(job, capture_of(wall), full, SfmSection(dense="on"))
