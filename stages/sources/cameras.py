@@ -55,15 +55,15 @@ def camera_of(origin: Path, model: str, params: Any, width: Any, height: Any) ->
         camera = Camera(model, tuple(number(v) for v in params), int(number(width)), int(number(height)))
     except (TypeError, ValueError) as error:
         raise InputError(f"{origin}: camera size or parameters are no numbers ({error}); restore the file") from None
-    if fault := _fault(camera):
+    if wrong := fault(camera):
         raise InputError(
-            f"{origin}: camera {model} {camera.width}x{camera.height} {camera.params} is not usable: {fault}; "
+            f"{origin}: camera {model} {camera.width}x{camera.height} {camera.params} is not usable: {wrong}; "
             "restore the file"
         )
     return camera
 
 
-def _fault(camera: Camera) -> str:
+def fault(camera: Camera) -> str:
     """What is wrong with a camera; nothing of a usable one."""
     width, height = camera.width, camera.height
     if len(camera.params) != (PINHOLES | DISTORTED)[camera.model]:

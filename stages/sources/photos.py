@@ -16,8 +16,18 @@ FILM = 36.0  # mm, the longer side of the frame that 35 mm equivalents refer to
 
 
 def read(folder: Path, settings: Any, class_names: tuple[str, ...] | None = None) -> dict[str, Any]:
-    """The fields of a capture, without poses. `class_names` is of no use here: photos have no labels."""
-    return assembly.assemble(_listing(folder), settings, class_names)
+    """The fields of a capture, without poses. `class_names` is of no use here: photos have no labels.
+
+    Choices: structure from motion works on the views that are made here, so that what a lens bends is undone before.
+    """
+    listing = _listing(folder)
+    if settings.lens == "estimated":
+        from chebsplat.stages.sources.lens import with_lens
+
+        used, notes = assembly.chosen(listing, settings)
+        listing.frames, note = with_lens(used, listing.upright)
+        listing.notes = [*notes, *([note] if note else [])]
+    return assembly.assemble(listing, settings, class_names)
 
 
 def probe(folder: Path) -> dict[str, bool]:
