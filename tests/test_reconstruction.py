@@ -84,7 +84,7 @@ def test_few_neighbours_by_pose_are_enough_and_counted(triangulated, tmp_path):
 
 
 def test_points_and_tracks_of_a_colmap_model_are_taken_and_nothing_is_matched(tmp_path):
-    found = points_of(tmp_path, "colmap", data("statue_colmap") / "dense/0", 23)
+    found = points_of(tmp_path, "colmap", data("statue_colmap") / "dense/0", 23, dense="off")
     facts = artifact.read_manifest(tmp_path / "colmap-points").facts
     assert facts["how"] == "source" and "feature matching" in facts["left_out"] and "n_pairs" not in facts
     assert len(found.means) > 1000
