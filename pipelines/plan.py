@@ -106,7 +106,7 @@ def overrides(text: str) -> dict[str, Any]:
     return values
 
 
-OFF_IS_CHOICE = ("ingest.depth", "train.encoder", "train.densify", "train.exposure", "refine.smooth")
+OFF_IS_CHOICE = ("ingest.depth", "sfm.dense", "train.encoder", "train.densify", "train.exposure", "refine.smooth")
 
 
 def parsed(key: str, value: str) -> Any:

@@ -71,3 +71,18 @@ def test_a_message_is_one_short_line():
         with pytest.raises(ConfigError) as error:
             config.build(values, "x.toml")
         assert len(str(error.value)) < 300 and "\n" not in str(error.value)
+
+
+def test_off_is_text_wherever_it_is_a_choice():
+    from typing import get_args
+
+    from chebsplat.pipelines.plan import OFF_IS_CHOICE
+
+    sections = {name: part.annotation.model_fields for name, part in config.Config.model_fields.items()}
+    choices = {
+        f"{section}.{name}"
+        for section, fields in sections.items()
+        for name, setting in fields.items()
+        if "off" in get_args(setting.annotation)
+    }
+    assert choices == set(OFF_IS_CHOICE)
