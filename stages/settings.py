@@ -165,6 +165,11 @@ class RefineSection(Section):
         "folder of a knowledge artifact (`chebsplat knowledge`), or none; default: the one that is shipped for the "
         "teacher",
     )
+    surface: Literal["depth", "rendered"] = setting(
+        "depth",
+        "whose shape knowledge is asked of: points of the capture's depth, without which knowledge is left out; or, "
+        "where there is none, what the Gaussians show",
+    )
 
 
 class KnowledgeSection(Section):

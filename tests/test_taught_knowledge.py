@@ -5,7 +5,7 @@ import shutil
 
 import numpy as np
 import pytest
-from shared import INPUTS, KEY, run_stage
+from shared import INPUTS, KEY, TOY, run_stage
 from tiny_teachers import color_teacher, knowing_rooms
 
 from chebsplat.errors import ConfigError, InputError
@@ -120,10 +120,10 @@ def test_onnx_of_a_taught_encoder_says_what_torch_says(toy):
     assert artifact.read_manifest(toy["teach"]).facts["largest_difference"] < 1e-5
 
 
-def refined(toy, out, **changes):
+def refined(toy, out, config=None, **changes):
     """Facts of a refine stage of the toy with some inputs changed or, where None, left away."""
     inputs = {role: toy[of] for role, of in INPUTS["refine"].items()} | changes
-    assert run_stage("refine", out, {role: path for role, path in inputs.items() if path is not None}) == 0
+    assert run_stage("refine", out, {role: path for role, path in inputs.items() if path is not None}, config) == 0
     return artifact.read_manifest(out).facts
 
 
@@ -136,7 +136,11 @@ def test_shape_is_told_of_depth_s_points_or_of_what_the_gaussians_show(toy, tmp_
     capture.depth = None
     with artifact.publish(tmp_path / "flat", Manifest(SCHEMA, KEY, "test")) as tmp:
         write_capture(tmp, capture)
-    facts = refined(toy, tmp_path / "b", capture=tmp_path / "flat")
+    without = refined(toy, tmp_path / "b", capture=tmp_path / "flat")
+    assert "no depth" in without["left_out"]["knowledge of shape"]
+    assert without["strength"] == without["changed_by_knowledge"] == 0
+    rendered = TOY | {"refine": {"surface": "rendered"}}
+    facts = refined(toy, tmp_path / "d", rendered, capture=tmp_path / "flat")
     assert facts["knowledge"]["of"] == "rendered depth"
     assert facts["unit_from"] == "source"  # generated: metric without depth, too
     assert "knowledge" not in refined(toy, tmp_path / "c", knowledge=None)
