@@ -205,7 +205,7 @@ class Viewing:
         Returns: None where nothing is under the pixel, or no Gaussian bears its label.
         Choices: the click's Gaussian is the nearest of the pixel's label to the surface under it.
         """
-        from chebsplat.splats.connected import connected_to
+        from chebsplat.splats.parts import connected_to
 
         if self.scene.labels is None:
             return None

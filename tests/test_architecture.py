@@ -85,8 +85,8 @@ def test_a_stage_is_known_by_every_kernel_it_runs_and_every_package_it_loads():
 
     found: dict[str, list] = {}
     code = Code(installed(), found)
-    code.stage("train")
-    code.stage("lift")
+    for stage in ("train", "lift", "refine"):
+        code.stage(stage)
     kernels = [
         path for path in installed()["chebsplat"].rglob("*.py") if "chebsplat.kernels.jit import" in path.read_text()
     ]

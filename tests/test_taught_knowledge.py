@@ -129,7 +129,9 @@ def refined(toy, out, config=None, **changes):
 
 @pytest.mark.xdist_group("toy")
 def test_shape_is_told_of_depth_s_points_or_of_what_the_gaussians_show(toy, tmp_path):
+    from chebsplat.formats import gaussians as gaussians_format
     from chebsplat.formats.capture import SCHEMA, read_capture, write_capture
+    from chebsplat.formats.gaussians import read_gaussians, write_gaussians
 
     assert refined(toy, tmp_path / "a")["knowledge"]["of"] == "points"
     capture = read_capture(toy["ingest"])
@@ -139,8 +141,12 @@ def test_shape_is_told_of_depth_s_points_or_of_what_the_gaussians_show(toy, tmp_
     without = refined(toy, tmp_path / "b", capture=tmp_path / "flat")
     assert "no depth" in without["left_out"]["knowledge of shape"]
     assert without["strength"] == without["changed_by_knowledge"] == 0
+    gaussians = read_gaussians(toy["train"])
+    gaussians.parameters["logit_opacities"] = gaussians.parameters["logit_opacities"] + 5  # 24 steps leave them faint
+    with artifact.publish(tmp_path / "opaque", Manifest(gaussians_format.SCHEMA, KEY, "test")) as tmp:
+        write_gaussians(tmp, gaussians)
     rendered = TOY | {"refine": {"surface": "rendered"}}
-    facts = refined(toy, tmp_path / "d", rendered, capture=tmp_path / "flat")
+    facts = refined(toy, tmp_path / "d", rendered, capture=tmp_path / "flat", gaussians=tmp_path / "opaque")
     assert facts["knowledge"]["of"] == "rendered depth"
     assert facts["unit_from"] == "source"  # generated: metric without depth, too
     assert "knowledge" not in refined(toy, tmp_path / "c", knowledge=None)

@@ -13,7 +13,7 @@ from chebsplat.labels.decode import decode_labels
 from chebsplat.pipelines.api import load
 from chebsplat.pipelines.cli import main
 from chebsplat.render import SceneRenderer
-from chebsplat.splats.connected import connected_to
+from chebsplat.splats.parts import connected_to
 from chebsplat.stages import view
 from chebsplat.stages.camera_paths import between
 from chebsplat.stages.evaluate import camera as evaluated
