@@ -50,9 +50,7 @@ BENCHMARKS = {
     ),
     "trust": Benchmark("trust", "whether views' agreement ranks 2D teachers as their true mIoU does; no training"),
     "mesh": Benchmark("mesh", "the mesh against exact depth: F-score, labels, seconds by voxel", ("report",)),
-    "label": Benchmark(
-        "label", "which Gaussians of a PLY are named right by shape alone; trains its scenes for colour"
-    ),
+    "label": Benchmark("label", "which Gaussians of a PLY are named right by shape alone; trains its scenes"),
     "teaching": Benchmark("teaching", "what the encoder of points owes to rooms, radii, descriptor, size"),
     "query": Benchmark("query", "asking at the suggested cut: precision, recall, absent words refused; trains 5 rooms"),
     "layouts": Benchmark("layouts", "the exported layouts: bytes, and images beside the checkpoint's", ("export",)),

@@ -1,8 +1,9 @@
 """Are a splat's Gaussians named right by shape and knowledge alone? Scenes that knowledge was not taught on, as a PLY.
 
-Every scene is trained for colour alone, then named from its PLY as `chebsplat label` names it: told which way is up and
-what a metre is, shown no photo. The truth of a Gaussian is what the true labels of all views say of it, lifted with the
-weights that it is rendered with. The houses need the test data (CHEBSPLAT_TEST_DATA), and are left out without it.
+Every scene is trained as it comes (as `query` trains it), and only its PLY, without features, is named as `chebsplat
+label` names it: told which way is up and what a metre is, shown no photo. The truth of a Gaussian is what the true
+labels of all views say of it, lifted with the weights that it is rendered with. The houses need the test data
+(CHEBSPLAT_TEST_DATA), and are left out without it.
 """
 
 from __future__ import annotations
@@ -87,7 +88,7 @@ def main(arguments: Sequence[str]) -> int:
         if (needed := data_of(scene)) and not needed[1].is_dir():
             print(f"{scene} is left out: {needed[1]} is not there ({needed[0]})")
             continue
-        plans[scene] = planner.plan(scene, f"train.steps={options.steps},teacher.kind=none")
+        plans[scene] = planner.plan(scene, f"train.steps={options.steps}")
     planner.save()
     with redirect_stdout(StringIO()):  # a path for every scene
         code = execute(list(plans.values()), "train", os.cpu_count() or 1)
