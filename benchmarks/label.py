@@ -8,10 +8,7 @@ labels of all views say of it, lifted with the weights that it is rendered with.
 
 from __future__ import annotations
 
-import os
 from collections.abc import Mapping, Sequence
-from contextlib import redirect_stdout
-from io import StringIO
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
@@ -27,8 +24,6 @@ from chebsplat.formats.knowledge import SHIPPED
 from chebsplat.formats.ply import write_ply
 from chebsplat.lifting.cell_maps import to_cells
 from chebsplat.pipelines.plan import Planner
-from chebsplat.pipelines.run import execute
-from chebsplat.pipelines.scenes import data_of
 from chebsplat.rasterize.lift import lift
 from chebsplat.splats.gaussians import activated
 from chebsplat.stages.known_shapes import up_of
@@ -84,15 +79,10 @@ def main(arguments: Sequence[str]) -> int:
     parser.add_argument("--steps", type=int, default=1000, help="of the trainings")
     options = parser.parse_args(arguments)
     planner, plans = Planner(running=True), {}
-    for scene in options.scenes:
-        if (needed := data_of(scene)) and not needed[1].is_dir():
-            print(f"{scene} is left out: {needed[1]} is not there ({needed[0]})")
-            continue
+    for scene in shared.there(options.scenes):
         plans[scene] = planner.plan(scene, f"train.steps={options.steps}")
     planner.save()
-    with redirect_stdout(StringIO()):  # a path for every scene
-        code = execute(list(plans.values()), "train", os.cpu_count() or 1)
-    if code:
+    if code := shared.ran(list(plans.values()), "train"):
         return code
     rows = []
     for scene, plan in plans.items():

@@ -3,11 +3,17 @@
 from __future__ import annotations
 
 import csv
+import os
 import platform
 from argparse import ArgumentParser, RawDescriptionHelpFormatter
 from collections.abc import Sequence
+from contextlib import redirect_stdout
+from io import StringIO
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from chebsplat.pipelines.plan import Plan
 
 
 def parser(name: str, description: str | None, work: bool = False) -> ArgumentParser:
@@ -27,6 +33,27 @@ def write_csv(path: Path, rows: Sequence[dict[str, Any]]) -> None:
         writer = csv.DictWriter(handle, list(dict.fromkeys(key for row in rows for key in row)))
         writer.writeheader()
         writer.writerows(rows)
+
+
+def there(scenes: Sequence[str]) -> list[str]:
+    """The scenes whose data is there; a line for each of the others."""
+    from chebsplat.pipelines.scenes import data_of
+
+    kept = []
+    for scene in scenes:
+        if (needed := data_of(scene)) and not needed[1].is_dir():
+            print(f"{scene} is left out: {needed[1]} is not there ({needed[0]})")
+        else:
+            kept.append(scene)
+    return kept
+
+
+def ran(plans: Sequence[Plan], stage: str) -> int:
+    """The exit code of running plans up to a stage, without a path for each on stdout."""
+    from chebsplat.pipelines.run import execute
+
+    with redirect_stdout(StringIO()):
+        return execute(list(plans), stage, os.cpu_count() or 1)
 
 
 def processor() -> str:

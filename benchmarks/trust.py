@@ -8,10 +8,7 @@ The houses need the test data (CHEBSPLAT_TEST_DATA), and are left out with a lin
 
 from __future__ import annotations
 
-import os
 from collections.abc import Mapping, Sequence
-from contextlib import redirect_stdout
-from io import StringIO
 from pathlib import Path
 
 import numpy as np
@@ -24,8 +21,6 @@ from chebsplat.formats.agreement import read_agreement
 from chebsplat.formats.capture import read_capture
 from chebsplat.formats.features import read_features
 from chebsplat.pipelines.plan import Planner
-from chebsplat.pipelines.run import execute
-from chebsplat.pipelines.scenes import data_of
 from chebsplat.stages.settings import AgreeSection
 
 SCENES = ("office0", "room0", "shuffled0", "kitchen", "living")
@@ -53,15 +48,10 @@ def main(arguments: Sequence[str]) -> int:
     parser.add_argument("--scenes", nargs="+", default=list(SCENES))
     options = parser.parse_args(arguments)
     planner, pairs = Planner(running=True), {}
-    for scene in options.scenes:
-        if (needed := data_of(scene)) and not needed[1].is_dir():
-            print(f"{scene} is left out: {needed[1]} is not there ({needed[0]})")
-            continue
+    for scene in shared.there(options.scenes):
         pairs |= {(scene, name): planner.plan(scene, settings) for name, settings in TEACHERS.items()}
     planner.save()
-    with redirect_stdout(StringIO()):  # a path for every pair
-        code = execute(list(pairs.values()), "agree", os.cpu_count() or 1)
-    if code:
+    if code := shared.ran(list(pairs.values()), "agree"):
         return code
     rows = []
     for (scene, teacher), plan in pairs.items():

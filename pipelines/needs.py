@@ -17,13 +17,7 @@ if TYPE_CHECKING:
 
 LIFTED = "train.features is lifted"
 POINTS = "train.encoder is points: the training holds none"
-PHOTOGRAPHS = (
-    "photos",
-    "colmap",
-    "transforms",
-    "seven_scenes",
-    "video",
-)  # kinds of sources that hold photos of any place
+PHOTOGRAPHS = ("photos", "colmap", "transforms", "seven_scenes", "video")  # kinds that hold photos of any place
 UNASKED = "no teacher is named"
 HOW = (
     "the embedded one has seen generated rooms only. `chebsplat get-teacher segformer-b0-ade` fetches one for photos "

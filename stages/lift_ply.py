@@ -58,7 +58,7 @@ def import_ply(ply: Path, out: Path) -> dict[str, Any]:
 
     taken_over(ply, foreign(ply).cameras, out)
     config = out / "settings.json"
-    config.write_text(json.dumps({}))
+    config.write_text("{}")
     publish("export", export.run, out / "export", {"gaussians": out / "gaussians"}, config)
     return {"gaussians": artifact.read_manifest(out / "export").facts["n_gaussians"]}
 

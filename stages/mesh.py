@@ -16,7 +16,7 @@ if TYPE_CHECKING:
     from chebsplat.stages.opened import Camera, OpenedScene
     from chebsplat.stages.progress import Progress
 
-N_VOXELS = 250  # along the longest side of what the cameras see, where no voxel is asked for
+N_VOXELS = 250  # along the longest side of the room, where no voxel is asked for
 OPAQUE = 0.6  # least coverage of a pixel whose depth counts
 STEP = 0.05  # of its depth, by which a neighbouring pixel may lie deeper: beyond, a pixel is on an edge
 LONGEST_HOLE = 60  # edges
@@ -89,14 +89,12 @@ def room_extent(scene: OpenedScene) -> float:
 def labels_at(scene: OpenedScene, points: np.ndarray) -> np.ndarray:
     """The label of each point i32 [M], of what the Gaussians around it mean; -1 where there is none."""
     import numpy as np
-    import torch
 
     from chebsplat.evaluation.surface import features_at
     from chebsplat.labels.decode import decode_labels
-    from chebsplat.splats.gaussians import activated
 
-    raw = {name: torch.from_numpy(np.ascontiguousarray(values)) for name, values in scene.parameters.items()}
-    means, quats, scales, opacities = (part.numpy() for part in activated(raw))
+    held = scene.renderer
+    means, quats, scales, opacities = (part.numpy() for part in (held.means, held.quats, held.scales, held.opacities))
     assert scene.features is not None and scene.label_embeddings is not None
     features, weights = features_at(points, means, quats, scales, opacities, scene.features)
     return np.where(weights > 0, decode_labels(features, scene.label_embeddings), -1).astype(np.int32)

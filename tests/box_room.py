@@ -9,6 +9,7 @@ from chebsplat.formats.cameras import Cameras
 from chebsplat.formats.features import Features, write_features
 from chebsplat.formats.manifest import Manifest
 from chebsplat.formats.packed import C0
+from chebsplat.formats.ply import write_ply
 from chebsplat.formats.scene import Scene, read_scene, write_scene
 
 LABELS = ["wall", "floor", "ceiling", "sofa", "chair"]
@@ -81,3 +82,10 @@ def made(folder):
     with artifact.publish(folder / "teacher", Manifest("chebsplat.features/1", KEY, "teacher", **facts)) as tmp:
         write_features(tmp, features)
     return folder, read_scene(folder / "export")
+
+
+def foreign_ply(path, n=300):
+    """A box room as a 3DGS PLY from elsewhere: no semantics, SH to degree 1."""
+    parameters, _, _ = room(n)
+    write_ply(path, {name: values for name, values in parameters.items() if name != "degrees"}, 1)
+    return path

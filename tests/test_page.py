@@ -6,14 +6,13 @@ import re
 
 import numpy as np
 import pytest
-from box_room import LABELS, MORE, SIZE, N, made, room, words
+from box_room import LABELS, MORE, SIZE, N, foreign_ply, made, room, words
 from browser import BROWSER
 from click.testing import CliRunner
 from driven import driven
 
 from chebsplat.errors import ConfigError
 from chebsplat.formats.packed import BYTES, C0, from_bytes, pack, to_bytes, unpack
-from chebsplat.formats.ply import write_ply
 from chebsplat.labels.decode import decode, decode_labels
 from chebsplat.labels.relevancy import relevancy
 from chebsplat.pipelines.cli import main
@@ -143,12 +142,6 @@ def test_a_page_of_an_artifact_alone_asks_for_labels(scene, tmp_path):
     np.testing.assert_allclose(arrays["against"], words()[:5], atol=1e-6)
     with pytest.raises(ConfigError, match="no other words"):
         write_page(scene[1], "alone", None, tmp_path / "no.html", phrases=["things"])
-
-
-def foreign_ply(path, n=300):
-    parameters, _, _ = room(n)
-    write_ply(path, {name: values for name, values in parameters.items() if name != "degrees"}, 1)
-    return path
 
 
 def test_a_page_of_a_foreign_ply_has_no_semantic_controls(tmp_path):

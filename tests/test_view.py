@@ -4,11 +4,10 @@ import sys
 
 import numpy as np
 import pytest
-from box_room import LABELS, SIZE, N, looking, made, room
+from box_room import LABELS, SIZE, N, foreign_ply, looking, made, room
 from click.testing import CliRunner
 
 from chebsplat.errors import ConfigError
-from chebsplat.formats.ply import write_ply
 from chebsplat.labels.decode import decode_labels
 from chebsplat.pipelines.api import load
 from chebsplat.pipelines.cli import main
@@ -133,12 +132,6 @@ def test_every_mode_has_a_picture_and_what_is_missing_is_said(scene, viewing):
         viewing.picture(opened.cameras[0], Shown("relevancy"))
     with pytest.raises(ConfigError, match="jump to a view"):
         viewing.picture(looking_away(opened), Shown("error"))
-
-
-def foreign_ply(path, n=300):
-    parameters, _, _ = room(n)
-    write_ply(path, {name: values for name, values in parameters.items() if name != "degrees"}, 1)
-    return path
 
 
 def test_a_foreign_splat_has_no_semantic_modes(tmp_path):

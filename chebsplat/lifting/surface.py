@@ -13,9 +13,8 @@ import numpy as np
 import torch
 
 from chebsplat.cameras import upright
-from chebsplat.rasterize.depths import depths
-from chebsplat.splats.gaussians import activated, surface_of
-from chebsplat.splats.planes import inverse_depths
+from chebsplat.render import SceneRenderer
+from chebsplat.views import View
 
 OPAQUE = 0.9  # least coverage of a pixel whose depth counts
 NEAREST = 0.05  # metres
@@ -44,20 +43,16 @@ def surface(
     Args: parameters: raw, of N Gaussians; cam_from_world [V, 4, 4] and Ks [V, 3, 3] of views of `size` (width, height);
           unit: scene units of a metre; n_pixels: that are looked at, of all views alike, drawn. A cube needs LEAST of
           N_PIXELS, and as many fewer as fewer are looked at, but three.
-    Choices: a Gaussian is a plane through its centre across its shortest axis; depth as `rasterize.depths` has it;
-      points averaged by cube.
+    Choices: depth as `render_depth` has it; points averaged by cube.
     """
-    raw = {name: torch.from_numpy(np.ascontiguousarray(values, np.float32)) for name, values in parameters.items()}
-    gaussians = tuple(part.numpy() for part in activated(raw))
-    normals, means = surface_of(parameters)[0].astype(np.float64), parameters["means"].astype(np.float64)
-    width, height = size
+    renderer, (width, height) = SceneRenderer(dict(parameters)), size
     rng, count = np.random.default_rng(0), min(max(n_pixels // max(len(Ks), 1), 1), width * height)
     seen, eyes = [np.zeros((0, 3))], [np.zeros((0, 3))]
     for pose, K in zip(cam_from_world, Ks, strict=True):
-        planes = inverse_depths(means @ pose[:3, :3].T + pose[:3, 3], normals @ pose[:3, :3].T, K, NEAREST * unit)
-        depth, covered = (image.ravel() for image in depths(gaussians, pose, K, size, planes))
+        view = View(torch.from_numpy(K).float(), torch.from_numpy(pose).float(), width, height)
+        depth, covered = (image.ravel() for image in renderer.render_depth(view, NEAREST * unit))
         pixels = rng.choice(width * height, count, replace=False)
-        pixels = pixels[(covered[pixels] > OPAQUE) & (depth[pixels] > NEAREST * unit) & np.isfinite(depth[pixels])]
+        pixels = pixels[(covered[pixels] > OPAQUE) & np.isfinite(depth[pixels])]
         rays = np.stack([pixels % width + 0.5, pixels // width + 0.5, np.ones(len(pixels))], 1) @ np.linalg.inv(K).T
         seen.append((rays * depth[pixels, None] - pose[:3, 3]) @ pose[:3, :3])
         eyes.append(np.tile(-pose[:3, :3].T @ pose[:3, 3], (len(pixels), 1)))
