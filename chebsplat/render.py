@@ -37,7 +37,7 @@ class SceneRenderer:
         raw = {name: torch.from_numpy(np.ascontiguousarray(values)) for name, values in parameters.items()}
         self.means, self.quats, self.scales, self.opacities = activated(raw)
         self.raw, self.reach = raw, 3 * self.scales.amax(1)
-        self.normals = surface_of(parameters)[0].astype(np.float64)
+        self.normals = torch.from_numpy(surface_of(parameters)[0])
 
     def colors(self, view: View, index: Tensor) -> Tensor:
         """Colours [V, 3] of these Gaussians as the view's camera sees them."""
@@ -67,9 +67,9 @@ class SceneRenderer:
           of a pixel's light has been gathered: their mean lies in front of walls.
         """
         index = in_frustum(self.means, view, self.reach)
-        K, pose = (matrix.numpy().astype(np.float64) for matrix in (view.K, view.viewmat))
-        means = self.means[index].numpy().astype(np.float64) @ pose[:3, :3].T + pose[:3, 3]
-        planes = inverse_depths(means, self.normals[index.numpy()] @ pose[:3, :3].T, K, nearest)
+        K, pose = view.K.double(), view.viewmat.double()
+        means, normals = (values[index].double() @ pose[:3, :3].T for values in (self.means, self.normals))
+        planes = inverse_depths(means + pose[:3, 3], normals, K, nearest)
         gaussians = tuple(part[index].numpy() for part in (self.means, self.quats, self.scales, self.opacities))
-        depth, covered = depths(gaussians, pose, K, (view.width, view.height), planes)
+        depth, covered = depths(gaussians, pose.numpy(), K.numpy(), (view.width, view.height), planes.numpy())
         return np.where((covered > 1e-3) & (depth > nearest) & np.isfinite(depth), depth, np.float32(np.nan)), covered

@@ -18,6 +18,7 @@ from chebsplat.stages.train_inputs import (
     knowledge,
     model_of,
     training_views,
+    with_depth_loss,
     with_feature_loss,
     within_cap,
 )
@@ -49,7 +50,7 @@ def run(job: Job) -> None:
     descriptors, points = described(job, given), within_cap(job, given)
     taught = "features" in job.inputs and train.semantics and train.features == "trained"
     features = read_features(job.inputs["features"]) if taught else None
-    train = with_feature_loss(train, features)
+    train = with_depth_loss(with_feature_loss(train, features), capture)
     note_left_out(job, train, features is not None)
     import torch  # once its inputs are known to be usable
 
@@ -58,7 +59,7 @@ def run(job: Job) -> None:
     torch.set_num_threads(n_threads())  # sums of torch depend on it; the same bytes are promised for the same number
     model = model_of(points, features, train, job.config.describe)
     regions, described_values = first_regions(descriptors if points is given else None)
-    views = training_views(capture, points, features, train.weight_depth > 0)
+    views = training_views(capture, points, features, bool(train.weight_depth))
     models = camera_models(job, capture, points, views)
     trainer = Trainer(
         model,
@@ -150,6 +151,8 @@ def guidance(
 
 def note_left_out(job: Job, train: TrainSection, has_semantics: bool) -> None:
     """Say what this training does without, and why."""
+    asked = job.config.train.weight_depth
+    why_no_depth = "the capture has no depth in the unit of poses" if asked is None else "train.weight_depth is 0"
     if not has_semantics:
         why = "no teacher features: rendering only" if train.semantics else "train.semantics is false"
         if train.semantics and train.features == "lifted":
@@ -163,6 +166,7 @@ def note_left_out(job: Job, train: TrainSection, has_semantics: bool) -> None:
         "pruning": [(not train.prune, "train.prune is false")],
         "densification": [(train.densify == "off", "train.densify is off")],
         "SH pruning": [(not train.sh_prune, "train.sh_prune is false")],
+        "depth loss": [(not train.weight_depth, why_no_depth)],
         "knowledge basis": [("basis" not in job.inputs, "no sequence is named: this scene starts from nothing")],
     }
     for what, reasons in unneeded.items():

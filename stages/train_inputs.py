@@ -23,11 +23,22 @@ if TYPE_CHECKING:
     from chebsplat.views import TaughtLabels, Views
 
 DEPTH_BYTES = 512 << 20  # of depth that are kept in memory
+DEPTH_WEIGHT = 1.2  # of the depth loss, where the config leaves it open
 FEATURE_BYTES = 64 << 20  # of features that are kept in memory; what is beyond is read when its view is looked at
 
 
+def with_depth_loss(train: TrainSection, capture: Capture) -> TrainSection:
+    """The depth loss that the capture's depth allows, where the config leaves it open: none if it has not its poses,
+    since its unit is not the scene's then.
+    """
+    if train.weight_depth is not None:
+        return train
+    there = capture.depth is not None and capture.cam_from_world is not None
+    return train.model_copy(update={"weight_depth": DEPTH_WEIGHT if there else 0.0})
+
+
 def training_views(capture: Capture, points: Points, features: Features | None, with_depth: bool = False) -> Views:
-    """The registered training views, joined by name, with the capture's depth where asked for and there.
+    """The registered training views, joined by name, with the capture's depth where asked for.
 
     Raises: InputError if artifacts do not belong together.
     """

@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+import torch
 
 from chebsplat.cameras import centers, common_up, upright
 from chebsplat.lifting.surface import EDGE, fused, lookouts, surface
@@ -49,7 +50,7 @@ def test_a_plane_s_inverse_depth_is_linear_in_pixels():
     rng = np.random.default_rng(0)
     means, normals = rng.normal((0, 0, 3), 0.3, (50, 3)), rng.normal(size=(50, 3))
     normals /= np.linalg.norm(normals, axis=1, keepdims=True)
-    planes = inverse_depths(means, normals, K, 0.05)
+    planes = inverse_depths(*map(torch.from_numpy, (means, normals, K)), 0.05).numpy()
     for mean, normal, plane in zip(means, normals, planes, strict=True):
         pixel = np.array([40.0, 30.0, 1.0])
         ray = np.linalg.inv(K) @ pixel
