@@ -23,7 +23,7 @@ if TYPE_CHECKING:
     from chebsplat.views import TaughtLabels, Views
 
 DEPTH_BYTES = 512 << 20  # of depth that are kept in memory
-DEPTH_WEIGHT = 1.2  # of the depth loss, where the config leaves it open
+DEPTH_WEIGHT = 0.8  # of the depth loss, where the config leaves it open
 FEATURE_BYTES = 64 << 20  # of features that are kept in memory; what is beyond is read when its view is looked at
 
 

@@ -13,8 +13,7 @@ from chebsplat.rasterize import CELL, rasterize
 from chebsplat.settings import DescribeSection, TrainSection
 from chebsplat.shape.branch import FreshEncodings, ShapeBranch
 from chebsplat.shape.regions import Regions, covering
-from chebsplat.splats.planes import at_pixels, inverse_depths
-from chebsplat.splats.rotations import rotation_matrices
+from chebsplat.splats.planes import at_pixels, planes_in_view
 from chebsplat.splats.sh_kernels import colors_in_view
 from chebsplat.training import prune, sh_mask_network, sh_prune
 from chebsplat.training.poses import moved
@@ -55,13 +54,6 @@ class Rendered:
     index: Tensor
     auxiliary: Auxiliary
     inverse_depth: Tensor | None = None
-
-
-def planes_in_view(means: Tensor, quats: Tensor, scales: Tensor, view: View) -> Tensor:
-    """q [V, 3] of the planes of Gaussians (`splats.planes.inverse_depths`), across their shortest axes."""
-    shortest = scales.detach().argmin(1)[:, None, None].expand(-1, 3, 1)
-    normals, turn = rotation_matrices(quats).gather(2, shortest)[..., 0], view.viewmat[:3, :3].T
-    return inverse_depths(means @ turn + view.viewmat[:3, 3], normals @ turn, view.K, NEAREST)
 
 
 class SceneModel:
@@ -240,7 +232,7 @@ class SceneModel:
             features = None
         colors = colors_in_view(self.bands(), masks, index, raw["means"], eye, degree)
         if depth:
-            colors = torch.cat([colors, planes_in_view(means, quats, scales, view)], -1)
+            colors = torch.cat([colors, planes_in_view(means, quats, scales, view.viewmat, view.K, NEAREST)], -1)
         n_colors = colors.shape[1]
         gaussians, camera = (means, quats, scales, opacities), (view.viewmat[None], view.K[None])
         size = view.width, view.height
