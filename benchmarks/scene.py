@@ -11,7 +11,8 @@ from chebsplat.formats.capture import read_capture
 from chebsplat.formats.features import read_features
 from chebsplat.formats.points import read_points
 from chebsplat.stages.config import Config
-from chebsplat.stages.train_inputs import model_of, training_views, with_depth_loss
+from chebsplat.stages.measured_depth import with_depth_loss
+from chebsplat.stages.train_inputs import model_of, training_views
 from chebsplat.training.trainer import Trainer
 
 
@@ -23,7 +24,7 @@ def trainer_from(work: Path, config: Config, backend: str = "auto", basis: dict[
     """
     capture, points = read_capture(work / "ingest"), read_points(work / "sfm")
     features = read_features(work / "teacher") if config.train.semantics else None
-    train = with_depth_loss(config.train, capture)
+    train, _ = with_depth_loss(config.train, capture, points)
     model = model_of(points, features, train, config.describe, backend)
     views = training_views(capture, points, features, bool(train.weight_depth))
     return Trainer(model, views, train, extent(points.cam_from_world), basis=basis)

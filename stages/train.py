@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 from chebsplat.errors import DataFailure
 from chebsplat.stages.command import Job, command, n_threads
+from chebsplat.stages.measured_depth import with_depth_loss
 from chebsplat.stages.photo_models import camera_models, facts, reached
 from chebsplat.stages.resume import Saves
 from chebsplat.stages.stopping import deferred
@@ -18,7 +19,6 @@ from chebsplat.stages.train_inputs import (
     knowledge,
     model_of,
     training_views,
-    with_depth_loss,
     with_feature_loss,
     within_cap,
 )
@@ -50,7 +50,9 @@ def run(job: Job) -> None:
     descriptors, points = described(job, given), within_cap(job, given)
     taught = "features" in job.inputs and train.semantics and train.features == "trained"
     features = read_features(job.inputs["features"]) if taught else None
-    train = with_depth_loss(with_feature_loss(train, features), capture)
+    train, without_depth = with_depth_loss(with_feature_loss(train, features), capture, points)
+    if without_depth:
+        job.left_out("depth loss", without_depth)
     note_left_out(job, train, features is not None)
     import torch  # once its inputs are known to be usable
 
@@ -151,8 +153,6 @@ def guidance(
 
 def note_left_out(job: Job, train: TrainSection, has_semantics: bool) -> None:
     """Say what this training does without, and why."""
-    asked = job.config.train.weight_depth
-    why_no_depth = "the capture has no depth in the unit of poses" if asked is None else "train.weight_depth is 0"
     if not has_semantics:
         why = "no teacher features: rendering only" if train.semantics else "train.semantics is false"
         if train.semantics and train.features == "lifted":
@@ -166,7 +166,6 @@ def note_left_out(job: Job, train: TrainSection, has_semantics: bool) -> None:
         "pruning": [(not train.prune, "train.prune is false")],
         "densification": [(train.densify == "off", "train.densify is off")],
         "SH pruning": [(not train.sh_prune, "train.sh_prune is false")],
-        "depth loss": [(not train.weight_depth, why_no_depth)],
         "knowledge basis": [("basis" not in job.inputs, "no sequence is named: this scene starts from nothing")],
     }
     for what, reasons in unneeded.items():

@@ -6,6 +6,7 @@ from typing import TYPE_CHECKING
 
 from chebsplat.errors import ConfigError, DataFailure, InputError
 from chebsplat.stages.command import Job
+from chebsplat.stages.measured_depth import measured_depth
 from chebsplat.stages.restored import without_basis
 
 if TYPE_CHECKING:
@@ -22,19 +23,7 @@ if TYPE_CHECKING:
     from chebsplat.training.model import SceneModel
     from chebsplat.views import TaughtLabels, Views
 
-DEPTH_BYTES = 512 << 20  # of depth that are kept in memory
-DEPTH_WEIGHT = 0.8  # of the depth loss, where the config leaves it open
 FEATURE_BYTES = 64 << 20  # of features that are kept in memory; what is beyond is read when its view is looked at
-
-
-def with_depth_loss(train: TrainSection, capture: Capture) -> TrainSection:
-    """The depth loss that the capture's depth allows, where the config leaves it open: none if it has not its poses,
-    since its unit is not the scene's then.
-    """
-    if train.weight_depth is not None:
-        return train
-    there = capture.depth is not None and capture.cam_from_world is not None
-    return train.model_copy(update={"weight_depth": DEPTH_WEIGHT if there else 0.0})
 
 
 def training_views(capture: Capture, points: Points, features: Features | None, with_depth: bool = False) -> Views:
@@ -82,29 +71,6 @@ def training_views(capture: Capture, points: Points, features: Features | None, 
         labels_of,
         depth_of,
     )
-
-
-def measured_depth(capture: Capture, rows: list[int]) -> Callable[[int, int], Tensor]:
-    """z-depth of the views with these rows in the capture, every so many pixels.
-
-    Raises: ConfigError where there is none, or where its unit is not the scene's, as poses are not the capture's own.
-    """
-    import torch
-
-    from chebsplat.views import remembered
-
-    depth = capture.depth
-    if depth is None or capture.cam_from_world is None:
-        raise ConfigError(
-            "train.weight_depth needs a capture with poses and depth, and this one has no depth; set it to 0"
-        )
-    read = remembered(lambda index: torch.from_numpy(depth[rows[index]]), DEPTH_BYTES)
-
-    def at(index: int, factor: int) -> Tensor:
-        height, width = (side // factor * factor for side in capture.size[::-1])
-        return read(index)[:height:factor, :width:factor]
-
-    return at
 
 
 def taught_labels(features: Features, rows: list[int]) -> Callable[[int], TaughtLabels]:

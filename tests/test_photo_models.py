@@ -17,8 +17,9 @@ from chebsplat.settings import TrainSection
 from chebsplat.stages import config, photo_models
 from chebsplat.stages.alignment import aligned_renders
 from chebsplat.stages.command import Job
+from chebsplat.stages.measured_depth import WEIGHT, with_depth_loss
 from chebsplat.stages.sources.disturbed import displaced, recolored
-from chebsplat.stages.train_inputs import DEPTH_WEIGHT, training_views, with_depth_loss
+from chebsplat.stages.train_inputs import training_views
 from chebsplat.training.camera_models import CameraModels
 from chebsplat.training.exposure import Exposure, exposure_spread
 from chebsplat.training.losses import depth_distance
@@ -226,14 +227,24 @@ def test_gaussians_go_where_depth_is_measured(tiny_trainer):
     assert pulled < 0.5 * without
 
 
-def test_the_depth_loss_is_left_open_for_the_capture_to_decide():
-    capture, _ = photographed("colmap", [1, 1, 1])
-    assert with_depth_loss(TrainSection(), capture).weight_depth == 0
-    capture.depth = np.ones((3, 40, 48), np.float32)
-    assert with_depth_loss(TrainSection(), capture).weight_depth == DEPTH_WEIGHT
-    assert with_depth_loss(TrainSection(weight_depth=0.5), capture).weight_depth == 0.5
+def test_the_depth_loss_is_on_where_views_tell_the_same_depth():
+    capture, points = photographed("colmap", [1, 1, 1])
+
+    def decided(**given):
+        train, why = with_depth_loss(TrainSection(**given), capture, points)
+        return train.weight_depth, why
+
+    assert decided() == (0, "the capture has no depth in the unit of its poses")
+    capture.cam_from_world[1, 2, 3], capture.cam_from_world[2, 2, 3] = 5.5, 6.0  # each half a unit farther back
+    capture.depth = np.stack([np.full((40, 48), z, np.float32) for z in (5, 5.5, 6)])
+    capture.depth[:, :3] = np.nan
+    assert decided() == (WEIGHT, "")
+    assert decided(weight_depth=0.5) == (0.5, "") and decided(weight_depth=0) == (0, "train.weight_depth is 0")
+    capture.depth[1] *= 1.01
+    weight, why = decided()
+    assert weight == 0 and "differ by 0.9% between views" in why  # as seen from the farther one
     capture.cam_from_world = None  # of matched photos: another unit
-    assert with_depth_loss(TrainSection(), capture).weight_depth == 0
+    assert decided()[0] == 0
 
 
 def test_a_colour_fit_undoes_an_affine_map():
