@@ -197,11 +197,11 @@ def decibels(image, truth):
     return 10 * np.log10(255**2 / np.mean((image.astype(float) - truth) ** 2))
 
 
-def picture(browser, view):
-    """What the page draws of a view, u8 [H, W, 3]."""
+def picture(browser, view, size=SIZE):
+    """What the page draws of a view, u8 [H, W, 3]; size: of the capture, width and height."""
     text = browser.run(f"(() => {{ let s = ''; for (const b of scene.picture({view})) s += String.fromCharCode(b); "
                        "return btoa(s); })()")  # fmt: skip
-    return np.frombuffer(base64.b64decode(text), np.uint8).reshape(SIZE[1], SIZE[0], 4)[..., :3]
+    return np.frombuffer(base64.b64decode(text), np.uint8).reshape(size[1], size[0], 4)[..., :3]
 
 
 @pytest.mark.slow
