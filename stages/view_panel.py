@@ -201,6 +201,7 @@ class Panel:
         frustum = self.visit.client.scene.add_camera_frustum(
             f"/views/{k}", fov=float(2 * np.arctan(camera.height / 2 / camera.K[1, 1])),
             aspect=camera.width / camera.height, scale=0.02 * self.viewing.far, color=(255, 200, 60),
+            thickness=1.0, thickness_units="screen",  # scene units may be anything
             wxyz=viser.transforms.SO3.from_matrix(camera.cam_from_world[:3, :3].T).wxyz, position=camera.position,
         )  # fmt: skip
         frustum.on_click(lambda _: self.visit.jump(camera))
