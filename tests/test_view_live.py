@@ -129,6 +129,8 @@ def ask(browser, words, answer):
     press(browser, field("words"))
     browser.run(f"{field('words')}.select()")
     browser.call("Input.insertText", text=words)
+    until(browser, f"{field('words')}.value === {json.dumps(words)}")
+    time.sleep(0.5)  # viser sends what is typed up to every 50 ms, a click at once
     press(browser, button("ask"))
     until(browser, f"{SELECTION}.includes({json.dumps(answer)})")
 
