@@ -16,19 +16,33 @@ MARK, LOCK = "rehearsed", ".rehearsal"
 
 
 def rasterizer() -> None:
-    """Colours alone, with depth, with features by cell: forward and backward."""
+    """A picture of few Gaussians."""
     import torch
 
     from chebsplat.rasterize import rasterize
 
     g = torch.Generator().manual_seed(0)
     means, quats, scales = torch.randn(N, 3, generator=g), torch.randn(N, 4, generator=g), torch.full((N, 3), 0.1)
-    leaves = [means, quats, scales, torch.full((N,), 0.5), torch.rand(N, 3, generator=g), torch.rand(N, CHANNELS)]
-    *gaussians, cells = (leaf.requires_grad_() for leaf in leaves)
     camera = torch.eye(4)[None], torch.tensor([[[30.0, 0, 16], [0, 30, 16], [0, 0, 1]]]), WIDTH, HEIGHT
-    for cell_colors in (None, cells):
-        render, alpha, meta = rasterize(*gaussians, *camera, cell_colors=cell_colors)
-        (render.sum() + alpha.sum() + (meta["cells"].sum() if "cells" in meta else 0)).backward()
+    rasterize(means, quats, scales, torch.full((N,), 0.5), torch.rand(N, 3), *camera, cell_colors=torch.rand(N, 4))
+
+
+def adjoints() -> None:
+    """The rasterizer's gradients, of a picture of one tile that shows nothing."""
+    import numpy as np
+
+    from chebsplat.rasterize import ellipses, tiles_adjoint
+    from chebsplat.rasterize.binning import TILE
+
+    def none(*shape: int, kind: type = np.float32) -> np.ndarray:
+        return np.zeros(shape, kind)
+
+    bins = none(0, kind=np.int32), none(2, kind=np.int64), *(none(0, kind=np.int32),) * 2, none(1, 1, kind=np.int32)
+    seen = none(0, kind=np.uint16), none(1, kind=np.int64), np.float32(0.99)
+    slopes = none(TILE, TILE, 3), none(TILE // 4, TILE // 4, 4), none(TILE, TILE)
+    tiles_adjoint.backward(0, none(1, 2 * TILE), *bins, *seen, *slopes, False)
+    gaussians, camera = (none(0, 3), none(0, 4), none(0, 3)), (np.eye(4), np.eye(3), TILE, TILE, 0.3)
+    ellipses.project_adjoint(*gaussians, *camera, none(0, kind=np.int32), none(0, 2), none(0, 3), none(0))
 
 
 def colors() -> None:
@@ -77,7 +91,7 @@ def afterwards() -> None:
 def rehearsed(n_threads: int, semantic: bool) -> Iterator[None]:
     """Within, what a training needs has been compiled; what follows a semantic one may still be.
 
-    Choices: the rasterizer's kernels here, the others in processes of their own, which end with the block at the
+    Choices: the kernels of a picture here, the others in processes of their own, which end with the block at the
       latest. Nothing is done where all is kept already or nothing can be, where another process is at it, and with one
       thread alone.
     """
@@ -96,15 +110,17 @@ def rehearsed(n_threads: int, semantic: bool) -> Iterator[None]:
             yield
             return
         new = partial(get_context("spawn").Process, target=alone, daemon=True)
-        beside, behind = new(args=(colors, losses)), new(args=(afterwards,))
-        started = [beside, behind] if semantic else [beside]
+        beside = [new(args=(5, *parts)) for parts in ((adjoints,), (colors, losses))]
+        behind = [new(args=(10, afterwards))] if semantic else []
+        started = [*beside, *behind]
         for process in started:
             process.start()
         try:
             rasterizer()
-            beside.join()
+            for process in beside:
+                process.join()
             yield
-            if all(process.exitcode == 0 for process in (beside, behind)):
+            if semantic and all(process.exitcode == 0 for process in started):
                 (FOLDER / MARK).touch()
         finally:
             for process in started:
@@ -112,8 +128,8 @@ def rehearsed(n_threads: int, semantic: bool) -> Iterator[None]:
                 process.join()
 
 
-def alone(*parts: Callable[[], None]) -> None:
+def alone(niceness: int, *parts: Callable[[], None]) -> None:
     """Rehearse parts in a process of its own, which gives way to others."""
-    os.nice(5)
+    os.nice(niceness)
     for part in parts:
         part()
