@@ -23,6 +23,6 @@ def trainer_from(work: Path, config: Config, backend: str = "auto", basis: dict[
     """
     capture, points = read_capture(work / "ingest"), read_points(work / "sfm")
     features = read_features(work / "teacher") if config.train.semantics else None
-    model = model_of(points, features, config.train, config.describe, backend)
+    model = model_of(points, features, config.train, config.describe, backend=backend)
     views = training_views(capture, points, features)
     return Trainer(model, views, config.train, extent(points.cam_from_world), basis=basis)
