@@ -9,6 +9,10 @@ ifneq ($(MADE),$(shell realpath .venv))
 .PHONY: $(READY)
 endif
 endif
+# `make setup device=cuda` adds to a .venv that may be there already.
+ifneq ($(and $(filter setup,$(MAKECMDGOALS)),$(device)),)
+.PHONY: $(READY)
+endif
 unexport PYTHONDONTWRITEBYTECODE
 
 CHEBSPLAT := .venv/bin/chebsplat
@@ -30,7 +34,7 @@ view: $(READY)  ## make view scene=NAME|FOLDER|FILE.ply [port=8080]: look at a f
 	@$(CHEBSPLAT) view '$(scene)' $(if $(port),--port '$(port)')
 
 plan: $(READY)  ## make plan scene=NAME (or study=NAME): what would run, what is fresh, what is left out, and why
-	@$(CHEBSPLAT) $(if $(study),study '$(study)' --plan,plan $(CHOICE))
+	@$(CHEBSPLAT) $(if $(study),study '$(study)' --plan,plan $(CHOICE)) $(if $(device),--device '$(device)')
 
 verify: $(READY)  ## make verify scene=NAME|FOLDER: recompute every digest of its artifacts, or (dir=) of one artifact
 	@$(CHEBSPLAT) verify $(if $(scene),'$(scene)') $(dir)
@@ -41,10 +45,10 @@ clean-stale: $(READY)  ## list artifacts that nothing names; yes=1 removes them
 help:  ## list the targets
 	@grep -hE '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed -E 's/:.*## /\t/' | expand -t 18
 
-setup: $(READY)  ## create .venv and install the lock (done on first use by every target)
+setup: $(READY)  ## create .venv and install the lock (done on first use); device=cuda: CUDA's torch, and gsplat
 
 $(READY): requirements.lock pyproject.toml pipelines/setup.sh
-	@bash pipelines/setup.sh
+	@device='$(if $(filter setup,$(MAKECMDGOALS)),$(device))' bash pipelines/setup.sh
 	@touch $@
 
 test: $(READY)  ## the tests, in parallel, without the slow ones

@@ -138,10 +138,12 @@ def publish(
         sources = {role: {"key": m.key, "schema": m.schema} for role, m in manifests.items()}
         if key is not None and not is_key(key):
             raise ConfigError(f"--key {key}: a key is 16 hexadecimal digits; leave it away, or correct it")
-        key = key or artifact.digest({"stage": name, "config": settings, "inputs": sources})
+        device, why = resolve(device)
+        device = device if stage.on_device else "cpu"
+        computed = {} if device == "cpu" else {"device": device}
+        key = key or artifact.digest({"stage": name, "config": settings, "inputs": sources} | computed)
         artifact.check_place(out, stage.schema, key, force)
         seed = next((settings[s]["seed"] for s in reversed(stage.sections) if "seed" in settings[s]), None)
-        device, why = resolve(device)
         if why:
             log.info("%s", why)
         manifest = Manifest(
