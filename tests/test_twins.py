@@ -3,7 +3,7 @@
 import chebsplat  # noqa: F401  # isort: skip
 import pytest
 import torch
-from shared import INPUTS, ROOT, TOY, run_stage
+from shared import ROOT
 
 from chebsplat.shape import cks
 from chebsplat.stages import config as configs
@@ -11,16 +11,6 @@ from chebsplat.training.losses import feature_distance
 
 STEPS = 200
 LIMIT = 2 / 255  # what a pair at the limit of 1/255 may change, where rounding decides whether it is drawn
-
-
-@pytest.fixture(scope="module")
-def up_to_teacher(tmp_path_factory):
-    """A folder of the toy scene's artifacts that a training reads."""
-    root = tmp_path_factory.mktemp("toy")
-    for stage in ("ingest", "sfm", "teacher"):
-        inputs = {role: root / of for role, of in INPUTS[stage].items()}
-        assert run_stage(stage, root / stage, inputs, TOY | {"sfm": {"max_points": 800}}) == 0
-    return root
 
 
 @pytest.fixture

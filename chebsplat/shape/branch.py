@@ -157,9 +157,9 @@ class ShapeBranch(nn.Module):
 
     def sample(self, features: Tensor, index: Tensor, generator: torch.Generator) -> FreshEncodings:
         """Encode anew `regions_per_step` of the regions that reach the Gaussians `index` [V]; the cache keeps them."""
-        cover, is_reached = self.cover[index], torch.zeros(len(self.members), dtype=torch.bool, device=index.device)
-        is_reached[cover[cover >= 0]] = True
-        reached = is_reached.nonzero()[:, 0]
+        is_reached = torch.zeros(len(self.members) + 1, dtype=torch.bool, device=index.device)
+        is_reached[self.cover[index]] = True  # the last stands for -1, no region
+        reached = is_reached[:-1].nonzero()[:, 0]
         order = torch.randperm(len(reached), generator=generator)[: self.train_settings.regions_per_step]
         chosen = reached[order.to(reached.device)]
         fresh = FreshEncodings(self.encode(features, chosen), chosen)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from functools import cache
 from typing import Any
 
 import numpy as np
@@ -11,11 +12,19 @@ from torch import Tensor
 from chebsplat.kernels.dispatch import is_compiled
 
 
+@cache
+def _taps(dtype: torch.dtype, device: torch.device) -> Tensor:
+    """SSIM's window [11]; kept, so that no step copies it to a GPU."""
+    from chebsplat.training.ssim import TAPS
+
+    return torch.as_tensor(TAPS, dtype=dtype).to(device)
+
+
 def _blur(images: Tensor) -> Tensor:
     """Window blur of [H, W, C] with zero padding, by plain convolutions."""
-    from chebsplat.training.ssim import TAPS, WINDOW
+    from chebsplat.training.ssim import WINDOW
 
-    taps = torch.as_tensor(TAPS).to(images)
+    taps = _taps(images.dtype, images.device)
     planes = images.permute(2, 0, 1)[:, None]
     planes = torch.nn.functional.conv2d(planes, taps[None, None, :, None], padding=(WINDOW // 2, 0))
     return torch.nn.functional.conv2d(planes, taps[None, None, None, :], padding=(0, WINDOW // 2))[:, 0].permute(

@@ -37,7 +37,8 @@ class Trainer:
       regions, descriptors: of the model's Gaussians as they are; None: they are computed.
       cameras:  what is learned of each view's camera; None: nothing.
     The model's Gaussians say which device computes; views, cameras and regions are to be there, too. On a GPU a step
-    waits for no number but that of the Gaussians in view: a loss that is not finite is found within READ_EVERY steps.
+    waits for no number but that of the Gaussians in view, and of regions where it encodes them: a loss that is not
+    finite is found within READ_EVERY steps.
     `state_dict()` between two steps holds all that the steps to come depend on: a trainer that loads it takes them as
     this one does, to the bit, with as many threads.
     """
@@ -249,7 +250,9 @@ class Trainer:
         self.cameras.step(index, share)
         self.laps.mark("optimizer")
         figures = {"loss": loss.detach()} | {f"loss_{k}": v.detach() for k, v in losses.items()}
-        return {name: float(value) if self.reads else value for name, value in figures.items()}
+        if not self.reads:
+            return dict(figures)
+        return dict(zip(figures, torch.stack(list(figures.values())).tolist(), strict=True))
 
     def _losses(
         self, rendered: Rendered, target: Tensor, mask: Tensor | None, wanted: Tensor | None, view: int
