@@ -21,7 +21,7 @@ CHOICE := $(if $(scene),--scene '$(scene)') $(if $(sequence),--sequence '$(seque
 
 # `make scene=office0` needs no target: naming a scene, a sequence, a study or a benchmark means running it.
 .DEFAULT_GOAL := $(if $(study),study,$(if $(bench),bench-$(bench),$(if $(scene)$(sequence),run,help)))
-.PHONY: help run study view plan verify clean-stale setup test test-all malformed soak stability bench text-model nouns knowledge calibration teacher teacher-quality lint lock
+.PHONY: help run study view plan verify clean-stale setup test test-all gpu malformed soak stability bench text-model nouns knowledge calibration teacher teacher-quality lint lock
 
 run: $(READY)  ## make scene=NAME|FOLDER [stage=] [set=a.b=c,...] [ablation=] [basis=NAME@REVISION|none] [cores=] [device=]; or sequence=NAME
 	@$(CHEBSPLAT) run $(CHOICE) $(if $(stage),--stage '$(stage)') $(if $(cores),--cores '$(cores)') $(if $(device),--device '$(device)')
@@ -56,6 +56,10 @@ test: $(READY)  ## the tests, in parallel, without the slow ones
 
 test-all: $(READY)  ## all tests, the slow ones too
 	@$(PY) -m pytest -q -n auto --dist loadgroup -m "not gpu" $(args)
+
+gpu: $(READY)  ## tests that need an NVIDIA GPU, then office0 on it beside the CPU: build/bench/gpu.csv (under 10 minutes)
+	@$(PY) -m pytest -q -m gpu $(args)
+	@$(PY) -m benchmarks gpu
 
 malformed: $(READY)  ## every malformed input of the corpus: exit code, seconds, memory; build/malformed.csv (args="WORD ...")
 	@PYTHONPATH=tests $(PY) -m malformed $(args)

@@ -15,14 +15,20 @@ from chebsplat.stages.train_inputs import model_of, training_views
 from chebsplat.training.trainer import Trainer
 
 
-def trainer_from(work: Path, config: Config, backend: str = "auto", basis: dict[str, Tensor] | None = None) -> Trainer:
+def trainer_from(
+    work: Path,
+    config: Config,
+    backend: str = "auto",
+    basis: dict[str, Tensor] | None = None,
+    device: str = "cpu",
+) -> Trainer:
     """A trainer before its first step.
 
     Args: work: folder of the links `ingest`, `sfm` and, if semantics are trained, `teacher`; backend: of the
-          rasterizer; basis: earlier knowledge, as `Trainer` takes it.
+          rasterizer; basis: earlier knowledge, as `Trainer` takes it; device: `cpu` or `cuda`.
     """
     capture, points = read_capture(work / "ingest"), read_points(work / "sfm")
     features = read_features(work / "teacher") if config.train.semantics else None
-    model = model_of(points, features, config.train, config.describe, backend=backend)
-    views = training_views(capture, points, features)
+    model = model_of(points, features, config.train, config.describe, device, backend)
+    views = training_views(capture, points, features).to(device)
     return Trainer(model, views, config.train, extent(points.cam_from_world), basis=basis)

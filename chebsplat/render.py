@@ -31,10 +31,10 @@ def colors_by_degree(sh0: Tensor, shN: Tensor, directions: Tensor, degrees: Tens
 
 
 class SceneRenderer:
-    """Renders an exported scene (`formats.scene.Scene.parameters`)."""
+    """Renders an exported scene (`formats.scene.Scene.parameters`) on a device; its depth, always on the CPU."""
 
-    def __init__(self, parameters: dict[str, np.ndarray]):
-        raw = {name: torch.from_numpy(np.ascontiguousarray(values)) for name, values in parameters.items()}
+    def __init__(self, parameters: dict[str, np.ndarray], device: str = "cpu"):
+        raw = {name: torch.from_numpy(np.ascontiguousarray(values)).to(device) for name, values in parameters.items()}
         self.means, self.quats, self.scales, self.opacities = activated(raw)
         self.raw, self.reach = raw, 3 * self.scales.amax(1)
         self.normals = surface_of(parameters)[0].astype(np.float64)
@@ -47,6 +47,7 @@ class SceneRenderer:
     @torch.no_grad()
     def render(self, view: View, with_features: bool = False) -> tuple[np.ndarray, np.ndarray | None]:
         """Image u8 [H, W, 3], and features f32 [H, W, C] where asked for and present."""
+        view = view.to(self.means.device)
         index = in_frustum(self.means, view, self.reach)
         raw, channels = self.raw, self.colors(view, index)
         if with_features and "features" in raw:
@@ -54,8 +55,8 @@ class SceneRenderer:
         gaussians = (self.means[index], self.quats[index], self.scales[index], self.opacities[index])
         camera = (view.viewmat[None], view.K[None], view.width, view.height)
         render, _, _ = rasterize(*gaussians, channels, *camera)
-        image = (render[0, ..., :3].clamp(0, 1) * 255).round().byte().numpy()
-        return image, render[0, ..., 3:].numpy() if channels.shape[1] > 3 else None
+        image = (render[0, ..., :3].clamp(0, 1) * 255).round().byte().cpu().numpy()
+        return image, render[0, ..., 3:].cpu().numpy() if channels.shape[1] > 3 else None
 
     @torch.no_grad()
     def render_depth(self, view: View, nearest: float = 0.01) -> tuple[np.ndarray, np.ndarray]:
@@ -66,10 +67,10 @@ class SceneRenderer:
         Choices: Gaussians are planes (`splats.planes.inverse_depths`), whose depth `rasterize.depths` takes where most
           of a pixel's light has been gathered: their mean lies in front of walls.
         """
-        index = in_frustum(self.means, view, self.reach)
-        K, pose = (matrix.numpy().astype(np.float64) for matrix in (view.K, view.viewmat))
-        means = self.means[index].numpy().astype(np.float64) @ pose[:3, :3].T + pose[:3, 3]
-        planes = inverse_depths(means, self.normals[index.numpy()] @ pose[:3, :3].T, K, nearest)
-        gaussians = tuple(part[index].numpy() for part in (self.means, self.quats, self.scales, self.opacities))
+        index = in_frustum(self.means, view.to(self.means.device), self.reach)
+        K, pose = (matrix.cpu().numpy().astype(np.float64) for matrix in (view.K, view.viewmat))
+        means = self.means[index].cpu().numpy().astype(np.float64) @ pose[:3, :3].T + pose[:3, 3]
+        planes = inverse_depths(means, self.normals[index.cpu().numpy()] @ pose[:3, :3].T, K, nearest)
+        gaussians = tuple(part[index].cpu().numpy() for part in (self.means, self.quats, self.scales, self.opacities))
         depth, covered = depths(gaussians, pose, K, (view.width, view.height), planes)
         return np.where((covered > 1e-3) & (depth > nearest) & np.isfinite(depth), depth, np.float32(np.nan)), covered

@@ -22,6 +22,10 @@ class View:
     height: int
     twist: Tensor | None = None
 
+    def to(self, device: str | torch.device) -> View:
+        """The same camera, its matrices on a device."""
+        return View(self.K.to(device), self.viewmat.to(device), self.width, self.height, self.twist)
+
 
 def in_frustum(means: Tensor, view: View, reach: Tensor, margin: float = 0.15) -> Tensor:
     """Indices of points whose sphere of radius `reach` [N] may touch the image; NaN never does."""

@@ -10,19 +10,17 @@ import pytest
 import stand_in_gsplat
 import torch
 from raster import camera, gradients, scene
+from shared import ROOT
 from simulated_gpu import GPU, SimulatedGpu
 
-from chebsplat.cameras import extent
-from chebsplat.formats.capture import read_capture
-from chebsplat.formats.features import read_features
-from chebsplat.formats.points import read_points
 from chebsplat.rasterize import rasterize
+from chebsplat.render import SceneRenderer
 from chebsplat.stages import config as configs
 from chebsplat.stages import train
 from chebsplat.stages.command import Job
-from chebsplat.stages.train_inputs import model_of, training_views
 from chebsplat.training import losses
-from chebsplat.training.trainer import READ_EVERY, Trainer
+from chebsplat.training.trainer import READ_EVERY
+from chebsplat.views import View
 
 WHOLE = {
     "steps": 40, "densify_from": 0.1, "densify_until": 0.6, "prune_from": 0.2, "encode_from": 0.2, "sh_freeze": 0.8,
@@ -43,16 +41,17 @@ def gpu(monkeypatch):
     losses._taps.cache_clear()
 
 
-def trainer_on(device, folder, **settings):
-    """A trainer of the toy scene before its first step."""
-    chosen = configs.build({"train": WHOLE | settings, "describe": REGIONS}, "toy")
-    capture, points, features = read_capture(folder / "ingest"), read_points(folder / "sfm"), None
-    if chosen.train.semantics:
-        features = read_features(folder / "teacher")
-    backend = "auto" if device == "cuda" else "reference"
-    model = model_of(points, features, chosen.train, chosen.describe, device, backend)
-    views = training_views(capture, points, features).to(device)
-    return Trainer(model, views, chosen.train, extent(points.cam_from_world))
+@pytest.fixture
+def trainer_on(up_to_teacher, monkeypatch):
+    """Makes a trainer of the toy scene before its first step, by device and settings."""
+    monkeypatch.syspath_prepend(str(ROOT))
+    from benchmarks.scene import trainer_from
+
+    def make(device, **settings):
+        chosen = configs.build({"train": WHOLE | settings, "describe": REGIONS}, "toy")
+        return trainer_from(up_to_teacher, chosen, "auto" if device == "cuda" else "reference", device=device)
+
+    return make
 
 
 def test_the_simulation_has_the_rules_of_torch(gpu):
@@ -88,9 +87,9 @@ def test_the_simulation_has_the_rules_of_torch(gpu):
     ],
     ids=["defaults", "regions", "printed", "colour alone"],
 )
-def test_growth_pruning_refresh_freeze_and_finish_mix_no_devices(settings, gpu, up_to_teacher):
+def test_growth_pruning_refresh_freeze_and_finish_mix_no_devices(settings, gpu, trainer_on):
     with gpu.active():
-        made = trainer_on("cuda", up_to_teacher, **settings)
+        made = trainer_on("cuda", **settings)
         n = len(made.model)
         for _ in made.steps():
             pass
@@ -102,11 +101,11 @@ def test_growth_pruning_refresh_freeze_and_finish_mix_no_devices(settings, gpu, 
     assert len(parameters["means"]) != n
 
 
-def test_a_step_moves_no_array_of_gaussians_and_reads_figures_every_tenth_time(gpu, up_to_teacher):
+def test_a_step_moves_no_array_of_gaussians_and_reads_figures_every_tenth_time(gpu, trainer_on):
     settings = {"densify": "off", "refresh_every": 1000, "remove_every": 1000, "report_every": 1000, "sh_freeze": 1.0}
     waits, largest, n_read = set(), 0, 0
     with gpu.active():
-        made = trainer_on("cuda", up_to_teacher, **settings)
+        made = trainer_on("cuda", **settings)
         gpu.moved.clear()
         for _ in made.steps():
             moved = [one for one in gpu.moved if "_refuse_broken" not in one.what]  # that is the stand-in's
@@ -127,12 +126,12 @@ def test_a_step_moves_no_array_of_gaussians_and_reads_figures_every_tenth_time(g
     assert waits == {"in_frustum", "ShapeBranch.sample", *by_mask}
 
 
-def test_a_training_on_the_simulated_gpu_is_the_one_in_plain_torch(gpu, up_to_teacher):
-    plain = trainer_on("cpu", up_to_teacher, densify="off")
+def test_a_training_on_the_simulated_gpu_is_the_one_in_plain_torch(gpu, trainer_on):
+    plain = trainer_on("cpu", densify="off")
     for _ in plain.steps():
         pass
     with gpu.active():
-        made = trainer_on("cuda", up_to_teacher, densify="off")
+        made = trainer_on("cuda", densify="off")
         for _ in made.steps():
             pass
         found = made.held_in_psnr([0, 1, 2])
@@ -192,3 +191,25 @@ def test_a_ceiling_that_gsplat_cannot_keep_is_refused(gpu):
         viewmats, Ks, *size = camera()
         with pytest.raises(ValueError, match=r"keeps none above 0.999"):
             rasterize(*there, viewmats.to("cuda"), Ks.to("cuda"), *size, max_alpha=1.0)
+
+
+def test_a_finished_scene_renders_there_as_on_the_cpu(gpu):
+    rng = np.random.default_rng(0)
+    means, quats, scales, opacities, _ = (value.numpy() for value in scene())
+    parameters = {
+        "means": means,
+        "quats": quats,
+        "log_scales": np.log(scales),
+        "logit_opacities": np.zeros_like(opacities),
+    }
+    parameters |= {"sh0": rng.normal(size=(150, 1, 3)).astype(np.float32), "features": np.ones((150, 4), np.float32)}
+    parameters |= {"shN": rng.normal(size=(150, 15, 3)).astype(np.float32), "degrees": np.sort(rng.integers(0, 4, 150))}
+    viewmats, Ks, width, height = camera()
+    view = View(Ks[0], viewmats[0], width, height)
+    wanted, depth = SceneRenderer(parameters).render(view, True), SceneRenderer(parameters).render_depth(view)
+    with gpu.active():
+        renderer = SceneRenderer(parameters, "cuda")
+        found, there = renderer.render(view, True), renderer.render_depth(view)
+    assert np.abs(found[0].astype(int) - wanted[0]).max() <= 1  # grey levels
+    np.testing.assert_allclose(found[1], wanted[1], atol=1e-5)
+    np.testing.assert_array_equal(there[0], depth[0])
