@@ -173,7 +173,19 @@ def _versions() -> dict[str, str]:
     """Versions of the packages that the stage really loaded."""
     from importlib import metadata
 
-    names = {"torch", "numpy", "scipy", "numba", "pycolmap", "open3d", "zarr", "onnxruntime", "fpsample", "PIL"}
+    names = {
+        "torch",
+        "numpy",
+        "scipy",
+        "numba",
+        "pycolmap",
+        "open3d",
+        "zarr",
+        "onnxruntime",
+        "fpsample",
+        "PIL",
+        "gsplat",
+    }
     distributions = {"open3d": "open3d-cpu", "PIL": "pillow"}
-    loaded = sorted(names & set(sys.modules))
+    loaded = sorted(name for name in names if sys.modules.get(name))
     return {n: metadata.version(distributions.get(n, n)) for n in loaded} | {"python": sys.version.split()[0]}
