@@ -89,7 +89,7 @@ def main(arguments: Sequence[str]) -> int:
             began, spent = time.perf_counter(), time.process_time()
             raw = fused(seen, voxel, 1e3)
             fusing, cleaning = time.perf_counter() - began, time.process_time()
-            mesh = cleaned(raw, options.triangles, LEAST_PART * voxel, LONGEST_HOLE)
+            mesh = cleaned(raw, options.triangles, LEAST_PART * voxel, LONGEST_HOLE, voxel)
             cleaning = time.process_time() - cleaning
             named = np.array([*names, -1])[labels_at(scene, mesh.vertices)] if names else None
             row = {"scene": work.name, "voxel_cm": 100 * voxel, "fused": len(raw.triangles)}
@@ -105,5 +105,7 @@ def main(arguments: Sequence[str]) -> int:
         work.name: max(row["f_5cm"] for row in rows if row["scene"] == work.name)
         for work in (options.work, *options.also)
     }
+    slowest = max(5e5 * row["clean_cpu_s"] / row["fused"] for row in rows)
     print(", ".join(f"{name}: F at 5 cm {value:.3f} (bar {BAR})" for name, value in best.items()))
-    return int(min(best.values()) < BAR)
+    print(f"half a million triangles are cleaned in at most {slowest:.1f} processor seconds (bar {MOST_SECONDS})")
+    return int(min(best.values()) < BAR or slowest > MOST_SECONDS)

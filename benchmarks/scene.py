@@ -11,6 +11,7 @@ from chebsplat.formats.capture import read_capture
 from chebsplat.formats.features import read_features
 from chebsplat.formats.points import read_points
 from chebsplat.stages.config import Config
+from chebsplat.stages.measured_depth import with_depth_loss
 from chebsplat.stages.train_inputs import model_of, training_views
 from chebsplat.training.trainer import Trainer
 
@@ -29,6 +30,7 @@ def trainer_from(
     """
     capture, points = read_capture(work / "ingest"), read_points(work / "sfm")
     features = read_features(work / "teacher") if config.train.semantics else None
-    model = model_of(points, features, config.train, config.describe, device, backend)
-    views = training_views(capture, points, features).to(device)
-    return Trainer(model, views, config.train, extent(points.cam_from_world), basis=basis)
+    train, _ = with_depth_loss(config.train, capture, points)
+    model = model_of(points, features, train, config.describe, device, backend)
+    views = training_views(capture, points, features, bool(train.weight_depth)).to(device)
+    return Trainer(model, views, train, extent(points.cam_from_world), basis=basis)

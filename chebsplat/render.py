@@ -37,7 +37,7 @@ class SceneRenderer:
         raw = {name: torch.from_numpy(np.ascontiguousarray(values)).to(device) for name, values in parameters.items()}
         self.means, self.quats, self.scales, self.opacities = activated(raw)
         self.raw, self.reach = raw, 3 * self.scales.amax(1)
-        self.normals = surface_of(parameters)[0].astype(np.float64)
+        self.normals = torch.from_numpy(surface_of(parameters)[0])
 
     def colors(self, view: View, index: Tensor) -> Tensor:
         """Colours [V, 3] of these Gaussians as the view's camera sees them."""
@@ -67,10 +67,12 @@ class SceneRenderer:
         Choices: Gaussians are planes (`splats.planes.inverse_depths`), whose depth `rasterize.depths` takes where most
           of a pixel's light has been gathered: their mean lies in front of walls.
         """
-        index = in_frustum(self.means, view.to(self.means.device), self.reach)
-        K, pose = (matrix.cpu().numpy().astype(np.float64) for matrix in (view.K, view.viewmat))
-        means = self.means[index].cpu().numpy().astype(np.float64) @ pose[:3, :3].T + pose[:3, 3]
-        planes = inverse_depths(means, self.normals[index.cpu().numpy()] @ pose[:3, :3].T, K, nearest)
-        gaussians = tuple(part[index].cpu().numpy() for part in (self.means, self.quats, self.scales, self.opacities))
-        depth, covered = depths(gaussians, pose, K, (view.width, view.height), planes)
+        index = in_frustum(self.means, view.to(self.means.device), self.reach).cpu()
+        K, pose = view.K.double().cpu(), view.viewmat.double().cpu()
+        held = (self.means, self.quats, self.scales, self.opacities)
+        gaussians = tuple(part.cpu()[index] for part in held)
+        means, normals = (values.double() @ pose[:3, :3].T for values in (gaussians[0], self.normals[index]))
+        planes = inverse_depths(means + pose[:3, 3], normals, K, nearest)
+        arrays = tuple(part.numpy() for part in gaussians)
+        depth, covered = depths(arrays, pose.numpy(), K.numpy(), (view.width, view.height), planes.numpy())
         return np.where((covered > 1e-3) & (depth > nearest) & np.isfinite(depth), depth, np.float32(np.nan)), covered

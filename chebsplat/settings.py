@@ -131,6 +131,7 @@ class TrainSection(Section):
     feature_every: int | None = number(
         None, "steps from one that teaches features to the next; default: views / 10, from 1 to 4", 1, 1_000_000
     )
+    depth_every: int = number(4, "steps from one that places the surface by measured depth to the next", 1, 1_000_000)
     encode_every: int = number(4, "steps from one that encodes regions anew to the next", 1, 1_000_000)
     regions_per_step: int = number(32, "encoded anew in such a step; the others come from the cache", 1, 4096)
     n_covers: int = number(4, "regions that reach a Gaussian, at most", 1, 64)
@@ -183,7 +184,9 @@ class TrainSection(Section):
     weight_mask: float = number(1e-2, "of the penalty that closes pruning masks", 0, 1e4)
     weight_sh: float = number(4e-5, "of the penalty that closes SH bands", 0, 1e4)
     weight_exposure: float = number(1e-2, "of the pull of a photo's exposure towards the others'", 0, 1e4)
-    weight_depth: float = number(0.0, "of the distance to the depth that a capture brings, in scene sizes", 0, 1e4)
+    weight_depth: float | None = number(
+        None, "of the relative distance to the depth that a capture brings; default: 0.8, without poses 0", 0, 1e4
+    )
     weight_basis: float = number(1.0, "of the pull towards the earlier scenes' knowledge", 0, 1e4)
     warm_start: bool = setting(True, "start the encoder from the basis' stored weights")
     alpha: Literal["network", "constant"] = setting(

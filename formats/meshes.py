@@ -17,6 +17,8 @@ BLOCK = 16  # voxels along a block of the grid
 N_BLOCKS = 20_000  # that the grid begins with; it grows
 TRUNCATED = 4.0  # voxels, where the signed distance ends
 LEAST_WEIGHT = 3.0  # views that a voxel of the surface was seen by
+EASY = 100_000  # triangles that the quadric collapse takes about a second for
+PER_CELL = 0.85  # of a fused mesh's triangles that clustering in cells of its own voxels leaves
 GLTF_FLOAT, GLTF_UINT, GLTF_UBYTE, GLTF_VERTICES, GLTF_INDICES = 5126, 5125, 5121, 34962, 34963
 
 
@@ -71,12 +73,15 @@ def fused(frames: Iterable[Frame], voxel: float, farthest: float) -> Mesh:
     return Mesh(found.vertex.positions.numpy(), found.triangle.indices.numpy().astype(np.int32), colors)
 
 
-def cleaned(mesh: Mesh, n_triangles: int, least_diagonal: float, longest_hole: int) -> Mesh:
+def cleaned(mesh: Mesh, n_triangles: int, least_diagonal: float, longest_hole: int, voxel: float) -> Mesh:
     """The mesh without what floats, its small holes closed, in at most so many triangles. Labels are dropped.
 
-    Args: least_diagonal: of a connected part that stays, scene units; longest_hole: edges of a hole that is closed.
+    Args: least_diagonal: of a connected part that stays, scene units; longest_hole: edges of a hole that is closed;
+      voxel: edge of those that it was fused from, scene units.
     Raises: ConfigError where pymeshlab, or a library of the system that it needs, is missing.
-    Choices: a vertex takes the colour of the nearest one before.
+    Choices: a vertex takes the colour of the nearest one before. Vertices are first clustered in cubic cells, of a size
+      that leaves what is wanted or EASY, and edges collapsed by quadrics from there on: the collapse alone takes four
+      times as long, for 0.002 of the F-score at 5 cm.
     """
     from scipy.spatial import cKDTree
 
@@ -92,6 +97,10 @@ def cleaned(mesh: Mesh, n_triangles: int, least_diagonal: float, longest_hole: i
     meshes.meshing_remove_connected_component_by_diameter(mincomponentdiag=pymeshlab.PureValue(least_diagonal))
     meshes.meshing_repair_non_manifold_edges()
     meshes.meshing_close_holes(maxholesize=longest_hole, newfaceselected=False)  # a selection alone would be decimated
+    count, clustered = meshes.current_mesh().face_number(), max(n_triangles, EASY)
+    if count > clustered:
+        cell = voxel * (PER_CELL * count / clustered) ** 0.5
+        meshes.meshing_decimation_clustering(threshold=pymeshlab.PureValue(cell))
     if meshes.current_mesh().face_number() > n_triangles:
         meshes.meshing_decimation_quadric_edge_collapse(
             targetfacenum=n_triangles, preserveboundary=True, preservenormal=True

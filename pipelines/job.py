@@ -6,7 +6,7 @@ import json
 import logging
 import os
 from collections.abc import Iterator
-from contextlib import contextmanager, suppress
+from contextlib import ExitStack, contextmanager, suppress
 from importlib import import_module
 from pathlib import Path
 from typing import Any
@@ -15,8 +15,9 @@ from chebsplat.errors import ChebsplatError
 from chebsplat.formats import disk
 from chebsplat.pipelines import store
 from chebsplat.pipelines.raw import unchanged
+from chebsplat.pipelines.rehearsal import rehearsed
 from chebsplat.pipelines.store import say
-from chebsplat.stages.command import exit_code, publish
+from chebsplat.stages.command import exit_code, n_threads, publish
 
 CODE = "{:<4d}"  # of a job, written over in place: a full disk does not keep it from being told
 
@@ -57,7 +58,17 @@ def make(plan: Path, key: str) -> None:
         config, hashes = Path(f"{files}.json"), json.loads(Path(f"{files}.raw.json").read_text())
         module = import_module(f"chebsplat.stages.{stage}")
         publish(stage, module.run, out, inputs, config, key=key, code=step["code"], device=step["device"],
-                within=unchanged(stage, step["config"], hashes))  # fmt: skip
+                within=prepared(step, hashes))  # fmt: skip
+
+
+@contextmanager
+def prepared(step: dict[str, Any], hashes: dict[str, Any]) -> Iterator[None]:
+    """What a stage reads stays as it was planned, and the first training on a machine has its kernels."""
+    with ExitStack() as entered:
+        entered.enter_context(unchanged(step["stage"], step["config"], hashes))
+        if step["stage"] == "train":
+            entered.enter_context(rehearsed(n_threads(), "features" in step["inputs"]))
+        yield
 
 
 @contextmanager

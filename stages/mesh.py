@@ -44,7 +44,7 @@ def mesh_of(
         raise DataFailure(f"{scene.source} shows no surface of voxels of {edge:.3g}; choose larger ones: --voxel")
     facts = {"voxel": edge, "n_fused": len(made.triangles)}
     if not raw:
-        made = cleaned(made, n_triangles, LEAST_PART * edge, LONGEST_HOLE)
+        made = cleaned(made, n_triangles, LEAST_PART * edge, LONGEST_HOLE, edge)
     if not len(made.triangles):
         raise DataFailure(f"nothing of the surface is larger than {LEAST_PART:g} voxels of {edge:.3g}; take --raw")
     if scene.features is not None and scene.label_embeddings is not None:

@@ -17,6 +17,7 @@ if TYPE_CHECKING:
     import numpy as np
 
     from chebsplat.formats.scene import Scene
+    from chebsplat.labels.calibration import Calibration
 
 log = logging.getLogger("chebsplat")
 
@@ -29,12 +30,17 @@ class Words:
     """What a page can be asked: L words, embeddings f32 [L, C], and f32 [K, C] of the phrases they are weighed against.
 
     against: None where words are the scene's labels, each weighed against all others.
+    rivals, calibration: f32 [R, C] and coefficients, where the teacher's relevancy is calibrated: words but the
+    `uncalibrated` ones, rows of `words`, are answered in probabilities, as `query` does.
     """
 
     words: list[str]
     embeddings: np.ndarray
     against: list[str] | None
     phrases: np.ndarray
+    rivals: np.ndarray | None = None
+    calibration: Calibration | None = None
+    uncalibrated: Sequence[int] = ()
 
 
 def write_page(
@@ -84,6 +90,9 @@ def write_page(
             "label_embeddings": scene.label_embeddings.astype(np.float32),
             "labels": (scene.labels + 1).astype(np.uint16),
         }
+        if words.calibration is not None and words.rivals is not None:
+            about |= {"calibration": words.calibration._asdict(), "uncalibrated": list(words.uncalibrated)}
+            arrays["rivals"] = words.rivals.astype(np.float32)
         counts |= {"labels": len(scene.label_names), "words": len(words.words)}
     blob, about["places"] = to_bytes(arrays)
     text = rendered(
@@ -92,7 +101,7 @@ def write_page(
         n=len(means),
         labels=about.get("labels"),
         words=f"{len(words.words):,}" if words else None,
-        weighed=f"weighed against {', '.join(words.against)}" if words and words.against else "the labels alone",
+        weighed=weighed(words),
         example=next((n for n in (scene.label_names or []) if n in ("chair", "sofa")), "a word"),
         note=f"SH degree {sh_degree}, quantised; made by chebsplat. Nothing is fetched or sent.",
         about=about,
@@ -157,7 +166,9 @@ def vocabulary(scene: Scene, teacher: Path | None, phrases: list[str], more: lis
     """
     import numpy as np
 
-    from chebsplat.stages.query import embedded, is_closed, taught, understood
+    from chebsplat.formats.calibration import calibration_of
+    from chebsplat.labels.calibration import Calibration
+    from chebsplat.stages.query import are_words, embedded, is_closed, taught, teacher_of, understood
     from chebsplat.stages.text import folded
 
     names, rows = scene.label_names, scene.label_embeddings
@@ -174,7 +185,25 @@ def vocabulary(scene: Scene, teacher: Path | None, phrases: list[str], more: lis
     found = embedded(others, features, model)
     order = sorted(range(len(names) + len(others)), key=[*names, *others].__getitem__)
     every = [*names, *others]
-    return Words([every[k] for k in order], np.concatenate([rows, found])[order], weighed.phrases, weighed.against)
+    words = Words([every[k] for k in order], np.concatenate([rows, found])[order], weighed.phrases, weighed.against)
+    held = teacher_of(features, model)
+    if not phrases and (calibration := calibration_of(held.path)) is not None:
+        words.rivals, words.calibration = (
+            embedded(calibration.rivals, features, model),
+            Calibration(**calibration.calibration),
+        )
+        words.uncalibrated = [k for k, known in enumerate(are_words(words.words, held)) if not known]
+    return words
+
+
+def weighed(words: Words | None) -> str:
+    """What a page says of how its words are answered."""
+    if words is None or words.against is None:
+        return "the labels alone"
+    if words.calibration is None:
+        return f"weighed against {', '.join(words.against)}"
+    others = f", but {len(words.uncalibrated):,} by LERF's relevancy" * bool(words.uncalibrated)
+    return f"answered in probabilities{others}"
 
 
 def table_words(model: str | None) -> list[str]:

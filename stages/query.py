@@ -159,7 +159,7 @@ def understood(path: Path, text: str, phrases: list[str], calibrated: bool = Tru
     if is_closed(features):
         return among_labels(features, text, phrases)
     teacher = teacher_of(features, model)
-    found = calibration_of(teacher.path) if calibrated and not phrases and is_word(text, teacher) else None
+    found = calibration_of(teacher.path) if calibrated and not phrases and all(are_words([text], teacher)) else None
     if found is not None:
         vectors = embedded([text, *found.rivals], features, model)
         return Query(text, vectors[0], found.rivals, vectors[1:], vectors[1:], Calibration(**found.calibration))
@@ -183,12 +183,14 @@ def teacher_of(features: Features, model: str | None) -> TeacherModel:
     return teacher
 
 
-def is_word(text: str, teacher: TeacherModel) -> bool:
-    """Whether a text is one of the words that a calibration speaks for: those of the teacher's table, if it has one."""
+def are_words(texts: list[str], teacher: TeacherModel) -> list[bool]:
+    """Whether each is one of the words that a calibration speaks for: those of the teacher's table, if it has one."""
     from chebsplat.formats.teacher_model import read_label_table
     from chebsplat.stages.text import found
 
-    return teacher.labels is None or found([text], read_label_table(teacher.labels)[0]) != [-1]
+    if teacher.labels is None:
+        return [True] * len(texts)
+    return [row >= 0 for row in found(texts, read_label_table(teacher.labels)[0])]
 
 
 def embedded(words: list[str], features: Features, model: str | None) -> np.ndarray:

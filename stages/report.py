@@ -47,6 +47,7 @@ def run(job: Job) -> None:
     `lifted`, `refined`, `scene`, `encoder` and `basis` what there is. Writes `report`.
     """
     import json
+    import shlex
 
     from chebsplat.formats.artifact import read_manifest
     from chebsplat.formats.documents import conform
@@ -86,6 +87,7 @@ def run(job: Job) -> None:
     text = rendered(
         REPORT,
         name=figures["source"].get("name") or figures["source"].get("kind", "scene"),
+        scene=shlex.quote(str(figures["source"].get("name") or "SCENE")),
         source=figures["source"],
         protocol=figures["protocol"],
         teacher=teacher_words(facts["features"]) if "features" in facts else None,

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 from chebsplat.errors import DataFailure
 from chebsplat.stages.command import Job, command, n_threads
+from chebsplat.stages.measured_depth import with_depth_loss
 from chebsplat.stages.photo_models import camera_models, facts, reached
 from chebsplat.stages.resume import Saves
 from chebsplat.stages.stopping import deferred
@@ -50,7 +51,9 @@ def run(job: Job) -> None:
     descriptors, points = described(job, given), within_cap(job, given)
     taught = "features" in job.inputs and train.semantics and train.features == "trained"
     features = read_features(job.inputs["features"]) if taught else None
-    train = with_feature_loss(train, features)
+    train, without_depth = with_depth_loss(with_feature_loss(train, features), capture, points)
+    if without_depth:
+        job.left_out("depth loss", without_depth)
     note_left_out(job, train, features is not None)
     import torch  # once its inputs are known to be usable
 
@@ -59,7 +62,7 @@ def run(job: Job) -> None:
     torch.set_num_threads(n_threads())  # sums of torch depend on it; the same bytes are promised for the same number
     model = model_of(points, features, train, job.config.describe, job.device)
     regions, described_values = first_regions(descriptors if points is given else None)
-    views = training_views(capture, points, features, train.weight_depth > 0).to(job.device)
+    views = training_views(capture, points, features, bool(train.weight_depth)).to(job.device)
     models = camera_models(job, capture, points, views)
     trainer = Trainer(
         model,

@@ -6,6 +6,7 @@ from typing import TYPE_CHECKING
 
 from chebsplat.errors import ConfigError, DataFailure, InputError
 from chebsplat.stages.command import Job
+from chebsplat.stages.measured_depth import measured_depth
 from chebsplat.stages.restored import without_basis
 
 if TYPE_CHECKING:
@@ -22,12 +23,11 @@ if TYPE_CHECKING:
     from chebsplat.training.model import SceneModel
     from chebsplat.views import TaughtLabels, Views
 
-DEPTH_BYTES = 512 << 20  # of depth that are kept in memory
 FEATURE_BYTES = 64 << 20  # of features that are kept in memory; what is beyond is read when its view is looked at
 
 
 def training_views(capture: Capture, points: Points, features: Features | None, with_depth: bool = False) -> Views:
-    """The registered training views, joined by name, with the capture's depth where asked for and there.
+    """The registered training views, joined by name, with the capture's depth where asked for.
 
     Raises: InputError if artifacts do not belong together.
     """
@@ -71,29 +71,6 @@ def training_views(capture: Capture, points: Points, features: Features | None, 
         labels_of,
         depth_of,
     )
-
-
-def measured_depth(capture: Capture, rows: list[int]) -> Callable[[int, int], Tensor]:
-    """z-depth of the views with these rows in the capture, every so many pixels.
-
-    Raises: ConfigError where there is none, or where its unit is not the scene's, as poses are not the capture's own.
-    """
-    import torch
-
-    from chebsplat.views import remembered
-
-    depth = capture.depth
-    if depth is None or capture.cam_from_world is None:
-        raise ConfigError(
-            "train.weight_depth needs a capture with poses and depth, and this one has no depth; set it to 0"
-        )
-    read = remembered(lambda index: torch.from_numpy(depth[rows[index]]), DEPTH_BYTES)
-
-    def at(index: int, factor: int) -> Tensor:
-        height, width = (side // factor * factor for side in capture.size[::-1])
-        return read(index)[:height:factor, :width:factor]
-
-    return at
 
 
 def taught_labels(features: Features, rows: list[int]) -> Callable[[int], TaughtLabels]:

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from chebsplat.errors import ChebsplatError
+from chebsplat.errors import ChebsplatError, DataFailure
 
 if TYPE_CHECKING:
     from chebsplat.stages.opened import Camera
@@ -100,23 +100,35 @@ class Panel:
         every.on_click(set_all)
         with self.gui.add_folder("selection"):
             self.chosen = self.gui.add_markdown("click on something")
+            self.gui.add_button("select what was asked for").on_click(lambda _: self.visit.do(self._take_asked))
             self.gui.add_button("clear").on_click(lambda _: self._choose(None, ""))
             self.gui.add_button("save as .ply").on_click(lambda _: self.visit.do(self._save))
         self.visit.client.scene.on_click()(lambda event: self.visit.do(lambda: self._click(*event.screen_pos)))
 
     def _ask(self) -> None:
-        from chebsplat.labels.relevancy import relevancy
-
         text = self.words.value.strip()
         if not text:
             self.chosen.content = "type some words first"
             return
         query = self.scene.understood(text, [word.strip() for word in self.against.value.split(",") if word.strip()])
         assert self.scene.features is not None
-        above = int((relevancy(self.scene.features, query.embedding, query.against) > 0.5).sum())
         self.visit.change(query=query, mode="relevancy")
         self.mode.value = "relevancy"
-        self.chosen.content = f"{text}: {above:,} of {len(self.scene):,} Gaussians above .5"
+        self.chosen.content = str(query.answer(self.scene.features))
+
+    def _take_asked(self) -> None:
+        from chebsplat.stages.extract import asked_for
+
+        query = self.visit.shown.query
+        if query is None:
+            self.chosen.content = "ask for some words first"
+            return
+        try:
+            mask = asked_for(self.scene.exported, query)
+        except DataFailure as error:
+            self._choose(None, str(error))
+        else:
+            self._choose(mask, f"{query.text}: {int(mask.sum()):,} Gaussians, as `extract --query` takes them")
 
     def _click(self, u: float, v: float) -> None:
         camera = self.visit.looked(np.inf)
@@ -189,6 +201,7 @@ class Panel:
         frustum = self.visit.client.scene.add_camera_frustum(
             f"/views/{k}", fov=float(2 * np.arctan(camera.height / 2 / camera.K[1, 1])),
             aspect=camera.width / camera.height, scale=0.02 * self.viewing.far, color=(255, 200, 60),
+            thickness=1.0, thickness_units="screen",  # scene units may be anything
             wxyz=viser.transforms.SO3.from_matrix(camera.cam_from_world[:3, :3].T).wxyz, position=camera.position,
         )  # fmt: skip
         frustum.on_click(lambda _: self.visit.jump(camera))

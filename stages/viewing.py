@@ -132,7 +132,6 @@ class Viewing:
 
         Raises: ConfigError where the mode needs what is not there: semantics, a query, a photo of this very view.
         """
-        from chebsplat.labels.relevancy import relevancy
         from chebsplat.stages.frames import depth_colors
         from chebsplat.stages.pages.pictures import colored, heat
 
@@ -149,7 +148,7 @@ class Viewing:
                 raise ConfigError("relevancy is of words; ask for some")
             color, features = renderer.render(view, with_features=True)
             assert features is not None
-            image = heat(color, relevancy(features, shown.query.embedding, shown.query.against))
+            image = heat(color, shown.query.scores(features))
         elif shown.mode == "depth":
             image = depth_colors(renderer.render_depth(view)[0], self.far)
         elif shown.mode == "density":

@@ -5,15 +5,19 @@ from shared import KEY
 
 from chebsplat.formats import artifact
 from chebsplat.formats.artifact import sha256_file
+from chebsplat.formats.calibration import TeacherCalibration, beside, write_calibration
 from chebsplat.formats.cameras import Cameras
 from chebsplat.formats.features import Features, write_features
 from chebsplat.formats.manifest import Manifest
 from chebsplat.formats.packed import C0
 from chebsplat.formats.ply import write_ply
 from chebsplat.formats.scene import Scene, read_scene, write_scene
+from chebsplat.labels.calibration import Calibration
 
 LABELS = ["wall", "floor", "ceiling", "sofa", "chair"]
 MORE = ["seat", "object", "things", "stuff", "texture"]
+RIVALS = [*LABELS, MORE[0]]
+CALIBRATION = Calibration(margin=12.0, cosine=6.0, bias=-0.2, strength=1.0, offset=-1.5)
 SIZE = (320, 240)
 N = 20_000
 
@@ -62,12 +66,18 @@ def looking(eye, target):
     return pose
 
 
-def made(folder):
-    """A folder of links of a scene with a teacher that knows ten words; as read from it."""
+def made(folder, calibrated=False):
+    """A folder of links of a scene with a teacher that knows ten words; as read from it.
+
+    calibrated: whether the teacher's relevancy is: RIVALS are the words that others are weighed against.
+    """
     model = folder.parent / "toy.onnx"
     model.write_bytes(b"not run by a page")
     model.with_suffix(".toml").write_text('labels = "toy.npz"\n')
     np.savez(folder.parent / "toy.npz", names=np.array(LABELS + MORE), embeddings=words())
+    if calibrated:
+        of = TeacherCalibration("toy", sha256_file(model), RIVALS, CALIBRATION._asdict(), {})
+        write_calibration(beside(model), of)
     parameters, labels, order = room()
     K = np.array([[220.0, 0, 163], [0, 222, 118], [0, 0, 1]])
     poses = np.stack([looking((x, -1.6, 1.5), (0, 1, 0.8)) for x in (-1.5, 0, 1.5)])

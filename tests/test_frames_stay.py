@@ -5,8 +5,10 @@ from copy import deepcopy
 import numpy as np
 import pytest
 from click.testing import CliRunner
+from scipy.spatial.transform import Rotation
 from shared import KEY
 from test_page import held_in
+from test_readers import CONVERSIONS, GRID, packages, transform  # noqa: F401  # a fixture among them
 
 from chebsplat.formats import artifact
 from chebsplat.formats.gaussians import write_gaussians
@@ -32,6 +34,8 @@ def moved(mixed, tmp_path_factory):
     means = SCALE * checkpoint.parameters["means"].astype(np.float64) @ TURN.T + SHIFT
     checkpoint.parameters["means"] = means.astype(np.float32)
     checkpoint.parameters["log_scales"] = checkpoint.parameters["log_scales"] + np.float32(np.log(SCALE))
+    turned = Rotation.from_matrix(TURN) * Rotation.from_quat(checkpoint.parameters["quats"], scalar_first=True)
+    checkpoint.parameters["quats"] = turned.as_quat(scalar_first=True).astype(np.float32)
     checkpoint.modules, checkpoint.optimizer = {}, {}
     poses = checkpoint.cameras.cam_from_world
     poses[:, :3, 3] = SCALE * poses[:, :3, 3] - poses[:, :3, :3] @ TURN.T @ SHIFT
@@ -105,3 +109,33 @@ def test_an_imported_splat_stays_where_it_was(moved, tmp_path):
                             (["--teacher", "x.onnx", "--out", tmp_path / "x"], "add --capture")):  # fmt: skip
         done = CliRunner().invoke(main, ["import", str(export / "scene.ply"), *map(str, arguments)])
         assert (done.exit_code, said in done.output) == (2, True)
+
+
+def test_a_mesh_lies_there_too(mixed, moved, tmp_path):
+    """That of the moved scene, moved back, is that of the scene: voxels lie elsewhere, surfaces where they were."""
+    from plyfile import PlyData
+    from scipy.spatial import cKDTree
+
+    voxel, found = 0.04, []
+    for scene, edge in ((mixed[1], voxel), (moved[1], SCALE * voxel)):
+        out = tmp_path / f"{len(found)}.ply"
+        arguments = ["mesh", scene, "--out", out, "--voxel", edge, "--raw"]
+        done = CliRunner().invoke(main, list(map(str, arguments)))
+        assert done.exit_code == 0, done.output
+        vertex = PlyData.read(out)["vertex"]
+        found.append(np.stack([vertex[axis] for axis in "xyz"], 1).astype(np.float64))
+    back = (found[1] - SHIFT) @ TURN / SCALE
+    for a, b in ((found[0], back), (back, found[0])):
+        assert len(a) > 500
+        assert np.median(cKDTree(b).query(a)[0]) < 0.75 * voxel  # vertices of either are about a voxel apart
+
+
+@pytest.mark.slow
+@pytest.mark.xdist_group("readers")
+def test_spz_by_the_documented_converter_lies_there_too(moved, packages, tmp_path):  # noqa: F811
+    import gsply
+
+    checkpoint, export = moved
+    transform(packages, *CONVERSIONS["scene.spz"], export / "scene.ply", tmp_path / "scene.spz")
+    found = gsply.read_spz(tmp_path / "scene.spz").means * [1, -1, -1]  # SPZ looks along -z, y up
+    close(found, checkpoint.parameters["means"], 1.01 * np.sqrt(3) * GRID)

@@ -58,20 +58,30 @@ def test_cleaning_removes_what_floats_closes_holes_and_keeps_to_the_number_of_tr
         np.concatenate([holed, len(ball.vertices) + np.arange(3)[None]]).astype(np.int32),
         np.concatenate([ball.colors, np.zeros((3, 3), np.uint8)]),
     )
-    whole = cleaned(mesh, 10**6, 0.2, 100)
+    whole = cleaned(mesh, 10**6, 0.2, 100, 0.02)
     assert np.linalg.norm(whole.vertices, axis=1).max() < 0.6
     edges = np.sort(whole.triangles[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2), axis=1)
     assert (np.unique(edges, axis=0, return_counts=True)[1] == 2).all()
-    fewer = cleaned(mesh, 500, 0.2, 100)
+    fewer = cleaned(mesh, 500, 0.2, 100, 0.02)
     assert len(fewer.triangles) <= 500
     assert np.abs(np.linalg.norm(fewer.vertices, axis=1) - 0.5).max() < 0.04
     assert len(fewer.colors) == len(fewer.vertices)
 
 
+def test_clustering_leaves_what_is_wanted_and_keeps_the_surface(monkeypatch):
+    pytest.importorskip("pymeshlab", reason="the extra mesh is not installed")
+    monkeypatch.setattr("chebsplat.formats.meshes.EASY", 1)  # nothing is left to the collapse but the excess
+    fine = fused(of_a_ball(), 0.01, 5.0)
+    for wanted in (len(fine.triangles) // 2, len(fine.triangles) // 8):
+        found = cleaned(fine, wanted, 0.2, 100, 0.01)
+        assert 0.6 * wanted < len(found.triangles) <= wanted
+        assert np.quantile(np.abs(np.linalg.norm(found.vertices, axis=1) - 0.5), 0.9) < 0.01
+
+
 def test_a_missing_pymeshlab_is_named_with_what_helps(ball, monkeypatch):
     monkeypatch.setitem(sys.modules, "pymeshlab", None)
     with pytest.raises(ConfigError, match=r"chebsplat\[mesh\].*--raw"):
-        cleaned(ball, 100, 0.1, 10)
+        cleaned(ball, 100, 0.1, 10, 0.02)
 
 
 def test_pixels_at_a_step_of_depth_and_without_depth_are_left_out():

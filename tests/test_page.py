@@ -6,7 +6,7 @@ import re
 
 import numpy as np
 import pytest
-from box_room import LABELS, MORE, SIZE, N, foreign_ply, made, room, words
+from box_room import CALIBRATION, LABELS, MORE, RIVALS, SIZE, N, foreign_ply, made, room, words
 from browser import BROWSER
 from click.testing import CliRunner
 from driven import driven
@@ -15,6 +15,7 @@ from chebsplat.errors import ConfigError
 from chebsplat.formats.packed import BYTES, C0, from_bytes, pack, to_bytes, unpack
 from chebsplat.labels.decode import decode, decode_labels
 from chebsplat.labels.relevancy import relevancy
+from chebsplat.pipelines.api import load
 from chebsplat.pipelines.cli import main
 from chebsplat.render import SceneRenderer
 from chebsplat.stages.evaluate import camera
@@ -32,6 +33,17 @@ def page(scene, tmp_path_factory):
     done = CliRunner().invoke(main, ["page", str(scene[0]), "--out", str(out)])
     assert (done.exit_code, done.stdout) == (0, f"{out}\n"), done.output
     return out
+
+
+@pytest.fixture(scope="module")
+def calibrated(tmp_path_factory):
+    """(scene as read, opened, page) of a scene whose teacher's relevancy is calibrated."""
+    root = tmp_path_factory.mktemp("calibrated")
+    folder, held = made(root / "box room", calibrated=True)
+    out = root / "room.html"
+    done = CliRunner().invoke(main, ["page", str(folder), "--out", str(out)])
+    assert (done.exit_code, done.stdout) == (0, f"{out}\n"), done.output
+    return held, load(folder), out
 
 
 def held_in(page):
@@ -135,6 +147,23 @@ def test_a_page_holds_the_words_that_the_teacher_knows(page):
     np.testing.assert_allclose(arrays["against"], words()[6:], atol=1e-6)
 
 
+def test_a_calibrated_page_holds_what_asking_takes(calibrated):
+    about, arrays = held_in(calibrated[2])
+    assert about["calibration"] == CALIBRATION._asdict()
+    assert about["uncalibrated"] == []
+    wanted = dict(zip(LABELS + MORE, words(), strict=True))
+    np.testing.assert_allclose(arrays["rivals"], [wanted[word] for word in RIVALS], atol=1e-6)
+    assert "answered in probabilities" in calibrated[2].read_text()
+
+
+def test_phrases_of_ones_own_are_taken_instead_of_the_calibration(scene, calibrated, tmp_path):
+    out = tmp_path / "against.html"
+    write_page(calibrated[0], "against", calibrated[1].source / "teacher", out, phrases=["things", "chair"])
+    about, arrays = held_in(out)
+    assert "calibration" not in about and "rivals" not in arrays
+    assert about["against"] == ["things", "chair"]
+
+
 def test_a_page_of_an_artifact_alone_asks_for_labels(scene, tmp_path):
     counts = write_page(scene[1], "alone", None, tmp_path / "alone.html")
     about, arrays = held_in(tmp_path / "alone.html")
@@ -168,11 +197,11 @@ def decibels(image, truth):
     return 10 * np.log10(255**2 / np.mean((image.astype(float) - truth) ** 2))
 
 
-def picture(browser, view):
-    """What the page draws of a view, u8 [H, W, 3]."""
+def picture(browser, view, size=SIZE):
+    """What the page draws of a view, u8 [H, W, 3]; size: of the capture, width and height."""
     text = browser.run(f"(() => {{ let s = ''; for (const b of scene.picture({view})) s += String.fromCharCode(b); "
                        "return btoa(s); })()")  # fmt: skip
-    return np.frombuffer(base64.b64decode(text), np.uint8).reshape(SIZE[1], SIZE[0], 4)[..., :3]
+    return np.frombuffer(base64.b64decode(text), np.uint8).reshape(size[1], size[0], 4)[..., :3]
 
 
 @pytest.mark.slow
@@ -210,6 +239,7 @@ def test_in_a_browser_a_page_shows_names_and_answers_as_we_do(scene, page, tmp_p
         warm = picture(browser, 1).astype(int)
         assert np.ptp(warm, axis=-1)[np.isin(truth, [3, 4]) & (shares > 0.5)].mean() > 60
         assert np.ptp(warm, axis=-1)[truth == 1].mean() < 40
+        assert (answer["presence"], "not calibrated" in browser.run("get('answer').textContent")) == (None, True)
         assert browser.run("scene.ask('zebra')") is None
         # a click brings out a label, the legend hides one
         browser.run("scene.show('color')")
@@ -232,6 +262,31 @@ def test_in_a_browser_a_page_shows_names_and_answers_as_we_do(scene, page, tmp_p
         browser.key("w", False)
         eyes.append(browser.run("camera.eye"))
         assert min(np.linalg.norm(np.diff(eyes, axis=0), axis=1)) > 0.01
+        assert browser.complaints == []
+        assert [url for url in browser.requested if not url.startswith("blob:")] == [page.as_uri()]
+
+
+@pytest.mark.slow
+@in_a_browser
+def test_in_a_browser_a_page_answers_each_word_as_asking_does(calibrated, tmp_path):
+    """Scores, what the cut selects, and whether the scene has it at all; features and words are quantised."""
+    _, opened, page = calibrated
+    with driven(tmp_path) as browser:
+        browser.open(page, 640, 480)
+        browser.run("scene.ready")
+        for word in LABELS + MORE:
+            wanted, given = opened.ask(word), browser.run(f"scene.ask('{word}')")
+            scores = np.array(browser.run("Array.from(asked.scores)"))
+            assert np.abs(scores - wanted.scores).max() < 0.05
+            assert ((scores > 0.5) != wanted.selected).mean() < 0.005
+            assert given["above"] == (scores > 0.5).sum()
+            assert given["presence"] == pytest.approx(wanted.presence, abs=0.03)
+            said = browser.run("get('answer').textContent")
+            assert ("probably not here" in said) == (not wanted.present)
+        browser.run("scene.ask('sofa')")
+        browser.screenshot(tmp_path / "sofa.png")
+        browser.run("scene.ask('things')")
+        browser.screenshot(tmp_path / "absent.png")
         assert browser.complaints == []
         assert [url for url in browser.requested if not url.startswith("blob:")] == [page.as_uri()]
 

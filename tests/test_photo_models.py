@@ -13,9 +13,11 @@ from chebsplat.formats.capture import Capture
 from chebsplat.formats.points import Points
 from chebsplat.rasterize import rasterize
 from chebsplat.render import SceneRenderer
+from chebsplat.settings import TrainSection
 from chebsplat.stages import config, photo_models
 from chebsplat.stages.alignment import aligned_renders
 from chebsplat.stages.command import Job
+from chebsplat.stages.measured_depth import WEIGHT, with_depth_loss
 from chebsplat.stages.sources.disturbed import displaced, recolored
 from chebsplat.stages.train_inputs import training_views
 from chebsplat.training.camera_models import CameraModels
@@ -190,20 +192,59 @@ def test_depth_is_a_channel_that_changes_no_colour(tiny_trainer):
     view = made.views.camera(0, 1)
     with_depth, without = (made.model.render(view, 3, depth=wanted) for wanted in (True, False))
     torch.testing.assert_close(with_depth.rgb, without.rgb, rtol=0, atol=1e-6)
-    assert without.depth is None
+    assert without.inverse_depth is None
     covered = with_depth.alpha[..., 0] > 0.5
-    near = (with_depth.depth / with_depth.alpha[..., 0])[covered]
+    near = (with_depth.alpha[..., 0] / with_depth.inverse_depth)[covered]
     assert covered.any() and near.min() > 2.5 and near.max() < 5.5  # a unit sphere four units away
 
 
 def test_depth_distance_counts_what_is_known_alone():
     truth = torch.full((4, 4), 2.0)
     truth[0, 0], truth[0, 1] = float("nan"), 0.0
-    depth = torch.full((4, 4), 2.2, requires_grad=True)
-    distance = depth_distance(depth, torch.ones(4, 4, 1), truth, None)
+    inverse = torch.full((4, 4), 0.55, requires_grad=True)
+    distance = depth_distance(inverse, torch.ones(4, 4, 1), truth, None)
     distance.backward()
-    assert distance.item() == pytest.approx(0.1) and not depth.grad[0, :2].any() and (depth.grad[1:] > 0).all()
-    assert depth_distance(depth, torch.ones(4, 4, 1), truth * float("nan"), None) == 0
+    assert distance.item() == pytest.approx(0.1) and not inverse.grad[0, :2].any() and (inverse.grad[1:] > 0).all()
+    assert depth_distance(inverse, torch.ones(4, 4, 1), truth * float("nan"), None) == 0
+
+
+def test_gaussians_go_where_depth_is_measured(tiny_trainer):
+    """The same training with and without a depth a tenth beyond what the Gaussians show at first."""
+
+    def distance(weight):
+        made = tiny_trainer(steps=60, densify="off", prune=False, depth_every=2, weight_depth=weight)
+        with torch.no_grad():
+            shown = [made.model.render(made.views.camera(v, 1), 0, depth=True) for v in range(len(made.views.names))]
+        truths = [torch.where(r.alpha[..., 0] > 0.5, 1.1 * r.alpha[..., 0] / r.inverse_depth, torch.nan) for r in shown]
+        made.views.depth = lambda index, factor: truths[index][::factor, ::factor]
+        losses = list(made.steps())
+        assert ["loss_depth" in figures for figures in losses] == [step % 2 == 1 for step in range(60)]
+        with torch.no_grad():
+            r = made.model.render(made.views.camera(0, 1), 0, depth=True)
+            return float(depth_distance(r.inverse_depth, r.alpha, truths[0], None))
+
+    without, pulled = distance(0.0), distance(3.0)
+    assert pulled < 0.5 * without
+
+
+def test_the_depth_loss_is_on_where_views_tell_the_same_depth():
+    capture, points = photographed("colmap", [1, 1, 1])
+
+    def decided(**given):
+        train, why = with_depth_loss(TrainSection(**given), capture, points)
+        return train.weight_depth, why
+
+    assert decided() == (0, "the capture has no depth in the unit of its poses")
+    capture.cam_from_world[1, 2, 3], capture.cam_from_world[2, 2, 3] = 5.5, 6.0  # each half a unit farther back
+    capture.depth = np.stack([np.full((40, 48), z, np.float32) for z in (5, 5.5, 6)])
+    capture.depth[:, :3] = np.nan
+    assert decided() == (WEIGHT, "")
+    assert decided(weight_depth=0.5) == (0.5, "") and decided(weight_depth=0) == (0, "train.weight_depth is 0")
+    capture.depth[1] *= 1.01
+    weight, why = decided()
+    assert weight == 0 and "differ by 0.9% between views" in why  # as seen from the farther one
+    capture.cam_from_world = None  # of matched photos: another unit
+    assert decided()[0] == 0
 
 
 def test_a_colour_fit_undoes_an_affine_map():

@@ -2,10 +2,12 @@
 
 import numpy as np
 import pytest
+import torch
 
 from chebsplat.cameras import centers, common_up, upright
 from chebsplat.lifting.surface import EDGE, fused, lookouts, surface
-from chebsplat.splats.planes import inverse_depths
+from chebsplat.splats.planes import inverse_depths, planes_in_view
+from chebsplat.splats.rotations import rotation_matrices
 from chebsplat.synthetic.path import intrinsics, look_at
 
 SIZE = 96, 72
@@ -49,13 +51,36 @@ def test_a_plane_s_inverse_depth_is_linear_in_pixels():
     rng = np.random.default_rng(0)
     means, normals = rng.normal((0, 0, 3), 0.3, (50, 3)), rng.normal(size=(50, 3))
     normals /= np.linalg.norm(normals, axis=1, keepdims=True)
-    planes = inverse_depths(means, normals, K, 0.05)
+    planes = inverse_depths(*map(torch.from_numpy, (means, normals, K)), 0.05).numpy()
     for mean, normal, plane in zip(means, normals, planes, strict=True):
         pixel = np.array([40.0, 30.0, 1.0])
         ray = np.linalg.inv(K) @ pixel
         facing = abs(normal @ mean) < 0.15 * np.linalg.norm(mean)
         depth = mean[2] if facing else normal @ mean / (normal @ ray)
         assert plane @ pixel == pytest.approx(1 / depth, rel=1e-9)
+
+
+def test_planes_in_view_have_the_gradient_of_what_they_are():
+    """Some are seen at a grazing angle; quaternions of any length."""
+    g = torch.Generator().manual_seed(0)
+    means = (torch.randn(60, 3, generator=g).double() + torch.tensor([0, 0, 3.0])).requires_grad_()
+    quats = (torch.randn(60, 4, generator=g).double() * 3).requires_grad_()
+    scales, intrinsic = torch.rand(60, 3, generator=g).double(), torch.from_numpy(K)
+    pose = torch.from_numpy(look_at(np.array([0.3, -0.2, -0.5]), np.array([0, 0.1, 3.0])))
+    given = means, quats, scales, pose, intrinsic, 0.05
+
+    def plainly(means, quats):
+        axes = rotation_matrices(quats)
+        normals = axes[torch.arange(60), :, scales.argmin(1)] @ pose[:3, :3].T
+        return inverse_depths(means @ pose[:3, :3].T + pose[:3, 3], normals, intrinsic, 0.05)
+
+    found, wanted = planes_in_view(*given), plainly(means, quats)
+    torch.testing.assert_close(found, wanted)
+    assert 5 < (wanted[:, :2] == 0).all(1).sum() < 40
+    slope = torch.randn(60, 3, generator=g).double()
+    gradients = [torch.autograd.grad((made * slope).sum(), (means, quats)) for made in (found, wanted)]
+    for ours, plain in zip(*gradients, strict=True):
+        torch.testing.assert_close(ours, plain, rtol=1e-9, atol=1e-9)
 
 
 def test_lookouts_see_a_room_from_within_whichever_way_is_up():

@@ -18,7 +18,7 @@ from chebsplat.stages.camera_paths import between
 from chebsplat.stages.evaluate import camera as evaluated
 from chebsplat.stages.opened import Camera, OpenedScene
 from chebsplat.stages.page import foreign
-from chebsplat.stages.pages.pictures import colored, error_map
+from chebsplat.stages.pages.pictures import colored, error_map, heat
 from chebsplat.stages.viewing import MODES, Shown, Viewing, coded, padded, pixel_of
 
 SOFA = LABELS.index("sofa")
@@ -132,6 +132,17 @@ def test_every_mode_has_a_picture_and_what_is_missing_is_said(scene, viewing):
         viewing.picture(opened.cameras[0], Shown("relevancy"))
     with pytest.raises(ConfigError, match="jump to a view"):
         viewing.picture(looking_away(opened), Shown("error"))
+
+
+def test_a_calibrated_question_is_shown_as_the_probability_that_the_api_gives(tmp_path):
+    folder, held = made(tmp_path / "box room", calibrated=True)
+    theirs = Viewing(load(folder))
+    query, view_ = theirs.scene.understood("sofa"), theirs.scene.cameras[1]
+    assert query.calibration is not None
+    color, features = SceneRenderer(held.parameters).render(view_.view(), with_features=True)
+    np.testing.assert_array_equal(
+        theirs.picture(view_, Shown("relevancy", query=query)), heat(color, query.scores(features))
+    )
 
 
 def test_a_foreign_splat_has_no_semantic_modes(tmp_path):

@@ -2,19 +2,75 @@
 
 from __future__ import annotations
 
-import numpy as np
+from typing import Any
+
+import torch
+from torch import Tensor
 
 GRAZING = 0.15  # cosine of the view's angle to a plane below which its depth is that of the centre
 
 
-def inverse_depths(means: np.ndarray, normals: np.ndarray, K: np.ndarray, nearest: float) -> np.ndarray:
-    """q [N, 3] of each Gaussian's plane, in a camera's frame: 1 / z = q · (u, v, 1) at pixel (u, v).
+def inverse_depths(means: Tensor, normals: Tensor, K: Tensor, nearest: float) -> Tensor:
+    """q [N, 3] of each Gaussian's plane, 1 / z = q · (u, v, 1) at pixel (u, v).
 
+    Args: means [N, 3] and unit normals [N, 3] in the camera's frame; K [3, 3] pixels; nearest: scene units, > 0.
     Choices: a plane that is seen at a grazing angle is taken to face the camera; its depth would be without bound.
     """
-    along = np.einsum("nk,nk->n", normals, means)
-    grazing = np.abs(along) < GRAZING * np.linalg.norm(means, axis=1).clip(nearest)
-    planes: np.ndarray = normals @ np.linalg.inv(K) / np.where(grazing, 1.0, along)[:, None]
-    planes[grazing] = 0
-    planes[grazing, 2] = 1 / means[grazing, 2].clip(nearest)
+    along, grazing = _along(means, normals, nearest)
+    planes = normals @ torch.linalg.inv(K) / torch.where(grazing, 1, along)[:, None]
+    facing = torch.nn.functional.pad(1 / means[:, 2:].clamp_min(nearest), (2, 0))
+    return torch.where(grazing[:, None], facing, planes)
+
+
+def _along(means: Tensor, normals: Tensor, nearest: float) -> tuple[Tensor, Tensor]:
+    """Distance [N] of each plane from the camera, of any sign, and whether it is seen at a grazing angle."""
+    along = (normals * means).sum(-1)
+    return along, along.abs() < GRAZING * means.norm(dim=-1).clamp_min(nearest)
+
+
+class _Planes(torch.autograd.Function):
+    """`planes_in_view`; its gradient by hand takes a fifth of the time of one through rotation matrices."""
+
+    @staticmethod
+    def forward(
+        ctx: Any, means: Tensor, quats: Tensor, scales: Tensor, viewmat: Tensor, K: Tensor, nearest: float
+    ) -> Tensor:
+        largest = quats.abs().amax(-1, keepdim=True).clamp_min(1e-30)
+        lengths = (quats / largest).norm(dim=-1, keepdim=True).clamp_min(1e-12)
+        w, r = (quats / largest / lengths).split([1, 3], -1)
+        axis, turn = torch.eye(3, dtype=means.dtype, device=means.device)[scales.argmin(1)], viewmat[:3, :3].T
+        normals = (2 * w * w - 1) * axis + 2 * ((r * axis).sum(-1, True) * r + w * torch.linalg.cross(r, axis))
+        where, across = means @ turn + viewmat[:3, 3], normals @ turn
+        ctx.save_for_backward(where, across, normals, w, r, largest * lengths, viewmat, K)
+        ctx.nearest = nearest
+        return inverse_depths(where, across, K, nearest)
+
+    @staticmethod
+    def backward(ctx: Any, grad: Tensor) -> tuple[Tensor | None, ...]:
+        where, across, normals, w, r, lengths, viewmat, K = ctx.saved_tensors
+        along, grazing = _along(where, across, ctx.nearest)
+        slope = grad @ torch.linalg.inv(K).T / torch.where(grazing, 1, along)[:, None]
+        pull = (slope * across).sum(-1, True) / torch.where(grazing, 1, along)[:, None]
+        z = where[:, 2:]
+        facing = torch.nn.functional.pad(torch.where(z > ctx.nearest, -grad[:, 2:] / z.square(), 0), (2, 0))
+        to_where = torch.where(grazing[:, None], facing, -pull * across)
+        to_normals = torch.where(grazing[:, None], 0, slope - pull * where) @ viewmat[:3, :3]
+        torque = torch.linalg.cross(normals, to_normals)  # of a small turn in the world
+        real, imaginary = -(torque * r).sum(-1, True), w * torque + torch.linalg.cross(torque, r)
+        return to_where @ viewmat[:3, :3], 2 * torch.cat([real, imaginary], -1) / lengths, None, None, None, None
+
+
+def planes_in_view(means: Tensor, quats: Tensor, scales: Tensor, viewmat: Tensor, K: Tensor, nearest: float) -> Tensor:
+    """q [N, 3] of `inverse_depths`, of planes across Gaussians' shortest axes; differentiable by means and quaternions.
+
+    Args: means [N, 3], quats [N, 4], scales [N, 3] in the world; viewmat [4, 4] world to camera; K, nearest: as there.
+    """
+    planes: Tensor = _Planes.apply(means, quats, scales, viewmat, K, nearest)
     return planes
+
+
+def at_pixels(planes: Tensor) -> Tensor:
+    """q · (u, v, 1) [H, W] at the pixels' centres, of an image of planes q [H, W, 3]."""
+    height, width = planes.shape[:2]
+    u, v = (torch.arange(n, dtype=planes.dtype, device=planes.device) + 0.5 for n in (width, height))
+    return planes[..., 0] * u + planes[..., 1] * v[:, None] + planes[..., 2]

@@ -102,17 +102,17 @@ def photometric_reference(render: Tensor, target: Tensor, mask: Tensor | None, w
     return (1 - weight_ssim) * distance + weight_ssim * (weight * (1 - ssim_map(render, target))).sum()
 
 
-def depth_distance(depth: Tensor, alpha: Tensor, truth: Tensor, mask: Tensor | None) -> Tensor:
-    """How far rendered surfaces lie from measured ones, relative to their depth: mean |Σ wᵢ (zᵢ − d)| / d.
+def depth_distance(inverse_depth: Tensor, alpha: Tensor, truth: Tensor, mask: Tensor | None) -> Tensor:
+    """How far rendered surfaces lie from measured ones, relative to their depth: mean |Σ wᵢ (d / zᵢ − 1)|.
 
-    Args: depth [H, W] composited like a colour, alpha [H, W, 1]; truth [H, W], nan where unknown; mask [H, W] or None.
+    Args: inverse_depth [H, W] Σ wᵢ / zᵢ, alpha [H, W, 1] Σ wᵢ; truth d [H, W], nan where unknown; mask [H, W] or None.
     Choices: no division by alpha, so that a pixel that little covers pulls little; 0 where nothing is known.
     """
     known = torch.isfinite(truth) & (truth > 0)
     if mask is not None:
         known &= mask > 0
     d = torch.where(known, truth, 1)
-    distance = torch.where(known, (depth - alpha[..., 0] * d).abs() / d, 0)
+    distance = torch.where(known, (inverse_depth * d - alpha[..., 0]).abs(), 0)
     return distance.sum() / known.sum().clamp_min(1)
 
 

@@ -13,6 +13,7 @@ from chebsplat.rasterize import CELL, rasterize
 from chebsplat.settings import DescribeSection, TrainSection
 from chebsplat.shape.branch import FreshEncodings, ShapeBranch
 from chebsplat.shape.regions import Regions, covering
+from chebsplat.splats.planes import at_pixels, planes_in_view
 from chebsplat.splats.rows import take
 from chebsplat.splats.sh_colors import colors_in_view
 from chebsplat.training import prune, sh_mask_network, sh_prune
@@ -20,6 +21,7 @@ from chebsplat.training.poses import moved
 from chebsplat.training.sh_mask_network import BandMaskNetwork
 from chebsplat.views import View, in_frustum
 
+NEAREST = 0.01  # scene units, of a plane's depth: the rasterizer's near plane
 GATES = {"product": prune.SemanticGate, "printed": prune.PrintedGate}
 
 
@@ -41,8 +43,8 @@ class Auxiliary:
 @dataclass
 class Rendered:
     """rgb [H, W, 3], alpha [H, W, 1], features [H, W, C], [h, w, C] by cell of the rasterizer, or None; `index` [V]
-    the Gaussians in the frustum, with `means2d` [1, V, 2] and `radii` [1, V, 2] in `meta`; depth [H, W] z-depths of
-    the centres, scene units, composited like colours, or None.
+    the Gaussians in the frustum, with `means2d` [1, V, 2] and `radii` [1, V, 2] in `meta`; inverse_depth [H, W] of the
+    Gaussians' planes, Σ w_i / z_i, 1 / scene unit, or None.
     """
 
     rgb: Tensor
@@ -51,7 +53,7 @@ class Rendered:
     meta: dict[str, Any]
     index: Tensor
     auxiliary: Auxiliary
-    depth: Tensor | None = None
+    inverse_depth: Tensor | None = None
 
 
 class SceneModel:
@@ -213,7 +215,7 @@ class SceneModel:
 
         degree: SH bands in use; masked: apply the pruning masks; semantic: render features too; fused: the fused ones,
         not the raw ones; grid: features are only wanted as means over h × w cells, and rendered so where these are the
-        rasterizer's; depth: render it too, a fourth channel beside the colours.
+        rasterizer's; depth: render it too, three channels beside the colours.
         """
         raw = self.raw
         with torch.no_grad():
@@ -245,7 +247,7 @@ class SceneModel:
             features = None
         colors = colors_in_view(self.bands(), masks, index, raw["means"], eye, degree, self.backend)
         if depth:
-            colors = torch.cat([colors, (means @ view.viewmat[2, :3] + view.viewmat[2, 3])[:, None]], -1)
+            colors = torch.cat([colors, planes_in_view(means, quats, scales, view.viewmat, view.K, NEAREST)], -1)
         n_colors = colors.shape[1]
         gaussians, camera = (means, quats, scales, opacities), (view.viewmat[None], view.K[None])
         size = view.width, view.height
@@ -254,13 +256,16 @@ class SceneModel:
                 *gaussians, colors, *camera, *size, cell_colors=features, backend=self.backend
             )
             cells = None if features is None else meta["cells"][0]
-            image, z = render[0].split([3, 1], -1) if depth else (render[0], None)
-            return Rendered(image, alpha[0], cells, meta, index, auxiliary, None if z is None else z[..., 0])
+            image, planes = render[0].split([3, 3], -1) if depth else (render[0], None)
+            return Rendered(
+                image, alpha[0], cells, meta, index, auxiliary, None if planes is None else at_pixels(planes)
+            )
         channels = torch.cat([colors, features], -1)
         render, alpha, meta = rasterize(*gaussians, channels, *camera, *size, backend=self.backend)
         sizes = [3, n_colors - 3, channels.shape[1] - n_colors]
         parts = render[0].split(sizes, -1)  # one gradient, where slices would make one each
-        return Rendered(parts[0], alpha[0], parts[2], meta, index, auxiliary, parts[1][..., 0] if depth else None)
+        inverse_depth = at_pixels(parts[1]) if depth else None
+        return Rendered(parts[0], alpha[0], parts[2], meta, index, auxiliary, inverse_depth)
 
     @torch.no_grad()
     def fused_features(self) -> np.ndarray | None:

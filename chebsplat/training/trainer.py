@@ -215,7 +215,8 @@ class Trainer:
         target, mask = self.views.target(index, factor)
         pruning, taught = self.schedule.prunes(share), self.step % self.feature_every == 0
         wanted = None if self.views.features is None or not taught else self.views.features(index)
-        surface = None if self.views.depth is None else self.views.depth(index, factor)
+        placed = self.views.depth if self.step % settings.depth_every == 0 else None
+        surface = None if placed is None else placed(index, factor)
         rendered = self.model.render(
             self.cameras.camera(self.views, index, factor),
             self.schedule.degree(share),
@@ -229,8 +230,9 @@ class Trainer:
         self.laps.mark("render")
         rendered.rgb = self.cameras.taken(rendered.rgb, index)
         losses = self._losses(rendered, target, mask, wanted, index) | self.cameras.losses()
-        if surface is not None and rendered.depth is not None:
-            losses["depth"] = settings.weight_depth * depth_distance(rendered.depth, rendered.alpha, surface, mask)
+        if surface is not None and rendered.inverse_depth is not None:
+            distance = depth_distance(rendered.inverse_depth, rendered.alpha, surface, mask)
+            losses["depth"] = (settings.weight_depth or 0) * distance
         loss = torch.stack(list(losses.values())).sum()
         if self.reads and not torch.isfinite(loss):
             bad = [name for name, value in losses.items() if not torch.isfinite(value)]

@@ -70,7 +70,8 @@ function legend() {
   }
 }
 
-// -- words: LERF's relevancy, as chebsplat/labels/relevancy.py computes it, and labels, as chebsplat/labels/decode.py
+// -- words: probabilities, as chebsplat/labels/calibration.py computes them, LERF's relevancy, as chebsplat/labels/relevancy.py
+// does, for words without a calibration, and labels, as chebsplat/labels/decode.py
 function unit_features(arrays) {
   const { n } = splats, C = about.ranges.features.step.length, rows = new Float32Array(n * C), lengths = new Float32Array(n);
   for (let c = 0; c < C; c++) for (let k = 0; k < n; k++) rows[k * C + c] = arrays.features[c * n + k] * about.ranges.features.step[c];
@@ -86,16 +87,18 @@ function dots(rows, C, vector) {
   return found;
 }
 const embedding = word => Float32Array.from({ length: features.C }, (_, c) => lists.words[word * features.C + c] * about.word_step[c]);
-/** Of unit rows [n, C]: the largest inner product with a phrase, the second largest, and whose the largest is. */
-function strongest(rows) {
+/** Of unit rows [n, C]: the largest inner product with one of the vectors, the second largest, and whose the largest is. */
+function strongest(rows, vectors) {
   const { C } = features, n = rows.length / C, best = new Float32Array(n).fill(-Infinity), second = best.slice(), whose = new Int32Array(n);
-  for (let phrase = 0; phrase * C < lists.against.length; phrase++) {
-    const found = dots(rows, C, lists.against.subarray(phrase * C, (phrase + 1) * C));
+  for (let phrase = 0; phrase * C < vectors.length; phrase++) {
+    const found = dots(rows, C, vectors.subarray(phrase * C, (phrase + 1) * C));
     for (let k = 0; k < n; k++) if (found[k] > best[k]) { second[k] = best[k]; best[k] = found[k]; whose[k] = phrase; }
       else if (found[k] > second[k]) second[k] = found[k];
   }
   return { best, second, whose };
 }
+/** What unit rows are weighed against: phrases and, where there is a calibration, rivals. */
+const weighed = rows => ({ against: strongest(rows, lists.against), rivals: about.calibration && strongest(rows, lists.rivals) });
 /** Margin of a word over the strongest phrase (where words are labels: over the strongest other one), in [0, 1]. */
 function relevancy(rows, lengths, word, { best, second, whose }) {
   const apart = !about.against;
@@ -104,17 +107,35 @@ function relevancy(rows, lengths, word, { best, second, whose }) {
     return lengths[k] > 0 ? 1 / (1 + Math.exp((phrase - value) / TEMPERATURE)) : 0;
   });
 }
+const calibrated = word => !!about.calibration && !about.uncalibrated.includes(word);
+const logistic = odds => 1 / (1 + Math.exp(-odds));
+/** How likely each of unit rows is what a word means: by how far it is behind the best rival, and its cosine. */
+function probability(rows, lengths, word, { best }) {
+  const { margin, cosine, bias } = about.calibration;
+  return dots(rows, features.C, embedding(word)).map((value, k) =>
+    lengths[k] > 0 ? logistic(margin * (value - best[k]) + cosine * value + bias) : 0);
+}
+/** How likely the scene has what was asked for: by the likeliest thousandth of its Gaussians, five at least. */
+function presence(scores) {
+  const count = Math.min(Math.max(Math.floor(scores.length / 1000), 5), scores.length), sure = p => Math.min(Math.max(p, 1e-6), 1 - 1e-6);
+  const odds = scores.slice().sort().slice(-count).reduce((sum, p) => sum + Math.log(sure(p) / (1 - sure(p))), 0) / count;
+  return logistic(about.calibration.strength * odds + about.calibration.offset);
+}
+/** Scores of unit rows for a word: probabilities, or relevancy where no calibration speaks for it. */
+const scored = (rows, lengths, word, of) => calibrated(word) ? probability(rows, lengths, word, of.rivals) : relevancy(rows, lengths, word, of.against);
 function ask(text) {
   const folded = text.toLowerCase().replace(/[_-]/g, " ").trim().split(/\s+/).join(" "), word = about.words.findIndex(known => known.toLowerCase() == folded);
   if (word < 0) {
     const near = about.words.filter(known => folded.length > 1 && (known.includes(folded) || folded.includes(known))).slice(0, 5);
     get("answer").textContent = `This page has no "${text}"${near.length ? `; near: ${near.join(", ")}` : ""}.`; return null;
   }
-  const began = performance.now(), scores = relevancy(features.rows, features.lengths, word, features.against), most = scores.reduce((a, b) => Math.max(a, b), 0);
+  const began = performance.now(), scores = scored(features.rows, features.lengths, word, features), most = scores.reduce((a, b) => Math.max(a, b), 0);
   asked = { text, word, scores }; tip.hidden = true; show("relevancy");
-  const above = scores.reduce((count, score) => count + (score > 0.5), 0), ms = performance.now() - began;
-  get("answer").textContent = `${about.words[word]}: ${above.toLocaleString("en")} Gaussians above 0.5, the highest ${most.toFixed(2)} (${Math.round(ms)} ms)`;
-  return { above, ms };
+  const there = calibrated(word) ? presence(scores) : null, above = scores.reduce((count, score) => count + (score > 0.5), 0), ms = performance.now() - began;
+  const many = `${above.toLocaleString("en")} Gaussian${above == 1 ? "" : "s"}`, name = about.words[word];
+  get("answer").textContent = there === null ? `${name}: ${many} above 0.5, the highest ${most.toFixed(2)}; not calibrated (${Math.round(ms)} ms)`
+    : there > 0.5 ? `${name}: ${many} likelier than not (${Math.round(ms)} ms)` : `${name}: probably not here (${Math.round(100 * there)} %); ${many} likelier than not`;
+  return { above, ms, presence: there };
 }
 /** Label, its share and, where a word was asked, relevancy, of the features that a pixel shows; null where nothing is. */
 function meaning(x, y) {
@@ -125,7 +146,7 @@ function meaning(x, y) {
   const length = Math.hypot(...mean), direction = mean.map(value => value / Math.max(length, 1e-6));
   const cosines = dots(lists.label_embeddings, C, direction), label = cosines.indexOf(cosines.reduce((a, b) => Math.max(a, b)));
   const share = 1 / cosines.reduce((sum, value) => sum + Math.exp((value - cosines[label]) / TEMPERATURE), 0);
-  return { hit, label, share, relevant: mode == "relevancy" ? relevancy(direction, [length], asked.word, strongest(direction))[0] : null };
+  return { hit, label, share, relevant: mode == "relevancy" ? scored(direction, [length], asked.word, weighed(direction))[0] : null };
 }
 
 // -- the loop: pictures are drawn when something changed, smaller while that is slow, whole again at rest
@@ -250,7 +271,7 @@ function hover(event) { // once a frame at most
   hovering = requestAnimationFrame(() => {
     const { label, share, relevant } = meaning(...at); tip.hidden = label === undefined; if (tip.hidden) return;
     const swatch = document.createElement("i"); swatch.style.background = about.labels[label].color;
-    tip.replaceChildren(swatch, `${about.labels[label].name} ${Math.round(100 * share)} %${relevant === null ? "" : `, relevancy ${relevant.toFixed(2)}`}`);
+    tip.replaceChildren(swatch, `${about.labels[label].name} ${Math.round(100 * share)} %${relevant === null ? "" : `, ${about.words[asked.word]} ${calibrated(asked.word) ? `${Math.round(100 * relevant)} %` : relevant.toFixed(2)}`}`);
     tip.style.left = `${Math.min(clientX, innerWidth - tip.offsetWidth - 20)}px`; tip.style.top = `${Math.min(clientY, innerHeight - 50)}px`;
   });
 }
@@ -278,7 +299,7 @@ function furnish() { // what the panel lists
 async function open() {
   const arrays = await unpacked(get("data").textContent, about.places); get("data").textContent = "";
   splats = decoded(arrays, about.ranges, about.center); views = arrays.views; lists = arrays; strength = new Float32Array(splats.n).fill(1);
-  if (semantic) { splats.labels = arrays.labels; features = unit_features(arrays); features.against = strongest(features.rows); }
+  if (semantic) { splats.labels = arrays.labels; features = unit_features(arrays); Object.assign(features, weighed(features.rows)); }
   drawing = new Drawing(canvas, splats); camera = at_view(0);
   sorter = new Sorter(splats, found => { order = found; drawing.order(order); dirty = true; });
   order = sorted(splats.means, splats.reach, sortable(seen(camera))); drawing.order(order);

@@ -61,7 +61,7 @@ function sorted(means, reach, { turn: R, shift, slopes: [wide, tall] }) {
   const scale = 65535 / Math.max(high - low, 1), starts = new Uint32Array(65537), order = new Uint32Array(count);
   for (let k = 0; k < n; k++) if (bits[k]) starts[bits[k] = 65536 - Math.floor((bits[k] - low) * scale)]++;
   for (let key = 1; key <= 65536; key++) starts[key] += starts[key - 1];
-  for (let k = 0; k < n; k++) if (bits[k]) order[starts[bits[k] - 1]++] = k;
+  for (let k = n; k--;) if (bits[k]) order[starts[bits[k] - 1]++] = k; // of equal depth the first is in front, as in ours
   return order;
 }
 

@@ -1,0 +1,90 @@
+"""Splats that others wrote, 150,000 of them, open in the viewer, the page and the renderer: what is shown is theirs."""
+
+import chebsplat.kernels.jit  # noqa: F401  # isort: skip  # gsply runs on numba too: the threading layer is chosen first
+
+import numpy as np
+import pytest
+from box_room import room
+from browser import BROWSER
+from click.testing import CliRunner
+from driven import driven
+from scipy.special import expit
+from shared import data
+from test_page import decibels, held_in, picture
+
+from chebsplat.formats.packed import Packed, unpack
+from chebsplat.pipelines.cli import main
+from chebsplat.render import SceneRenderer
+from chebsplat.stages.opened import OpenedScene
+from chebsplat.stages.page import foreign
+from chebsplat.stages.viewing import Shown, Viewing
+
+N = 150_000
+
+
+@pytest.fixture(scope="module")
+def written_by_gsply(tmp_path_factory):
+    """(parameters of 150,000 Gaussians, the PLY of them that gsply wrote)."""
+    import gsply
+
+    parameters, _, _ = room(N)
+    parameters["log_scales"] -= np.float32(0.7)
+    ply = tmp_path_factory.mktemp("gsply") / "theirs.ply"
+    raw = [parameters[name] for name in ("means", "log_scales", "quats", "logit_opacities")]
+    gsply.plywrite(ply, *raw, parameters["sh0"][:, 0], parameters["shN"][:, :3])
+    return parameters, ply
+
+
+@pytest.fixture(scope="module")
+def trained_elsewhere():
+    """A PLY of 90,854 Gaussians of degree 0, in the layout of 17 floats."""
+    return data("gs_ply") / "guitar_decoded_sh0.ply"
+
+
+def shown_in_both(ply, tmp_path):
+    """The scene as opened, the viewer's first picture of it, what its page holds, and the page."""
+    opened = OpenedScene(foreign(ply), ply)
+    viewing = Viewing(opened)
+    assert viewing.modes == ["color", "depth", "density"]
+    images = {mode: viewing.picture(opened.cameras[0], Shown(mode)) for mode in viewing.modes}
+    assert all(image.any() for image in images.values())
+    out = tmp_path / "theirs.html"
+    done = CliRunner().invoke(main, ["page", str(ply), "--out", str(out), "--sh", "1"])
+    assert done.exit_code == 0, done.output
+    about, arrays = held_in(out)
+    held = unpack(Packed({name: values for name, values in arrays.items() if name != "views"}, about["ranges"]))
+    return opened, images["color"], held, out
+
+
+def test_150000_splats_of_gsply_open_in_viewer_and_page(written_by_gsply, tmp_path):
+    parameters, ply = written_by_gsply
+    opened, image, held, _ = shown_in_both(ply, tmp_path)
+    assert len(opened) == len(held["means"]) == N
+    truth = SceneRenderer(parameters | {"degrees": np.ones(N, np.uint8)}).render(opened.cameras[0].view())[0]
+    np.testing.assert_array_equal(image, truth)
+    np.testing.assert_array_equal(np.sort(opened.parameters["means"][:, 0]), np.sort(parameters["means"][:, 0]))
+    assert np.abs(held["means"] - opened.parameters["means"]).max() < 1e-5
+    opacities = expit(opened.parameters["logit_opacities"])
+    assert np.abs(expit(held["logit_opacities"]) - opacities).max() < 0.51 / 255
+
+
+@pytest.mark.data
+def test_a_splat_trained_elsewhere_opens_in_viewer_and_page(trained_elsewhere, tmp_path):
+    opened, _, held, _ = shown_in_both(trained_elsewhere, tmp_path)
+    assert len(opened) == len(held["means"]) == 90_854
+    assert opened.parameters["degrees"].max() == 0
+    extent = np.ptp(opened.parameters["means"], axis=0).max()
+    assert np.abs(held["means"] - opened.parameters["means"]).max() < 1e-5 * extent
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(BROWSER is None, reason="neither chromium nor google-chrome is installed")
+def test_in_a_browser_150000_splats_are_drawn_as_we_draw_them(written_by_gsply, tmp_path):
+    opened, _, _, out = shown_in_both(written_by_gsply[1], tmp_path)
+    truth = opened.render(opened.cameras[0]).color
+    with driven(tmp_path) as browser:
+        browser.open(out, 960, 720)
+        browser.run("scene.ready")
+        assert decibels(picture(browser, 0, (640, 480)), truth) > 40
+        browser.screenshot(tmp_path / "theirs.png")
+        assert browser.complaints == []
