@@ -9,6 +9,10 @@ ifneq ($(MADE),$(shell realpath .venv))
 .PHONY: $(READY)
 endif
 endif
+# `make setup device=cuda` adds to a .venv that may be there already.
+ifneq ($(and $(filter setup,$(MAKECMDGOALS)),$(device)),)
+.PHONY: $(READY)
+endif
 unexport PYTHONDONTWRITEBYTECODE
 
 CHEBSPLAT := .venv/bin/chebsplat
@@ -17,7 +21,7 @@ CHOICE := $(if $(scene),--scene '$(scene)') $(if $(sequence),--sequence '$(seque
 
 # `make scene=office0` needs no target: naming a scene, a sequence, a study or a benchmark means running it.
 .DEFAULT_GOAL := $(if $(study),study,$(if $(bench),bench-$(bench),$(if $(scene)$(sequence),run,help)))
-.PHONY: help run study view plan verify clean-stale setup test test-all malformed soak stability bench text-model nouns knowledge calibration teacher teacher-quality lint lock
+.PHONY: help run study view plan verify clean-stale setup test test-all gpu malformed soak stability bench text-model nouns knowledge calibration teacher teacher-quality lint lock
 
 run: $(READY)  ## make scene=NAME|FOLDER [stage=] [set=a.b=c,...] [ablation=] [basis=NAME@REVISION|none] [cores=] [device=]; or sequence=NAME
 	@$(CHEBSPLAT) run $(CHOICE) $(if $(stage),--stage '$(stage)') $(if $(cores),--cores '$(cores)') $(if $(device),--device '$(device)')
@@ -30,7 +34,7 @@ view: $(READY)  ## make view scene=NAME|FOLDER|FILE.ply [port=8080]: look at a f
 	@$(CHEBSPLAT) view '$(scene)' $(if $(port),--port '$(port)')
 
 plan: $(READY)  ## make plan scene=NAME (or study=NAME): what would run, what is fresh, what is left out, and why
-	@$(CHEBSPLAT) $(if $(study),study '$(study)' --plan,plan $(CHOICE))
+	@$(CHEBSPLAT) $(if $(study),study '$(study)' --plan,plan $(CHOICE)) $(if $(device),--device '$(device)')
 
 verify: $(READY)  ## make verify scene=NAME|FOLDER: recompute every digest of its artifacts, or (dir=) of one artifact
 	@$(CHEBSPLAT) verify $(if $(scene),'$(scene)') $(dir)
@@ -41,10 +45,10 @@ clean-stale: $(READY)  ## list artifacts that nothing names; yes=1 removes them
 help:  ## list the targets
 	@grep -hE '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed -E 's/:.*## /\t/' | expand -t 18
 
-setup: $(READY)  ## create .venv and install the lock (done on first use by every target)
+setup: $(READY)  ## create .venv and install the lock (done on first use); device=cuda: CUDA's torch, and gsplat
 
 $(READY): requirements.lock pyproject.toml pipelines/setup.sh
-	@bash pipelines/setup.sh
+	@device='$(if $(filter setup,$(MAKECMDGOALS)),$(device))' bash pipelines/setup.sh
 	@touch $@
 
 test: $(READY)  ## the tests, in parallel, without the slow ones
@@ -52,6 +56,10 @@ test: $(READY)  ## the tests, in parallel, without the slow ones
 
 test-all: $(READY)  ## all tests, the slow ones too
 	@$(PY) -m pytest -q -n auto --dist loadgroup -m "not gpu" $(args)
+
+gpu: $(READY)  ## tests that need an NVIDIA GPU, then office0 on it beside the CPU: build/bench/gpu.csv (under 10 minutes)
+	@$(PY) -m pytest -q -m gpu $(args)
+	@$(PY) -m benchmarks gpu
 
 malformed: $(READY)  ## every malformed input of the corpus: exit code, seconds, memory; build/malformed.csv (args="WORD ...")
 	@PYTHONPATH=tests $(PY) -m malformed $(args)

@@ -55,6 +55,7 @@ BENCHMARKS = {
     "query": Benchmark("query", "asking at the suggested cut: precision, recall, absent words refused; trains 5 rooms"),
     "layouts": Benchmark("layouts", "the exported layouts: bytes, and images beside the checkpoint's", ("export",)),
     "store": Benchmark("store", "the feature store: bytes, error, label decisions, bandwidth, memory"),
+    "gpu": Benchmark("gpu", "office0 on a GPU beside the CPU: seconds, PSNR, mIoU, frames/s, memory; needs a GPU"),
     "stability": Benchmark("stability.main", "every extreme case of the maths, naive and ours; fails if one does"),
 }
 

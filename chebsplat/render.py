@@ -31,10 +31,10 @@ def colors_by_degree(sh0: Tensor, shN: Tensor, directions: Tensor, degrees: Tens
 
 
 class SceneRenderer:
-    """Renders an exported scene (`formats.scene.Scene.parameters`)."""
+    """Renders an exported scene (`formats.scene.Scene.parameters`) on a device; its depth, always on the CPU."""
 
-    def __init__(self, parameters: dict[str, np.ndarray]):
-        raw = {name: torch.from_numpy(np.ascontiguousarray(values)) for name, values in parameters.items()}
+    def __init__(self, parameters: dict[str, np.ndarray], device: str = "cpu"):
+        raw = {name: torch.from_numpy(np.ascontiguousarray(values)).to(device) for name, values in parameters.items()}
         self.means, self.quats, self.scales, self.opacities = activated(raw)
         self.raw, self.reach = raw, 3 * self.scales.amax(1)
         self.normals = torch.from_numpy(surface_of(parameters)[0])
@@ -47,6 +47,7 @@ class SceneRenderer:
     @torch.no_grad()
     def render(self, view: View, with_features: bool = False) -> tuple[np.ndarray, np.ndarray | None]:
         """Image u8 [H, W, 3], and features f32 [H, W, C] where asked for and present."""
+        view = view.to(self.means.device)
         index = in_frustum(self.means, view, self.reach)
         raw, channels = self.raw, self.colors(view, index)
         if with_features and "features" in raw:
@@ -54,8 +55,8 @@ class SceneRenderer:
         gaussians = (self.means[index], self.quats[index], self.scales[index], self.opacities[index])
         camera = (view.viewmat[None], view.K[None], view.width, view.height)
         render, _, _ = rasterize(*gaussians, channels, *camera)
-        image = (render[0, ..., :3].clamp(0, 1) * 255).round().byte().numpy()
-        return image, render[0, ..., 3:].numpy() if channels.shape[1] > 3 else None
+        image = (render[0, ..., :3].clamp(0, 1) * 255).round().byte().cpu().numpy()
+        return image, render[0, ..., 3:].cpu().numpy() if channels.shape[1] > 3 else None
 
     @torch.no_grad()
     def render_depth(self, view: View, nearest: float = 0.01) -> tuple[np.ndarray, np.ndarray]:
@@ -66,10 +67,12 @@ class SceneRenderer:
         Choices: Gaussians are planes (`splats.planes.inverse_depths`), whose depth `rasterize.depths` takes where most
           of a pixel's light has been gathered: their mean lies in front of walls.
         """
-        index = in_frustum(self.means, view, self.reach)
-        K, pose = view.K.double(), view.viewmat.double()
-        means, normals = (values[index].double() @ pose[:3, :3].T for values in (self.means, self.normals))
+        index = in_frustum(self.means, view.to(self.means.device), self.reach).cpu()
+        K, pose = view.K.double().cpu(), view.viewmat.double().cpu()
+        held = (self.means, self.quats, self.scales, self.opacities)
+        gaussians = tuple(part.cpu()[index] for part in held)
+        means, normals = (values.double() @ pose[:3, :3].T for values in (gaussians[0], self.normals[index]))
         planes = inverse_depths(means + pose[:3, 3], normals, K, nearest)
-        gaussians = tuple(part[index].numpy() for part in (self.means, self.quats, self.scales, self.opacities))
-        depth, covered = depths(gaussians, pose.numpy(), K.numpy(), (view.width, view.height), planes.numpy())
+        arrays = tuple(part.numpy() for part in gaussians)
+        depth, covered = depths(arrays, pose.numpy(), K.numpy(), (view.width, view.height), planes.numpy())
         return np.where((covered > 1e-3) & (depth > nearest) & np.isfinite(depth), depth, np.float32(np.nan)), covered

@@ -22,6 +22,10 @@ class View:
     height: int
     twist: Tensor | None = None
 
+    def to(self, device: str | torch.device) -> View:
+        """The same camera, its matrices on a device."""
+        return View(self.K.to(device), self.viewmat.to(device), self.width, self.height, self.twist)
+
 
 def in_frustum(means: Tensor, view: View, reach: Tensor, margin: float = 0.15) -> Tensor:
     """Indices of points whose sphere of radius `reach` [N] may touch the image; NaN never does."""
@@ -62,12 +66,13 @@ def remembered(read: Callable[[int], Tensor], budget: int) -> Callable[[int], Te
 
 class TaughtLabels(NamedTuple):
     """What a teacher takes a view's cells for: classes i64 [h, w], -1 where it says nothing; confidence [h, w] in
-    [0, 1]; class_codes [L, C] that features of a label are near.
+    [0, 1]; class_codes [L, C] that features of a label are near; complete: whether every cell has a label.
     """
 
     classes: Tensor
     confidence: Tensor
     class_codes: Tensor
+    complete: bool = False
 
 
 @dataclass
@@ -86,10 +91,30 @@ class Views:
     labels: Callable[[int], TaughtLabels] | None = None
     depth: Callable[[int, int], Tensor] | None = None
 
+    def to(self, device: str | torch.device) -> Views:
+        """The same views on a device: photos, masks and cameras for good, the rest as each step reads it."""
+        features, labels, depth = self.features, self.labels, self.depth
+
+        def labels_there(index: int) -> TaughtLabels:
+            assert labels is not None
+            classes, confidence, codes, complete = labels(index)
+            return TaughtLabels(classes.to(device), confidence.to(device), codes.to(device), complete)
+
+        return Views(
+            self.names,
+            self.images.to(device),
+            self.Ks.to(device),
+            self.viewmats.to(device),
+            None if self.masks is None else self.masks.to(device),
+            None if features is None else lambda index: features(index).to(device),
+            None if labels is None else labels_there,
+            None if depth is None else lambda index, factor: depth(index, factor).to(device),
+        )
+
     def camera(self, index: int, factor: int) -> View:
         """The view's camera at 1/factor of its resolution."""
         height, width = self.images.shape[1] // factor, self.images.shape[2] // factor
-        scale = torch.tensor([[width / self.images.shape[2]], [height / self.images.shape[1]], [1.0]])
+        scale = self.Ks.new_tensor([[width / self.images.shape[2]], [height / self.images.shape[1]], [1.0]])
         return View(self.Ks[index] * scale, self.viewmats[index], width, height)
 
     def target(self, index: int, factor: int) -> tuple[Tensor, Tensor | None]:

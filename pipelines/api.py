@@ -48,8 +48,9 @@ def train(
     from chebsplat.pipelines.cli.runs import plans
     from chebsplat.pipelines.run import device_of, execute
 
-    chosen = plans(str(capture), None, as_text(settings), ablation, basis, running=True)
-    if execute(chosen, None, cores or os.cpu_count() or 1, device_of(device)):
+    used = device_of(device)
+    chosen = plans(str(capture), None, as_text(settings), ablation, basis, running=True, device=used)
+    if execute(chosen, None, cores or os.cpu_count() or 1, used):
         raise ChebsplatError(f"{capture} could not be finished; the lines above name the stage and its log")
     return load(store.work() / chosen[-1].title)
 

@@ -15,6 +15,7 @@ from chebsplat.pipelines.plan import Plan, Planner
 from chebsplat.pipelines.run import HERE, entry, git_state, write_plan
 from chebsplat.pipelines.scenes import names
 from chebsplat.pipelines.sequences import chain, scenes_of
+from chebsplat.stages.device import resolve
 from chebsplat.stages.registry import STAGES
 
 PREFIX = "basis-"  # of a HEAD's folder, whose links keep its artifacts
@@ -111,7 +112,7 @@ def revisions(text: str) -> list[Path]:
     if not is_sequence(reference.name):
         found = revisions_of_head(reference.name)
         return found[: chosen(reference, len(found))]
-    planner = Planner()
+    planner = Planner(device=resolve("auto")[0])  # what `make sequence=` takes unless it is told
     plans = chain(planner, reference.name, length=chosen(reference, len(scenes_of(reference.name))))
     planner.save()
     made = [plan.targets["cks"] for plan in plans]

@@ -22,12 +22,18 @@ PLACES = (
 
 
 def step_key(
-    stage: Stage, sections: dict[str, Any], inputs: dict[str, str], code: dict[str, Any], raw: str | None = None
+    stage: Stage,
+    sections: dict[str, Any],
+    inputs: dict[str, str],
+    code: dict[str, Any],
+    raw: str | None = None,
+    device: str = "cpu",
 ) -> str:
     """Key of a stage's artifact, 16 hex digits.
 
     Args: sections: the config that the stage reads; inputs: keys of artifacts by role;
-          code: of `Code.stage`; raw: `raw.content_hash` of the files outside the store that the stage reads.
+          code: of `Code.stage`; raw: `raw.content_hash` of the files outside the store that the stage reads;
+          device: of the run. The CPU's keys do not name it.
     """
     identity = {
         "stage": stage.name,
@@ -36,6 +42,8 @@ def step_key(
         "inputs": inputs,
         "code": code,
     } | ({} if raw is None else {"raw": raw})
+    if stage.on_device and device != "cpu":
+        identity["device"] = device
     text = json.dumps(identity, sort_keys=True, separators=(",", ":"), allow_nan=False)
     return hashlib.sha256(text.encode()).hexdigest()[:16]
 

@@ -123,12 +123,13 @@ class Planner:
     """Plans scenes; remembers hashes of code and raw files between runs.
 
     Args: code: where the layers lie; running: what is planned will run, so that the work folder is made, and a folder
-          gets its name for good.
+          gets its name for good; device: that steps which can use a GPU run on.
     """
 
-    def __init__(self, code: dict[str, Path] | None = None, running: bool = False):
+    def __init__(self, code: dict[str, Path] | None = None, running: bool = False, device: str = "cpu"):
         self.code_memo, self.file_memo = store.Memo("code"), store.Memo("files")
         self.code, self.running = Code(code or installed(), self.code_memo.values), running
+        self.device = device
 
     def save(self) -> None:
         self.code_memo.save()
@@ -217,8 +218,10 @@ class Planner:
         sections = config.sections(stage.sections)
         root, files = raw_files(stage.name, sections)
         raw = hashes(files, self.file_memo.values)
-        code = self.code.stage(stage.name, (*used, *media_packages(files)))
-        key = step_key(stage, sections, keys, code, content_hash(raw, root) if raw or stage.name == "ingest" else None)
+        rendering = ("gsplat",) if stage.on_device and self.device == "cuda" else ()
+        code = self.code.stage(stage.name, (*used, *rendering, *media_packages(files)))
+        content = content_hash(raw, root) if raw or stage.name == "ingest" else None
+        key = step_key(stage, sections, keys, code, content, self.device)
         return Step(stage.name, key, store.artifact_path(stage.name, key), inputs, sections, code, raw)
 
     def _probe(self, source: Any, scene: str) -> dict[str, bool]:

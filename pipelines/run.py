@@ -21,6 +21,7 @@ from chebsplat.pipelines import children, job, store, summary
 from chebsplat.pipelines.plan import Plan, Step
 from chebsplat.pipelines.store import say
 from chebsplat.pipelines.tables import aligned
+from chebsplat.stages.registry import STAGES
 
 HERE = Path(__file__).parent
 
@@ -187,7 +188,7 @@ def entry(step: Step, state: dict[str, Any], device: str = "cpu") -> dict[str, A
         "config": step.sections,
         "code": step.code | state,
         "raw": step.raw,
-        "device": device,
+        "device": device if STAGES[step.stage].on_device else "cpu",
     }
 
 

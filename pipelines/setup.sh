@@ -1,8 +1,17 @@
 #!/usr/bin/env bash
 # Create .venv and install the lock: no root, nothing global, never a CUDA torch on a machine without a GPU.
+# device=cuda: the lock's torch as built for CUDA, and the extra `cuda` (gsplat).
 set -euo pipefail
 cd "$(dirname "$0")/.."
 py=.venv/bin/python
+device=${device:-}
+
+has_gpu() { [ -e /proc/driver/nvidia/version ] || nvidia-smi -L >/dev/null 2>&1; }
+case "$device" in
+  "" | auto | cpu) ;;
+  cuda) has_gpu || { echo "setup: device=cuda: this machine has no NVIDIA driver; install it first" >&2; exit 2; } ;;
+  *) echo "setup: device=$device is none of auto, cpu, cuda" >&2; exit 2 ;;
+esac
 
 # A torch that lies in a folder which pip is told to look in (find-links) decides for the Pythons it is built for.
 links=$(python3 -m pip config get global.find-links 2>/dev/null || true)
@@ -46,14 +55,19 @@ $py -m pip install --quiet "uv==0.13.8"
 options=()
 for folder in $links; do options+=(--find-links "$folder"); done
 [ -n "$wheels" ] || options+=(--torch-backend auto)
+if [ "$device" = cuda ]; then  # not from a folder of wheels for the CPU, nor what is installed of them
+  options=(--torch-backend auto)
+  $py -c 'import sys, torch; sys.exit(torch.version.cuda is None)' 2>/dev/null || options+=(--reinstall-package torch)
+fi
 $py -m uv pip install --quiet --python $py -r requirements.lock "${options[@]}"
 $py -m uv pip install --quiet --python $py --no-deps --editable .
+[ "$device" != cuda ] || $py -m uv pip install --quiet --python $py --constraint requirements.lock --editable '.[cuda]'
 
 # open3d wants libusb-1.0.so.0; libusb-package ships it, and a link beside libOpen3D lets the loader find it.
 site=$($py -c 'import sysconfig; print(sysconfig.get_path("purelib"))')
 ln -sfn ../libusb_package/libusb-1.0.so "$site/open3d/libusb-1.0.so.0"
 
-if [ ! -e /proc/driver/nvidia/version ]; then
+if ! has_gpu; then
   $py -c 'import sys, torch; sys.exit(f"setup: a CUDA torch ({torch.__version__}) on a machine without a GPU" if torch.version.cuda else 0)'
 fi
 echo "setup: ready ($($py --version))" >&2

@@ -138,10 +138,12 @@ def publish(
         sources = {role: {"key": m.key, "schema": m.schema} for role, m in manifests.items()}
         if key is not None and not is_key(key):
             raise ConfigError(f"--key {key}: a key is 16 hexadecimal digits; leave it away, or correct it")
-        key = key or artifact.digest({"stage": name, "config": settings, "inputs": sources})
+        device, why = resolve(device)
+        device = device if stage.on_device else "cpu"
+        computed = {} if device == "cpu" else {"device": device}
+        key = key or artifact.digest({"stage": name, "config": settings, "inputs": sources} | computed)
         artifact.check_place(out, stage.schema, key, force)
         seed = next((settings[s]["seed"] for s in reversed(stage.sections) if "seed" in settings[s]), None)
-        device, why = resolve(device)
         if why:
             log.info("%s", why)
         manifest = Manifest(
@@ -171,7 +173,19 @@ def _versions() -> dict[str, str]:
     """Versions of the packages that the stage really loaded."""
     from importlib import metadata
 
-    names = {"torch", "numpy", "scipy", "numba", "pycolmap", "open3d", "zarr", "onnxruntime", "fpsample", "PIL"}
+    names = {
+        "torch",
+        "numpy",
+        "scipy",
+        "numba",
+        "pycolmap",
+        "open3d",
+        "zarr",
+        "onnxruntime",
+        "fpsample",
+        "PIL",
+        "gsplat",
+    }
     distributions = {"open3d": "open3d-cpu", "PIL": "pillow"}
-    loaded = sorted(names & set(sys.modules))
+    loaded = sorted(name for name in names if sys.modules.get(name))
     return {n: metadata.version(distributions.get(n, n)) for n in loaded} | {"python": sys.version.split()[0]}

@@ -1,4 +1,4 @@
-"""What computes: the CPU, until training on a GPU is there."""
+"""What computes: an NVIDIA GPU where torch and gsplat can use one, otherwise the CPU, and why."""
 
 from __future__ import annotations
 
@@ -7,19 +7,36 @@ from pathlib import Path
 from chebsplat.errors import ConfigError
 
 DRIVER = Path("/proc/driver/nvidia/version")  # there where an NVIDIA driver is
-NO_GPU = "this version does not train on a GPU yet"
 DEVICES = ("auto", "cpu", "cuda")
+REMEDY = "`make setup device=cuda` adds it"
 
 
-def resolve(wanted: str, driver: Path | None = None) -> tuple[str, str]:
-    """What computes, and why it is not the GPU of a machine that has one ("": there is nothing to say).
+def resolve(wanted: str) -> tuple[str, str]:
+    """What computes, `cpu` or `cuda`, and why it is not the GPU of a machine that has one ("": nothing is to be said).
 
-    Args: driver: a file that is there where an NVIDIA driver is; default: DRIVER.
-    Raises: ConfigError on `cuda`.
+    Raises: ConfigError, with the remedy, on `cuda` where something is missing.
+    Choices: `auto` loads no torch to ask it on a machine without an NVIDIA driver; `cuda` asks it in any case.
     """
-    present = (driver or DRIVER).exists()
+    if wanted == "cpu" or (wanted == "auto" and not DRIVER.exists()):
+        return "cpu", ""
+    lack = missing()
+    if not lack:
+        return "cuda", ""
     if wanted == "cuda":
-        lead = "an NVIDIA driver was found, but" if present else "no NVIDIA driver was found, and"
-        raise ConfigError(f"--device cuda: {lead} {NO_GPU}; use cpu, or auto")
-    mention = wanted == "auto" and present
-    return "cpu", f"an NVIDIA driver was found, but {NO_GPU}: everything runs on the CPU" if mention else ""
+        raise ConfigError(f"--device cuda: {lack}; or use cpu, or auto")
+    return "cpu", f"an NVIDIA driver was found, but {lack}: everything runs on the CPU"
+
+
+def missing() -> str:
+    """What a GPU lacks here to train on it, and what adds it: CUDA in torch, an answer, or gsplat; "": nothing."""
+    import torch
+
+    if torch.version.cuda is None:
+        return f"torch {torch.__version__} is built without CUDA ({REMEDY})"
+    if not torch.cuda.is_available():
+        return "no GPU answers (`nvidia-smi` says more; the driver must know CUDA " + torch.version.cuda + ")"
+    try:
+        import gsplat  # noqa: F401
+    except ImportError as error:
+        return f"gsplat cannot be imported: {error} ({REMEDY})"
+    return ""

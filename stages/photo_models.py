@@ -28,14 +28,15 @@ def camera_models(job: Job, capture: Capture, points: Points, views: Views) -> C
     train, exposure, poses = job.config.train, None, None
     wanted, why = wants_exposure(job, capture, points)
     if wanted:
-        exposure = Exposure(len(views.names), train.lr_exposure, train.weight_exposure)
+        exposure = Exposure(len(views.names), train.lr_exposure, train.weight_exposure, job.device)
     else:
         job.left_out("exposure by photo", why)
     if train.poses == "refined":
         size = capture.size
         row = {name: k for k, name in enumerate(points.names)}
         given = torch.from_numpy(points.cam_from_world[[row[name] for name in views.names]])
-        poses = Poses(given, views.Ks, size, torch.from_numpy(points.means), train.lr_poses)
+        of_scene = torch.from_numpy(points.means)
+        poses = Poses(given, views.Ks.cpu(), size, of_scene, train.lr_poses, device=job.device)
     else:
         job.left_out("pose refinement", "train.poses is given")
     return CameraModels(exposure, poses)
@@ -79,7 +80,7 @@ def reached(models: CameraModels, views: Views, points: Points) -> np.ndarray:
     poses = points.cam_from_world.copy()
     if models.poses is not None:
         row = {name: k for k, name in enumerate(points.names)}
-        poses[[row[name] for name in views.names]] = models.poses.viewmats.numpy()
+        poses[[row[name] for name in views.names]] = models.poses.viewmats.cpu().numpy()
     return poses
 
 
@@ -93,7 +94,7 @@ def facts(models: CameraModels) -> dict[str, Any]:
     if models.exposure is not None:
         found["exposure"] = float(models.exposure.maps.square().sum((1, 2)).mean().sqrt())
     if models.poses is not None:
-        given, now = models.poses.given.numpy(), models.poses.viewmats.numpy()
+        given, now = models.poses.given.cpu().numpy(), models.poses.viewmats.cpu().numpy()
         cosines = (np.einsum("vij,vij->v", given[:, :3, :3], now[:, :3, :3]) - 1) / 2
         shifts = np.linalg.norm(centers(now) - centers(given), axis=1)
         found["poses"] = {"degrees": float(np.degrees(np.arccos(cosines.clip(-1, 1))).mean()), "shift": shifts.mean()}

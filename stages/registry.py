@@ -18,6 +18,7 @@ class Stage:
 
     of_scene: bool = True  # false: never a part of a scene's run, only what such a run is given
     after: tuple[str, ...] = ()  # stages of the scene that come first, although nothing of theirs is read
+    on_device: bool = False  # computes on a GPU where one is used, to other bytes than the CPU's: the key says so then
 
     @property
     def roles(self) -> dict[str, str]:
@@ -45,7 +46,7 @@ STAGES: dict[str, Stage] = {
         Stage("train", "chebsplat.gaussians/1", ("describe", "train"),
               (("capture", "ingest"), ("points", "sfm")),
               (("features", "teacher"), ("descriptors", "describe"), ("basis", "cks")),
-              after=("agree",), help="Train the semantic Gaussian scene (Eqs 7-13)."),
+              after=("agree",), on_device=True, help="Train the semantic Gaussian scene (Eqs 7-13)."),
         Stage("lift", "chebsplat.lifted/1", ("lift",),
               (("capture", "ingest"), ("gaussians", "train"), ("features", "teacher")),
               help="Features of the teacher on trained Gaussians, and how much the views agree, without training."),

@@ -18,8 +18,8 @@ SECONDS = 30.0  # between two saves
 class Saves:
     """States of one training, the last one kept, in the job's scratch folder.
 
-    A state fits only the same settings, inputs, package versions and number of threads: from another one the training
-    starts anew and says so.
+    A state fits only the same settings, inputs, package versions, device and number of threads: from another one the
+    training starts anew and says so.
     """
 
     def __init__(self, job: Job):
@@ -28,7 +28,9 @@ class Saves:
         inputs = {role: read_manifest(path).key for role, path in job.inputs.items()}
         settings = job.config.sections(("describe", "train"))
         versions = {name: version(name) for name in ("torch", "numba")}
-        self.identity = digest({"inputs": inputs, "config": settings, "versions": versions, "threads": n_threads()})
+        self.identity = digest(
+            {"inputs": inputs, "config": settings, "device": job.device, "versions": versions, "threads": n_threads()}
+        )
         self.file = job.scratch / "training.pt"
         self.saved = time.monotonic()
 

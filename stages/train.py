@@ -25,6 +25,7 @@ from chebsplat.stages.train_inputs import (
 
 if TYPE_CHECKING:
     import numpy as np
+    from torch import Tensor
 
     from chebsplat.settings import TrainSection
     from chebsplat.training.trainer import Trainer
@@ -59,9 +60,9 @@ def run(job: Job) -> None:
     from chebsplat.training.trainer import Trainer
 
     torch.set_num_threads(n_threads())  # sums of torch depend on it; the same bytes are promised for the same number
-    model = model_of(points, features, train, job.config.describe)
+    model = model_of(points, features, train, job.config.describe, job.device)
     regions, described_values = first_regions(descriptors if points is given else None)
-    views = training_views(capture, points, features, bool(train.weight_depth))
+    views = training_views(capture, points, features, bool(train.weight_depth)).to(job.device)
     models = camera_models(job, capture, points, views)
     trainer = Trainer(
         model,
@@ -80,7 +81,9 @@ def run(job: Job) -> None:
     left = parameters["degrees"].size
     if left == 0:
         raise DataFailure("no Gaussian is left; lower train.weight_mask or raise train.min_gaussians")
-    modules = {f"{n}.{k}": v.detach().numpy() for n, m in model.modules.items() for k, v in m.state_dict().items()}
+    modules = {
+        f"{n}.{k}": v.detach().cpu().numpy() for n, m in model.modules.items() for k, v in m.state_dict().items()
+    }
     cameras = Cameras(points.names, points.Ks, reached(models, views, points), *capture.size)
     given_poses = None if models.poses is None else points.cam_from_world
     job.facts |= facts(models)
@@ -97,12 +100,17 @@ def run(job: Job) -> None:
         if model.shape.modulation is not None and trainer.basis:
             job.facts["alpha"] = float(model.shape.modulation(model.shape.cache.mean(0)))
     if model.shape is not None and features is not None:
-        job.facts["encoder"] = agreement(model.shape.alone().numpy(), parameters["features"], features.label_embeddings)
+        job.facts["encoder"] = agreement(
+            model.shape.alone().cpu().numpy(), parameters["features"], features.label_embeddings
+        )
     if features is not None:
         mask = trainer.final_mask()
-        job.facts["guidance"] = guidance(parameters, None if mask is None else mask.numpy(), features.label_embeddings)
+        soft = None if mask is None else mask.cpu().numpy()
+        job.facts["guidance"] = guidance(parameters, soft, features.label_embeddings)
     timed = max(trainer.step - 1, 1)  # all but the first
     job.facts |= {"n_gaussians": left, "steps": trainer.step, "seconds_per_step": trace[-1]["seconds"] / timed}
+    if job.device == "cuda":
+        job.facts["peak_device_bytes"] = torch.cuda.max_memory_allocated()
     job.facts["milliseconds"] = {part: 1e3 * seconds / timed for part, seconds in trainer.laps.seconds.items()}
     moments = optimizer_state(trainer)
     write_gaussians(job.out, Gaussians(parameters, cameras, modules, moments, trace, notes, given_poses))
@@ -186,7 +194,7 @@ def follow(job: Job, trainer: Trainer, train: TrainSection) -> list[dict[str, fl
     watched = list(range(0, n_views, max(n_views // 4, 1)))[:4]
     saves = Saves(job)
     trace: list[dict[str, float]] = []
-    since: list[dict[str, float]] = []
+    since: list[dict[str, float | Tensor]] = []
     if (held := saves.load()) is not None:
         trainer.load_state_dict(held["trainer"])
         trace, since = held["trace"], held["since"]
@@ -194,7 +202,7 @@ def follow(job: Job, trainer: Trainer, train: TrainSection) -> list[dict[str, fl
         log.info("resumed at step %d", trainer.step)
     with deferred() as asked:
         periods = train.encode_every, trainer.feature_every
-        losses: deque[float] = deque(maxlen=max(periods))  # some terms are in one step of so many alone
+        losses: deque[float | Tensor] = deque(maxlen=max(periods))  # some terms are in one step of so many alone
         rounds = job.progress.track(trainer.steps(), lambda: expected(trainer), "train", start=trainer.step)
         for figures, status in rounds:
             since.append(figures)
@@ -203,7 +211,9 @@ def follow(job: Job, trainer: Trainer, train: TrainSection) -> list[dict[str, fl
                 since = []
                 job.progress.record(**trace[-1])
             losses.append(figures["loss"])
-            status |= {"mean loss": f"{np.mean(losses):.4f}", "gaussians": figures["n"]} | shown(trace)
+            if trainer.reads:
+                mean = np.mean([float(loss) for loss in losses])
+                status |= {"mean loss": f"{mean:.4f}", "gaussians": figures["n"]} | shown(trace)
             saves.offer(partial(state, trainer, trace, since, job), now=asked.stop is not None)
             if asked.stop is not None:
                 log.info("saved at step %d; the same command goes on from there", trainer.step)
@@ -212,9 +222,9 @@ def follow(job: Job, trainer: Trainer, train: TrainSection) -> list[dict[str, fl
     return [{k: row.get(k, 0.0) for k in columns} for row in trace]
 
 
-def measured(trainer: Trainer, since: list[dict[str, float]], watched: list[int]) -> dict[str, float]:
+def measured(trainer: Trainer, since: list[dict[str, float | Tensor]], watched: list[int]) -> dict[str, float]:
     """A row of the trace, from the figures of steps since the row before and the PSNR of the training views watched."""
-    row = {"step": trainer.step, "seconds": trainer.seconds, "n": since[-1]["n"]}
+    row: dict[str, float | Tensor] = {"step": trainer.step, "seconds": trainer.seconds, "n": since[-1]["n"]}
     for name in {name for entry in since for name in entry} - row.keys():
         values = [entry[name] for entry in since if name in entry]  # encodings have a loss in some steps only
         row[name] = sum(values) / len(values)
@@ -232,7 +242,9 @@ def expected(trainer: Trainer) -> int:
     return trainer.schedule.last_step(trainer.step, trainer.seconds)
 
 
-def state(trainer: Trainer, trace: list[dict[str, float]], since: list[dict[str, float]], job: Job) -> dict[str, Any]:
+def state(
+    trainer: Trainer, trace: list[dict[str, float]], since: list[dict[str, float | Tensor]], job: Job
+) -> dict[str, Any]:
     """All that a resumed training goes on from."""
     resumed = job.facts.get("resumed_at", [])
     return {"trainer": trainer.state_dict(), "trace": trace, "since": since, "resumed_at": resumed}
@@ -244,7 +256,7 @@ def optimizer_state(trainer: Trainer) -> dict[str, np.ndarray]:
     for group in trainer.optimizer.param_groups:
         state = trainer.optimizer.state.get(group["params"][0], {})
         if group["name"] not in ("modules", "gates") and "exp_avg" in state:
-            arrays |= {f"{group['name']}.{k}": state[k].numpy() for k in ("exp_avg", "exp_avg_sq")}
+            arrays |= {f"{group['name']}.{k}": state[k].cpu().numpy() for k in ("exp_avg", "exp_avg_sq")}
     return arrays
 
 

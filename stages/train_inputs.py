@@ -85,7 +85,12 @@ def taught_labels(features: Features, rows: list[int]) -> Callable[[int], Taught
 
     classes = remembered(lambda index: torch.from_numpy(labels[rows[index]]).long(), FEATURE_BYTES)
     certainty = remembered(lambda index: torch.from_numpy(confidence[rows[index]]).float(), FEATURE_BYTES)
-    return lambda index: TaughtLabels(classes(index), certainty(index), codes)
+
+    def of(index: int) -> TaughtLabels:
+        found = classes(index)
+        return TaughtLabels(found, certainty(index), codes, bool((found >= 0).all()))
+
+    return of
 
 
 def with_feature_loss(train: TrainSection, features: Features | None) -> TrainSection:
@@ -103,16 +108,24 @@ def with_feature_loss(train: TrainSection, features: Features | None) -> TrainSe
 
 
 def model_of(
-    points: Points, features: Features | None, train: TrainSection, describe: DescribeSection, backend: str = "auto"
+    points: Points,
+    features: Features | None,
+    train: TrainSection,
+    describe: DescribeSection,
+    device: str = "cpu",
+    backend: str = "auto",
 ) -> SceneModel:
-    """The scene before training: a Gaussian at each point, modules drawn by the training's seed."""
+    """The scene before training: a Gaussian at each point, modules drawn by the training's seed. backend: of
+    `rasterize`.
+    """
     import torch
 
     from chebsplat.splats.gaussians import initial_gaussians
     from chebsplat.training.model import SceneModel
 
     torch.manual_seed(train.seed)
-    raw = initial_gaussians(points.means, points.colors, points.covariances)
+    initial = initial_gaussians(points.means, points.colors, points.covariances)
+    raw = {name: value.to(device) for name, value in initial.items()}
     return SceneModel(raw, describe, train, None if features is None else features.features.shape[-1], backend)
 
 

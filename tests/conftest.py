@@ -35,6 +35,16 @@ def toy(tmp_path_factory):
 
 
 @pytest.fixture(scope="session")
+def up_to_teacher(tmp_path_factory):
+    """A folder of the toy scene's artifacts that a training reads."""
+    root = tmp_path_factory.mktemp("toy")
+    for stage in ("ingest", "sfm", "teacher"):
+        inputs = {role: root / of for role, of in INPUTS[stage].items()}
+        assert run_stage(stage, root / stage, inputs, TOY | {"sfm": {"max_points": 800}}) == 0
+    return root
+
+
+@pytest.fixture(scope="session")
 def mixed(toy, tmp_path_factory):
     """The toy checkpoint with every SH degree in use, and its scene."""
     import numpy as np

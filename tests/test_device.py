@@ -1,8 +1,12 @@
-"""On a machine with an NVIDIA driver everything runs on the CPU, says so once, and is recorded so."""
+"""A GPU computes where it answers, and torch's CUDA and gsplat are there; where one is missing, the CPU says so."""
 
 import json
+import re
+import sys
+import types
 
 import pytest
+import torch
 from click.testing import CliRunner
 from shared import ROOT
 
@@ -10,50 +14,92 @@ from chebsplat.errors import ConfigError
 from chebsplat.formats import artifact
 from chebsplat.pipelines.cli import main
 from chebsplat.pipelines.plan import Planner
+from chebsplat.pipelines.run import entry
 from chebsplat.stages import device
 
-SAID = "an NVIDIA driver was found, but this version does not train on a GPU yet: everything runs on the CPU"
+LACKS = {
+    "CUDA": "torch .* is built without CUDA .`make setup device=cuda` adds it.",
+    "GPU": "no GPU answers .`nvidia-smi` says more",
+    "gsplat": "gsplat cannot be imported: .* .`make setup device=cuda` adds it.",
+}
 
 
-@pytest.fixture(params=[True, False], ids=["driver", "no driver"])
-def driver(request, tmp_path, monkeypatch):
-    """Whether the machine that is simulated has one."""
-    if request.param:
-        (tmp_path / "version").write_text("NVRM version: 1")
-    monkeypatch.setattr(device, "DRIVER", tmp_path / "version")
+@pytest.fixture
+def machine(tmp_path, monkeypatch):
+    """Makes this machine one with or without an NVIDIA driver, CUDA in torch, a GPU that answers, and gsplat."""
+
+    def make(driver=True, lacks=""):
+        if driver:
+            (tmp_path / "version").write_text("NVRM version: 1")
+        monkeypatch.setattr(device, "DRIVER", tmp_path / "version")
+        monkeypatch.setattr(torch.version, "cuda", None if lacks == "CUDA" else "13.0")
+        monkeypatch.setattr(torch.cuda, "is_available", lambda: lacks not in ("CUDA", "GPU"))
+        monkeypatch.setitem(sys.modules, "gsplat", None if lacks == "gsplat" else types.SimpleNamespace())
+
     monkeypatch.setenv("CHEBSPLAT_WORK", str(tmp_path / "work"))
     monkeypatch.chdir(ROOT)
-    return request.param
+    return make
 
 
-def test_auto_is_the_cpu_and_says_why_where_a_gpu_might_be_expected(driver, tmp_path):
-    assert device.resolve("auto") == ("cpu", SAID if driver else "")
-    assert device.resolve("cpu") == ("cpu", "")
-    with pytest.raises(ConfigError, match="an NVIDIA driver was found, but" if driver else "no NVIDIA driver"):
+@pytest.mark.parametrize("lacks", LACKS)
+def test_what_is_missing_is_named_with_its_remedy(lacks, machine):
+    machine(lacks=lacks)
+    used, why = device.resolve("auto")
+    assert used == "cpu" and "\n" not in why
+    assert [name for name, words in LACKS.items() if re.search(words, why)] == [lacks]
+    with pytest.raises(ConfigError, match=LACKS[lacks]):
         device.resolve("cuda")
-    assert device.resolve("auto", tmp_path / "nowhere") == ("cpu", "")
+    assert device.resolve("cpu") == ("cpu", "")
 
 
-def test_a_stage_runs_and_its_manifest_names_what_computed(driver, tmp_path, capfd):
+def test_a_machine_with_all_three_computes_on_its_gpu(machine):
+    machine()
+    assert device.resolve("auto") == device.resolve("cuda") == ("cuda", "")
+    assert device.resolve("cpu") == ("cpu", "")
+
+
+def test_a_machine_without_a_driver_is_not_asked_unless_cuda_is_asked_for(machine):
+    machine(driver=False)
+    assert device.resolve("auto") == ("cpu", "")
+    assert device.resolve("cuda") == ("cuda", "")
+
+
+def test_a_stage_runs_and_its_manifest_names_what_computed(machine, tmp_path):
+    machine(lacks="gsplat")
     (tmp_path / "toy.json").write_text(json.dumps({"source": {"kind": "generated", "preset": "toy", "seed": 1}}))
     command = ["ingest", "--config", str(tmp_path / "toy.json"), "--out", str(tmp_path / "capture")]
     assert CliRunner().invoke(main, [*command, "--device", "cuda"]).exit_code == 2
     assert not (tmp_path / "capture").exists()
     done = CliRunner().invoke(main, command)
     assert done.exit_code == 0
-    assert done.stderr.count(SAID) == int(driver)
+    assert done.stderr.count("everything runs on the CPU") == 1
     assert artifact.read_manifest(tmp_path / "capture").device == "cpu"
 
 
-@pytest.mark.parametrize("driver", [True], indirect=True)
-def test_a_run_says_it_once_for_all_its_stages(driver):
-    key = Planner().plan("toy").steps[0].key
-    refused = CliRunner().invoke(main, ["run", "--scene", "toy", "--stage", "ingest", "--device", "cuda"])
-    assert refused.exit_code == 2
-    assert "--device cuda" in refused.stderr
+@pytest.mark.parametrize("lacks", ["CUDA", "gsplat"])
+@pytest.mark.slow
+def test_toy_succeeds_on_the_cpu_of_a_machine_with_a_gpu_that_cannot_be_used(lacks, machine):
+    machine(lacks=lacks)
+    refused = CliRunner().invoke(main, ["run", "--scene", "toy", "--device", "cuda"])
+    assert refused.exit_code == 2 and "--device cuda" in refused.stderr
+    done = CliRunner().invoke(main, ["run", "--scene", "toy"])
+    assert done.exit_code == 0, done.stderr
+    assert done.stderr.count("an NVIDIA driver was found, but") == 1
+    assert {artifact.read_manifest(path).device for path in Planner().plan("toy").targets.values()} == {"cpu"}
+
+
+def test_a_run_says_it_once_for_all_its_stages(machine):
+    machine(lacks="CUDA")
     done = CliRunner().invoke(main, ["run", "--scene", "toy", "--stage", "ingest"])
     assert done.exit_code == 0, done.stderr
-    assert done.stderr.count(SAID) == 1
+    assert done.stderr.count("an NVIDIA driver was found, but") == 1
     path = Planner().plan("toy").targets["ingest"]
-    assert path.name == key
     assert artifact.read_manifest(path).device == "cpu"
+
+
+def test_the_device_is_in_the_keys_of_what_it_computes_and_of_all_that_follows(quick_plans):
+    on_cpu, on_gpu = ({step.stage: step for step in Planner(device=name).plan("toy").steps} for name in ("cpu", "cuda"))
+    same = {stage for stage in on_cpu if on_cpu[stage].key == on_gpu[stage].key}
+    assert same == {"ingest", "sfm", "teacher", "agree", "describe"}
+    computing = {step.stage: entry(step, {}, "cuda")["device"] for step in on_gpu.values()}
+    assert {stage for stage, used in computing.items() if used == "cuda"} == {"train"}

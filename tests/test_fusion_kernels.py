@@ -5,8 +5,7 @@ import numba
 import pytest
 import torch
 
-from chebsplat.shape.fusion import Gate, propagate
-from chebsplat.shape.fusion_kernels import fuse_in_view
+from chebsplat.shape.fusion import Gate, fuse_in_view, propagate
 
 
 def scene(channels, n=400, m=20, n_fresh=6):

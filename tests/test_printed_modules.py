@@ -9,8 +9,7 @@ from scipy.special import erf
 
 from chebsplat.shape.cks import update
 from chebsplat.shape.encoder import N_FREQUENCIES, RegionEncoder, positional_encoding
-from chebsplat.shape.fusion import Fusion, Gate, propagate, propagation_weights
-from chebsplat.shape.fusion_kernels import fuse_in_view
+from chebsplat.shape.fusion import Fusion, Gate, fuse_in_view, propagate, propagation_weights
 from chebsplat.shape.region_inputs import in_scene
 from chebsplat.splats.rotations import rotation_matrices
 from chebsplat.training.densify import densify, region_gradients

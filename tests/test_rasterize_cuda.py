@@ -90,7 +90,7 @@ def test_long_quaternions_do_not_overflow(asked):
 
 def test_a_missing_gsplat_is_named_with_its_remedy(monkeypatch):
     monkeypatch.setitem(sys.modules, "gsplat", None)
-    with pytest.raises(ImportError, match=r"pip install 'chebsplat\[cuda\]'.*backend='reference'"):
+    with pytest.raises(ImportError, match=r"make setup device=cuda.*backend='reference'"):
         render(scene(channels=3))
 
 

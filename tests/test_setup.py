@@ -11,6 +11,7 @@ from shared import ROOT
 # What `python3.11` and .venv/bin/python do here: a venv that says where it was made, and nothing else; no downloads.
 PYTHON = """#!/bin/bash
 here=$(pwd -P)
+[ -z "$CALLS" ] || echo "$*" >> "$CALLS"
 case "$*" in
   "-m venv .venv")
     mkdir -p .venv/bin .venv/site/open3d
@@ -18,6 +19,7 @@ case "$*" in
     printf '#!%s/.venv/bin/python\\n' "$here" > .venv/bin/chebsplat
     printf 'home = /usr/bin\\ncommand = /usr/bin/python3.11 -m venv %s/.venv\\n' "$here" > .venv/pyvenv.cfg ;;
   *purelib*) echo .venv/site ;;
+  *"cuda is None"*) exit ${CPU_TORCH:-0} ;;
   *sys.version_info*) echo cp${TAG:-311} ;;
   --version) echo "Python of the test" ;;
   *ensurepip*) exit ${NO_VENV:-0} ;;
@@ -120,3 +122,34 @@ def test_without_a_python_that_will_do_the_setup_says_which_and_how_to_get_one(c
     assert "python3.10 is cp310" in done.stderr
     assert "apt install python3.12-venv" in done.stderr
     assert not (clone / ".venv").exists()
+
+
+def installing(clone, *arguments, **variables):
+    """What uv is called with by `make setup`, and how it ended."""
+    calls = clone.parent / "calls"
+    calls.unlink(missing_ok=True)
+    done = run(clone, "make", "setup", *arguments, CALLS=str(calls), **variables)
+    lines = calls.read_text().splitlines() if calls.exists() else []
+    return done, [line.partition(" pip install ")[2] for line in lines if line.startswith("-m uv")]
+
+
+def test_device_cuda_adds_the_cuda_torch_and_gsplat_to_what_is_there(clone):
+    make(clone, "setup")
+    gpu = clone.parent / "bin/nvidia-smi"
+    gpu.write_text("#!/bin/bash\n")
+    gpu.chmod(0o755)
+    done, installed = installing(clone, "device=cuda", CPU_TORCH="1")
+    assert done.returncode == 0, done.stderr
+    lock, _, extra = installed
+    assert "-r requirements.lock --torch-backend auto --reinstall-package torch" in lock
+    assert "--constraint requirements.lock --editable .[cuda]" in extra
+    lock, *_ = installing(clone, "device=cuda")[1]
+    assert "--reinstall-package" not in lock  # it is a CUDA torch already
+    assert installing(clone)[1] == []
+
+
+def test_device_cuda_is_refused_where_there_is_no_driver(clone):
+    done, installed = installing(clone, "device=cuda")
+    assert done.returncode == 2 and installed == []
+    assert "this machine has no NVIDIA driver" in done.stderr
+    assert "none of auto, cpu, cuda" in installing(clone, "device=tpu")[0].stderr

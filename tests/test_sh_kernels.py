@@ -5,7 +5,7 @@ import pytest
 import torch
 
 from chebsplat.splats.sh import eval_sh, n_coefficients
-from chebsplat.splats.sh_kernels import colors_in_view
+from chebsplat.splats.sh_colors import colors_in_view
 from chebsplat.training.sh_prune import dense, masked_sh
 
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import logging
 from typing import Any
 
 import torch
@@ -11,9 +10,7 @@ from torch import Tensor
 from chebsplat.rasterize import reference
 from chebsplat.rasterize.projection import is_antialiased
 
-log = logging.getLogger("chebsplat")
-
-MAX_ALPHA = 0.999  # built into gsplat's kernels
+MAX_ALPHA = 0.999  # built into gsplat's kernels: no ceiling above it can be had
 CHUNK, MOST = 32, 512  # channels at a time by default, and the most that its kernels are made for
 
 
@@ -39,32 +36,36 @@ def rasterize(
 ) -> tuple[Tensor, Tensor, dict[str, Any]]:
     """As `reference.rasterize`, of float32 tensors on a GPU.
 
-    Raises: ValueError unless the Gaussians are float32 on a GPU, or beyond 512 channels; ImportError, with the remedy,
-      without gsplat.
-    Choices: gsplat fixes the ceiling of alpha at 0.999; another `max_alpha` is reported once and has no effect. All
-      channels go at once: of gsplat's chunks only one would leave its absolute gradient. A broken Gaussian is replaced
-      by one that nobody sees, because gsplat would draw a NaN opaque.
+    Raises: ValueError unless the Gaussians are float32 on a GPU, for a `max_alpha` above 0.999, or beyond 512 channels;
+      ImportError, with the remedy, without gsplat.
+    Choices: gsplat fixes the ceiling of alpha at 0.999; a lower one is kept by what a Gaussian's opacity is at most, so
+      that no alpha exceeds it. Renders are those of the other backends where no opacity is above `max_alpha`; where one
+      is, alpha is the same at its middle and lower by up to a hundredth around it. The gradient passes as if there were
+      no ceiling: a Gaussian that has reached it can become fainter again. All channels go at once: of gsplat's chunks
+      only one would leave its absolute gradient. A broken Gaussian is replaced by one that nobody sees, because gsplat
+      would draw a NaN opaque.
     """
     is_antialiased(rasterize_mode)
     if means.dtype != torch.float32 or means.device.type != "cuda":
         raise ValueError(f"means is {means.dtype} on {means.device}; the cuda backend takes float32 on a GPU")
     n_colors, colors = colors.shape[-1], reference.with_cells(colors, cell_colors)
+    if max_alpha > MAX_ALPHA:
+        raise ValueError(f"max_alpha {max_alpha}; the cuda backend keeps none above {MAX_ALPHA}")
     if colors.shape[-1] > MOST:
         raise ValueError(f"{colors.shape[-1]} channels; the cuda backend takes at most {MOST} channels")
     try:
         from gsplat import rasterization
     except ImportError as error:
         raise ImportError(
-            "torch sees a GPU, but gsplat, which renders on it, cannot be imported: pip install 'chebsplat[cuda]'; "
+            "torch sees a GPU, but gsplat, which renders on it, cannot be imported: make setup device=cuda; "
             "or move the tensors to the CPU, or pass backend='reference'"
         ) from error
-    _report_ceiling(max_alpha)
     if len(means) == 0:  # the background: gsplat is not asked to sort an empty scene
         empty = (means, quats, scales, opacities, colors[..., :n_colors], viewmats, Ks, width, height)
         return reference.rasterize(*empty, backgrounds=backgrounds, absgrad=absgrad, cell_colors=cell_colors)
     if backgrounds is not None:
         backgrounds = torch.nn.functional.pad(backgrounds, (0, colors.shape[-1] - n_colors))
-    gaussians = _without_broken(means, quats, scales, opacities, colors)
+    gaussians = _without_broken(means, quats, scales, _at_most(opacities, max_alpha), colors)
     renders, alphas, gsplat_meta = rasterization(
         *gaussians, viewmats, Ks, width, height,
         near_plane=near_plane, far_plane=far_plane, eps2d=eps2d, sh_degree=None, packed=False, render_mode="RGB",
@@ -75,6 +76,11 @@ def rasterize(
     if cell_colors is not None:
         meta["cells"] = reference.cell_means(renders[..., n_colors:])
     return renders[..., :n_colors], alphas, meta
+
+
+def _at_most(opacities: Tensor, ceiling: float) -> Tensor:
+    """Opacities [N] no higher than the ceiling, with a gradient as if they were as given."""
+    return opacities + (opacities.clamp_max(ceiling) - opacities).detach()
 
 
 def _without_broken(
@@ -103,13 +109,3 @@ def own_meta(gsplat_meta: dict[str, Any]) -> dict[str, Any]:
         means2d.retain_grad()
     radii = radii.amax(-1) if radii.ndim == 3 else radii
     return {"means2d": means2d, "conics": gsplat_meta["conics"], "depths": gsplat_meta["depths"], "radii": radii}
-
-
-_reported: set[float] = set()
-
-
-def _report_ceiling(max_alpha: float) -> None:
-    if max_alpha != MAX_ALPHA and max_alpha not in _reported:
-        _reported.add(max_alpha)
-        log.warning("gsplat clamps alpha at %s, not at %s: renders differ where Gaussians are opaque",
-                    MAX_ALPHA, max_alpha)  # fmt: skip

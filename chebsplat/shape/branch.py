@@ -12,8 +12,7 @@ from chebsplat.settings import DescribeSection, TrainSection
 from chebsplat.shape import cks
 from chebsplat.shape.descriptor import n_degrees
 from chebsplat.shape.encoder import RegionEncoder
-from chebsplat.shape.fusion import Gate, propagate, propagation_weights, share_undefined
-from chebsplat.shape.fusion_kernels import fuse_in_view
+from chebsplat.shape.fusion import Gate, fuse_in_view, propagate, propagation_weights, share_undefined
 from chebsplat.shape.refresh import Descriptors, GaussianIds
 from chebsplat.shape.region_inputs import placed
 from chebsplat.shape.regions import Regions, regions_of
@@ -33,7 +32,8 @@ class FreshEncodings(NamedTuple):
 class ShapeBranch(nn.Module):
     """Regions of the current Gaussians, their descriptors, and the encoder and gate that use them.
 
-    `encoder` and `gate` are learned. All else follows the Gaussians: `refresh` computes it, before any other use.
+    `encoder` and `gate` are learned. All else follows the Gaussians: `refresh` computes it on the CPU, before any other
+    use; what steps read then lies where the Gaussians are. backend: of `rasterize`.
     """
 
     members: Tensor  # i64 [M, n], -1 where padded
@@ -44,9 +44,9 @@ class ShapeBranch(nn.Module):
     weights: Tensor  # [N, k] of Eq 8
     cache: Tensor  # [M, C] encodings, as last computed
 
-    def __init__(self, n_channels: int, describe: DescribeSection, train: TrainSection):
+    def __init__(self, n_channels: int, describe: DescribeSection, train: TrainSection, backend: str = "auto"):
         super().__init__()
-        self.describe, self.train_settings = describe, train
+        self.describe, self.train_settings, self.backend = describe, train, backend
         per_angle = n_degrees(describe.spectrum, describe.max_degree, describe.from_degree)
         self.n_described = describe.n_angles * per_angle if train.albo else 0
         n_context = n_channels if train.context == "features" else 0
@@ -67,6 +67,7 @@ class ShapeBranch(nn.Module):
 
     def keep(self, rows: Tensor) -> None:
         """Gaussians were removed, all but `rows` [N] bool; those that are added go behind the others unannounced."""
+        rows = rows.cpu()
         kept = rows.numpy()
         self.ids.keep(kept)
         if self.regions is not None:
@@ -76,10 +77,11 @@ class ShapeBranch(nn.Module):
 
     def reorder(self, order: Tensor) -> None:
         """The Gaussians were put into another order i64 [N]."""
-        self.ids.keep(order.numpy())
+        places = order.cpu().numpy()
+        self.ids.keep(places)
         if self.regions is not None:
-            new_index = np.empty(len(order), np.int64)
-            new_index[order.numpy()] = np.arange(len(order))
+            new_index = np.empty(len(places), np.int64)
+            new_index[places] = np.arange(len(places))
             self.regions = self.regions._replace(centers=new_index[self.regions.centers])
 
     @torch.no_grad()
@@ -95,7 +97,7 @@ class ShapeBranch(nn.Module):
 
         Centres stay where they still cover the scene, unless `anew`; then the result owes nothing to earlier calls.
         """
-        means, log_scales, quats = (raw[name].detach() for name in ("means", "log_scales", "quats"))
+        means, log_scales, quats = (raw[name].detach().cpu() for name in ("means", "log_scales", "quats"))
         if anew:
             self.regions, self.ids = None, GaussianIds()
             self.described.forget()
@@ -103,24 +105,26 @@ class ShapeBranch(nn.Module):
             places, ids = means.double().numpy(), self.ids.of(len(means))
             regions = regions_of(places, self.describe, ids=ids, earlier=self.regions)
         self.regions = regions
-        self.members, self.centers = torch.as_tensor(regions.members), torch.as_tensor(regions.centers)
+        members, centers = torch.as_tensor(regions.members), torch.as_tensor(regions.centers)
         if not self.n_described:
-            self.descriptors = torch.zeros(*self.members.shape, 0)
+            described = torch.zeros(*members.shape, 0)
         else:
-            around = self.members, regions.radius, descriptors
-            self.descriptors = self.described.update(means, quats, log_scales, *around)
-        rows = self.descriptors[self.members >= 0]
+            described = self.described.update(means, quats, log_scales, members, regions.radius, descriptors)
+        rows = described[members >= 0]
         if self.n_described and len(rows) and not self.keeps_norm:
             self.encoder.norm_input.set(0, rows.mean(0), rows.std(0, unbiased=False))
-        positions, cover = placed(means.numpy(), regions, self.train_settings.n_covers, self.train_settings.position)
-        self.positions, self.cover = torch.from_numpy(positions), torch.from_numpy(cover)
-        frames, scales = rotation_matrices(quats[self.centers]), log_scales.exp()[self.centers]
-        settings, covered = self.train_settings, (self.cover, means[self.centers], frames, scales, regions.radius)
+        places, near = placed(means.numpy(), regions, self.train_settings.n_covers, self.train_settings.position)
+        positions, cover = torch.from_numpy(places), torch.from_numpy(near)
+        frames, scales = rotation_matrices(quats[centers]), log_scales.exp()[centers]
+        settings, covered = self.train_settings, (cover, means[centers], frames, scales, regions.radius)
         inflation, temperature = settings.inflation, settings.temperature
-        self.weights = propagation_weights(means, *covered, inflation=inflation, temperature=temperature)
+        weights = propagation_weights(means, *covered, inflation=inflation, temperature=temperature)
         if inflation == 0:
             self.share_undefined = share_undefined(means, *covered, temperature=temperature)
-        parts = torch.arange(len(self.members)).split(CHUNK)
+        device = raw["means"].device
+        self.members, self.centers, self.descriptors = members.to(device), centers.to(device), described.to(device)
+        self.positions, self.cover, self.weights = positions.to(device), cover.to(device), weights.to(device)
+        parts = torch.arange(len(members), device=device).split(CHUNK)
         self.cache = torch.cat([self.encode(raw["features"], part) for part in parts])
 
     def region_state(self) -> dict[str, Any]:
@@ -153,19 +157,20 @@ class ShapeBranch(nn.Module):
 
     def sample(self, features: Tensor, index: Tensor, generator: torch.Generator) -> FreshEncodings:
         """Encode anew `regions_per_step` of the regions that reach the Gaussians `index` [V]; the cache keeps them."""
-        cover, is_reached = self.cover[index], torch.zeros(len(self.members), dtype=torch.bool)
-        is_reached[cover[cover >= 0]] = True
-        reached = is_reached.nonzero()[:, 0]
+        is_reached = torch.zeros(len(self.members) + 1, dtype=torch.bool, device=index.device)
+        is_reached[self.cover[index]] = True  # the last stands for -1, no region
+        reached = is_reached[:-1].nonzero()[:, 0]
         order = torch.randperm(len(reached), generator=generator)[: self.train_settings.regions_per_step]
-        chosen = reached[order]
+        chosen = reached[order.to(reached.device)]
         fresh = FreshEncodings(self.encode(features, chosen), chosen)
         self.cache = self.cache.index_copy(0, chosen, fresh.values.detach())
         return fresh
 
     def fuse(self, features: Tensor, index: Tensor, fresh: FreshEncodings | None = None) -> Tensor:
         """Fused features [V, C] of the Gaussians `index` [V]; encodings are fresh ones, or as the cache has them."""
-        fresh = fresh or FreshEncodings(self.cache[:0], torch.zeros(0, dtype=torch.int64))
-        return fuse_in_view(self.gate, features, (self.cache, *fresh), self.cover, self.weights, index)
+        fresh = fresh or FreshEncodings(self.cache[:0], index[:0])
+        encodings = self.cache, *fresh
+        return fuse_in_view(self.gate, features, encodings, self.cover, self.weights, index, self.backend)
 
     def alone(self) -> Tensor:
         """Features [N, C] of all Gaussians by the cached encodings alone (Eq 9), zero where no region reaches."""
@@ -185,5 +190,5 @@ class ShapeBranch(nn.Module):
 
     def basis_loss(self, bases: dict[str, Tensor], fresh: FreshEncodings) -> Tensor:
         """How far the encoder lies outside earlier scenes' bases (Eq 14), modulated by the shapes it sees."""
-        loss = cks.basis_loss(self.encoder.linear_maps(), bases)
+        loss = cks.basis_loss(self.encoder.linear_maps(), bases, self.backend)
         return loss if self.modulation is None else self.modulation(fresh.values.mean(0)) * loss

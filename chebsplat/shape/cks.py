@@ -12,6 +12,8 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
+from chebsplat.kernels.dispatch import is_compiled
+
 EPS = torch.finfo(torch.float64).eps
 DROPPED = 1e-6  # a column that keeps less of its length than this beside the others is dropped
 WEAKEST, STRONGEST = 1e-3, 10.0  # α, at least and at most
@@ -211,12 +213,23 @@ def regularizer(W: Tensor, basis: Tensor) -> Tensor:
     return basis_loss({"": W}, {"": basis})
 
 
-def basis_loss(maps: dict[str, Tensor], bases: dict[str, Tensor]) -> Tensor:
-    """Mean over linear maps of `regularizer`; 0 without bases (the first scene)."""
+def basis_loss(maps: dict[str, Tensor], bases: dict[str, Tensor], backend: str = "auto") -> Tensor:
+    """Mean over linear maps of `regularizer`; 0 without bases (the first scene). backend: of `rasterize`."""
     if not bases:
         return torch.tensor(0.0)
-    loss: Tensor = _Outside.apply(list(bases.values()), *(maps[name] for name in bases)).mean()
+    weights = [maps[name] for name in bases]
+    if not is_compiled(weights[0], backend):
+        return torch.stack([_outside(W, B) for W, B in zip(weights, bases.values(), strict=True)]).mean()
+    loss: Tensor = _Outside.apply(list(bases.values()), *weights).mean()
     return loss
+
+
+def _outside(W: Tensor, B: Tensor) -> Tensor:
+    """`regularizer` by autograd, on any device: twin of `_Outside`."""
+    largest = W.detach().abs().amax() if W.numel() and B.shape[1] else W.new_zeros(())
+    scaled = W / torch.where(largest > 0, largest, 1)
+    share = (scaled - B @ (B.T @ scaled)).square().sum() / scaled.detach().square().sum().clamp_min(1e-30)
+    return torch.where(largest > 0, share, 0)
 
 
 class Modulation(nn.Module):

@@ -5,7 +5,9 @@ from __future__ import annotations
 import torch
 from torch import Tensor, nn
 
+from chebsplat.kernels.dispatch import is_compiled
 from chebsplat.splats.rotations import rotation_matrices
+from chebsplat.splats.rows import take
 
 LEAST = 1e-30  # of a squared scale in radii: where the print divides by 0
 
@@ -73,6 +75,31 @@ def _logits(
     local = torch.einsum("nkji,nkj->nki", rotmats[index], (means[:, None] - centers[index]) / radius)
     deviations = ((scales[index] / radius) ** 2 + inflation**2).clamp_min(LEAST).sqrt()
     return -((local / deviations) ** 2).sum(-1) / temperature  # a variance has no square in the gradient's float32
+
+
+def fuse_in_view(
+    gate: Gate,
+    features: Tensor,
+    encodings: tuple[Tensor, Tensor, Tensor],
+    cover: Tensor,
+    weights: Tensor,
+    index: Tensor,
+    backend: str = "auto",
+) -> Tensor:
+    """Fused features [V, C] (Eqs 9-10) of the Gaussians `index` i64 [V] (no row twice).
+
+    Args: features [N, C]; encodings: of all regions [M, C], without a gradient, and fresh ones [R, C], with one, that
+      take the place of rows i64 [R] of the former (none twice); cover i64 [N, k] and weights [N, k] of
+      `propagation_weights`; backend: of `rasterize`.
+    """
+    if is_compiled(features, backend):
+        from chebsplat.shape import fusion_kernels
+
+        return fusion_kernels.fuse_in_view(gate.linear, features, encodings, cover, weights, index)
+    cache, fresh, chosen = encodings
+    shape = propagate(cache.index_copy(0, chosen, fresh), cover[index], weights[index])
+    fused: Tensor = gate(take(features, index), shape, cover[index, 0] >= 0)[0]
+    return fused
 
 
 def propagate(encodings: Tensor, cover: Tensor, weights: Tensor) -> Tensor:

@@ -1,6 +1,6 @@
 """Propagation and gate (Eqs 9-10) of the Gaussians in view in one sweep, in numba.
 
-Twin of `fusion.propagate` and `fusion.Gate`, which are its oracles. What the gate's linear map makes of a propagated
+`fusion.fuse_in_view` holds the plain twin, and chooses. What the gate's linear map makes of a propagated
 shape is the propagated image of the regions' encodings: that half of its products is done by region, of which there are
 far fewer. Sums run in a fixed order, so the gradients are the same bits for any number of threads; plain indexing would
 add them up in the order in which threads arrive.
@@ -12,11 +12,10 @@ from typing import Any
 
 import numpy as np
 import torch
-from torch import Tensor
+from torch import Tensor, nn
 
 from chebsplat.kernels.jit import inline, kernel, prange
 from chebsplat.kernels.simd import exp2, fma, load, splat, spread, store, where
-from chebsplat.shape.fusion import Gate
 
 LANES = 16
 N_BLOCKS = 16  # of the Gaussians in view, each with sums of its own
@@ -174,20 +173,14 @@ class _Fuse(torch.autograd.Function):
 
 
 def fuse_in_view(
-    gate: Gate,
+    linear: nn.Linear,
     features: Tensor,
     encodings: tuple[Tensor, Tensor, Tensor],
     cover: Tensor,
     weights: Tensor,
     index: Tensor,
 ) -> Tensor:
-    """Fused features [V, C] of the Gaussians `index` i64 [V] (no row twice).
-
-    Args: features [N, C]; encodings: of all regions [M, C], without a gradient, and fresh ones [R, C], with one, that
-      take the place of rows i64 [R] of the former (none twice); cover i64 [N, k] and weights [N, k] of
-      `fusion.propagation_weights`.
-    """
+    """As `fusion.fuse_in_view`, of float32 on the CPU; linear: the gate's."""
     cache, fresh, chosen = encodings
-    linear = gate.linear
     fused: Tensor = _Fuse.apply(features, fresh, linear.weight, linear.bias, cache, chosen, cover, weights, index)
     return fused

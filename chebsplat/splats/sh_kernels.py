@@ -1,7 +1,7 @@
 """Colour by spherical harmonics of the Gaussians in view, in numba: a Gaussian costs only the bands it keeps.
 
-Twin of `sh.eval_sh` with `sh_prune.masked_sh`, which are its oracles; reads and writes whole parameters, so that no
-copy of the coefficients in view is ever made. A band is a tensor [N_l, 2 l + 1, 3] that the first N_l Gaussians have.
+Reads and writes whole parameters, so that no copy of the coefficients in view is ever made. A band is a tensor
+[N_l, 2 l + 1, 3] that the first N_l Gaussians have. `sh_colors` holds the plain twin, and chooses.
 """
 
 from __future__ import annotations
@@ -138,17 +138,7 @@ class _Colors(torch.autograd.Function):
 def colors_in_view(
     bands: Sequence[Tensor], masks: Tensor | None, index: Tensor, means: Tensor, eye: Tensor, degree: int
 ) -> Tensor:
-    """Colours [V, 3], at least 0, of the Gaussians `index` i64 [V] (no row twice) as seen from `eye` [3].
-
-    Args: bands: coefficients [N_l, 2 l + 1, 3] of bands 0 to 3 or fewer, float32: the first N_l Gaussians have band l,
-      N = N_0 ≥ N_1 ≥ ...; masks [V, 3] nested, of bands 1 to 3, None for all open; means [N, 3]; degree: the highest
-      band to use.
-    Raises: ValueError if the degree is not within 0 and 3.
-    Choices: no gradient reaches the means through the view's direction; a closed band costs nothing, except while its
-      mask still learns; a band that is not used gets no gradient at all, so that the optimizer leaves it out.
-    """
-    if not 0 <= degree <= 3:
-        raise ValueError(f"degree {degree} is not within 0 and 3")
+    """As `sh_colors.colors_in_view`, of float32 on the CPU; a closed band costs nothing, unless its mask learns."""
     used = [band if at <= degree else band[:0].detach() for at, band in enumerate(bands)]
     used += [bands[0].new_zeros(0, 2 * at + 1, 3) for at in range(len(used), 4)]
     if masks is None:

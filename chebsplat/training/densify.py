@@ -75,18 +75,19 @@ def densify(
       rounded up (printed: density · 4/3 π ρ³ · (gradient / threshold − 1)), uniform in the ball about its members'
       mean; new ones also keep `nearest` spacings apart. Each inherits from the nearest Gaussian, which is its parent
       once at most, and both change so that the two render like the one (`shared_opacity`, `shared_scales`). Gaussians
-      with non-finite means are left out.
+      with non-finite means are left out. Neighbours are searched for on the CPU, wherever the Gaussians are.
     """
     if not (threshold > 0 and 0 < nearest < farthest):
         raise ValueError(f"threshold {threshold} and 0 < nearest {nearest} < farthest {farthest} do not hold")
     from scipy.spatial import cKDTree
 
-    alive = torch.isfinite(raw["means"]).all(1).numpy()
+    gradient, members, places = gradient.cpu(), members.cpu(), raw["means"].detach().cpu()
+    alive = torch.isfinite(places).all(1).numpy()
     order = torch.argsort(gradient, descending=True, stable=True)
     steep = order[gradient[order] > threshold]
     positions, index = np.zeros((0, 3)), np.zeros(0, np.int64)
     if budget > 0 and len(steep) and alive.sum() > 3:
-        means, ids = raw["means"].detach().double().numpy()[alive], np.flatnonzero(alive)
+        means, ids = places.double().numpy()[alive], np.flatnonzero(alive)
         tree = cKDTree(means)
         excess = (gradient[steep].double() / threshold - 1).clamp_max(LARGEST if printed else 1).numpy()
         inside = np.where(alive, np.cumsum(alive) - 1, -1)[members[steep].clamp_min(0).numpy()]
@@ -104,7 +105,7 @@ def densify(
         kept = kept[np.sort(np.unique(parents[kept], return_index=True)[1])]
         kept = kept[_apart(positions[kept], nearest * spacing[kept])][:budget]
         positions, index = positions[kept], ids[parents[kept]]
-    parent = torch.from_numpy(index)
+    parent = torch.from_numpy(index).to(raw["means"].device)
     rows = {name: value.detach()[parent] for name, value in raw.items()}
     offsets = torch.from_numpy(positions).to(rows["means"]) - rows["means"]
     changed = {
@@ -205,7 +206,7 @@ def clone_or_split(
     first = torch.argsort(gradients[parents], descending=True, stable=True)[: max(budget, 0)]
     parents, large = parents[first], first >= len(clones)
     rows = {name: value.detach()[parents] for name, value in raw.items()}
-    draws = torch.randn(2, *rows["log_scales"].shape, generator=generator) * rows["log_scales"].exp()
+    draws = torch.randn(2, *rows["log_scales"].shape, generator=generator).to(parents.device) * rows["log_scales"].exp()
     offsets = torch.einsum("nij,knj->kni", rotation_matrices(rows["quats"]), draws)
     offsets = torch.where(large[:, None], offsets, 0.0)
     smaller = torch.where(large[:, None], rows["log_scales"] - float(np.log(SHRINK)), rows["log_scales"])

@@ -2,18 +2,29 @@
 
 from __future__ import annotations
 
+from functools import cache
 from typing import Any
 
 import numpy as np
 import torch
 from torch import Tensor
 
+from chebsplat.kernels.dispatch import is_compiled
+
+
+@cache
+def _taps(dtype: torch.dtype, device: torch.device) -> Tensor:
+    """SSIM's window [11]; kept, so that no step copies it to a GPU."""
+    from chebsplat.training.ssim import TAPS
+
+    return torch.as_tensor(TAPS, dtype=dtype).to(device)
+
 
 def _blur(images: Tensor) -> Tensor:
     """Window blur of [H, W, C] with zero padding, by plain convolutions."""
-    from chebsplat.training.ssim import TAPS, WINDOW
+    from chebsplat.training.ssim import WINDOW
 
-    taps = torch.as_tensor(TAPS, dtype=images.dtype)
+    taps = _taps(images.dtype, images.device)
     planes = images.permute(2, 0, 1)[:, None]
     planes = torch.nn.functional.conv2d(planes, taps[None, None, :, None], padding=(WINDOW // 2, 0))
     return torch.nn.functional.conv2d(planes, taps[None, None, None, :], padding=(0, WINDOW // 2))[:, 0].permute(
@@ -22,7 +33,7 @@ def _blur(images: Tensor) -> Tensor:
 
 
 def ssim_map(a: Tensor, b: Tensor) -> Tensor:
-    """Structural similarity [H, W, C] of images [H, W, C] in [0, 1]; plain torch, the oracle of the fused loss.
+    """Structural similarity [H, W, C] of images [H, W, C] in [0, 1]; plain torch, any float type.
 
     Choices: Gaussian window 11, σ 1.5, zero padding, biased variances, as 3DGS.
     """
@@ -60,14 +71,18 @@ class _Photometric(torch.autograd.Function):
         return grad * gradient, None, None, None
 
 
-def photometric(render: Tensor, target: Tensor, mask: Tensor | None, weight_ssim: float) -> Tensor:
+def photometric(
+    render: Tensor, target: Tensor, mask: Tensor | None, weight_ssim: float, backend: str = "auto"
+) -> Tensor:
     """(1 − w) L1 + w (1 − SSIM) over the pixels that count.
 
-    Args: render, target [H, W, 3] float32 in [0, 1]; mask [H, W] bool, true where a pixel counts, or float ≥ 0, how
-      much it does; None: all alike.
+    Args: render, target [H, W, 3] in [0, 1]; mask [H, W] bool, true where a pixel counts, or float ≥ 0, how much it
+      does; None: all alike; backend: of `rasterize`.
     Choices: pixels that do not count take the target's colour first, so they have no gradient, not even through
       SSIM's window. 0 where nothing counts.
     """
+    if not is_compiled(render, backend):
+        return photometric_reference(render, target, mask, weight_ssim)
     if mask is None:
         weight = torch.full_like(target, 1 / target.numel())
     else:
@@ -79,7 +94,7 @@ def photometric(render: Tensor, target: Tensor, mask: Tensor | None, weight_ssim
 
 
 def photometric_reference(render: Tensor, target: Tensor, mask: Tensor | None, weight_ssim: float) -> Tensor:
-    """As `photometric`, in plain torch and any float type: the oracle of the fused loss."""
+    """As `photometric`, in plain torch, of any float type on any device: twin and oracle of the fused loss."""
     counted = torch.ones_like(target[..., 0]) if mask is None else mask.to(target.dtype)
     render = torch.where(counted[..., None] > 0, render, target)
     weight = counted[..., None].expand_as(target) / (counted.sum() * target.shape[-1]).clamp_min(1e-6)
@@ -119,14 +134,14 @@ class _FeatureDistance(torch.autograd.Function):
         return grad * gradient, None, None, None
 
 
-def cell_shares(mask: Tensor | None, size: tuple[int, int], kind: torch.dtype, counted: Tensor | None = None) -> Tensor:
+def cell_shares(mask: Tensor | None, size: tuple[int, int], like: Tensor, counted: Tensor | None = None) -> Tensor:
     """What each cell of the target counts, [h, w], summing to 1 (or 0): the mean of its pixels' mask [H, W], and
-    nothing where `counted` [h, w] is false.
+    nothing where `counted` [h, w] is false. Of the type and device of `like`.
     """
     if mask is None:
-        share = torch.full(size, 1 / (size[0] * size[1]), dtype=kind)
+        share = like.new_full(size, 1 / (size[0] * size[1]))
     else:
-        share = torch.nn.functional.adaptive_avg_pool2d(mask[None].to(kind), size)[0]
+        share = torch.nn.functional.adaptive_avg_pool2d(mask[None].to(like), size)[0]
     if counted is not None:
         share = share * counted
     return share if mask is None and counted is None else share / share.sum().clamp_min(1e-6)
@@ -138,27 +153,35 @@ def feature_distance(
     mask: Tensor | None = None,
     kind: str = "length",
     counted: Tensor | None = None,
+    backend: str = "auto",
 ) -> Tensor:
     """Mean distance to the teacher's features at the teacher's resolution.
 
     Args: render [H, W, C]; target [h, w, C], h ≤ H; mask [H, W] bool, true where a pixel counts, or float ≥ 0, how
-      much it does; float32. kind: `length` of the difference over √C, or `l1`, its mean magnitude by channel;
-      counted [h, w] bool: cells of the target that say something, None: all do.
+      much it does. kind: `length` of the difference over √C, or `l1`, its mean magnitude by channel; counted [h, w]
+      bool: cells of the target that say something, None: all do; backend: of `rasterize`.
     Choices: the render is averaged over each cell of the target; a cell counts by the mean of its pixels' mask.
       Where views disagree about a Gaussian the shortest total length is at their geometric median, which lies near the
       most common vector; the median channel by channel, where L1 is least, may be near none of them.
     """
-    share = cell_shares(mask, (target.shape[0], target.shape[1]), render.dtype, counted)
+    if not is_compiled(render, backend):
+        return feature_distance_reference(render, target.to(render.dtype), mask, kind, counted)
+    share = cell_shares(mask, (target.shape[0], target.shape[1]), render, counted)
     loss: Tensor = _FeatureDistance.apply(render, target.to(render.dtype), share, kind == "l1")
     return loss
 
 
 def feature_distance_reference(
-    render: Tensor, target: Tensor, mask: Tensor | None = None, kind: str = "length"
+    render: Tensor,
+    target: Tensor,
+    mask: Tensor | None = None,
+    kind: str = "length",
+    counted: Tensor | None = None,
 ) -> Tensor:
-    """As `feature_distance`, in plain torch and any float type: the oracle of the fused loss."""
+    """As `feature_distance`, in plain torch, of any float type on any device: twin and oracle of the fused loss."""
     size = (target.shape[0], target.shape[1])
     pooled = torch.nn.functional.adaptive_avg_pool2d(render.permute(2, 0, 1), size).permute(1, 2, 0)
-    difference = pooled - target
+    share = cell_shares(mask, size, render, counted)
+    difference = torch.where(share[..., None] != 0, pooled - target, 0.0)  # what does not count may be anything
     distance = difference.abs().mean(-1) if kind == "l1" else difference.square().mean(-1).clamp_min(1e-30).sqrt()
-    return (distance * cell_shares(mask, size, render.dtype)).sum()
+    return (distance * share).sum()

@@ -14,10 +14,10 @@ from chebsplat.settings import DescribeSection, TrainSection
 from chebsplat.shape.branch import FreshEncodings, ShapeBranch
 from chebsplat.shape.regions import Regions, covering
 from chebsplat.splats.planes import at_pixels, planes_in_view
-from chebsplat.splats.sh_kernels import colors_in_view
+from chebsplat.splats.rows import take
+from chebsplat.splats.sh_colors import colors_in_view
 from chebsplat.training import prune, sh_mask_network, sh_prune
 from chebsplat.training.poses import moved
-from chebsplat.training.rows import take
 from chebsplat.training.sh_mask_network import BandMaskNetwork
 from chebsplat.views import View, in_frustum
 
@@ -62,8 +62,8 @@ class SceneModel:
     `features` [N, C], `prune_logits` [N] and `sh_logits` [N, 3] are there only if the scene needs them, and SH band l,
     `sh<l>` [N_l, 2 l + 1, 3], only for the first N_l Gaussians: all until the trainer freezes them.
 
-    Args: raw: of `splats.gaussians.initial_gaussians`; n_channels: of the features, None without semantics; backend: of
-      `rasterize`.
+    Args: raw: of `splats.gaussians.initial_gaussians`, on the device that is to compute; n_channels: of the features,
+      None without semantics; backend: of `rasterize`, and of all else in a step that has a compiled kernel.
     """
 
     def __init__(
@@ -74,20 +74,22 @@ class SceneModel:
         n_channels: int | None,
         backend: str = "auto",
     ):
-        n = len(raw["means"])
+        n, device = len(raw["means"]), raw["means"].device
         self.describe, self.backend = describe, backend
         self.raw = dict(raw)
         for band in range(1, train.sh_degree + 1):
-            self.raw[f"sh{band}"] = torch.zeros(n, 2 * band + 1, 3)
+            self.raw[f"sh{band}"] = torch.zeros(n, 2 * band + 1, 3, device=device)
         if n_channels is not None:
-            self.raw["features"] = torch.zeros(n, n_channels)
+            self.raw["features"] = torch.zeros(n, n_channels, device=device)
         if train.prune:
-            self.raw["prune_logits"] = torch.full((n,), 1.0)
+            self.raw["prune_logits"] = torch.full((n,), 1.0, device=device)
         if train.sh_prune and train.sh_degree > 0:
-            self.raw["sh_logits"] = torch.zeros(n, 3)
+            self.raw["sh_logits"] = torch.zeros(n, 3, device=device)
         for value in self.raw.values():
             value.requires_grad_(True)
-        self.shape = ShapeBranch(n_channels, describe, train) if n_channels and train.trains_encoder else None
+        self.shape: ShapeBranch | None = None
+        if n_channels and train.trains_encoder:
+            self.shape = ShapeBranch(n_channels, describe, train, backend)
         self.threshold = train.mask_threshold
         self.semantic_gate: prune.SemanticGate | prune.PrintedGate | None = None
         if n_channels and train.prune and train.prune_semantic:
@@ -96,9 +98,21 @@ class SceneModel:
         if "sh_logits" in self.raw and train.sh_masks == "printed":
             self.band_network = BandMaskNetwork(n_channels or 0, train.sh_bins, guided=train.sh_guided)
         self.members = self.nearest = torch.zeros(0, dtype=torch.int64)  # of the regions whose colours guide SH masks
+        for module in self.modules.values():  # drawn on the CPU: the same values wherever they are used
+            module.to(device)
 
     def __len__(self) -> int:
         return len(self.raw["means"])
+
+    @property
+    def device(self) -> torch.device:
+        """Where the Gaussians are."""
+        return self.raw["means"].device
+
+    @property
+    def rows(self) -> Tensor:
+        """Indices i64 [N] of all Gaussians."""
+        return torch.arange(len(self), device=self.device)
 
     @property
     def modules(self) -> dict[str, nn.Module]:
@@ -109,9 +123,10 @@ class SceneModel:
     def follow(self, regions: Regions) -> None:
         """Printed SH masks are guided by the colours of these regions from now on; others need none."""
         if self.band_network is not None:
-            means = self.raw["means"].detach().double().numpy()
+            means = self.raw["means"].detach().double().cpu().numpy()
             nearest = covering(means, means[regions.centers], regions.radius, 1)[:, 0]
-            self.members, self.nearest = torch.as_tensor(regions.members), torch.from_numpy(nearest)
+            self.members = torch.as_tensor(regions.members).to(self.device)
+            self.nearest = torch.from_numpy(nearest).to(self.device)
 
     def bands(self) -> list[Tensor]:
         """Coefficients [N_l, 2 l + 1, 3] of the SH bands, from 0 to the highest that any Gaussian has."""
@@ -180,8 +195,8 @@ class SceneModel:
         logits = self.raw["sh_logits"]
         if self.band_network is None:
             return sh_prune.band_mask(logits, self.threshold)
-        directions = sh_prune.guidance_directions()[:, None]
-        delta = self._delta(logits, torch.arange(len(self)), features, directions)
+        directions = sh_prune.guidance_directions()[:, None].to(logits)
+        delta = self._delta(logits, self.rows, features, directions)
         return sh_mask_network.nested(delta, self.threshold)[:, 1:]
 
     def render(
@@ -230,7 +245,7 @@ class SceneModel:
             auxiliary.band_masks = masks
         if not semantic:  # the masks have seen them
             features = None
-        colors = colors_in_view(self.bands(), masks, index, raw["means"], eye, degree)
+        colors = colors_in_view(self.bands(), masks, index, raw["means"], eye, degree, self.backend)
         if depth:
             colors = torch.cat([colors, planes_in_view(means, quats, scales, view.viewmat, view.K, NEAREST)], -1)
         n_colors = colors.shape[1]
@@ -258,4 +273,4 @@ class SceneModel:
         if self.shape is None:
             return None
         self.shape.refresh(self.raw, anew=True)
-        return self.shape.fuse(self.raw["features"], torch.arange(len(self))).numpy()
+        return self.shape.fuse(self.raw["features"], self.rows).cpu().numpy()

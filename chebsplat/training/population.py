@@ -39,7 +39,8 @@ class Population:
 
     def clear_gradients(self) -> None:
         """Begin to gather gradients anew, of as many Gaussians as there are."""
-        self.gradient_sum, self.gradient_count = (torch.zeros(len(self.model)) for _ in range(2))
+        means = self.model.raw["means"]
+        self.gradient_sum, self.gradient_count = (means.new_zeros(len(means)) for _ in range(2))
 
     def note_gradients(self, rendered: Rendered) -> None:
         """Length of the total loss' gradient to the 2D means, in half image widths as gsplat counts it."""
@@ -47,11 +48,10 @@ class Population:
         if gradient is None:
             return
         height, width = rendered.rgb.shape[:2]
-        length = (gradient[0] * torch.tensor([0.5 * width, 0.5 * height])).norm(dim=-1)
+        length = (gradient[0] * gradient.new_tensor([0.5 * width, 0.5 * height])).norm(dim=-1)
         visible = rendered.meta["radii"][0] > 0
-        index = rendered.index[visible]
-        self.gradient_sum[index] += length[visible]
-        self.gradient_count[index] += 1
+        self.gradient_sum.index_add_(0, rendered.index, torch.where(visible, length, 0))  # nothing waits for a count
+        self.gradient_count.index_add_(0, rendered.index, visible.to(length))
 
     def grow(self, optimizer: torch.optim.Optimizer, members: Tensor, generator: torch.Generator) -> None:
         """Densify: by regions (Eqs 11-12), whose members are i64 [M, n], by classic clone and split, or by turns.
@@ -90,7 +90,7 @@ class Population:
     @torch.no_grad()
     def drop_broken(self, optimizer: torch.optim.Optimizer) -> bool:
         """Remove Gaussians with a value that is not finite; were there any? Leaves fewer than `min_gaussians` alone."""
-        sound = torch.ones(len(self.model), dtype=torch.bool)
+        sound = torch.ones(len(self.model), dtype=torch.bool, device=self.model.device)
         for value in self.model.raw.values():
             sound[: len(value)] &= finite_rows(value)
         if sound.all() or sound.sum() < min(self.settings.min_gaussians, len(sound)):

@@ -30,7 +30,7 @@ def hat(vectors: Tensor) -> Tensor:
 
 def motion(twists: Tensor) -> Tensor:
     """Rigid motions exp(ξ) [..., 4, 4] of twists [..., 6]."""
-    generator = torch.zeros(*twists.shape[:-1], 4, 4, dtype=twists.dtype)
+    generator = twists.new_zeros(*twists.shape[:-1], 4, 4)
     generator[..., :3, :3], generator[..., :3, 3] = hat(twists[..., :3]), twists[..., 3:]
     motions: Tensor = torch.linalg.matrix_exp(generator)
     return motions
@@ -84,27 +84,35 @@ def preconditioner(points: Tensor, K: Tensor, viewmat: Tensor, size: tuple[int, 
 class Poses:
     """Poses of V training views that follow the gradient of what is rendered with them.
 
-    Args: viewmats [V, 4, 4] and Ks [V, 3, 3] as given; size: width, height; points [N, 3] of the scene; rate: pixels
-      that a view may move by in its first step; free: nothing ties the views to each other.
+    Args: viewmats [V, 4, 4] and Ks [V, 3, 3] as given, on the CPU; size: width, height; points [N, 3] of the scene;
+      rate: pixels that a view may move by in its first step; free: nothing ties the views to each other; device: of
+      the Gaussians.
     Choices: the mean of all corrections, as motions of the world, stays zero to first order: no photo sees a motion of
       all cameras and the scene together, and test views would.
     """
 
     def __init__(
-        self, viewmats: Tensor, Ks: Tensor, size: tuple[int, int], points: Tensor, rate: float, free: bool = False
+        self,
+        viewmats: Tensor,
+        Ks: Tensor,
+        size: tuple[int, int],
+        points: Tensor,
+        rate: float,
+        free: bool = False,
+        device: str | torch.device = "cpu",
     ):
-        self.rate, self.given, self.free = rate, viewmats.double(), free
-        self.viewmats = self.given.clone()
-        pairs = zip(Ks, self.given, strict=True)
-        self.scales = torch.stack([preconditioner(points, K, viewmat, size) for K, viewmat in pairs])
-        self.optimizer = RowAdam(len(viewmats), 6, DECAYS, joint=True)
-        self.twist = torch.zeros(6)
+        pairs = zip(Ks, viewmats.double(), strict=True)
+        self.scales = torch.stack([preconditioner(points, K, viewmat, size) for K, viewmat in pairs]).to(device)
+        self.rate, self.given, self.free = rate, viewmats.double().to(device), free
+        self.viewmats, self.inverse = self.given.clone(), torch.linalg.inv(self.given)
+        self.optimizer = RowAdam(len(viewmats), 6, DECAYS, joint=True, device=device)
+        self.twist = torch.zeros(6, device=device)
 
     def camera(self, camera: View, view: int, learning: bool = True) -> View:
         """A view's camera at the pose that was reached; `step` follows the gradient of the last one that is learned."""
         twist = None
         if learning:
-            twist = self.twist = torch.zeros(6, requires_grad=True)
+            twist = self.twist = torch.zeros(6, device=self.given.device, requires_grad=True)
         return View(camera.K, self.viewmats[view].float(), camera.width, camera.height, twist)
 
     def step(self, view: int, share: float) -> None:
@@ -116,7 +124,7 @@ class Poses:
         self.viewmats[view] = motion(change) @ self.viewmats[view]
         if self.free:
             return
-        drift = small_twist(torch.linalg.inv(self.given) @ self.viewmats).mean(0)
+        drift = small_twist(self.inverse @ self.viewmats).mean(0)
         self.viewmats = self.viewmats @ motion(-drift)
 
     def state_dict(self) -> dict[str, Any]:

@@ -15,24 +15,33 @@ class RowAdam:
       first steps would be √V too long.
     """
 
-    def __init__(self, n_rows: int, size: int, decays: tuple[float, float] = (0.9, 0.99), joint: bool = False):
+    def __init__(
+        self,
+        n_rows: int,
+        size: int,
+        decays: tuple[float, float] = (0.9, 0.99),
+        joint: bool = False,
+        device: str | torch.device = "cpu",
+    ):
         self.decays, self.joint = decays, joint
-        self.moments = torch.zeros(2, n_rows, size, dtype=torch.float64)
-        self.counts = torch.zeros(n_rows, dtype=torch.int64)
+        self.moments = torch.zeros(2, n_rows, size, dtype=torch.float64, device=device)
+        self.counts = torch.zeros(n_rows, dtype=torch.int64, device=device)
 
     def change(self, row: int, gradient: Tensor, rate: float) -> Tensor:
         """What the row's values [K] change by, float64; a gradient that is not finite changes nothing."""
         gradient = gradient.detach().double()
-        if not torch.isfinite(gradient).all():
-            return torch.zeros_like(gradient)
-        self.counts[row] += 1
-        mean, square = self.moments[:, row]
-        mean.lerp_(gradient, 1 - self.decays[0])
-        square.lerp_((gradient**2).sum().expand_as(square) if self.joint else gradient**2, 1 - self.decays[1])
-        count = int(self.counts[row])
-        corrected = [moment / (1 - decay**count) for moment, decay in zip((mean, square), self.decays, strict=True)]
-        change: Tensor = -rate * corrected[0] / (corrected[1].sqrt() + 1e-15)
-        return change
+        usable = torch.isfinite(gradient).all()  # not asked for as a truth: on a GPU, that would wait
+        self.counts[row] += usable
+        count, held = self.counts[row].double(), self.moments[:, row]
+        size = (gradient**2).sum().expand_as(gradient) if self.joint else gradient**2
+        moments = [
+            held[k].lerp(torch.where(usable, value, held[k]), 1 - self.decays[k])
+            for k, value in enumerate((gradient, size))
+        ]
+        self.moments[:, row] = torch.stack(moments)
+        mean, square = (moment / (1 - decay**count) for moment, decay in zip(moments, self.decays, strict=True))
+        change = -rate * mean / (square.sqrt() + 1e-15)
+        return torch.where(usable, change, 0)
 
     def state_dict(self) -> dict[str, Tensor]:
         return {"moments": self.moments, "counts": self.counts}

@@ -11,19 +11,25 @@ from chebsplat.views import TaughtLabels
 
 
 def semantic_loss(
-    render: Tensor, features: Tensor, labels: TaughtLabels | None, mask: Tensor | None, settings: TrainSection
+    render: Tensor,
+    features: Tensor,
+    labels: TaughtLabels | None,
+    mask: Tensor | None,
+    settings: TrainSection,
+    backend: str = "auto",
 ) -> Tensor:
     """What a view's rendered features [H, W, C] cost, by `train.feature_loss`; cells without a label cost nothing.
 
-    Args: features [h, w, C] and labels of the teacher; mask [H, W], true where a pixel counts, or None.
+    Args: features [h, w, C] and labels of the teacher; mask [H, W], true where a pixel counts, or None;
+      backend: of `rasterize`.
     Raises: ValueError where cross-entropy is asked for without labels.
     """
     if settings.feature_loss == "cross-entropy":
         if labels is None:
             raise ValueError("cross-entropy needs labels with a confidence")
         return label_entropy(render, labels, mask, settings.label_temperature)
-    counted = None if labels is None or bool((labels.classes >= 0).all()) else labels.classes >= 0
-    return feature_distance(render, features, mask, settings.feature_loss or "length", counted)
+    counted = None if labels is None or labels.complete else labels.classes >= 0
+    return feature_distance(render, features, mask, settings.feature_loss or "length", counted, backend)
 
 
 def label_entropy(render: Tensor, labels: TaughtLabels, mask: Tensor | None, temperature: float) -> Tensor:
@@ -40,5 +46,5 @@ def label_entropy(render: Tensor, labels: TaughtLabels, mask: Tensor | None, tem
     logits = pooled @ labels.class_codes.to(render.dtype).T / temperature
     log_likelihood = logits.log_softmax(-1).gather(-1, labels.classes.clamp_min(0)[..., None])[..., 0]
     counted = labels.classes >= 0
-    share = cell_shares(mask, size, render.dtype, counted) * labels.confidence.to(render.dtype)
+    share = cell_shares(mask, size, render, counted) * labels.confidence.to(render.dtype)
     return -torch.where(counted & (share > 0), share * log_likelihood, 0.0).sum()

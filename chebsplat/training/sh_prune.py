@@ -108,15 +108,15 @@ def region_guidance(shN: Tensor, members: Tensor, n: int, n_bins: int = 8) -> Te
     """
     present = members >= 0
     if not present.any():
-        return torch.ones(n, 3)
+        return shN.new_ones(n, 3)
     n_bins += 1 - n_bins % 2
     used, slot = members[present].unique(return_inverse=True)
     index = torch.zeros_like(members).masked_scatter(present, slot)  # of rows of `used`
     colors = band_colors(shN[used], guidance_directions()[:, None].to(shN)).movedim(-1, 0).contiguous()
     highest, lowest = colors.amax(0), colors.amin(0)
     changes = torch.where(highest >= -lowest, highest, lowest).permute(1, 2, 0)  # [used, 3 bands, Q]
-    weight, times = torch.zeros(len(used), 3), torch.zeros(len(used), 1)
-    for rows in torch.arange(len(members)).split(128):
+    weight, times = shN.new_zeros(len(used), 3), shN.new_zeros(len(used), 1)
+    for rows in torch.arange(len(members), device=shN.device).split(128):
         inside = changes[index[rows]].permute(0, 2, 1, 3).flatten(2)  # [M, 3 bands, k * Q]
         valid = present[rows][:, None, :, None].expand(-1, 3, -1, changes.shape[-1]).flatten(2)
         reach = (inside.abs() * valid).amax((1, 2)).clamp_min(n_bins * 0.5 / 255)[:, None].expand(-1, 3)
@@ -126,13 +126,13 @@ def region_guidance(shN: Tensor, members: Tensor, n: int, n_bins: int = 8) -> Te
         spared = (1 - 0.5 * (histogram - without).abs().sum(-1)).clamp(0.05, 1)
         spared = spared.flip(-1).cummin(-1).values.flip(-1)
         weight.index_add_(0, index[rows][present[rows]], spared[:, None].expand(*index[rows].shape, 3)[present[rows]])
-    times.index_add_(0, slot, torch.ones(len(slot), 1))
-    return torch.ones(n, 3).index_copy_(0, used, weight / times)
+    times.index_add_(0, slot, shN.new_ones(len(slot), 1))
+    return shN.new_ones(n, 3).index_copy_(0, used, weight / times)
 
 
 def sh_loss(mask: Tensor, guidance: Tensor | None = None) -> Tensor:
     """Mean over Gaussians of Σ_l (2l + 1) m_l, each band weighted by `guidance` [N, 3] where given; 0 for none."""
     if len(mask) == 0:
         return mask.sum()
-    cost = mask * torch.tensor([3.0, 5.0, 7.0], dtype=mask.dtype)
+    cost = mask * mask.new_tensor([3.0, 5.0, 7.0])
     return (cost if guidance is None else cost * guidance).sum(-1).mean()

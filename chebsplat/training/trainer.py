@@ -25,6 +25,7 @@ from chebsplat.training.semantic_loss import semantic_loss
 from chebsplat.views import Views
 
 PROGRESS = ("step", "seconds", "order", "members", "guidance")
+READ_EVERY = 10  # steps on a GPU from one that waits for its figures to the next
 
 
 class Trainer:
@@ -35,6 +36,9 @@ class Trainer:
       basis:    matrices [q, r] by name of an earlier scene's knowledge; None: of none.
       regions, descriptors: of the model's Gaussians as they are; None: they are computed.
       cameras:  what is learned of each view's camera; None: nothing.
+    The model's Gaussians say which device computes; views, cameras and regions are to be there, too. On a GPU a step
+    waits for no number but that of the Gaussians in view, and of regions where it encodes them: a loss that is not
+    finite is found within READ_EVERY steps.
     `state_dict()` between two steps holds all that the steps to come depend on: a trainer that loads it takes them as
     this one does, to the bit, with as many threads.
     """
@@ -54,7 +58,8 @@ class Trainer:
         self.feature_every = feature_every(settings, len(views.names))
         settings = settings.model_copy(update={"feature_every": self.feature_every})
         self.model, self.views, self.settings, self.extent = model, views, settings, extent
-        self.basis = basis if basis and model.shape is not None else {}
+        given = basis if basis and model.shape is not None else {}
+        self.basis = {name: value.to(model.device) for name, value in given.items()}
         self.cameras = cameras or CameraModels()
         self.schedule = Schedule(settings)
         self.guidance: Tensor | None = None
@@ -73,8 +78,13 @@ class Trainer:
         """Part of the budget that is spent."""
         return self.schedule.share(self.step, self.seconds)
 
-    def steps(self) -> Iterator[dict[str, float]]:
-        """Train until the budget is spent; yields each step's figures."""
+    @property
+    def reads(self) -> bool:
+        """Whether this step's figures are numbers: every step's on the CPU; tensors wait for nobody on a GPU."""
+        return self.model.device.type == "cpu" or self.step % READ_EVERY == 0
+
+    def steps(self) -> Iterator[dict[str, float | Tensor]]:
+        """Train until the budget is spent; yields each step's figures, as tensors [] where it does not read them."""
         while self.share < 1:
             began = time.perf_counter()
             self.laps.start()
@@ -123,7 +133,7 @@ class Trainer:
         if not self.schedule.prunes(share):
             return None
         features = None if self.model.semantic_gate is None else self._features(share)
-        return self.model.soft_mask(torch.arange(len(self.model)), features)
+        return self.model.soft_mask(self.model.rows, features)
 
     @torch.no_grad()
     def final_mask(self) -> Tensor | None:
@@ -136,7 +146,7 @@ class Trainer:
         features, shape = self.model.raw.get("features"), self.model.shape
         if shape is None or features is None or not self._encodes(share):
             return features
-        return shape.fuse(features, torch.arange(len(self.model)))
+        return shape.fuse(features, self.model.rows)
 
     def state_dict(self) -> dict[str, Any]:
         """All that the steps to come depend on: tensors (shared, not copied) and plain values."""
@@ -182,10 +192,10 @@ class Trainer:
             shape.refresh(self.model.raw, regions, descriptors)
             regions = shape.regions
         elif regions is None:
-            means = self.model.raw["means"].detach().double().numpy()
+            means = self.model.raw["means"].detach().double().cpu().numpy()
             regions = regions_of(means, self.model.describe)
         assert regions is not None
-        self.members, self.guidance = torch.as_tensor(regions.members), None
+        self.members, self.guidance = torch.as_tensor(regions.members).to(self.model.device), None
         self.model.follow(regions)
         self.laps.mark("refresh")
 
@@ -200,7 +210,7 @@ class Trainer:
             self.laps.mark("refresh")
         return self.guidance[index]
 
-    def _step(self, index: int, share: float) -> dict[str, float]:
+    def _step(self, index: int, share: float) -> dict[str, float | Tensor]:
         settings, factor = self.settings, self.schedule.factor(share)
         target, mask = self.views.target(index, factor)
         pruning, taught = self.schedule.prunes(share), self.step % self.feature_every == 0
@@ -224,7 +234,7 @@ class Trainer:
             distance = depth_distance(rendered.inverse_depth, rendered.alpha, surface, mask)
             losses["depth"] = (settings.weight_depth or 0) * distance
         loss = torch.stack(list(losses.values())).sum()
-        if not torch.isfinite(loss):
+        if self.reads and not torch.isfinite(loss):
             bad = [name for name, value in losses.items() if not torch.isfinite(value)]
             where = f"step {self.step}, view {self.views.names[index]}: loss {', '.join(bad)} is not finite"
             raise DataFailure(f"{where}; {broken(self.model) or 'all parameters are finite: look at the view itself'}")
@@ -241,17 +251,20 @@ class Trainer:
         self.optimizer.step()
         self.cameras.step(index, share)
         self.laps.mark("optimizer")
-        return {"loss": float(loss.detach())} | {f"loss_{k}": float(v.detach()) for k, v in losses.items()}
+        figures = {"loss": loss.detach()} | {f"loss_{k}": v.detach() for k, v in losses.items()}
+        if not self.reads:
+            return dict(figures)
+        return dict(zip(figures, torch.stack(list(figures.values())).tolist(), strict=True))
 
     def _losses(
         self, rendered: Rendered, target: Tensor, mask: Tensor | None, wanted: Tensor | None, view: int
     ) -> dict[str, Tensor]:
         """Weighted losses by name (docs/method.md, section 8), those that this training and step have."""
-        settings, auxiliary = self.settings, rendered.auxiliary
-        losses = {"color": photometric(rendered.rgb, target, mask, settings.weight_ssim)}
+        settings, auxiliary, backend = self.settings, rendered.auxiliary, self.model.backend
+        losses = {"color": photometric(rendered.rgb, target, mask, settings.weight_ssim, backend)}
         if rendered.features is not None and wanted is not None:
             labels = None if self.views.labels is None else self.views.labels(view)
-            distance = semantic_loss(rendered.features, wanted, labels, mask, settings)
+            distance = semantic_loss(rendered.features, wanted, labels, mask, settings, backend)
             losses["features"] = settings.weight_features * distance
         if auxiliary.soft_mask is not None:
             losses["mask"] = settings.weight_mask * auxiliary.soft_mask.mean()
@@ -272,9 +285,9 @@ class Trainer:
         for index in indices:
             camera, degree = self.cameras.camera(self.views, index, 1, False), self.schedule.degree(self.share)
             rendered = self.model.render(camera, degree, semantic=False)
-            image = (self.cameras.taken(rendered.rgb, index).clamp(0, 1) * 255).round().byte().numpy()
-            mask = None if self.views.masks is None else self.views.masks[index].numpy()
-            truth = self.views.images[index].numpy()
+            image = (self.cameras.taken(rendered.rgb, index).clamp(0, 1) * 255).round().byte().cpu().numpy()
+            mask = None if self.views.masks is None else self.views.masks[index].cpu().numpy()
+            truth = self.views.images[index].cpu().numpy()
             scores.append(psnr(image, truth) if mask is None else psnr(image[mask], truth[mask]))
         return float(np.mean(scores))
 
@@ -286,8 +299,8 @@ class Trainer:
             self.population.freeze_bands(self.optimizer, self._features(self.share))
         bands = [band.detach() for band in self.model.bands()][: self.schedule.degree(1.0) + 1]
         others = self.model.raw.keys() - {"sh1", "sh2", "sh3", "prune_logits"}
-        parameters = {name: self.model.raw[name].detach().numpy() for name in sorted(others)}
-        parameters["shN"] = sh_prune.dense(bands[1:], len(self.model)).numpy()
+        parameters = {name: self.model.raw[name].detach().cpu().numpy() for name in sorted(others)}
+        parameters["shN"] = sh_prune.dense(bands[1:], len(self.model)).cpu().numpy()
         parameters["degrees"] = np.zeros(len(self.model), np.uint8)
         for band in bands[1:]:
             parameters["degrees"][: len(band)] += 1

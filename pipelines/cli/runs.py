@@ -15,7 +15,13 @@ from chebsplat.stages.registry import STAGES
 
 
 def plans(
-    scene: str | None, sequence: str | None, settings: str, ablation: str, basis: str, running: bool = False
+    scene: str | None,
+    sequence: str | None,
+    settings: str,
+    ablation: str,
+    basis: str,
+    running: bool = False,
+    device: str = "cpu",
 ) -> list[Any]:
     """The plan of a scene, after those of the scenes that its basis comes from, or the plans of a sequence."""
     from chebsplat.pipelines import bases, sequences
@@ -25,7 +31,7 @@ def plans(
         raise ConfigError("name one of scene= and sequence=")
     if sequence is not None and basis:
         raise ConfigError("a sequence starts from nothing; basis= goes with scene=")
-    planner = Planner(running=running)
+    planner = Planner(running=running, device=device)
     try:
         if sequence is not None:
             return sequences.chain(planner, sequence, settings, ablation)
@@ -88,17 +94,19 @@ def run(stage: str | None, cores: int, device: str, **choice: Any) -> int:
     """Bring a scene up to date; recompute only what is stale."""
     from chebsplat.pipelines.run import device_of, execute
 
-    used, chosen = device_of(device), plans(**choice, running=True)
+    used = device_of(device)
+    chosen = plans(**choice, running=True, device=used)
     return execute(chosen, checked_stage(stage or None, chosen), cores, used)
 
 
 @click.command()
 @with_scene
-def plan(**choice: Any) -> None:
+@ON_DEVICE
+def plan(device: str, **choice: Any) -> None:
     """Show what would run, what is fresh, and what the scene leaves out, and why."""
-    from chebsplat.pipelines.run import wanted_steps
+    from chebsplat.pipelines.run import device_of, wanted_steps
 
-    chosen = plans(**choice)
+    chosen = plans(**choice, device=device_of(device))
     keys = {step.key for one in chosen if one.asked for step in wanted_steps(one, None, chosen)}
     for one in chosen:
         print(f"{one.title}: {one.source}")
@@ -123,7 +131,7 @@ def study(name: str, cores: int, threads: int, out: Path | None, only_plan: bool
     from chebsplat.pipelines.studies import study as studies
 
     computing, asked = device_of(device), studies.read_study(name)
-    runs = studies.expand(asked, running=not (only_plan or no_run))
+    runs = studies.expand(asked, running=not (only_plan or no_run), device=computing)
     say(f"{name}: {len(runs)} runs, {sum(run.plan.targets['evaluate'].is_dir() for run in runs)} of them done")
     if only_plan:
         print(studies.describe(studies.outstanding(runs)))

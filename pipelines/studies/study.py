@@ -127,15 +127,14 @@ def checked_study(values: dict[str, Any], origin: str) -> Study:
     return checked(Study, values, origin)
 
 
-def expand(study: Study, running: bool = False) -> list[Run]:
+def expand(study: Study, running: bool = False, device: str = "cpu") -> list[Run]:
     """Every run, planned; scenes vary slowest and variants fastest, so that a study cut short has compared something.
 
-    Args: running: of `Planner`.
-
+    Args: running, device: of `Planner`.
     Raises: ConfigError, InputError.
     Choices: all runs of a condition are measured under one protocol, since figures of two must not meet in a mean.
     """
-    planner = Planner(running=running)
+    planner = Planner(running=running, device=device)
     chains = [("", [scene]) for scene in study.scenes]
     chains += [(Path(name).stem, scenes_of(name)) for name in study.sequences]
     order = list(study.budgets.settings())

@@ -1,0 +1,92 @@
+"""gsplat 1.5.3's `rasterization` without a GPU: its signature and its rules, on our reference rasterizer.
+
+Its rules: shapes as its assertions have them, float32 on one GPU, channels in chunks whose count its kernels are made
+for, each of which overwrites the absolute gradient of the one before; radii by axis, [C, N, 2], int32.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from contextlib import AbstractContextManager, nullcontext
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from chebsplat.rasterize import reference
+
+NATIVE = (1, 2, 3, 4, 5, 8, 9, 16, 17, 32, 33, 64, 65, 128, 129, 256, 257, 512, 513)
+CEILING = 0.999
+asked: dict[str, Any] = {}  # the options of the last call
+within: list[Callable[[], AbstractContextManager[None]]] = []  # the last one makes what a call computes in
+
+
+def rasterization(
+    means: Tensor,
+    quats: Tensor,
+    scales: Tensor,
+    opacities: Tensor,
+    colors: Tensor,
+    viewmats: Tensor,
+    Ks: Tensor,
+    width: int,
+    height: int,
+    near_plane: float = 0.01,
+    far_plane: float = 1e10,
+    radius_clip: float = 0.0,
+    eps2d: float = 0.3,
+    sh_degree: int | None = None,
+    packed: bool = True,
+    tile_size: int = 16,
+    backgrounds: Tensor | None = None,
+    render_mode: str = "RGB",
+    sparse_grad: bool = False,
+    absgrad: bool = False,
+    rasterize_mode: str = "classic",
+    channel_chunk: int = 32,
+    distributed: bool = False,
+    camera_model: str = "pinhole",
+    segmented: bool = False,
+    covars: Tensor | None = None,
+    with_ut: bool = False,
+    with_eval3d: bool = False,
+    radial_coeffs: Tensor | None = None,
+    tangential_coeffs: Tensor | None = None,
+    thin_prism_coeffs: Tensor | None = None,
+    ftheta_coeffs: Any = None,
+    rolling_shutter: int = 0,
+    viewmats_rs: Tensor | None = None,
+) -> tuple[Tensor, Tensor, dict[str, Any]]:
+    others = (radial_coeffs, tangential_coeffs, thin_prism_coeffs, ftheta_coeffs, viewmats_rs, covars, sh_degree)
+    if any(value is not None for value in others) or packed or sparse_grad or distributed or segmented:
+        raise NotImplementedError("the stand-in renders what chebsplat asks for, and nothing else")
+    if with_ut or with_eval3d or rolling_shutter or radius_clip or camera_model != "pinhole" or render_mode != "RGB":
+        raise NotImplementedError("the stand-in renders what chebsplat asks for, and nothing else")
+    N, C, D = len(means), len(viewmats), colors.shape[-1]
+    assert means.shape == (N, 3), means.shape
+    assert quats.shape == (N, 4), quats.shape
+    assert scales.shape == (N, 3), scales.shape
+    assert opacities.shape == (N,), opacities.shape
+    assert viewmats.shape == (C, 4, 4), viewmats.shape
+    assert Ks.shape == (C, 3, 3), Ks.shape
+    assert colors.shape in ((N, D), (C, N, D)), colors.shape
+    assert backgrounds is None or backgrounds.shape == (C, D), backgrounds
+    assert N > 0, "its kernels sort no empty scene"
+    assert isinstance(width, int) and isinstance(height, int), (width, height)
+    for tensor in (means, quats, scales, opacities, colors, viewmats, Ks):
+        assert tensor.dtype == torch.float32 and tensor.device.type == "cuda", (tensor.dtype, tensor.device)
+    for first in range(0, D, channel_chunk):
+        chunk = min(channel_chunk, D - first)
+        padded = chunk if chunk in NATIVE else 1 << (chunk - 1).bit_length()
+        if padded > NATIVE[-1]:
+            raise ValueError(f"Unsupported number of color channels: {chunk}")
+        assert not absgrad or chunk == D, "a second chunk would overwrite the absolute gradient"
+    asked.clear()
+    asked.update(channel_chunk=channel_chunk, packed=packed, absgrad=absgrad, rasterize_mode=rasterize_mode)
+    with within[-1]() if within else nullcontext():
+        image, alpha, meta = reference.rasterize(
+            means, quats, scales, opacities, colors, viewmats, Ks, width, height,
+            near_plane=near_plane, far_plane=far_plane, eps2d=eps2d, max_alpha=CEILING, rasterize_mode=rasterize_mode,
+            backgrounds=backgrounds, absgrad=absgrad,
+        )  # fmt: skip
+    return image, alpha, meta | {"radii": meta["radii"][..., None].expand(-1, -1, 2).int()}

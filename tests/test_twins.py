@@ -1,0 +1,136 @@
+"""A training in plain torch, which is what a GPU takes, is the training of the compiled kernels."""
+
+import chebsplat  # noqa: F401  # isort: skip
+import pytest
+import torch
+from shared import ROOT
+
+from chebsplat.shape import cks
+from chebsplat.stages import config as configs
+from chebsplat.training.losses import feature_distance
+
+STEPS = 200
+LIMIT = 2 / 255  # what a pair at the limit of 1/255 may change, where rounding decides whether it is drawn
+
+
+@pytest.fixture
+def trainer_of(up_to_teacher, monkeypatch):
+    """Makes a trainer of the toy scene before its first step, by backend and settings."""
+    monkeypatch.syspath_prepend(str(ROOT))
+    from benchmarks.scene import trainer_from
+
+    def make(backend, **train):
+        return trainer_from(up_to_teacher, configs.build({"train": {"steps": STEPS} | train}, "toy"), backend)
+
+    return make
+
+
+@pytest.fixture
+def no_kernels(monkeypatch):
+    """Fails where a compiled kernel is called."""
+
+    def refuse(*_):
+        raise AssertionError("a compiled kernel was called")
+
+    def forbid():
+        from chebsplat.rasterize import cpu
+        from chebsplat.shape import fusion_kernels
+        from chebsplat.splats import sh_kernels
+        from chebsplat.training import pooling, ssim
+
+        monkeypatch.setattr(cpu, "rasterize", refuse)
+        monkeypatch.setattr(fusion_kernels, "fuse_in_view", refuse)
+        monkeypatch.setattr(sh_kernels, "colors_in_view", refuse)
+        monkeypatch.setattr(pooling, "feature_distance", refuse)
+        monkeypatch.setattr(ssim, "photometric", refuse)
+
+    return forbid
+
+
+def gradients(trainer):
+    model = trainer.model
+    leaves = dict(model.raw)
+    for name, module in model.modules.items():
+        leaves |= {f"{name}.{part}": value for part, value in module.named_parameters()}
+    return {name: leaf.grad for name, leaf in leaves.items() if leaf.grad is not None}
+
+
+@pytest.mark.slow
+def test_two_hundred_steps_in_plain_torch_reach_the_same_psnr(trainer_of, no_kernels):
+    # Without growth: which Gaussians grow is decided by comparisons, and what rounding decides there is worth 0.1 dB.
+    settings = {"densify": "off", "encoder": "transformer"}
+    compiled, plain = trainer_of("auto", **settings), trainer_of("reference", **settings)
+    for _ in compiled.steps():
+        pass
+    every = list(range(len(compiled.views.names)))
+    wanted, finished = compiled.held_in_psnr(every), compiled.finish()
+    no_kernels()
+    for _ in plain.steps():
+        pass
+    assert abs(plain.held_in_psnr(every) - wanted) < 0.01
+    assert plain.finish().keys() == finished.keys()
+
+
+@pytest.mark.parametrize("after", [1, 30], ids=["at the start", "with masks, encodings and bands"])
+def test_gradients_of_a_step_in_plain_torch_are_those_of_the_kernels(after, trainer_of):
+    settings = {"densify": "off", "prune_from": 0.1, "encode_from": 0.1, "encode_every": 1, "feature_every": 1}
+    settings["encoder"] = "transformer"
+    compiled, plain = (trainer_of(backend, steps=40, **settings) for backend in ("auto", "reference"))
+    steps = compiled.steps()
+    for _ in range(after):
+        next(steps)
+    plain.load_state_dict(torch.load(_saved(compiled), weights_only=True))
+    figures = next(steps), next(plain.steps())
+    assert figures[0].keys() == figures[1].keys()
+    for name, value in figures[0].items():
+        assert figures[1][name] == pytest.approx(value, rel=1e-5), name
+    found, wanted = gradients(plain), gradients(compiled)
+    assert found.keys() == wanted.keys()
+    if after > 1:
+        assert {"sh1", "sh_logits", "prune_logits", "shape.gate.linear.weight"} <= wanted.keys()
+    for name, expected in wanted.items():
+        if name.endswith("key.bias"):  # changes no attention: its gradient is 0 but for rounding
+            continue
+        off = (found[name] - expected).abs() / expected.abs().max()
+        assert off.max() < LIMIT, name
+        assert (off > 1e-4).float().mean() < 2e-3, name
+
+
+def _saved(trainer):
+    import io
+
+    file = io.BytesIO()
+    torch.save(trainer.state_dict(), file)
+    file.seek(0)
+    return file
+
+
+def test_a_basis_costs_as_much_by_autograd_as_in_closed_form():
+    g = torch.Generator().manual_seed(0)
+    basis = torch.linalg.qr(torch.randn(12, 4, generator=g))[0]
+    for scale in (1.0, 1e-18, 1e15, 0.0):
+        W = torch.randn(12, 7, generator=g) * scale
+        both = [W.clone().requires_grad_(True) for _ in range(2)]
+        values = [
+            cks.basis_loss({"a": w}, {"a": basis}, name) for w, name in zip(both, ("auto", "reference"), strict=True)
+        ]
+        for value in values:
+            value.backward()
+        assert values[0].item() == pytest.approx(values[1].item(), rel=1e-5)
+        torch.testing.assert_close(both[1].grad * scale, both[0].grad * scale, rtol=1e-4, atol=1e-6)
+
+
+@pytest.mark.parametrize("kind", ["length", "l1"])
+def test_cells_that_do_not_count_may_be_anything_in_plain_torch_too(kind):
+    render = torch.rand(8, 8, 3, requires_grad=True)
+    target, counted = torch.rand(4, 4, 3), torch.ones(4, 4, dtype=torch.bool)
+    target[1, 2], counted[1, 2] = torch.nan, False
+    found = [feature_distance(render, target, None, kind, counted, backend) for backend in ("auto", "reference")]
+    assert found[0].item() == pytest.approx(found[1].item(), rel=1e-6)
+    (gradient,) = torch.autograd.grad(found[1], render)
+    assert torch.isfinite(gradient).all() and (gradient[2:4, 4:6] == 0).all()
+
+
+def test_an_unknown_backend_is_refused():
+    with pytest.raises(ValueError, match="none of auto, cpu, cuda, reference"):
+        feature_distance(torch.rand(8, 8, 3), torch.rand(4, 4, 3), backend="gpu")
