@@ -63,10 +63,10 @@ def make(plan: Path, key: str) -> None:
 
 @contextmanager
 def prepared(step: dict[str, Any], hashes: dict[str, Any]) -> Iterator[None]:
-    """What a stage reads stays as it was planned, and the first training on a machine has its kernels."""
+    """What a stage reads stays as it was planned, and the first training on a processor has its kernels."""
     with ExitStack() as entered:
         entered.enter_context(unchanged(step["stage"], step["config"], hashes))
-        if step["stage"] == "train":
+        if step["stage"] == "train" and step["device"] != "cuda":
             entered.enter_context(rehearsed(n_threads(), "features" in step["inputs"]))
         yield
 
