@@ -41,7 +41,7 @@ def with_depth_loss(train: TrainSection, capture: Capture, points: Points) -> tu
 
 def disagreement(capture: Capture, points: Points) -> float:
     """Median over points of |z' / z - 1|, z' from one training view's depth and z what another sees there; 0 if no two
-    views see a point in common.
+    views see a point in common, or there are none.
     """
     import numpy as np
 
@@ -51,7 +51,7 @@ def disagreement(capture: Capture, points: Points) -> float:
     row, rng = {name: view for view, name in enumerate(capture.names)}, np.random.default_rng(0)
     used = [k for k, name in enumerate(points.names) if not capture.is_test[row[name]]]
     differences = [np.zeros(0)]
-    for a, b in rng.choice(used, (N_PAIRS, 2)):
+    for a, b in rng.choice(used, (N_PAIRS, 2)) if used else ():
         one, other = (np.asarray(capture.depth[row[points.names[view]]]) for view in (a, b))
         pixels = np.stack([rng.integers(0, side, N_PIXELS) for side in one.shape], 1)
         pixels = pixels[one[pixels[:, 0], pixels[:, 1]] > 0]  # nan is none

@@ -21,6 +21,8 @@ SETTINGS = TrainSection(encode_every=4, report_every=6)
 class Alternating:
     """A trainer of 12 steps, of which every fourth has a loss that the others have not."""
 
+    reads = True
+
     def __init__(self, stop_at=None):
         self.step, self.seconds, self.stop_at = 0, 0.0, stop_at
         self.views, self.feature_every = SimpleNamespace(names=["a", "b"]), 1
