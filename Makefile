@@ -24,6 +24,8 @@ CHOICE := $(if $(scene),--scene '$(scene)') $(if $(sequence),--sequence '$(seque
 .PHONY: help run study view plan verify clean-stale setup test test-all gpu malformed soak stability bench text-model nouns knowledge calibration teacher teacher-quality lint lock
 
 run: $(READY)  ## make scene=NAME|FOLDER [stage=] [set=a.b=c,...] [ablation=] [basis=NAME@REVISION|none] [cores=] [device=]; or sequence=NAME
+	@[ '$(stage)' != mesh ] || $(PY) -c 'import pymeshlab' 2>/dev/null || \
+	  $(PY) -m uv pip install --quiet --python $(PY) --editable '.[mesh]'
 	@$(CHEBSPLAT) run $(CHOICE) $(if $(stage),--stage '$(stage)') $(if $(cores),--cores '$(cores)') $(if $(device),--device '$(device)')
 
 study: $(READY)  ## make study=NAME [cores=] [threads=] [args=--no-run]: its runs, then table, figure, page in build/studies

@@ -6,6 +6,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from chebsplat.errors import ConfigError, DataFailure
+from chebsplat.stages.command import Job, command
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
@@ -21,6 +22,26 @@ OPAQUE = 0.6  # least coverage of a pixel whose depth counts
 STEP = 0.05  # of its depth, by which a neighbouring pixel may lie deeper: beyond, a pixel is on an edge
 LONGEST_HOLE = 60  # edges
 LEAST_PART = 12.0  # voxels across a connected part that stays
+FILES = ("mesh.ply", "mesh.glb")
+
+
+def run(job: Job) -> None:
+    """The surface of an exported scene, as triangles with colours and labels, in its frame and units.
+
+    Reads `scene`. Writes `mesh`.
+    """
+    from chebsplat.formats.meshes import write_mesh
+    from chebsplat.formats.scene import read_scene
+    from chebsplat.stages.opened import OpenedScene
+
+    settings, source = job.config.mesh, job.inputs["scene"]
+    scene = OpenedScene(read_scene(source), source)
+    mesh, facts = mesh_of(scene, settings.voxel, settings.n_triangles, job.progress, settings.raw)
+    if mesh.labels is None:
+        job.left_out("labels", "the scene has no semantics")
+    for name in FILES:
+        write_mesh(job.out / name, mesh, scene.label_names)
+    job.facts |= facts
 
 
 def mesh_of(
@@ -112,3 +133,6 @@ def write(scene: OpenedScene, out: Path, voxel: float | None, n_triangles: int, 
     mesh, facts = mesh_of(scene, voxel, n_triangles, Progress(), raw)
     write_mesh(out, mesh, scene.label_names)
     return facts
+
+
+main = command("mesh", run)

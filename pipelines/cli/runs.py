@@ -22,6 +22,7 @@ def plans(
     basis: str,
     running: bool = False,
     device: str = "cpu",
+    also: str | None = None,
 ) -> list[Any]:
     """The plan of a scene, after those of the scenes that its basis comes from, or the plans of a sequence."""
     from chebsplat.pipelines import bases, sequences
@@ -38,9 +39,9 @@ def plans(
         if basis == "none":
             settings = ",".join(part for part in (settings, "refine.knowledge=none") if part)
         if basis in ("", "none"):
-            return [planner.plan(str(scene), settings, ablation)]
+            return [planner.plan(str(scene), settings, ablation, also=also)]
         earlier, path, name = bases.before(planner, basis, settings, ablation)
-        plan = planner.plan(str(scene), settings, ablation, path)
+        plan = planner.plan(str(scene), settings, ablation, path, also=also)
         plan.title += ("+" if ablation or settings else "@") + f"basis={name}"
         for one in earlier:
             one.asked = False
@@ -95,7 +96,7 @@ def run(stage: str | None, cores: int, device: str, **choice: Any) -> int:
     from chebsplat.pipelines.run import device_of, execute
 
     used = device_of(device)
-    chosen = plans(**choice, running=True, device=used)
+    chosen = plans(**choice, running=True, device=used, also=stage)
     return execute(chosen, checked_stage(stage or None, chosen), cores, used)
 
 
