@@ -75,6 +75,7 @@ class TrainSection(Section):
     steps: int = number(3000, "of training; the schedule's fractions are of these", 1, 1_000_000)
     seconds: float | None = number(None, "of training, instead of steps: the schedule follows the clock", 0.1, 604_800)
     seed: int = seed("of the order of views and of all that is drawn in training")
+    start: str | None = setting(None, "a 3DGS PLY that training goes on from, instead of the points")
     # what is built
     semantics: bool = setting(True, "false: colour only")
     features: Literal["trained", "lifted"] = setting(

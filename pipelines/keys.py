@@ -16,6 +16,7 @@ PLACES = (
     ("channels", "reference"),
     ("teacher", "model"),
     ("teacher", "labels"),
+    ("train", "start"),
     ("knowledge", "model"),
     ("evaluate", "lpips_weights"),
 )

@@ -35,6 +35,8 @@ def raw_files(stage: str, sections: dict[str, Any]) -> tuple[Path | None, list[P
         return None, _of_channels(sections["channels"])
     if stage == "teacher" and sections["teacher"]["model"]:
         return None, _of_teacher(sections["teacher"])
+    if stage == "train" and sections["train"]["start"]:
+        return None, [_named(sections["train"]["start"], "train.start")]
     if stage == "teach":
         return None, _of_model(sections["knowledge"]["model"])
     if stage == "evaluate" and sections["evaluate"]["lpips_weights"]:

@@ -61,7 +61,8 @@ def run(job: Job) -> None:
 
     torch.set_num_threads(n_threads())  # sums of torch depend on it; the same bytes are promised for the same number
     model = model_of(points, features, train, job.config.describe, job.device)
-    regions, described_values = first_regions(descriptors if points is given else None)
+    n_initial = len(model)
+    regions, described_values = first_regions(descriptors if points is given and not train.start else None)
     views = training_views(capture, points, features, bool(train.weight_depth)).to(job.device)
     models = camera_models(job, capture, points, views)
     trainer = Trainer(
@@ -88,7 +89,7 @@ def run(job: Job) -> None:
     given_poses = None if models.poses is None else points.cam_from_world
     job.facts |= facts(models)
     notes: dict[str, Any] = {"left_out": job.facts.get("left_out", {}), "n_added": population.n_added}
-    notes |= {"n_removed": population.n_removed, "n_broken": population.n_broken, "n_initial": len(points.means)}
+    notes |= {"n_removed": population.n_removed, "n_broken": population.n_broken, "n_initial": n_initial}
     if features is not None:
         notes |= {"label_names": features.label_names, "convention": features.convention}
     if model.shape is not None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from pathlib import Path
 from typing import TYPE_CHECKING
 
 from chebsplat.errors import ConfigError, DataFailure, InputError
@@ -115,8 +116,8 @@ def model_of(
     device: str = "cpu",
     backend: str = "auto",
 ) -> SceneModel:
-    """The scene before training: a Gaussian at each point, modules drawn by the training's seed. backend: of
-    `rasterize`.
+    """The scene before training: a Gaussian at each point, or those of `train.start`; modules drawn by the training's
+    seed. backend: of `rasterize`.
     """
     import torch
 
@@ -124,9 +125,34 @@ def model_of(
     from chebsplat.training.model import SceneModel
 
     torch.manual_seed(train.seed)
-    initial = initial_gaussians(points.means, points.colors, points.covariances)
+    initial = (
+        started(Path(train.start), train)
+        if train.start
+        else initial_gaussians(points.means, points.colors, points.covariances)
+    )
     raw = {name: value.to(device) for name, value in initial.items()}
     return SceneModel(raw, describe, train, None if features is None else features.features.shape[-1], backend)
+
+
+def started(ply: Path, train: TrainSection) -> dict[str, Tensor]:
+    """Raw parameters of the Gaussians of a 3DGS PLY, in the frame of the scene's cameras, with its SH bands.
+
+    Raises: InputError naming the file; ConfigError where they are more than `train.max_gaussians`.
+    """
+    import torch
+
+    from chebsplat.formats.ply import read_ply
+
+    parameters, degree, _ = read_ply(ply)
+    n = len(parameters["means"])
+    if n == 0:
+        raise InputError(f"{ply} holds no Gaussians; choose another train.start")
+    if n > train.max_gaussians:
+        raise ConfigError(f"{ply} holds {n} Gaussians; set train.max_gaussians={n} or more")
+    raw = {name: parameters[name] for name in ("means", "log_scales", "quats", "logit_opacities", "sh0")}
+    for band in range(1, min(degree, train.sh_degree) + 1):
+        raw[f"sh{band}"] = parameters["shN"][:, band**2 - 1 : (band + 1) ** 2 - 1]
+    return {name: torch.tensor(values, dtype=torch.float32) for name, values in raw.items()}
 
 
 def knowledge(job: Job, model: SceneModel, train: TrainSection) -> dict[str, Tensor]:

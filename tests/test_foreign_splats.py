@@ -9,11 +9,14 @@ from browser import BROWSER
 from click.testing import CliRunner
 from driven import driven
 from scipy.special import expit
-from shared import data
+from shared import INPUTS, TOY, data, run_stage
 from test_page import decibels, held_in, picture
 
+from chebsplat.formats.gaussians import read_gaussians
 from chebsplat.formats.packed import Packed, unpack
+from chebsplat.formats.ply import read_ply
 from chebsplat.pipelines.cli import main
+from chebsplat.pipelines.plan import Planner
 from chebsplat.render import SceneRenderer
 from chebsplat.stages.opened import OpenedScene
 from chebsplat.stages.page import foreign
@@ -88,3 +91,36 @@ def test_in_a_browser_150000_splats_are_drawn_as_we_draw_them(written_by_gsply, 
         assert decibels(picture(browser, 0, (640, 480)), truth) > 40
         browser.screenshot(tmp_path / "theirs.png")
         assert browser.complaints == []
+
+
+@pytest.mark.xdist_group("toy")
+def test_training_goes_on_from_a_splat_that_others_made(toy, tmp_path):
+    """It begins where the PLY is, not at the points, and as many Gaussians as it holds must be allowed."""
+    ply, inputs = toy["export"] / "scene.ply", {role: toy[of] for role, of in INPUTS["train"].items()}
+    n = len(read_ply(ply)[0]["means"])
+
+    def trained(name, **train):
+        settings = TOY["train"] | {"steps": 4, "report_every": 1, "densify": "off", "prune": False} | train
+        assert run_stage("train", tmp_path / name, inputs, TOY | {"train": settings}) == 0
+        found = read_gaussians(tmp_path / name)
+        return found.notes["n_initial"], found.trace[0]["psnr"]
+
+    count, on = trained("on", start=str(ply))
+    assert count == n
+    assert on > trained("anew")[1] + 1
+    config = TOY | {"train": TOY["train"] | {"start": str(ply), "max_gaussians": n - 1}}
+    assert run_stage("train", tmp_path / "no", inputs, config) == 2
+    (tmp_path / "cut.ply").write_bytes(ply.read_bytes()[:400])
+    config = TOY | {"train": TOY["train"] | {"start": str(tmp_path / "cut.ply")}}
+    assert run_stage("train", tmp_path / "no", inputs, config) == 3
+
+
+def test_a_key_holds_what_training_starts_from_and_not_where_that_lies(tmp_path, quick_plans):
+    keys = []
+    for name, tail in (("a/theirs.ply", b""), ("b/theirs.ply", b""), ("c/theirs.ply", b"\0")):
+        path = tmp_path / name
+        path.parent.mkdir()
+        path.write_bytes(b"ply\n" + tail)
+        plan = Planner().plan("toy", f"train.start={path}")
+        keys.append(next(step.key for step in plan.steps if step.stage == "train"))
+    assert keys[0] == keys[1] != keys[2]

@@ -62,8 +62,9 @@ class SceneModel:
     `features` [N, C], `prune_logits` [N] and `sh_logits` [N, 3] are there only if the scene needs them, and SH band l,
     `sh<l>` [N_l, 2 l + 1, 3], only for the first N_l Gaussians: all until the trainer freezes them.
 
-    Args: raw: of `splats.gaussians.initial_gaussians`, on the device that is to compute; n_channels: of the features,
-      None without semantics; backend: of `rasterize`, and of all else in a step that has a compiled kernel.
+    Args: raw: of `splats.gaussians.initial_gaussians`, with SH bands or without, on the device that is to compute;
+      n_channels: of the features, None without semantics; backend: of `rasterize`, and of all else in a step that has
+      a compiled kernel.
     """
 
     def __init__(
@@ -78,7 +79,7 @@ class SceneModel:
         self.describe, self.backend = describe, backend
         self.raw = dict(raw)
         for band in range(1, train.sh_degree + 1):
-            self.raw[f"sh{band}"] = torch.zeros(n, 2 * band + 1, 3, device=device)
+            self.raw.setdefault(f"sh{band}", torch.zeros(n, 2 * band + 1, 3, device=device))
         if n_channels is not None:
             self.raw["features"] = torch.zeros(n, n_channels, device=device)
         if train.prune:
