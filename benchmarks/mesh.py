@@ -82,7 +82,7 @@ def main(arguments: Sequence[str]) -> int:
         scene, capture = load(work), read_capture(work / "ingest")
         points, labels = truth(capture)
         began = time.perf_counter()
-        seen = list(frames(scene, scene.cameras, Progress()))
+        seen = list(frames(scene.renderer, scene.exported.cameras, Progress()))
         rendering = time.perf_counter() - began
         names = [list(capture.class_names or []).index(name) for name in scene.label_names or []]
         for voxel in options.voxels:
@@ -91,7 +91,9 @@ def main(arguments: Sequence[str]) -> int:
             fusing, cleaning = time.perf_counter() - began, time.process_time()
             mesh = cleaned(raw, options.triangles, LEAST_PART * voxel, LONGEST_HOLE, voxel)
             cleaning = time.process_time() - cleaning
-            named = np.array([*names, -1])[labels_at(scene, mesh.vertices)] if names else None
+            named = None
+            if scene.label_embeddings is not None:
+                named = np.array([*names, -1])[labels_at(scene.renderer, scene.label_embeddings, mesh.vertices)]
             row = {"scene": work.name, "voxel_cm": 100 * voxel, "fused": len(raw.triangles)}
             row |= {"triangles": len(mesh.triangles), "render_s": rendering, "fuse_s": fusing, "clean_cpu_s": cleaning}
             rows.append(row | measured(mesh, points, labels, named) | {"spent_s": time.process_time() - spent})

@@ -13,8 +13,10 @@ if TYPE_CHECKING:
 
     import numpy as np
 
+    from chebsplat.formats.cameras import Cameras
     from chebsplat.formats.meshes import Frame, Mesh
-    from chebsplat.stages.opened import Camera, OpenedScene
+    from chebsplat.formats.scene import Scene
+    from chebsplat.render import SceneRenderer
     from chebsplat.stages.progress import Progress
 
 N_VOXELS = 250  # along the longest side of the room, where no voxel is asked for
@@ -32,11 +34,10 @@ def run(job: Job) -> None:
     """
     from chebsplat.formats.meshes import write_mesh
     from chebsplat.formats.scene import read_scene
-    from chebsplat.stages.opened import OpenedScene
 
     settings, source = job.config.mesh, job.inputs["scene"]
-    scene = OpenedScene(read_scene(source), source)
-    mesh, facts = mesh_of(scene, settings.voxel, settings.n_triangles, job.progress, settings.raw)
+    scene = read_scene(source)
+    mesh, facts = mesh_of(scene, source, settings.voxel, settings.n_triangles, job.progress, settings.raw)
     if mesh.labels is None:
         job.left_out("labels", "the scene has no semantics")
     for name in FILES:
@@ -45,44 +46,51 @@ def run(job: Job) -> None:
 
 
 def mesh_of(
-    scene: OpenedScene, voxel: float | None, n_triangles: int, progress: Progress, raw: bool = False
+    scene: Scene, source: Path, voxel: float | None, n_triangles: int, progress: Progress, raw: bool = False
 ) -> tuple[Mesh, dict[str, Any]]:
     """The mesh of a scene in its own frame and units, and facts: voxel, and how many triangles before and after.
 
-    Args: voxel: edge, scene units; None: the 250th part of the room; n_triangles: at most; raw: nothing is cleaned.
+    Args: source: where the scene is, for a message; voxel: edge, scene units; None: the 250th part of the room;
+      n_triangles: at most; raw: nothing is cleaned.
     Raises: ConfigError on a scene without cameras; DataFailure where its Gaussians show no surface.
     Choices: depth is that of `render_depth`, from every view of the capture; a pixel on an edge of depth has none. A
       vertex means what the Gaussians around it mean (`evaluation.surface.features_at`).
     """
     from chebsplat.formats.meshes import cleaned, fused
+    from chebsplat.render import SceneRenderer
 
-    if not scene.cameras:
-        raise ConfigError(f"{scene.source} has no cameras to see its surface from; open a scene that was trained")
-    extent = room_extent(scene)
+    if not scene.cameras.names:
+        raise ConfigError(f"{source} has no cameras to see its surface from; open a scene that was trained")
+    extent, renderer = room_extent(scene), SceneRenderer(scene.parameters)
     edge = extent / N_VOXELS if voxel is None else voxel
-    made = fused(frames(scene, scene.cameras, progress), edge, 2 * extent)
+    made = fused(frames(renderer, scene.cameras, progress), edge, 2 * extent)
     if not len(made.triangles):
-        raise DataFailure(f"{scene.source} shows no surface of voxels of {edge:.3g}; choose larger ones: --voxel")
+        raise DataFailure(f"{source} shows no surface of voxels of {edge:.3g}; choose larger ones: --voxel")
     facts = {"voxel": edge, "n_fused": len(made.triangles)}
     if not raw:
         made = cleaned(made, n_triangles, LEAST_PART * edge, LONGEST_HOLE, edge)
     if not len(made.triangles):
         raise DataFailure(f"nothing of the surface is larger than {LEAST_PART:g} voxels of {edge:.3g}; take --raw")
-    if scene.features is not None and scene.label_embeddings is not None:
-        made = made._replace(labels=labels_at(scene, made.vertices))
+    if "features" in scene.parameters and scene.label_embeddings is not None:
+        made = made._replace(labels=labels_at(renderer, scene.label_embeddings, made.vertices))
     return made, facts | {"n_triangles": len(made.triangles), "n_vertices": len(made.vertices)}
 
 
-def frames(scene: OpenedScene, cameras: list[Camera], progress: Progress) -> Iterator[Frame]:
+def frames(renderer: SceneRenderer, cameras: Cameras, progress: Progress) -> Iterator[Frame]:
     """Depth of the surface and colour from each camera."""
-    from chebsplat.formats.meshes import Frame
+    import torch
 
-    for camera, _ in progress.track(cameras, len(cameras), "views"):
-        view = camera.view()
-        depth, covered = scene.renderer.render_depth(view)
+    from chebsplat.formats.meshes import Frame
+    from chebsplat.views import View
+
+    pairs = list(zip(cameras.Ks, cameras.cam_from_world, strict=True))
+    for (K, pose), _ in progress.track(pairs, len(pairs), "views"):
+        intrinsic, extrinsic = (torch.from_numpy(matrix).float() for matrix in (K, pose))
+        view = View(intrinsic, extrinsic, cameras.width, cameras.height)
+        depth, covered = renderer.render_depth(view)
         depth[covered < OPAQUE] = 0
-        color, _ = scene.renderer.render(view)
-        yield Frame(without_edges(depth), color, camera.K, camera.cam_from_world)
+        color, _ = renderer.render(view)
+        yield Frame(without_edges(depth), color, K, pose)
 
 
 def without_edges(depth: np.ndarray) -> np.ndarray:
@@ -97,7 +105,7 @@ def without_edges(depth: np.ndarray) -> np.ndarray:
     return np.where(on_edge | np.isnan(logarithm), 0, depth).astype(np.float32)
 
 
-def room_extent(scene: OpenedScene) -> float:
+def room_extent(scene: Scene) -> float:
     """The longest side of the box that holds 98 % of the opaque Gaussians along each axis, scene units."""
     import numpy as np
 
@@ -107,21 +115,22 @@ def room_extent(scene: OpenedScene) -> float:
     return max(float((high - low).max()), 1e-9)
 
 
-def labels_at(scene: OpenedScene, points: np.ndarray) -> np.ndarray:
-    """The label of each point i32 [M], of what the Gaussians around it mean; -1 where there is none."""
+def labels_at(renderer: SceneRenderer, embeddings: np.ndarray, points: np.ndarray) -> np.ndarray:
+    """The label of each point i32 [M], of what the Gaussians around it mean; -1 where there is none.
+
+    Args: renderer: of a scene with features; embeddings [L, C] of its labels; points [M, 3].
+    """
     import numpy as np
 
     from chebsplat.evaluation.surface import features_at
     from chebsplat.labels.decode import decode_labels
 
-    held = scene.renderer
-    means, quats, scales, opacities = (part.numpy() for part in (held.means, held.quats, held.scales, held.opacities))
-    assert scene.features is not None and scene.label_embeddings is not None
-    features, weights = features_at(points, means, quats, scales, opacities, scene.features)
-    return np.where(weights > 0, decode_labels(features, scene.label_embeddings), -1).astype(np.int32)
+    gaussians = renderer.means, renderer.quats, renderer.scales, renderer.opacities, renderer.raw["features"]
+    features, weights = features_at(points, *(part.numpy() for part in gaussians))
+    return np.where(weights > 0, decode_labels(features, embeddings), -1).astype(np.int32)
 
 
-def write(scene: OpenedScene, out: Path, voxel: float | None, n_triangles: int, raw: bool) -> dict[str, Any]:
+def write(scene: Scene, source: Path, out: Path, voxel: float | None, n_triangles: int, raw: bool) -> dict[str, Any]:
     """Make and write the mesh of a scene; returns the facts. Raises ConfigError where `out` exists."""
     from chebsplat.formats.meshes import write_mesh
     from chebsplat.stages.progress import Progress
@@ -130,7 +139,7 @@ def write(scene: OpenedScene, out: Path, voxel: float | None, n_triangles: int, 
         raise ConfigError(f"--out {out}: a mesh is written as .ply or .glb")
     if out.exists():
         raise ConfigError(f"{out} exists; remove it, or choose another --out")
-    mesh, facts = mesh_of(scene, voxel, n_triangles, Progress(), raw)
+    mesh, facts = mesh_of(scene, source, voxel, n_triangles, Progress(), raw)
     write_mesh(out, mesh, scene.label_names)
     return facts
 

@@ -280,7 +280,8 @@ def mesh(scene: str, out: Path, voxel: float | None, triangles: int, raw: bool) 
 
     logging.basicConfig(stream=sys.stderr, format="mesh: %(message)s", level="WARNING", force=True)
     logging.getLogger("chebsplat").setLevel("INFO")
-    facts = write(load(scene), out, voxel, triangles, raw)
+    opened = load(scene)
+    facts = write(opened.exported, opened.source, out, voxel, triangles, raw)
     print("voxels of {voxel:.3g}: {n_fused:,} triangles, {n_triangles:,} of them written, {n_vertices:,} vertices"
           .format(**facts), file=sys.stderr)  # fmt: skip
     print(out)
