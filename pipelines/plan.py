@@ -204,7 +204,7 @@ class Planner:
             steps[stage.name].after = [steps[earlier].path for earlier in stage.after if earlier in steps]
             if stage.on_demand and also != stage.name and not steps[stage.name].fresh:
                 del steps[stage.name]
-        if also == "mesh" and not config.mesh.raw:
+        if also == "mesh" and not config.mesh.raw and not steps[also].fresh:
             require_meshlab()
         title = self._named(scene) + title
         return Plan(title, source_sentence(name, asked, source), list(steps.values()), left_out)

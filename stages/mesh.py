@@ -65,12 +65,13 @@ def mesh_of(
     edge = extent / N_VOXELS if voxel is None else voxel
     made = fused(frames(renderer, scene.cameras, progress), edge, 2 * extent)
     if not len(made.triangles):
-        raise DataFailure(f"{source} shows no surface of voxels of {edge:.3g}; choose larger ones: --voxel")
+        raise DataFailure(f"{source} shows no surface of voxels of {edge:.3g}; choose larger ones: --voxel, mesh.voxel")
     facts = {"voxel": edge, "n_fused": len(made.triangles)}
     if not raw:
         made = cleaned(made, n_triangles, LEAST_PART * edge, LONGEST_HOLE, edge)
     if not len(made.triangles):
-        raise DataFailure(f"nothing of the surface is larger than {LEAST_PART:g} voxels of {edge:.3g}; take --raw")
+        why = f"nothing of the surface is larger than {LEAST_PART:g} voxels of {edge:.3g}"
+        raise DataFailure(f"{why}; take --raw, mesh.raw")
     if "features" in scene.parameters and scene.label_embeddings is not None:
         made = made._replace(labels=labels_at(renderer, scene.label_embeddings, made.vertices))
     return made, facts | {"n_triangles": len(made.triangles), "n_vertices": len(made.vertices)}

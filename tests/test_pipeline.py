@@ -413,6 +413,7 @@ def test_a_mesh_is_made_where_it_is_asked_for_and_stays_as_long_as_it_is_the_sce
     assert "mesh" in Planner().plan("toy", "mesh.raw=true").targets
     assert "mesh" not in Planner().plan("toy", "mesh.raw=true,train.steps=9").targets
     monkeypatch.setattr("chebsplat.pipelines.needs.find_spec", lambda name: None)
+    assert "mesh" in Planner().plan("toy", "mesh.raw=true", also="mesh").targets
     with pytest.raises(ConfigError, match="stage=mesh"):
         Planner().plan("toy", also="mesh")
 
