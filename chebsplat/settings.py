@@ -186,7 +186,7 @@ class TrainSection(Section):
     weight_sh: float = number(4e-5, "of the penalty that closes SH bands", 0, 1e4)
     weight_exposure: float = number(1e-2, "of the pull of a photo's exposure towards the others'", 0, 1e4)
     weight_depth: float | None = number(
-        None, "of the relative distance to the depth that a capture brings; default: 0.8, without poses 0", 0, 1e4
+        None, "of the relative distance to measured depth; default: 0.8 where views agree on it, else 0", 0, 1e4
     )
     weight_basis: float = number(1.0, "of the pull towards the earlier scenes' knowledge", 0, 1e4)
     warm_start: bool = setting(True, "start the encoder from the basis' stored weights")

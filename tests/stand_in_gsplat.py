@@ -58,10 +58,9 @@ def rasterization(
     viewmats_rs: Tensor | None = None,
 ) -> tuple[Tensor, Tensor, dict[str, Any]]:
     others = (radial_coeffs, tangential_coeffs, thin_prism_coeffs, ftheta_coeffs, viewmats_rs, covars, sh_degree)
-    if any(value is not None for value in others) or packed or sparse_grad or distributed or segmented:
-        raise NotImplementedError("the stand-in renders what chebsplat asks for, and nothing else")
-    if with_ut or with_eval3d or rolling_shutter or radius_clip or camera_model != "pinhole" or render_mode != "RGB":
-        raise NotImplementedError("the stand-in renders what chebsplat asks for, and nothing else")
+    assert all(value is None for value in others), "an option that chebsplat never gives"
+    assert not (packed or sparse_grad or distributed or segmented or with_ut or with_eval3d or rolling_shutter)
+    assert (radius_clip, camera_model, render_mode) == (0, "pinhole", "RGB")
     N, C, D = len(means), len(viewmats), colors.shape[-1]
     assert means.shape == (N, 3), means.shape
     assert quats.shape == (N, 4), quats.shape
