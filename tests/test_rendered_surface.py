@@ -97,11 +97,14 @@ def test_lookouts_see_a_room_from_within_whichever_way_is_up():
         assert sure > 0.8
 
 
-def test_cubes_of_few_pixels_and_empty_views_give_no_points():
-    points = np.array([[0, 0, 0.01]] * 4 + [[1.0, 1, 1]] * 3)
-    found = fused(points, points + 1, EDGE, 4)
-    np.testing.assert_allclose(found.means, [[0, 0, 0.01]])
-    np.testing.assert_allclose(found.eyes, [[1, 1, 1.01]])
+def test_cubes_of_fewer_pixels_than_most_and_empty_views_give_no_points():
+    at, floats = [0, 0, 0.01], [1.0, 1, 1]
+    found = fused(np.array([at] * 20 + [floats] * 7), np.ones((27, 3)), EDGE)
+    np.testing.assert_allclose(found.means, [at])
+    np.testing.assert_allclose(found.eyes, [[1, 1, 1]])
+    few = np.array([at] * 6 + [floats] * 3)  # a wider room, of as many pixels
+    np.testing.assert_allclose(fused(few, few, EDGE).means, [at, floats])
+    assert len(fused(few[4:6], few[4:6], EDGE).means) == 0
     raw, _ = tiles((0, 0, 1.0), (0, 0, 0))
     away = look_at(np.array([0, 0, 1.0]), np.array([1.0, 0, 1.2]))[None]
     assert len(surface(raw, away, K[None], SIZE).means) == 0

@@ -19,7 +19,8 @@ from chebsplat.views import View
 OPAQUE = 0.9  # least coverage of a pixel whose depth counts
 NEAREST = 0.05  # metres
 EDGE = 0.06  # metres, of the cubes that one point stands for
-N_PIXELS, LEAST = 600_000, 10  # that are looked at, and how many of them a cube must hold: what floats holds fewer
+N_PIXELS = 600_000  # that are looked at
+LEAST = 0.4  # of the pixels in the cube of a middling pixel, and three: what floats before a view holds fewer
 LOOKOUT_SIZE, LOOKOUT_ANGLE = (192, 144), 1.4  # pixels; rad, across
 
 
@@ -41,9 +42,9 @@ def surface(
     """Points of the surface, at most one in a cube of edge EDGE.
 
     Args: parameters: raw, of N Gaussians; cam_from_world [V, 4, 4] and Ks [V, 3, 3] of views of `size` (width, height);
-          unit: scene units of a metre; n_pixels: that are looked at, of all views alike, drawn. A cube needs LEAST of
-          N_PIXELS, and as many fewer as fewer are looked at, but three.
-    Choices: depth as `render_depth` has it; points averaged by cube.
+          unit: scene units of a metre; n_pixels: that are looked at, of all views alike, drawn.
+    Choices: depth as `render_depth` has it; points averaged by cube. How many pixels a cube needs follows from how many
+      others hold: in a wide room, or of few pixels, all hold fewer.
     """
     renderer, (width, height) = SceneRenderer(dict(parameters)), size
     rng, count = np.random.default_rng(0), min(max(n_pixels // max(len(Ks), 1), 1), width * height)
@@ -56,8 +57,7 @@ def surface(
         rays = np.stack([pixels % width + 0.5, pixels // width + 0.5, np.ones(len(pixels))], 1) @ np.linalg.inv(K).T
         seen.append((rays * depth[pixels, None] - pose[:3, 3]) @ pose[:3, :3])
         eyes.append(np.tile(-pose[:3, :3].T @ pose[:3, 3], (len(pixels), 1)))
-    least = max(3, round(LEAST * count * len(Ks) / N_PIXELS))
-    return fused(np.concatenate(seen), np.concatenate(eyes), EDGE * unit, least)
+    return fused(np.concatenate(seen), np.concatenate(eyes), EDGE * unit)
 
 
 def lookouts(means: np.ndarray, opacities: np.ndarray, up: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -85,8 +85,8 @@ def lookouts(means: np.ndarray, opacities: np.ndarray, up: np.ndarray) -> tuple[
     return np.stack(poses), np.tile(K, (len(poses), 1, 1))
 
 
-def fused(points: np.ndarray, eyes: np.ndarray, edge: float, least: int) -> Surface:
-    """The mean of the points in each cube of this edge that holds the least number of them, and of their eyes."""
+def fused(points: np.ndarray, eyes: np.ndarray, edge: float) -> Surface:
+    """The mean of the points in each cube of this edge, and of their eyes, where it holds enough of them (LEAST)."""
     if len(points) == 0:
         return Surface(points, eyes)
     cells = np.floor((points - points.min(0)) / edge).astype(np.int64)
@@ -94,5 +94,5 @@ def fused(points: np.ndarray, eyes: np.ndarray, edge: float, least: int) -> Surf
     sums = np.zeros((2, len(count), 3))
     np.add.at(sums[0], cell.ravel(), points)
     np.add.at(sums[1], cell.ravel(), eyes)
-    kept = count >= least
+    kept = count >= max(3, LEAST * np.median(count[cell]))
     return Surface(*(total[kept] / count[kept, None] for total in sums))
