@@ -34,7 +34,7 @@ def step_key(
 
     Args: sections: the config that the stage reads; inputs: keys of artifacts by role;
           code: of `Code.stage`; raw: `raw.content_hash` of the files outside the store that the stage reads;
-          device: of the run. The CPU's keys do not name it.
+          device: that computes it. The CPU's keys do not name it.
     """
     identity = {
         "stage": stage.name,
@@ -43,7 +43,7 @@ def step_key(
         "inputs": inputs,
         "code": code,
     } | ({} if raw is None else {"raw": raw})
-    if stage.on_device and device != "cpu":
+    if device != "cpu":
         identity["device"] = device
     text = json.dumps(identity, sort_keys=True, separators=(",", ":"), allow_nan=False)
     return hashlib.sha256(text.encode()).hexdigest()[:16]

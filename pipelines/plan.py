@@ -225,10 +225,11 @@ class Planner:
         sections = config.sections(stage.sections)
         root, files = raw_files(stage.name, sections)
         raw = hashes(files, self.file_memo.values)
-        rendering = ("gsplat",) if stage.on_device and self.device == "cuda" else ()
-        code = self.code.stage(stage.name, (*used, *rendering, *media_packages(files)))
+        device = stage.device(self.device, sections)
+        computing = stage.device_packages if device == "cuda" else ()
+        code = self.code.stage(stage.name, (*used, *computing, *media_packages(files)))
         content = content_hash(raw, root) if raw or stage.name == "ingest" else None
-        key = step_key(stage, sections, keys, code, content, self.device)
+        key = step_key(stage, sections, keys, code, content, device)
         return Step(stage.name, key, store.artifact_path(stage.name, key), inputs, sections, code, raw)
 
     def _probe(self, source: Any, scene: str) -> dict[str, bool]:

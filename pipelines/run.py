@@ -188,7 +188,7 @@ def entry(step: Step, state: dict[str, Any], device: str = "cpu") -> dict[str, A
         "config": step.sections,
         "code": step.code | state,
         "raw": step.raw,
-        "device": device if STAGES[step.stage].on_device else "cpu",
+        "device": STAGES[step.stage].device(device, step.sections),
     }
 
 

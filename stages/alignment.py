@@ -32,13 +32,14 @@ def aligned_renders(
     from chebsplat.training.poses import Poses, moved
     from chebsplat.views import in_frustum
 
-    renders = []
+    renders, device, points = [], renderer.means.device, renderer.means.cpu()
     for k, _ in job.progress.track(range(len(cameras)), len(cameras), "align"):
-        view, photo = cameras[k], torch.from_numpy(truth[k]).float() / 255
-        mask = None if masks is None else torch.from_numpy(np.asarray(masks[k]))
-        poses = Poses(view.viewmat[None], view.K[None], (view.width, view.height), renderer.means, RATE, free=True)
+        view, photo = cameras[k].to(device), torch.from_numpy(truth[k]).to(device).float() / 255
+        mask = None if masks is None else torch.from_numpy(np.asarray(masks[k])).to(device)
+        given, size = (cameras[k].viewmat[None], cameras[k].K[None]), (view.width, view.height)
+        poses = Poses(*given, size, points, RATE, free=True, device=device)
         index = in_frustum(renderer.means, view, renderer.reach)
-        parts = [part[index] for part in (renderer.scales, renderer.opacities, renderer.colors(view, index))]
+        parts = renderer.scales[index], renderer.opacities[index], renderer.colors(view, index)
         for step in range(STEPS):
             camera = poses.camera(view, 0)
             means, quats = moved(renderer.means[index], renderer.quats[index], camera)

@@ -139,7 +139,7 @@ def publish(
         if key is not None and not is_key(key):
             raise ConfigError(f"--key {key}: a key is 16 hexadecimal digits; leave it away, or correct it")
         device, why = resolve(device)
-        device = device if stage.on_device else "cpu"
+        device = stage.device(device, settings)
         computed = {} if device == "cpu" else {"device": device}
         key = key or artifact.digest({"stage": name, "config": settings, "inputs": sources} | computed)
         artifact.check_place(out, stage.schema, key, force)

@@ -50,7 +50,7 @@ def run(job: Job) -> None:
     if not places:
         raise DataFailure("no view to evaluate has a camera; lower ingest.test_every")
     names = [scene.cameras.names[k] for k in places]
-    renderer = SceneRenderer(scene.parameters)
+    renderer = SceneRenderer(scene.parameters, job.device)
     cameras = [camera(scene, k) for k in places]
     pictures: dict[str, Any] = {"truth": np.stack([capture.images[row[name]] for name in names])}
     figures: dict[str, Any] = {"names": names, "protocol": capture.protocol, "source": capture.source}
@@ -80,7 +80,10 @@ def run(job: Job) -> None:
     figures |= {"frames_per_second": {}, "milliseconds": {}}
     if settings.timing_repeats:
         figures["frames_per_second"] = timing(renderer, cameras, settings.timing_repeats, scene.labels is not None)
-        figures["milliseconds"] = frame_split(renderer, cameras, settings.timing_repeats)
+        if job.device == "cpu":
+            figures["milliseconds"] = frame_split(renderer, cameras, settings.timing_repeats)
+        else:
+            job.left_out("milliseconds of a frame by part", "gsplat renders a frame on the GPU in one go")
     else:
         job.left_out("frames a second", "evaluate.timing_repeats is 0")
     figures["lpips"] = figures["image"]["lpips"]
@@ -126,7 +129,7 @@ def task(job: Job, capture: Capture, scene: Scene, renderer: SceneRenderer) -> A
 
     def at(points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         parts = (renderer.means, renderer.quats, renderer.scales, renderer.opacities)
-        means, quats, scales, opacities = (part.double().numpy() for part in parts)
+        means, quats, scales, opacities = (part.double().cpu().numpy() for part in parts)
         return features_at(points, means, quats, scales, opacities, scene.parameters["features"])
 
     assert scene.label_embeddings is not None and scene.label_names is not None

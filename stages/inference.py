@@ -22,17 +22,18 @@ if TYPE_CHECKING:
 SECONDS = 600.0  # of one run, of a window or of a text
 LOOPING = 10.0  # of one run of a model that holds a Loop or a Scan: only such a one may never end
 LARGEST = 1 << 30  # bytes of one output, where the graph says them
+CUDA = "CUDAExecutionProvider"
 LOOPS = (b'"\x04Loop', b'"\x04Scan')  # as protobuf writes a node's operator
 
 
 class Model:
-    """An ONNX model in onnxruntime on the CPU.
+    """An ONNX model in onnxruntime, on the CPU or, where onnxruntime has CUDA and it is asked for, on a GPU.
 
-    Args: remedy: what the user can do, for messages; options: onnxruntime's SessionOptions.
+    Args: remedy: what the user can do, for messages; options: onnxruntime's SessionOptions; device: cpu or cuda.
     Raises: InputError naming the file.
     """
 
-    def __init__(self, path: Path, remedy: str, options: Any = None):
+    def __init__(self, path: Path, remedy: str, options: Any = None, device: str = "cpu"):
         import onnxruntime
 
         self.path, self.remedy = Path(path), remedy
@@ -40,7 +41,7 @@ class Model:
         options = options or onnxruntime.SessionOptions()
         options.log_severity_level = 4  # what fails is raised, and reported once
         try:
-            self._session: Any = onnxruntime.InferenceSession(str(path), options, providers=["CPUExecutionProvider"])
+            self._session: Any = onnxruntime.InferenceSession(str(path), options, providers=providers(device))
         except Exception as error:  # onnxruntime's own exception types are not public
             raise InputError(f"{path} is not a usable ONNX model ({_line(error)}); {remedy}") from None
         self.inputs: list[Any] = self._session.get_inputs()
@@ -74,6 +75,14 @@ class Model:
         if not all(isinstance(value, np.ndarray) and value.dtype.kind in "fiub" for value in outputs):
             raise InputError(f"{self.path} gives more than tensors of numbers; {self.remedy}")
         return outputs
+
+
+def providers(device: str) -> list[str]:
+    """What onnxruntime computes with on a device, the first that has an operator: CUDA only where this build has it."""
+    import onnxruntime
+
+    on_gpu = [CUDA] if device == "cuda" and CUDA in onnxruntime.get_available_providers() else []
+    return [*on_gpu, "CPUExecutionProvider"]
 
 
 def _loops(path: Path) -> bool:

@@ -2,7 +2,11 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
+from typing import Any
+
+MODEL_FREE = ("labels", "given", "none")  # kinds of teacher that run no model
 
 
 @dataclass(frozen=True)
@@ -20,6 +24,12 @@ class Stage:
     after: tuple[str, ...] = ()  # stages of the scene that come first, although nothing of theirs is read
     on_demand: bool = False  # part of a run only where `--stage` names it, or where it is there already
     on_device: bool = False  # computes on a GPU where one is used, to other bytes than the CPU's: the key says so then
+    device_packages: tuple[str, ...] = ()  # what it computes with there
+
+    def device(self, wanted: str, sections: Mapping[str, Any]) -> str:
+        """What computes it, where `wanted` is there: that, or the CPU, where its settings make no use of a GPU."""
+        idle = self.name == "teacher" and sections["teacher"]["kind"] in MODEL_FREE
+        return wanted if self.on_device and not idle else "cpu"
 
     @property
     def roles(self) -> dict[str, str]:
@@ -36,7 +46,7 @@ STAGES: dict[str, Stage] = {
         Stage("channels", "chebsplat.channels/1", ("channels",),
               help="From a teacher's channels to the fewer that all scenes are trained in."),
         Stage("teacher", "chebsplat.features/1", ("teacher",), (("capture", "ingest"),),
-              (("channels", "channels"),), help="Per-view semantic features of a 2D teacher."),
+              (("channels", "channels"),), on_device=True, help="Per-view semantic features of a 2D teacher."),
         Stage("agree", "chebsplat.agreement/1", ("agree",),
               (("capture", "ingest"), ("points", "sfm"), ("features", "teacher")),
               help="How far views agree on what the same points are: whether the teacher knows the scene."),
@@ -47,7 +57,8 @@ STAGES: dict[str, Stage] = {
         Stage("train", "chebsplat.gaussians/1", ("describe", "train"),
               (("capture", "ingest"), ("points", "sfm")),
               (("features", "teacher"), ("descriptors", "describe"), ("basis", "cks")),
-              after=("agree",), on_device=True, help="Train the semantic Gaussian scene (Eqs 7-13)."),
+              after=("agree",), on_device=True, device_packages=("gsplat",),
+              help="Train the semantic Gaussian scene (Eqs 7-13)."),
         Stage("lift", "chebsplat.lifted/1", ("lift",),
               (("capture", "ingest"), ("gaussians", "train"), ("features", "teacher")),
               help="Features of the teacher on trained Gaussians, and how much the views agree, without training."),
@@ -64,7 +75,8 @@ STAGES: dict[str, Stage] = {
         Stage("cks", "chebsplat.basis/3", ("scene", "cks"), (("gaussians", "train"),), (("basis", "cks"),),
               help="Update the core knowledge space with a trained scene (Eqs 14-15)."),
         Stage("evaluate", "chebsplat.evaluation/1", ("evaluate",), (("capture", "ingest"), ("scene", "export")),
-              (("features", "teacher"),), help="Measure the exported scene on the test views."),
+              (("features", "teacher"),), on_device=True, device_packages=("gsplat",),
+              help="Measure the exported scene on the test views."),
         Stage("report", "chebsplat.report/1", ("report",), (("evaluation", "evaluate"), ("gaussians", "train")),
               (("capture", "ingest"), ("points", "sfm"), ("channels", "channels"), ("features", "teacher"),
                ("agreement", "agree"), ("descriptors", "describe"), ("lifted", "lift"), ("refined", "refine"),

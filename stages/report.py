@@ -189,6 +189,8 @@ def summary_rows(figures: dict[str, Any], by_degree: list[int] | None, trained: 
         share = f"{known['agreement']:.1%} (the commonest label: {known['commonest']:.1%})"
         rows.append(["Gaussians that encodings alone name as their features do", share, ""])
     rows += [[f"ms a training step, {part}", f"{v:.2f}", ""] for part, v in trained["milliseconds"].items()]
+    if peak := trained.get("peak_device_bytes"):
+        rows.append(["bytes of the GPU's memory in training, at most", f"{peak:,}", ""])
     return rows
 
 

@@ -38,6 +38,7 @@ class Agreement(TypedDict):
 
 class Trained(Facts):
     milliseconds: dict[str, float]
+    peak_device_bytes: NotRequired[Count]
     encoder: NotRequired[Agreement]
 
 

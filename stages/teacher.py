@@ -15,6 +15,7 @@ if TYPE_CHECKING:
     from chebsplat.stages.settings import TeacherSection
 
 log = logging.getLogger("chebsplat")
+GPU_REMEDY = "`.venv/bin/pip install onnxruntime-gpu` in the place of onnxruntime adds it"
 
 
 def run(job: Job) -> None:
@@ -48,11 +49,14 @@ def from_onnx(job: Job, capture: Capture, settings: TeacherSection) -> None:
     from chebsplat.formats.features import FeatureWriter
     from chebsplat.formats.teacher_model import EMBEDDED, read_teacher
     from chebsplat.stages.command import n_threads
+    from chebsplat.stages.inference import CUDA, providers
     from chebsplat.stages.label_space import MAX_CHANNELS, closed_set, label_set, open_vocabulary
     from chebsplat.stages.teacher_inference import TeacherInference
 
     teacher = read_teacher(Path(settings.model) if settings.model else EMBEDDED)
-    network = TeacherInference(teacher, n_threads())
+    network = TeacherInference(teacher, n_threads(), job.device)
+    if job.device == "cuda" and CUDA not in providers(job.device):
+        job.left_out("the teacher on the GPU", f"onnxruntime here has no CUDA ({GPU_REMEDY})")
     grid, n_channels = network.grid(capture.images[0], settings.downscale)
     channels = None
     if teacher.output == "logits":

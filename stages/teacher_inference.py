@@ -22,11 +22,11 @@ MAX_SHARE = 0.5  # of the image's side that an entry of the map may be wide
 class TeacherInference:
     """Runs one teacher, one window at a time: on a CPU a batch gains nothing, and memory stays that of one window.
 
-    Args: threads: that onnxruntime may use.
+    Args: threads: that onnxruntime may use; device: cpu, or cuda where onnxruntime has it.
     Raises: InputError naming a model that cannot be used.
     """
 
-    def __init__(self, teacher: TeacherModel, threads: int):
+    def __init__(self, teacher: TeacherModel, threads: int, device: str = "cpu"):
         import onnxruntime
 
         teacher.verify()
@@ -36,7 +36,7 @@ class TeacherInference:
         options.use_deterministic_compute = True
         options.add_session_config_entry("session.intra_op.allow_spinning", "0")  # leave the cores to others
         remedy = f"correct `size` or `multiple` in {teacher.settings}, or export it again"
-        self.model = Model(teacher.path, remedy, options)
+        self.model = Model(teacher.path, remedy, options, device)
         self.size = self._window_size()
 
     def _window_size(self) -> tuple[int, int] | None:

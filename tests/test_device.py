@@ -102,4 +102,6 @@ def test_the_device_is_in_the_keys_of_what_it_computes_and_of_all_that_follows(q
     same = {stage for stage in on_cpu if on_cpu[stage].key == on_gpu[stage].key}
     assert same == {"ingest", "sfm", "teacher", "agree", "describe"}
     computing = {step.stage: entry(step, {}, "cuda")["device"] for step in on_gpu.values()}
-    assert {stage for stage, used in computing.items() if used == "cuda"} == {"train"}
+    assert {stage for stage, used in computing.items() if used == "cuda"} == {"train", "evaluate"}
+    seen = {step.stage: step for step in Planner(device="cuda").plan("office0").steps}
+    assert entry(seen["teacher"], {}, "cuda")["device"] == "cuda"  # a model runs there; labels with noise do not

@@ -1,9 +1,11 @@
 """A training on a simulated GPU: nothing mixes devices, and a step moves no array of Gaussians."""
 
 import chebsplat  # noqa: F401  # isort: skip
+import json
 import logging
 import sys
 import types
+from contextlib import nullcontext
 
 import numpy as np
 import pytest
@@ -16,7 +18,7 @@ from simulated_gpu import GPU, SimulatedGpu
 from chebsplat.rasterize import rasterize
 from chebsplat.render import SceneRenderer
 from chebsplat.stages import config as configs
-from chebsplat.stages import train
+from chebsplat.stages import evaluate, train
 from chebsplat.stages.command import Job
 from chebsplat.training import losses
 from chebsplat.training.trainer import READ_EVERY
@@ -214,3 +216,21 @@ def test_a_finished_scene_renders_there_as_on_the_cpu(gpu):
     assert np.abs(found[0].astype(int) - wanted[0]).max() <= 1  # grey levels
     np.testing.assert_allclose(found[1], wanted[1], atol=1e-5)
     np.testing.assert_array_equal(there[0], depth[0])
+
+
+@pytest.mark.xdist_group("toy")
+def test_a_scene_is_evaluated_there_as_on_the_cpu_with_poses_refined(gpu, toy, tmp_path):
+    inputs = {"capture": toy["ingest"], "scene": toy["export"], "features": toy["teacher"]}
+    config = configs.build({"evaluate": {"poses": "refined", "timing_repeats": 1}}, "toy")
+    made = {}
+    for device in ("cpu", "cuda"):
+        (out := tmp_path / device).mkdir()
+        job = Job(inputs, config, out, tmp_path / "scratch", device)
+        with gpu.active() if device == "cuda" else nullcontext():
+            evaluate.run(job)
+        made[device] = json.loads((out / "figures.json").read_text())
+    found, wanted = made["cuda"], made["cpu"]
+    for name in ("image", "image_aligned"):
+        assert found[name]["psnr"] == pytest.approx(wanted[name]["psnr"], abs=0.05)
+    assert found["segmentation"]["scene"]["miou"] == pytest.approx(wanted["segmentation"]["scene"]["miou"], abs=0.01)
+    assert found["frames_per_second"] and "by part" in str(found["left_out"]) and not found["milliseconds"]

@@ -22,6 +22,9 @@ from chebsplat.formats.channels import ChannelMap, write_channels
 from chebsplat.formats.features import read_features
 from chebsplat.formats.manifest import Manifest
 from chebsplat.formats.teacher_model import read_label_set, read_teacher
+from chebsplat.stages import config as configs
+from chebsplat.stages import inference, teacher
+from chebsplat.stages.command import Job
 from chebsplat.stages.teacher_inference import TeacherInference
 
 SIZE = (48, 64)
@@ -453,3 +456,17 @@ def test_views_that_a_killed_run_finished_are_kept_and_the_bytes_are_the_same(tm
     assert resumed.returncode == 0, resumed.stderr
     assert f"{len(kept)} of 16 views are there" in resumed.stderr
     assert values_of(again) == values_of(whole)
+
+
+def test_a_model_runs_on_the_gpu_where_onnxruntime_has_cuda_and_is_said_not_to_otherwise(
+    tmp_path, capture, monkeypatch
+):
+    assert inference.providers("cpu") == inference.providers("cuda") == ["CPUExecutionProvider"]
+    (tmp_path / "out").mkdir()
+    config = configs.build({"teacher": {"model": str(color_teacher(tmp_path))}}, "colors")
+    job = Job({"capture": capture}, config, tmp_path / "out", tmp_path / "scratch", "cuda")
+    teacher.run(job)
+    assert "onnxruntime-gpu" in job.facts["left_out"]["the teacher on the GPU"]
+    both = [inference.CUDA, "CPUExecutionProvider"]
+    monkeypatch.setattr("onnxruntime.get_available_providers", lambda: both)
+    assert (inference.providers("cpu"), inference.providers("cuda")) == (both[1:], both)
