@@ -11,7 +11,7 @@ from annotated_types import Ge, Le
 
 from chebsplat.errors import InputError
 from chebsplat.formats import artifact
-from chebsplat.formats.documents import TypedDict, read_document, write_document
+from chebsplat.formats.documents import NotRequired, TypedDict, read_document, write_document
 from chebsplat.formats.manifest import remedy_of
 from chebsplat.formats.tensors import Spec, read_tensors, write_tensors
 
@@ -24,6 +24,7 @@ class Notes(TypedDict):
     start: Literal["trained", "lifted"]
     smooth: bool
     strength: Annotated[float, Ge(0), Le(1e6)]
+    familiar: NotRequired[Annotated[float, Ge(0), Le(1)]]
     curve: dict[Literal["off", "on"], dict[str, Agreement]]
 
 
@@ -33,8 +34,8 @@ class Refined:
 
     features:   f32 [N, C].
     confidence: f32 [N] in [0, 1]: how many votes there are and how far they agree; 0 where nothing is known.
-    notes:      what it started from, whether it was smoothed, views that knowledge counts for, and by smoothing and
-                strength the agreement of half the training views with the other half.
+    notes:      what it started from, whether it was smoothed, views that knowledge counts for, what all views count
+                for where the teacher is unsure of the scene, and by smoothing and strength the agreement of half the training views with the other half.
     """
 
     features: np.ndarray

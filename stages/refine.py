@@ -22,9 +22,10 @@ def run(job: Job) -> None:
     `features`, by which the share of labels that change is counted, too. Writes `refined`.
     """
     from chebsplat.formats.gaussians import read_gaussians
+    from chebsplat.formats.features import read_features
     from chebsplat.formats.lifted import read_lifted
     from chebsplat.formats.refined import Refined, write_refined
-    from chebsplat.lifting.blend import blend, calibrate, confidence, effective, reliable, trusted
+    from chebsplat.lifting.blend import blend, calibrate, confidence, effective, familiar, reliable, trusted
     from chebsplat.lifting.smoothing import affinities, smooth
     from chebsplat.splats.gaussians import surface_of
 
@@ -49,14 +50,16 @@ def run(job: Job) -> None:
     choice = calibrate(lifted.halves, lifted.half_views, near, knowledge)
     smoothed = choice.smooth if settings.smooth == "auto" else settings.smooth == "on"
     strength = choice.strength
+    known_to_teacher = 1.0
     made = [features, smooth(features, lifted.n_views, near) if smoothed else features]
     made.append(made[1])
     if knowledge is not None:
-        evidence = effective(lifted.n_views) * reliable(lifted.halves, lifted.half_views)
+        known_to_teacher = familiar(lifted.features, knowledge, read_features(job.inputs["features"]).label_embeddings)
+        evidence = effective(lifted.n_views) * reliable(lifted.halves, lifted.half_views) * known_to_teacher
         blended = blend(made[1], evidence, knowledge, strength)
         made[2] = smooth(blended, evidence + trusted(knowledge, strength), near) if smoothed else blended
     curve = {name: {f"{k:g}": value for k, value in row.items()} for name, row in choice.curve.items()}
-    notes = {"start": started, "smooth": smoothed, "strength": strength, "curve": curve}
+    notes = {"start": started, "smooth": smoothed, "strength": strength, "familiar": known_to_teacher, "curve": curve}
     sure = confidence(made[1], lifted.n_views, lifted.agreement, knowledge, strength)
     write_refined(job.out, Refined(made[2], sure, notes))
     job.facts |= {"n_gaussians": len(features), "unit": unit, **notes} | shares(job, made)

@@ -201,6 +201,8 @@ def refined_rows(facts: dict[str, Any] | None) -> list[list[str]]:
     changed = {name: facts.get(f"changed_by_{name}") for name in ("smoothing", "knowledge")}
     words = {name: "" if share is None else f", {share:.1%} of the labels changed" for name, share in changed.items()}
     counts = f"counts as {facts['strength']:g} views" if facts["strength"] else "none"
+    if (familiar := facts.get("familiar", 1.0)) < 1:
+        counts += f"; the teacher is unsure of this scene, its views count for {familiar:.2f}"
     rows = [
         ["smoothing of features", ("on" if facts["smooth"] else "off") + words["smoothing"], ""],
         ["knowledge in features", counts + words["knowledge"], ""],

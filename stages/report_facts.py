@@ -99,6 +99,7 @@ class Refined(Facts):
     start: Literal["trained", "lifted"]
     smooth: bool
     strength: float
+    familiar: NotRequired[float]
     curve: dict[Literal["off", "on"], dict[str, float]]
     changed_by_smoothing: NotRequired[float]
     changed_by_knowledge: NotRequired[float]

@@ -5,7 +5,7 @@ import math
 import numpy as np
 import pytest
 
-from chebsplat.lifting.blend import LEAST, STRENGTHS, blend, calibrate, confidence, effective, reliable
+from chebsplat.lifting.blend import LEAST, STRENGTHS, blend, calibrate, confidence, effective, familiar, reliable
 from chebsplat.lifting.carry import carry
 from chebsplat.lifting.smoothing import N_NEIGHBORS, REACH, Affinities, affinities, room_unit, smooth
 
@@ -117,6 +117,15 @@ def test_views_count_by_how_far_their_halves_agree():
     mean = (1 + 0 + 0.5**0.5) / 3
     np.testing.assert_allclose(reliable(halves, views), [1, 0, 0.5**3, mean**6], rtol=1e-5)
     np.testing.assert_array_equal(reliable(halves, 0 * views), 1)
+
+
+def test_views_of_a_scene_count_for_less_where_they_are_less_sure_of_labels_than_shape_is():
+    labels = np.eye(3)
+    sure, between = np.tile([1.0, 0, 0], (5, 1)), np.tile([1.0, 0.9, 0], (5, 1))
+    assert familiar(sure, sure, labels) == familiar(sure, between, labels) == 1
+    shares = [1 / (1 + np.exp(-0.1 / np.hypot(1, 0.9) / 0.1)), 1.0]  # of two labels; the third is far from both
+    assert familiar(between, sure, labels) == pytest.approx((shares[0] / shares[1]) ** 6, rel=5e-3)
+    assert familiar(sure[:0], sure[:0], labels) == 1
 
 
 def test_confidence_grows_with_votes_that_agree_and_falls_where_they_do_not():

@@ -6,12 +6,13 @@ from typing import NamedTuple
 
 import numpy as np
 
+from chebsplat.labels.decode import decode
 from chebsplat.lifting.smoothing import Affinities, smooth
 
 STRENGTHS = (0.0, 0.5, 1.0, 2.0, 4.0, 8.0)  # views that knowledge may count for
 ALIKE = 0.2  # correlation of the errors of two views of a thing
 SURE = 3  # power of its length by which knowledge counts
-AGREED = 6  # power of the agreement of two halves of the views by which views count
+AGREED = 6  # power of the agreement of two halves of the views, and of their sureness beside shape's, by which views count
 LEAST = 1.0  # strength: what a teacher gets wrong alike in both halves counts as right when they are asked
 
 
@@ -67,6 +68,21 @@ def reliable(halves: np.ndarray, half_views: np.ndarray) -> np.ndarray:
     both, agreed = (half_views > 0).all(0), cosines(*halves).clip(0, 1)
     mean = float(agreed[both].mean()) if both.any() else 1.0
     return np.asarray(np.where(both, agreed, mean) ** AGREED, np.float32)
+
+
+def familiar(lifted: np.ndarray, knowledge: np.ndarray, embeddings: np.ndarray) -> float:
+    """σ^AGREED, σ = min(c / c', 1): what all views count for in a scene where they are sure of labels by c, shape by c'.
+
+    Args: lifted [N, C], what the views say of Gaussians; knowledge [N, C]; embeddings [L, C] of the scene's labels.
+    Returns: in (0, 1]; 1 without Gaussians.
+    Choices: c and c' are mean confidences of `decode`. Views that agree may agree in what none of them knows: a teacher
+      shown a world that it was not taught is between labels, wherever it looks from. Of a scene, not of a Gaussian:
+      small things have no sure label in either, and are the views' to tell.
+    """
+    if len(lifted) == 0:
+        return 1.0
+    sure, beside = (float(decode(rows, embeddings)[1].mean()) for rows in (lifted, knowledge))
+    return min(sure / beside, 1.0) ** AGREED
 
 
 def calibrate(
