@@ -48,6 +48,9 @@ BENCHMARKS = {
     "lift": Benchmark(
         "lift", "features lifted to a finished scene: seconds, error", ("train", "teacher"), "train.features=lifted"
     ),
+    "refine": Benchmark(
+        "refine", "what follows a training: error against run time of lift, smoothing, encoders by size", ("lift",)
+    ),
     "trust": Benchmark("trust", "whether views' agreement ranks 2D teachers as their true mIoU does; no training"),
     "mesh": Benchmark("mesh", "the mesh against exact depth: F-score, labels, seconds by voxel", ("report",)),
     "label": Benchmark("label", "which Gaussians of a PLY are named right by shape alone; trains its scenes"),

@@ -42,6 +42,14 @@ def score(features: np.ndarray, rooms: Sequence[Room], embeddings: np.ndarray) -
     return f"{100 * figures.oa:5.1f} {100 * np.nanmean(figures.iou):5.1f}"
 
 
+def made(folder: Path, seeds: Sequence[int], settings: KnowledgeSection, matrix: np.ndarray) -> list[list[Room]]:
+    """The rooms of these seeds, as depth has them and worn; kept in the folder."""
+    folder.mkdir(parents=True, exist_ok=True)
+    with ProcessPoolExecutor(torch.get_num_threads(), mp_context=get_context("spawn")) as pool:
+        list(pool.map(prepare, *zip(*((folder, seed, settings, matrix) for seed in seeds), strict=True)))
+    return [held(folder, seed) for seed in seeds]
+
+
 def narrowed(room: Room, n_scales: int, described: bool) -> Room:
     """The room as an encoder of fewer radii, or without descriptors, sees it."""
     inputs = room.inputs
@@ -63,10 +71,7 @@ def main(arguments: Sequence[str]) -> None:
     embeddings = knowledge.embeddings[found(list(CLASS_NAMES), knowledge.words)].astype(np.float32)
     most, settings = max(options.rooms), KnowledgeSection()
     seeds = [*KNOWLEDGE[:most], *KNOWLEDGE[-options.held_out :]]
-    options.rooms_in.mkdir(parents=True, exist_ok=True)
-    with ProcessPoolExecutor(torch.get_num_threads(), mp_context=get_context("spawn")) as pool:
-        list(pool.map(prepare, *zip(*((options.rooms_in, s, settings, knowledge.matrix) for s in seeds), strict=True)))
-    rooms = [held(options.rooms_in, seed) for seed in seeds]
+    rooms = made(options.rooms_in, seeds, settings, knowledge.matrix)
     tested = [room[0] for room in rooms[most:]]
     averages = np.concatenate([room.features for room in tested])
     n_views = np.concatenate([room.n_views for room in tested])
@@ -77,19 +82,21 @@ def main(arguments: Sequence[str]) -> None:
     variants += [(f"{n} radii, no descriptor", {"n_scales": n, "described": False}) for n in (1, 4)]
     variants += [("half as wide", {"hidden": 16}), ("no worn rooms", {"worn": False})]
     for name, variant in variants:
-        result, seconds = measured(rooms, most, variant, options.steps, embeddings)
+        encoder, seconds = taught(rooms[:most], variant, options.steps, embeddings)
+        seen = variant.get("n_scales", 4), variant.get("described", True)
+        result = np.concatenate([encoder.predict(narrowed(room, *seen).inputs) for room in tested])
         both = blend(averages, effective(n_views), result, K)
         print(f"{name:34s}{score(result, tested, embeddings)}   both {score(both, tested, embeddings)}   "
               f"{seconds:5.0f} s", flush=True)  # fmt: skip
 
 
-def measured(
-    rooms: list[list[Room]], most: int, variant: dict[str, Any], steps: int, embeddings: np.ndarray
-) -> tuple[np.ndarray, float]:
-    """What an encoder that was taught so answers in the rooms held out, and the seconds of teaching."""
+def taught(
+    rooms: list[list[Room]], variant: dict[str, Any], steps: int, embeddings: np.ndarray
+) -> tuple[PointEncoder, float]:
+    """An encoder that was taught so in these rooms, and the seconds of teaching."""
     n_scales, described = variant.get("n_scales", 4), variant.get("described", True)
     kinds = (0, 1) if variant.get("worn", True) else (0,)
-    chosen = [room[kind] for kind in kinds for room in rooms[: variant.get("n_rooms", most)]]
+    chosen = [room[kind] for kind in kinds for room in rooms[: variant.get("n_rooms", len(rooms))]]
     lessons = [lesson_of(narrowed(room, n_scales, described), embeddings) for room in chosen]
     torch.manual_seed(0)
     width = lessons[0].cloud.descriptors.shape[1]
@@ -98,7 +105,4 @@ def measured(
     began = time.perf_counter()
     for _ in teach.taught(encoder, lessons, teach.Course(steps=steps)):
         pass
-    seconds = time.perf_counter() - began
-    encoder.eval()
-    answers = [encoder.predict(narrowed(room[0], n_scales, described).inputs) for room in rooms[most:]]
-    return np.concatenate(answers), seconds
+    return encoder.eval(), time.perf_counter() - began

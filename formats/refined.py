@@ -34,8 +34,9 @@ class Refined:
 
     features:   f32 [N, C].
     confidence: f32 [N] in [0, 1]: how many votes there are and how far they agree; 0 where nothing is known.
-    notes:      what it started from, whether it was smoothed, views that knowledge counts for, what all views count
-                for where the teacher is unsure of the scene, and by smoothing and strength the agreement of half the training views with the other half.
+    notes:      what it started from, whether it was smoothed, views that knowledge counts for, what a view counts for
+                where the teacher is unsure of the scene, and by smoothing and strength the agreement of half the
+                training views with the other half.
     """
 
     features: np.ndarray

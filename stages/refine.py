@@ -21,8 +21,8 @@ def run(job: Job) -> None:
     Reads `gaussians` and `lifted`, for the scene's unit `capture`, for what knowledge says `knowledge`, `points` and
     `features`, by which the share of labels that change is counted, too. Writes `refined`.
     """
-    from chebsplat.formats.gaussians import read_gaussians
     from chebsplat.formats.features import read_features
+    from chebsplat.formats.gaussians import read_gaussians
     from chebsplat.formats.lifted import read_lifted
     from chebsplat.formats.refined import Refined, write_refined
     from chebsplat.lifting.blend import blend, calibrate, confidence, effective, familiar, reliable, trusted

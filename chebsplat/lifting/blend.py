@@ -12,7 +12,7 @@ from chebsplat.lifting.smoothing import Affinities, smooth
 STRENGTHS = (0.0, 0.5, 1.0, 2.0, 4.0, 8.0)  # views that knowledge may count for
 ALIKE = 0.2  # correlation of the errors of two views of a thing
 SURE = 3  # power of its length by which knowledge counts
-AGREED = 6  # power of the agreement of two halves of the views, and of their sureness beside shape's, by which views count
+AGREED = 6  # power by which views count of how far their halves agree, and of how sure they are beside shape
 LEAST = 1.0  # strength: what a teacher gets wrong alike in both halves counts as right when they are asked
 
 
@@ -71,7 +71,7 @@ def reliable(halves: np.ndarray, half_views: np.ndarray) -> np.ndarray:
 
 
 def familiar(lifted: np.ndarray, knowledge: np.ndarray, embeddings: np.ndarray) -> float:
-    """σ^AGREED, σ = min(c / c', 1): what all views count for in a scene where they are sure of labels by c, shape by c'.
+    """σ^AGREED, σ = min(c / c', 1): what a scene's views count for that are sure of labels by c, where shape is by c'.
 
     Args: lifted [N, C], what the views say of Gaussians; knowledge [N, C]; embeddings [L, C] of the scene's labels.
     Returns: in (0, 1]; 1 without Gaussians.

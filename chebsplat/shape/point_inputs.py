@@ -44,6 +44,7 @@ def point_inputs(
     unit: float = 1.0,
     describe: DescribeSection | None = None,
     n_neighbors: int = 24,
+    n_scales: int = len(RADII),
 ) -> PointInputs:
     """Inputs of every point.
 
@@ -51,7 +52,7 @@ def point_inputs(
       means:       [N, 3] scene units, float64; normals [N, 3] unit, towards a camera; covariances [N, 3, 3].
       up:          [3] against gravity; unit: scene units in a metre.
       describe:    of the descriptors, the defaults if None: full spectrum, or torch is needed.
-      n_neighbors: K, at most 31.
+      n_neighbors: K, at most 31; n_scales: S, of the first radii.
     Raises: ValueError on values that are not finite, or no unit at all.
     Choices: a neighbourhood of radius r is of points of which a cube of edge 0.36 r keeps one, so that K of them reach
       as far as r however dense the cloud is; the nearest K to 1.3 r are taken. Descriptors are of the point itself in
@@ -73,7 +74,7 @@ def point_inputs(
     ratios = deviations[:, :2] / deviations[:, 2:]
     own = np.column_stack([height, facing[:, 2], np.abs(facing[:, 2]), ratios, np.log(deviations[:, 2])])
     shape = where.astype(np.float32), quats.astype(np.float32), deviations.astype(np.float32)
-    parts = [_scale(where, radius, shape, describe or DescribeSection(), n_neighbors) for radius in RADII]
+    parts = [_scale(where, radius, shape, describe or DescribeSection(), n_neighbors) for radius in RADII[:n_scales]]
     neighbors, descriptors = (list(part) for part in zip(*parts, strict=True))
     return PointInputs(
         own.astype(np.float32),

@@ -1,0 +1,154 @@
+"""Error against run time of what follows a training: the lift, smoothing, and knowledge by encoders of several sizes.
+
+mIoU is of rendered test views, beside the processor seconds that each form takes once kernels are compiled, all that it
+needs included: knowledge needs the lift, for its evidence, and smoothing. Encoders are taught alike, for a short course
+on a few rooms; the shipped one, longer, on many. Figures and picture go to `--out`.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Any, TypeVar
+
+import numpy as np
+
+from benchmarks import shared
+from benchmarks.teaching import made, taught
+from chebsplat.evaluation.metrics import confusion, segmentation
+from chebsplat.formats.capture import read_capture
+from chebsplat.formats.features import read_features
+from chebsplat.formats.gaussians import read_gaussians
+from chebsplat.formats.knowledge import SHIPPED, read_knowledge
+from chebsplat.formats.points import read_points
+from chebsplat.labels.decode import decode_labels
+from chebsplat.lifting.blend import blend, calibrate, effective, familiar, reliable, trusted
+from chebsplat.lifting.carry import carry
+from chebsplat.lifting.smoothing import affinities, smooth
+from chebsplat.render import SceneRenderer
+from chebsplat.shape.point_encoder import PointEncoder
+from chebsplat.shape.point_inputs import point_inputs
+from chebsplat.splats.gaussians import surface_of
+from chebsplat.stages.evaluate import camera
+from chebsplat.stages.known_shapes import into_channels, up_of
+from chebsplat.stages.lift import lifted_from
+from chebsplat.stages.progress import Progress
+from chebsplat.stages.settings import KnowledgeSection, LiftSection
+from chebsplat.stages.text import found
+from chebsplat.synthetic import CLASS_NAMES
+from chebsplat.synthetic.seeds import KNOWLEDGE
+
+SIZES: dict[str, dict[str, Any]] = {
+    "1 radius": {"n_scales": 1},
+    "2 radii": {"n_scales": 2},
+    "4 radii, 8 wide": {"hidden": 8},
+    "4 radii, 32 wide": {},
+}
+Result = TypeVar("Result")
+
+
+class Scene:
+    """A trained scene with a teacher, its artifacts below `work`."""
+
+    def __init__(self, work: Path):
+        self.capture, self.gaussians = read_capture(work / "ingest"), read_gaussians(work / "train")
+        self.points, self.taught = read_points(work / "sfm"), read_features(work / "teacher")
+        parameters = self.gaussians.parameters
+        self.means, self.surface = parameters["means"], surface_of(parameters)
+        self.features: np.ndarray = parameters.get("fused", parameters["features"])
+
+    def score(self, features: np.ndarray) -> tuple[float, float]:
+        """mIoU and OA of the test views, by these features [N, C]."""
+        capture, cameras, names = self.capture, self.gaussians.cameras, list(self.capture.class_names or [])
+        parameters = {name: values for name, values in self.gaussians.parameters.items() if name != "fused"}
+        renderer, row = SceneRenderer(parameters | {"features": features}), {n: k for k, n in enumerate(capture.names)}
+        as_class = np.array([names.index(name) if name in names else len(names) for name in self.taught.label_names])
+        counts = np.zeros((len(names) + 1,) * 2, np.int64)
+        for k, name in enumerate(cameras.names):
+            if capture.is_test[row[name]]:
+                _, rendered = renderer.render(camera(self.gaussians, k), with_features=True)
+                assert rendered is not None and capture.labels is not None
+                said = as_class[decode_labels(rendered, self.taught.label_embeddings)]
+                counts += confusion(said, capture.labels[row[name]], len(names) + 1)
+        figures = segmentation(counts)
+        return 100 * float(np.nanmean(figures.iou[: len(names)])), 100 * figures.oa
+
+
+def timed(make: Callable[[], Result]) -> tuple[Result, float]:
+    """What the second call gives, and its processor seconds, of all threads; the first compiles."""
+    make()
+    began = time.process_time()
+    return make(), time.process_time() - began
+
+
+def main(arguments: Sequence[str]) -> None:
+    parser = shared.parser("refine", __doc__, work=True)
+    parser.add_argument("--rooms", type=int, default=8, help="that the encoders by size are taught on")
+    parser.add_argument("--steps", type=int, default=400)
+    parser.add_argument("--rooms-in", type=Path, default=Path("build/bench/teaching"))
+    options = parser.parse_args(arguments)
+    scene, shipped = Scene(options.work), read_knowledge(SHIPPED)
+    words = shipped.embeddings[found(list(CLASS_NAMES), shipped.words)].astype(np.float32)
+    rooms = made(options.rooms_in, KNOWLEDGE[: options.rooms], KnowledgeSection(), shipped.matrix)
+    encoders = {name: taught(rooms, variant, options.steps, words)[0] for name, variant in SIZES.items()}
+    encoders["as shipped"] = PointEncoder.restored(shipped.encoder, shipped.weights)
+    told = scene.capture, scene.gaussians.cameras, scene.gaussians.parameters, scene.taught
+    lifted, to_lift = timed(lambda: lifted_from(*told, LiftSection(), Progress(False)))
+    near, to_compare = timed(lambda: affinities(scene.means, *scene.surface))
+    smoothed, to_smooth = timed(lambda: smooth(scene.features, lifted.n_views, near))
+    rows: list[dict[str, Any]] = []
+
+    def add(name: str, seconds: float, features: np.ndarray) -> None:
+        miou, oa = scene.score(features)
+        rows.append({"form": name, "processor_seconds": round(seconds, 2), "miou": round(miou, 2), "oa": round(oa, 2)})
+        print(f"{name:34s}{seconds:7.2f} s   mIoU {miou:5.1f}   OA {oa:5.1f}", flush=True)
+
+    add("features as trained", 0.0, scene.features)
+    add("lifted features", to_lift, lifted.features)
+    add("smoothed", to_lift + to_compare + to_smooth, smoothed)
+    translated, (up, _) = into_channels(SHIPPED, shipped, scene.taught), up_of(scene.points.cam_from_world)
+    points = scene.points.means, scene.points.normals, scene.points.covariances
+    for name, encoder in encoders.items():
+
+        def known(encoder: PointEncoder = encoder) -> np.ndarray:
+            inputs = point_inputs(*points, up=up, n_scales=encoder.settings["n_scales"])
+            answers = translated(encoder.predict(inputs))
+            return carry(answers, *points[:2], scene.means, scene.surface[0])[0]
+
+        knowledge, to_know = timed(known)
+
+        def blended(knowledge: np.ndarray = knowledge) -> np.ndarray:
+            chosen = calibrate(lifted.halves, lifted.half_views, near, knowledge)
+            evidence = effective(lifted.n_views) * reliable(lifted.halves, lifted.half_views)
+            evidence = evidence * familiar(lifted.features, knowledge, scene.taught.label_embeddings)
+            start = smoothed if chosen.smooth else scene.features
+            result = blend(start, evidence, knowledge, chosen.strength)
+            votes = evidence + trusted(knowledge, chosen.strength)
+            return smooth(result, votes, near) if chosen.smooth else result
+
+        result, to_blend = timed(blended)
+        add(f"and knowledge: {name}", to_lift + to_compare + to_smooth + to_know + to_blend, result)
+    shared.write_csv(options.out / "refine.csv", rows)
+    draw(options.out / "refine.png", rows, options.work.resolve().name)
+
+
+def draw(path: Path, rows: list[dict[str, Any]], scene: str) -> None:
+    """mIoU against processor seconds, a point a form, as PNG."""
+    import matplotlib
+
+    matplotlib.use("Agg")
+    import matplotlib.pyplot as plt
+
+    figure, axis = plt.subplots(figsize=(7, 4.2), layout="constrained")
+    for row in rows:
+        axis.plot(row["processor_seconds"], row["miou"], "o", color="C0" if "knowledge" in row["form"] else "C1")
+        axis.annotate(row["form"].removeprefix("and "), (row["processor_seconds"], row["miou"]), fontsize=8,
+                      xytext=(5, 3), textcoords="offset points")  # fmt: skip
+    axis.set_xlabel("processor seconds after the training")
+    axis.set_ylabel("mIoU of test views, %")
+    axis.set_title(f"What follows a training: {scene}", fontsize=10)
+    axis.margins(0.18, 0.1)
+    axis.grid(alpha=0.3)
+    figure.savefig(path, dpi=130)
+    plt.close(figure)
