@@ -60,7 +60,7 @@ def run(job: Job) -> None:
         made[2] = smooth(blended, evidence + trusted(knowledge, strength), near) if smoothed else blended
     curve = {name: {f"{k:g}": value for k, value in row.items()} for name, row in choice.curve.items()}
     notes = {"start": started, "smooth": smoothed, "strength": strength, "familiar": known_to_teacher, "curve": curve}
-    sure = confidence(made[1], lifted.n_views, lifted.agreement, knowledge, strength)
+    sure = confidence(made[1], lifted.n_views, lifted.agreement, knowledge, strength, known_to_teacher)
     write_refined(job.out, Refined(made[2], sure, notes))
     job.facts |= {"n_gaussians": len(features), "unit": unit, **notes} | shares(job, made)
 

@@ -135,6 +135,8 @@ def test_confidence_grows_with_votes_that_agree_and_falls_where_they_do_not():
     same, other = (confidence(f, n, np.ones(4), np.tile(g, (4, 1)), 2.0) for g in ([1.0, 0], [0, 1.0]))
     np.testing.assert_allclose(same, [2 / 3, 3 / 4, 5 / 6, 5 / 6], atol=1e-6)
     assert (other[1:] < same[1:]).all()
+    doubted = confidence(f, n, np.ones(4), np.tile([0, 1.0], (4, 1)), 2.0, worth=0.0)  # shape alone is heard
+    np.testing.assert_allclose(doubted, 2 / 3, atol=1e-6)
     nothing = confidence(f, n, np.ones(4), np.zeros((4, 2)), 2.0)
     np.testing.assert_allclose(nothing, [0, 1 / 2, 3 / 4, 3 / 4], atol=1e-6)
 

@@ -122,12 +122,14 @@ def confidence(
     agreement: np.ndarray,
     knowledge: np.ndarray | None = None,
     strength: float = 0.0,
+    worth: float = 1.0,
 ) -> np.ndarray:
     """How long the mean of all votes is beside one for nothing: |n' r f/|f| + k' g/|g|| / (n' + k' + 1), f32 [N].
 
-    Args: agreement r [N] in [0, 1] of the views; the others as for `blend`.
+    Args: agreement r [N] in [0, 1] of the views; worth: of `familiar`, which n' is multiplied by; the others as for
+      `blend`.
     """
-    n = effective(n_views)
+    n = effective(n_views) * worth
     votes, total = (n * agreement)[:, None] * unit(features), n + 1
     if knowledge is not None:
         k = trusted(knowledge, strength)
