@@ -27,7 +27,7 @@ PACKAGES = {
     "rasterize": {"kernels", "splats"},
     "render": {"rasterize", "splats", "views"},
     "shape": {"cameras", "kernels", "settings", "splats"},
-    "lifting": {"cameras", "kernels", "rasterize", "render", "views"},
+    "lifting": {"cameras", "kernels", "labels", "rasterize", "render", "views"},
     "evaluation": {"labels", "rasterize", "render", "views"},
     "training": {"evaluation", "kernels", "rasterize", "settings", "shape", "splats", "views"},
 }
