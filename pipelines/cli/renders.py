@@ -92,6 +92,7 @@ def cameras(scene: str, path: str, frames: int, size: str | None, out: Path) -> 
 @click.option("--frames", type=click.Path(path_type=Path), help="where camera paths go; default: frames-of-SCENE, here")
 def view(scene: str, port: int, host: str, frames: Path | None) -> None:
     """Look at a finished SCENE (or a .ply) in a browser, live: fly, point at things, ask for words. Ctrl-C ends it."""
+    import gc
     import os
     import warnings
 
@@ -105,6 +106,7 @@ def view(scene: str, port: int, host: str, frames: Path | None) -> None:
     if theirs and not source.is_file():
         raise InputError(f"{source} is missing; correct the path")
     name = (source.stem if theirs else Path(os.path.abspath(scene)).name).partition("@")[0]
+    gc.disable()  # until the scene is there: what is imported stays, and looking for garbage costs a tenth of the wait
     viewer = Viewer(name, host, port)
     try:
         print(f"http://{'localhost' if host == '0.0.0.0' else host}:{viewer.port}", flush=True)
@@ -119,6 +121,8 @@ def view(scene: str, port: int, host: str, frames: Path | None) -> None:
         with suppress(ConfigError, InputError, KeyError):  # a .ply or an artifact alone has no photos
             photos = None if theirs else photos_of(links(scene_folder(scene))["ingest"])
         viewer.show(Viewing(opened, photos), (frames or Path(f"frames-of-{name}")).absolute())
+        gc.freeze()
+        gc.enable()
         while True:
             time.sleep(3600)
     finally:
