@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 from chebsplat.errors import ConfigError, InputError
 from chebsplat.formats.files import atomic_path
 from chebsplat.formats.manifest import remedy_of
-from chebsplat.stages.inference import Model
+from chebsplat.stages.inference import CUDA, GPU_REMEDY, Model, providers
 
 if TYPE_CHECKING:
     import numpy as np
@@ -20,7 +20,7 @@ if TYPE_CHECKING:
 CHUNK = 256  # regions that the encoder sees at once
 
 
-def encode(scene: Path, encoder: Path, features: Path | None, out: Path) -> dict[str, Any]:
+def encode(scene: Path, encoder: Path, features: Path | None, out: Path, device: str = "cpu") -> dict[str, Any]:
     """Describe the regions of a scene, encode them, fuse, and write a .npz.
 
     Args:
@@ -29,6 +29,7 @@ def encode(scene: Path, encoder: Path, features: Path | None, out: Path) -> dict
       features: .npy [N, C] that encoder and gate see, for a PLY, which holds none.
       out:      holds fused, gate f32 [N, C], encodings f32 [M, C], centers i64 [M], members i64 [M, n] (-1: padding)
                 and radius; Gaussians are numbered as in the scene's files.
+      device:   cpu, or cuda, which onnxruntime must have.
     Returns: counts, and seconds of each part.
     Raises:  ConfigError, InputError: arguments that do not fit one another, each named with the remedy.
     """
@@ -42,6 +43,8 @@ def encode(scene: Path, encoder: Path, features: Path | None, out: Path) -> dict
         raise ConfigError(f"{out}: the result is a .npz; name it so")
     if out.exists():
         raise ConfigError(f"{out} exists; remove it, or choose another --out")
+    if device == "cuda" and CUDA not in providers(device):
+        raise ConfigError(f"onnxruntime here has no CUDA: {GPU_REMEDY}, or encode with --device cpu")
     name = FLOAT if encoder.is_dir() else encoder.name
     if name not in (FLOAT, DYNAMIC):
         raise ConfigError(f"{encoder} is neither an onnx artifact nor its {FLOAT} or {DYNAMIC}; pass one of these")
@@ -57,10 +60,10 @@ def encode(scene: Path, encoder: Path, features: Path | None, out: Path) -> dict
     except ValueError as error:
         raise InputError(f"{scene} cannot be encoded: {error}") from None
     described = time.perf_counter()
-    encodings = encoded(held.models[name], inputs)
+    encodings = encoded(held.models[name], inputs, device)
     done = time.perf_counter()
     centers = inputs.regions.centers
-    fused, gate = opened(held.models[FUSED]).run(
+    fused, gate = opened(held.models[FUSED], device).run(
         {
             "features": p["raw_features"],
             "encodings": encodings,
@@ -141,22 +144,22 @@ def read_features(path: Path, n: int) -> np.ndarray:
     return values
 
 
-def opened(path: Path) -> Model:
-    """A model on the CPU, on as many threads as the other kernels."""
+def opened(path: Path, device: str) -> Model:
+    """A model; on the CPU on as many threads as the other kernels."""
     import onnxruntime
 
     from chebsplat.stages.command import n_threads
 
     options = onnxruntime.SessionOptions()
     options.intra_op_num_threads = n_threads()
-    return Model(path, remedy_of(path.parent), options)
+    return Model(path, remedy_of(path.parent), options, device)
 
 
-def encoded(model: Path, inputs: RegionInputs) -> np.ndarray:
+def encoded(model: Path, inputs: RegionInputs, device: str = "cpu") -> np.ndarray:
     """Encodings f32 [M, C] of all regions."""
     import numpy as np
 
-    runner = opened(model)
+    runner = opened(model, device)
     feed = {"inputs": inputs.inputs, "positions": inputs.positions, "mask": inputs.mask}
     starts = range(0, len(inputs.mask), CHUNK)
     encodings = np.concatenate([runner.run({k: v[s : s + CHUNK] for k, v in feed.items()})[0] for s in starts])

@@ -23,6 +23,7 @@ SECONDS = 600.0  # of one run, of a window or of a text
 LOOPING = 10.0  # of one run of a model that holds a Loop or a Scan: only such a one may never end
 LARGEST = 1 << 30  # bytes of one output, where the graph says them
 CUDA = "CUDAExecutionProvider"
+GPU_REMEDY = "`.venv/bin/pip install onnxruntime-gpu` in the place of onnxruntime adds it"
 LOOPS = (b'"\x04Loop', b'"\x04Scan')  # as protobuf writes a node's operator
 
 

@@ -15,7 +15,6 @@ if TYPE_CHECKING:
     from chebsplat.stages.settings import TeacherSection
 
 log = logging.getLogger("chebsplat")
-GPU_REMEDY = "`.venv/bin/pip install onnxruntime-gpu` in the place of onnxruntime adds it"
 
 
 def run(job: Job) -> None:
@@ -49,7 +48,7 @@ def from_onnx(job: Job, capture: Capture, settings: TeacherSection) -> None:
     from chebsplat.formats.features import FeatureWriter
     from chebsplat.formats.teacher_model import EMBEDDED, read_teacher
     from chebsplat.stages.command import n_threads
-    from chebsplat.stages.inference import CUDA, providers
+    from chebsplat.stages.inference import CUDA, GPU_REMEDY, providers
     from chebsplat.stages.label_space import MAX_CHANNELS, closed_set, label_set, open_vocabulary
     from chebsplat.stages.teacher_inference import TeacherInference
 

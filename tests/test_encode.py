@@ -176,6 +176,7 @@ def test_arguments_that_do_not_fit_are_errors_that_name_the_remedy(toy, tmp_path
         (3, "expected chebsplat.scene", [toy["train"], *onnx, *out]),
         (2, ".npz", [toy["export"], *onnx, "--out", tmp_path / "a.zarr"]),
         (2, "exists", [toy["export"], *onnx, "--out", tmp_path / "there.npz"]),
+        (2, "onnxruntime-gpu", [toy["export"], *onnx, *out, "--device", "cuda"]),
     ]
     for code, message, arguments in cases:
         done = run(*arguments)

@@ -95,7 +95,8 @@ def extract(
 @click.option("--encoder", help="an onnx artifact, or a model in it; default: the scene's")
 @click.option("--features", type=click.Path(path_type=Path), help="of a PLY: .npy [N, C], float32, before fusion")
 @click.option("--out", type=click.Path(path_type=Path), required=True, help="the .npz to write")
-def encode(scene: str, encoder: str | None, features: Path | None, out: Path) -> None:
+@click.option("--device", type=click.Choice(["cpu", "cuda"]), default="cpu", show_default=True, help="of the models")
+def encode(scene: str, encoder: str | None, features: Path | None, out: Path, device: str) -> None:
     """Fused features of a finished SCENE (or a .ply), by onnxruntime, without torch."""
     from chebsplat.pipelines.finished import artifact_of, scene_folder
     from chebsplat.stages.encode import encode as write
@@ -108,7 +109,7 @@ def encode(scene: str, encoder: str | None, features: Path | None, out: Path) ->
         source = artifact_of(scene, "export")
         encoder = encoder or str(scene_folder(scene) / "onnx")
     model = Path(encoder) if encoder.endswith(".onnx") else artifact_of(encoder, "onnx")
-    figures = write(source, model, features, out)
+    figures = write(source, model, features, out, device)
     print(", ".join(f"{name} {value}" for name, value in figures.items()), file=sys.stderr)
     print(out)
 
