@@ -140,15 +140,16 @@ def draw(path: Path, rows: list[dict[str, Any]], scene: str) -> None:
     matplotlib.use("Agg")
     import matplotlib.pyplot as plt
 
-    figure, axis = plt.subplots(figsize=(7, 4.2), layout="constrained")
-    for row in rows:
-        axis.plot(row["processor_seconds"], row["miou"], "o", color="C0" if "knowledge" in row["form"] else "C1")
-        axis.annotate(row["form"].removeprefix("and "), (row["processor_seconds"], row["miou"]), fontsize=8,
-                      xytext=(5, 3), textcoords="offset points")  # fmt: skip
+    figure, axis = plt.subplots(figsize=(8, 4.2), layout="constrained")
+    for number, row in enumerate(rows, 1):
+        place, form = (row["processor_seconds"], row["miou"]), row["form"].removeprefix("and ")
+        axis.plot(*place, "o", color="C0" if "knowledge" in form else "C1", label=f"{number}  {form}")
+        axis.annotate(str(number), place, fontsize=9, xytext=(5, 4), textcoords="offset points")
+    figure.legend(loc="outside right upper", fontsize=8, handlelength=0, markerscale=0.6, frameon=False)
     axis.set_xlabel("processor seconds after the training")
     axis.set_ylabel("mIoU of test views, %")
-    axis.set_title(f"What follows a training: {scene}", fontsize=10)
-    axis.margins(0.18, 0.1)
+    axis.set_title(f"What follows a training: {scene.partition('@')[0]}", fontsize=10)
+    axis.margins(0.08, 0.1)
     axis.grid(alpha=0.3)
     figure.savefig(path, dpi=130)
     plt.close(figure)
