@@ -1,4 +1,4 @@
-"""`points/1`: registered cameras, and points with normals and local anisotropic covariances."""
+"""`points/1`: registered cameras, and points with normals and local anisotropic covariances, and swept depth."""
 
 from __future__ import annotations
 
@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 
+from chebsplat.errors import InputError
 from chebsplat.formats import artifact
 from chebsplat.formats.cameras import POSES, check_cameras
 from chebsplat.formats.documents import TypedDict, read_document, write_document
@@ -23,6 +24,7 @@ SPECS: dict[str, Spec] = POSES | {
     "covariances": (FLOAT, "n", 3, 3),
     "tracks": ("int32 or int64", "t", 2),
 }
+SWEPT = "swept.safetensors"  # of depths, where photos were swept for it
 
 
 @dataclass
@@ -35,6 +37,7 @@ class Points:
     covariances:    f32 [N, 3, 3] of the neighbourhood, scaled to the local spacing (docs/method.md, section 1).
     tracks:         i32 [T, 2] (point, view) observations; empty where points come from depth.
     notes:          how the points came about, reprojection errors, counts.
+    depths:         f32 [V, h, w] z that a sweep of the photos, reduced to this size, found; 0: none; None: no sweep.
     """
 
     names: list[str]
@@ -46,6 +49,7 @@ class Points:
     covariances: np.ndarray
     tracks: np.ndarray
     notes: dict[str, Any] = field(default_factory=dict)
+    depths: np.ndarray | None = None
 
 
 class Document(TypedDict):
@@ -66,6 +70,8 @@ def write_points(out: Path, points: Points) -> None:
     """Fill the directory that `artifact.publish` yields. Raises ValueError on a non-finite value."""
     arrays = {name: getattr(points, name) for name in SPECS}
     write_tensors(out / "points.safetensors", arrays)
+    if points.depths is not None:
+        write_tensors(out / SWEPT, {"depths": points.depths})
     write_document(out / "points.json", {"names": points.names, "notes": points.notes})
 
 
@@ -81,4 +87,9 @@ def read_points(path: Path) -> Points:
     check_names(names, "names", path / "points.json", remedy_of(path))
     arrays = read_tensors(path, manifest, file.name, SPECS)
     check_cameras(names, arrays["Ks"], arrays["cam_from_world"], file, remedy_of(path))
-    return Points(names, **{name: arrays[name] for name in SPECS}, notes=document["notes"])
+    depths = None
+    if SWEPT in manifest.files:
+        depths = read_tensors(path, manifest, SWEPT, {"depths": ("float32", "v", "h", "w")})["depths"]
+        if len(depths) != len(names):
+            raise InputError(f"{path / SWEPT} has depth of {len(depths)} views, not {len(names)}; {remedy_of(path)}")
+    return Points(names, **{name: arrays[name] for name in SPECS}, notes=document["notes"], depths=depths)

@@ -1,4 +1,4 @@
-"""Depth that a capture brings: whether a training relies on it, and how it is read."""
+"""Depth that a capture brings, or a sweep of its photos has found: whether a training relies on it, how it is read."""
 
 from __future__ import annotations
 
@@ -26,10 +26,13 @@ def with_depth_loss(train: TrainSection, capture: Capture, points: Points) -> tu
     """The section with its depth loss decided where the config leaves it open, and why there is none ("": there is).
 
     Choices: none if the capture has no poses, since its unit is not the scene's then, or if its views contradict one
-      another, as a sensor's do: its noise and its place beside the colour camera would be taught.
+      another, as a sensor's do: its noise and its place beside the colour camera would be taught. Swept depth is only
+      where views agree.
     """
     if train.weight_depth is not None:
         return train, "" if train.weight_depth else "train.weight_depth is 0"
+    if capture.depth is None and points.depths is not None:
+        return train.model_copy(update={"weight_depth": WEIGHT}), ""
     if capture.depth is None or capture.cam_from_world is None:
         return train.model_copy(update={"weight_depth": 0.0}), "the capture has no depth in the unit of its poses"
     apart = disagreement(capture, points)
@@ -69,8 +72,9 @@ def disagreement(capture: Capture, points: Points) -> float:
     return float(np.median(every)) if len(every) else 0.0
 
 
-def measured_depth(capture: Capture, rows: list[int]) -> Callable[[int, int], Tensor]:
-    """z-depth of the views with these rows in the capture, every so many pixels.
+def measured_depth(capture: Capture, points: Points, used: list[int]) -> Callable[[int, int], Tensor]:
+    """z-depth, every so many pixels, of the views of the points that have these indices: the capture's, otherwise what
+    was swept, 0 where neither tells.
 
     Raises: ConfigError where there is none, or where its unit is not the scene's, as poses are not the capture's own.
     """
@@ -78,15 +82,27 @@ def measured_depth(capture: Capture, rows: list[int]) -> Callable[[int, int], Te
 
     from chebsplat.views import remembered
 
-    depth = capture.depth
-    if depth is None or capture.cam_from_world is None:
+    depth, swept, (width, height) = capture.depth, points.depths, capture.size
+    if depth is not None and capture.cam_from_world is not None:
+        row = {name: view for view, name in enumerate(capture.names)}
+        read = remembered(lambda index: torch.from_numpy(depth[row[points.names[used[index]]]]), MEMORY)
+    elif swept is not None:
+        factor = width // swept.shape[2]  # of the blocks of pixels that a swept one stands for
+
+        def read(index: int) -> Tensor:
+            blocks = torch.from_numpy(swept[used[index]]).repeat_interleave(factor, 0).repeat_interleave(factor, 1)
+            whole = torch.zeros(height, width)
+            whole[: len(blocks), : blocks.shape[1]] = blocks
+            return whole
+
+    else:
         raise ConfigError(
-            "train.weight_depth needs a capture with poses and depth, and this one has no depth; set it to 0"
+            "train.weight_depth needs a capture with poses and depth, and this one has no depth; set it to 0, or sweep "
+            "the photos for it (sfm.dense=on)"
         )
-    read = remembered(lambda index: torch.from_numpy(depth[rows[index]]), MEMORY)
 
     def at(index: int, factor: int) -> Tensor:
-        height, width = (side // factor * factor for side in capture.size[::-1])
-        return read(index)[:height:factor, :width:factor]
+        rows, columns = (side // factor * factor for side in (height, width))
+        return read(index)[:rows:factor, :columns:factor]
 
     return at

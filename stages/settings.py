@@ -82,7 +82,7 @@ class SfmSection(Section):
     )
     dense: Literal["auto", "on", "off"] = setting(
         "auto",
-        "add points of a plane sweep of the photos; auto: where half their cells hold no point, and no depth is given",
+        "depth of a plane sweep of the photos; auto: where a fifth of their cells hold no point, and no depth is given",
     )
     min_registered: float = number(0.5, "fraction of the views that a reconstruction must register", 1e-3, 1)
     seed: int = seed("of the choice among points, and of the reconstruction")

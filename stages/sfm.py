@@ -9,6 +9,7 @@ from chebsplat.errors import DataFailure
 from chebsplat.stages.command import Job, command
 from chebsplat.stages.dense import MOST, swept, wants_more
 from chebsplat.stages.pose_check import wants_adjustment
+from chebsplat.stages.thinning import thin
 
 if TYPE_CHECKING:
     import numpy as np
@@ -50,8 +51,11 @@ def run(job: Job) -> None:
         cloud = reconstruction.reconstruct(job, capture, settings, adjusted)
         if "poses_kept" in cloud["notes"] and capture.depth is not None:
             cloud = filled(cloud, from_depth(job, capture, settings, cloud["cam_from_world"]), settings.max_points)
+    depths = None
     if len(cloud["means"]) >= 16 and wants_more(job, capture, cloud, settings):
-        cloud = filled(cloud, swept(job, capture, cloud), min(MOST, settings.max_points), "n_swept")
+        more = swept(job, capture, cloud)
+        depths = more.pop("depths")
+        cloud = filled(cloud, more, min(MOST, settings.max_points), "n_swept")
     means = cloud["means"]
     if len(means) < 16:
         raise DataFailure(f"only {len(means)} points were found, at least 16 are needed; add views with more overlap")
@@ -72,6 +76,7 @@ def run(job: Job) -> None:
             covariances,
             cloud["tracks"],
             cloud["notes"],
+            depths,
         ),
     )
 
@@ -192,28 +197,6 @@ def tracks_of(capture: Capture, kept: np.ndarray) -> np.ndarray:
     place[kept] = np.arange(len(kept))
     tracks = np.stack([place[capture.tracks[:, 0]], capture.tracks[:, 1]], 1)
     return tracks[tracks[:, 0] >= 0].astype(np.int32)
-
-
-def thin(points: np.ndarray, count: int) -> np.ndarray:
-    """Indices of at most `count` points, one a voxel of the smallest cube that allows it."""
-    import numpy as np
-
-    if len(points) <= count:
-        return np.arange(len(points))
-    origin = points.min(0)
-    size = float(np.ptp(points, axis=0).max()) or 1.0
-
-    def occupied(edge: float) -> np.ndarray:
-        cells = np.floor((points - origin) / edge).astype(np.int64)
-        sides = cells.max(0) + 1
-        flat = (cells[:, 0] * sides[1] + cells[:, 1]) * sides[2] + cells[:, 2]
-        return np.sort(np.unique(flat, return_index=True)[1])
-
-    low, high = size / 4096, size
-    for _ in range(24):
-        middle = (low * high) ** 0.5
-        low, high = (middle, high) if len(occupied(middle)) > count else (low, middle)
-    return occupied(high)
 
 
 main = command("sfm", run)

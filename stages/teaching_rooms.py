@@ -117,7 +117,7 @@ def surface(
     import numpy as np
 
     from chebsplat.cameras import centers, unproject
-    from chebsplat.stages.sfm import thin
+    from chebsplat.stages.thinning import thin
 
     means, eyes, named = [], [], []
     for view, eye in enumerate(centers(poses)):

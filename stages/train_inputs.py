@@ -28,7 +28,7 @@ FEATURE_BYTES = 64 << 20  # of features that are kept in memory; what is beyond 
 
 
 def training_views(capture: Capture, points: Points, features: Features | None, with_depth: bool = False) -> Views:
-    """The registered training views, joined by name, with the capture's depth where asked for.
+    """The registered training views, joined by name, with their depth where asked for.
 
     Raises: InputError if artifacts do not belong together.
     """
@@ -61,7 +61,7 @@ def training_views(capture: Capture, points: Points, features: Features | None, 
         if features.pseudo_labels is not None and features.confidence is not None:
             labels_of = taught_labels(features, [source[name] for name in names])
 
-    depth_of = measured_depth(capture, chosen) if with_depth else None
+    depth_of = measured_depth(capture, points, used) if with_depth else None
     return Views(
         names,
         torch.from_numpy(images[chosen]),

@@ -63,6 +63,7 @@ def make_points():
         np.tile(np.eye(3, dtype=np.float32), (5, 1, 1)),
         np.zeros((0, 2), np.int32),
         {"how": "depth"},
+        rng.random((1, 3, 4), np.float32),
     )
 
 

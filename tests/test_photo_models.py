@@ -235,6 +235,9 @@ def test_the_depth_loss_is_on_where_views_tell_the_same_depth():
         return train.weight_depth, why
 
     assert decided() == (0, "the capture has no depth in the unit of its poses")
+    points.depths = np.full((3, 20, 24), 5, np.float32)
+    assert decided() == (WEIGHT, "")
+    points.depths = None
     capture.cam_from_world[1, 2, 3], capture.cam_from_world[2, 2, 3] = 5.5, 6.0  # each half a unit farther back
     capture.depth = np.stack([np.full((40, 48), z, np.float32) for z in (5, 5.5, 6)])
     capture.depth[:, :3] = np.nan
@@ -339,6 +342,16 @@ def test_depth_of_a_view_is_thinned_like_its_picture():
         assert views.depth(2, factor).shape == target.shape[:2]
     assert views.depth(2, 2)[1, 3] == capture.depth[2, 2, 6]
     assert training_views(capture, points, None).depth is None
+
+
+def test_swept_depth_stands_for_blocks_of_pixels_of_its_view():
+    capture, points = photographed("colmap", [1, 1, 1])
+    capture.is_test[0] = True  # and so the first training view is the second of the points
+    points.depths = np.arange(3 * 13 * 16, dtype=np.float32).reshape(3, 13, 16)
+    depth = training_views(capture, points, None, with_depth=True).depth
+    assert np.array_equal(depth(0, 3)[:13], points.depths[1])
+    assert depth(0, 1).shape == (40, 48) and not depth(0, 1)[39].any()  # a line that no block holds
+    assert depth(1, 1)[4, 5] == points.depths[2, 1, 1]
 
 
 def test_a_test_view_that_is_aligned_finds_its_pose_again(tmp_path):

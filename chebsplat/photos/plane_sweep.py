@@ -10,7 +10,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-WINDOW, SMOOTH = 2, 2  # half widths in pixels: of the patches that are compared, and of the mean over their costs
+WINDOW, SMOOTH = 1, 2  # half widths in pixels: of the patches that are compared, and of the mean over their costs
 FLAT = 1e-4  # variance that patches are given: two without texture are alike
 BRIGHT = 0.3  # weight of a difference in brightness, as a logarithm, beside 1 - correlation
 OUTSIDE = 4.0  # cost of a pixel that the other view does not see
@@ -34,11 +34,12 @@ def rays(K: Tensor, height: int, width: int) -> Tensor:
 def swept_depth(
     grey: Tensor, valid: Tensor, Ks: Tensor, poses: Tensor, view: int, neighbors: list[int], depths: Tensor
 ) -> tuple[Tensor, Tensor]:
-    """The depth [H, W] of a view, among `depths` [D], at which its neighbours look most like it, and its cost [H, W].
+    """The depth [H, W] of a view at which its neighbours look most like it, and its cost [H, W].
 
-    Args:    valid f32 [V, H, W]: 1 where a pixel counts.
+    Args:    valid f32 [V, H, W]: 1 where a pixel counts; depths [D], evenly spaced in 1 / z.
     Choices: the cost is one minus the correlation of patches, which no exposure changes, and a little of the difference
-      in brightness, without which flat patches are alike at any depth; of the neighbours the best two count.
+      in brightness, without which flat patches are alike at any depth; of the neighbours the best two count. The
+      lowest point of the parabola through three costs lies between the depths that were tried.
     """
     height, width = grey.shape[1:]
     mean, spread = _moments(grey[view])
@@ -61,18 +62,27 @@ def swept_depth(
         brighter = (their_mean.clamp_min(1e-3) / mean.clamp_min(1e-3)).log().abs().clamp_max(1)
         cost = torch.where(counts, 1 - correlation + BRIGHT * brighter, OUTSIDE)
         costs.append(box_mean(cost, SMOOTH))
-    best = torch.stack(costs).sort(0).values[:BEST].mean(0).min(0)
-    return depths[best.indices], best.values
+    volume = torch.stack(costs).sort(0).values[:BEST].mean(0)
+    best = volume.min(0)
+    middle = best.indices.clamp(1, len(depths) - 2)
+    before, here, after = (volume.gather(0, (middle + step)[None])[0] for step in (-1, 0, 1))
+    lowest = (0.5 * (before - after) / (before - 2 * here + after).clamp_min(1e-6)).clamp(-0.5, 0.5)
+    lowest = torch.where(middle == best.indices, lowest, 0)
+    return 1 / (1 / depths[best.indices] + lowest * (1 / depths[1] - 1 / depths[0])), best.values
 
 
-def n_agreeing(depth: Tensor, Ks: Tensor, poses: Tensor, view: int, neighbors: list[int], tolerance: float) -> Tensor:
-    """How many neighbours have, where they see a pixel's point, its depth within a relative tolerance: [H, W].
+def agreed(
+    depth: Tensor, Ks: Tensor, poses: Tensor, view: int, neighbors: list[int], tolerance: float
+) -> tuple[Tensor, Tensor]:
+    """How many neighbours have, where they see a pixel's point, its depth within a relative tolerance, and the mean of
+    what these and the view itself have, as depth of the view: [H, W] each.
 
     Args: depth: [V, H, W] of all views.
     """
     height, width = depth.shape[1:]
-    count = torch.zeros(height * width)
-    points = rays(Ks[view], height, width) * depth[view].reshape(-1)
+    own = depth[view].reshape(-1)
+    count, ratios = torch.zeros_like(own), torch.ones_like(own)
+    points = rays(Ks[view], height, width) * own
     for other in neighbors:
         between = poses[other] @ torch.linalg.inv(poses[view])
         x, y, z = Ks[other] @ (between[:3, :3] @ points + between[:3, 3:])
@@ -80,8 +90,10 @@ def n_agreeing(depth: Tensor, Ks: Tensor, poses: Tensor, view: int, neighbors: l
         inside = (z > 0) & (column >= 0) & (column < width) & (row >= 0) & (row < height)
         theirs = torch.full_like(z, torch.nan)
         theirs[inside] = depth[other][row[inside].long(), column[inside].long()]
-        count += (theirs / z - 1).abs() < tolerance
-    return count.reshape(height, width)
+        agrees = (theirs / z - 1).abs() < tolerance
+        count += agrees
+        ratios += torch.where(agrees, theirs / z, 0)
+    return count.reshape(height, width), (own * ratios / (1 + count)).reshape(height, width)
 
 
 def _moments(values: Tensor) -> tuple[Tensor, Tensor]:
