@@ -333,6 +333,13 @@ def test_refined_poses_are_those_of_training_views_and_test_views_keep_theirs(tm
         training_views(capture, points, None, with_depth=True)
 
 
+def test_a_motion_leaves_the_last_row_of_a_pose_exact():
+    g = torch.Generator().manual_seed(0)
+    for scale in (1e-3, 0.1):
+        for twist in scale * torch.randn(50, 6, generator=g, dtype=torch.float64):  # one by one, as views are moved
+            assert motion(twist)[3].tolist() == [0, 0, 0, 1]
+
+
 def test_depth_of_a_view_is_thinned_like_its_picture():
     capture, points = photographed("colmap", [1, 1, 1])
     capture.depth = np.arange(3 * 40 * 48, dtype=np.float32).reshape(3, 40, 48)

@@ -33,7 +33,8 @@ def motion(twists: Tensor) -> Tensor:
     generator = twists.new_zeros(*twists.shape[:-1], 4, 4)
     generator[..., :3, :3], generator[..., :3, 3] = hat(twists[..., :3]), twists[..., 3:]
     motions: Tensor = torch.linalg.matrix_exp(generator)
-    return motions
+    last = motions.new_tensor([0, 0, 0, 1]).expand(*motions.shape[:-2], 1, 4)  # exactly: poses are tested for it
+    return torch.cat([motions[..., :3, :], last], -2)
 
 
 def small_twist(motions: Tensor) -> Tensor:
