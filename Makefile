@@ -19,17 +19,24 @@ CHEBSPLAT := .venv/bin/chebsplat
 CHOICE := $(if $(scene),--scene '$(scene)') $(if $(sequence),--sequence '$(sequence)') $(if $(set),--set '$(set)') \
   $(if $(ablation),--ablation '$(ablation)') $(if $(basis),--basis '$(basis)')
 
+CLUSTER := $(if $(filter-out local,$(on)),slurm)
+
 # `make scene=office0` needs no target: naming a scene, a sequence, a study or a benchmark means running it.
 .DEFAULT_GOAL := $(if $(study),study,$(if $(bench),bench-$(bench),$(if $(scene)$(sequence),run,help)))
-.PHONY: help run study view plan verify clean-stale setup test test-all gpu malformed soak stability bench text-model nouns knowledge calibration teacher teacher-quality lint lock
+.PHONY: help run study slurm cluster-test view plan verify clean-stale setup test test-all gpu malformed soak stability bench text-model nouns knowledge calibration teacher teacher-quality lint lock
 
-run: $(READY)  ## make scene=NAME|FOLDER [stage=] [set=a.b=c,...] [ablation=] [basis=NAME@REVISION|none] [cores=] [device=]; or sequence=NAME
+run: $(READY) $(CLUSTER)  ## make scene=NAME|FOLDER [stage=] [set=a.b=c,...] [ablation=] [basis=NAME@REVISION|none] [cores=] [device=] [on=slurm]; or sequence=NAME
 	@[ '$(stage)' != mesh ] || $(PY) -c 'import pymeshlab' 2>/dev/null || \
 	  $(PY) -m uv pip install --quiet --python $(PY) --editable '.[mesh]'
-	@$(CHEBSPLAT) run $(CHOICE) $(if $(stage),--stage '$(stage)') $(if $(cores),--cores '$(cores)') $(if $(device),--device '$(device)')
+	@$(CHEBSPLAT) run $(CHOICE) $(if $(stage),--stage '$(stage)') $(if $(cores),--cores '$(cores)') $(if $(device),--device '$(device)') $(if $(on),--on '$(on)')
 
-study: $(READY)  ## make study=NAME [cores=] [threads=] [args=--no-run]: its runs, then table, figure, page in build/studies
-	@$(CHEBSPLAT) study '$(study)' $(if $(cores),--cores '$(cores)') $(if $(threads),--threads '$(threads)') $(if $(device),--device '$(device)') $(args)
+study: $(READY) $(CLUSTER)  ## make study=NAME [cores=] [threads=] [on=slurm] [args=--no-run]: its runs, then table, figure, page in build/studies
+	@$(CHEBSPLAT) study '$(study)' $(if $(cores),--cores '$(cores)') $(if $(threads),--threads '$(threads)') $(if $(device),--device '$(device)') $(if $(on),--on '$(on)') $(args)
+
+# Snakemake's plugin for Slurm is installed when a run first goes there.
+slurm: $(READY)
+	@$(PY) -c 'import snakemake_executor_plugin_slurm' 2>/dev/null || \
+	  $(PY) -m uv pip install --quiet --python $(PY) --editable '.[slurm]'
 
 view: $(READY)  ## make view scene=NAME|FOLDER|FILE.ply [port=8080]: look at a finished scene in a browser, live
 	@$(PY) -c 'import viser' 2>/dev/null || $(PY) -m uv pip install --quiet --python $(PY) --editable '.[view]'
@@ -58,6 +65,9 @@ test: $(READY)  ## the tests, in parallel, without the slow ones
 
 test-all: $(READY)  ## all tests, the slow ones too
 	@$(PY) -m pytest -q -n auto --dist loadgroup -m "not gpu" $(args)
+
+cluster-test: slurm  ## study=toys on a Slurm of its own on 127.0.0.1 (apt-get install munge slurm-wlm): build/cluster.csv
+	@$(PY) -m pytest -q -rs tests/test_cluster.py $(args)
 
 gpu: $(READY)  ## tests that need an NVIDIA GPU, then office0 on it beside the CPU: build/bench/gpu.csv (under 10 minutes)
 	@$(PY) -m pytest -q -m gpu $(args)

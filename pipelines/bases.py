@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import shutil
+from contextlib import ExitStack
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -12,7 +13,7 @@ from chebsplat.formats.basis import SCHEMA, read_lineage
 from chebsplat.formats.names import suggest
 from chebsplat.pipelines import job, store
 from chebsplat.pipelines.plan import Plan, Planner
-from chebsplat.pipelines.run import HERE, entry, git_state, write_plan
+from chebsplat.pipelines.run import HERE, entry, git_state, plan_of
 from chebsplat.pipelines.scenes import names
 from chebsplat.pipelines.sequences import chain, scenes_of
 from chebsplat.stages.device import resolve
@@ -137,7 +138,7 @@ def extend(name: str, gaussians: Path, scene: str) -> list[Path]:
 
     manifest, planner = artifact.read_manifest(gaussians, STAGES["train"].schema), Planner()
     config = configs.build({"scene": {"name": scene}}, f"scene {scene}")
-    folders: list[Path] = []
+    plans = ExitStack()
 
     def build(head: Path | None) -> Path | None:
         if head is not None and manifest.key in {entry["gaussians"] for entry in read_lineage(head)}:
@@ -145,14 +146,14 @@ def extend(name: str, gaussians: Path, scene: str) -> list[Path]:
         earlier = {} if head is None else {"basis": head}
         keys = {"gaussians": manifest.key} | {role: path.name for role, path in earlier.items()}
         step = planner.step(STAGES["cks"], config, {"gaussians": gaussians} | earlier, keys)
-        plan = write_plan([entry(step, git_state(HERE)) | {"threads": 1}])
-        folders.append(plan.parent)  # until the revision is linked, its plan keeps `clean-stale` from it
+        # until the revision is linked, its plan keeps `clean-stale` from it
+        plan = plans.enter_context(plan_of([entry(step, git_state(HERE)) | {"threads": 1}]))
+        plans.callback(shutil.rmtree, plan.parent, ignore_errors=True)
         job.make(plan, step.key)
         return step.path
 
     try:
-        return heads.extend(head_folder(name), build)
+        with plans:
+            return heads.extend(head_folder(name), build)
     finally:
         planner.save()
-        for folder in folders:
-            shutil.rmtree(folder, ignore_errors=True)

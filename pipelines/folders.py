@@ -6,7 +6,6 @@ lock, so that two runs at once never share a name.
 
 from __future__ import annotations
 
-import fcntl
 import glob
 import hashlib
 import json
@@ -15,7 +14,7 @@ from pathlib import Path
 
 from chebsplat.errors import ConfigError, InputError
 from chebsplat.formats.files import atomic_write, parse_json
-from chebsplat.pipelines import store
+from chebsplat.pipelines import leases, store
 from chebsplat.pipelines.scenes import folder_name, names
 
 UNKNOWN = ""  # the owner of a name whose links were made by something else
@@ -79,8 +78,7 @@ def claim(folder: Path) -> str:
     """The folder's name, from now on its own."""
     file = record("any")
     file.parent.mkdir(parents=True, exist_ok=True)
-    with (file.parent / ".lock").open("w") as lock:
-        fcntl.flock(lock, fcntl.LOCK_EX)
+    with leases.held(store.locks(store.work()) / "names"):
         name = name_of(folder)
         if not record(name).exists():
             atomic_write(record(name), json.dumps({"source": str(folder)}) + "\n")

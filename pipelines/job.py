@@ -1,4 +1,4 @@
-"""One Snakemake job: a stage in this process, under its artifact's lock."""
+"""One Snakemake job: a stage in this process, under its artifact's lease."""
 
 from __future__ import annotations
 
@@ -11,23 +11,29 @@ from importlib import import_module
 from pathlib import Path
 from typing import Any
 
-from chebsplat.errors import ChebsplatError
+from chebsplat.errors import ChebsplatError, ConfigError, DataFailure, InputError
 from chebsplat.formats import disk
-from chebsplat.pipelines import store
+from chebsplat.pipelines import leases, store
 from chebsplat.pipelines.raw import unchanged
 from chebsplat.pipelines.rehearsal import rehearsed
 from chebsplat.pipelines.store import say
 from chebsplat.stages.command import exit_code, n_threads, publish
 
+FINAL = {error.exit_code for error in (ConfigError, InputError, DataFailure)}
 CODE = "{:<4d}"  # of a job, written over in place: a full disk does not keep it from being told
 
 
-def run(plan: Path, key: str) -> int:
-    """One Snakemake job; returns the exit code of its step, which is written beside the plan, and so is its log."""
+def run(plan: Path, key: str, again: bool = False) -> int:
+    """One Snakemake job; returns the exit code of its step, which is written beside the plan, and so is its log.
+
+    Args: again: it may be another attempt, with more memory. What settings or data do not allow is not tried again.
+    """
     # Snakemake sets OMP_NUM_THREADS to the one thread that a rule declares; a stage may use all cores of the run.
     if threads := os.environ.get("CHEBSPLAT_THREADS"):
         os.environ |= {"OMP_NUM_THREADS": threads, "NUMBA_NUM_THREADS": threads}
     step, files = read_step(plan, key)
+    if again and (earlier := int(Path(f"{files}.exit").read_text())) in FINAL:
+        return earlier
     try:
         with disk.explained(plan.parent), logged(Path(f"{files}.log")):
             code = exit_code(lambda: make(plan, key))
@@ -46,14 +52,22 @@ def read_step(plan: Path, key: str) -> tuple[dict[str, Any], Path]:
 
 
 def make(plan: Path, key: str) -> None:
-    """Run a step's stage in this process, under its artifact's lock; a twin in another run is waited for.
+    """Run a step's stage in this process, under its artifact's lease; a twin in another run is waited for. Nothing is
+    done where the artifact is there already: a job whose node was lost begins with its first step again.
 
     Raises: ChebsplatError, Stopped.
     """
     step, files = read_step(plan, key)
     stage, out = step["stage"], Path(step["path"])
     inputs = {role: Path(path) for role, path in step["inputs"].items()}
-    with disk.explained(plan.parent), alone(out):
+    if store.is_fresh(out):
+        return
+    lease = store.locks(out.parents[2]) / f"{stage}-{key}"
+
+    def wait(machine: str) -> None:
+        say(f"{stage}: another run is making it on {machine}; waiting")
+
+    with disk.explained(plan.parent), leases.held(lease, wait):
         store.remove_half(out)
         config, hashes = Path(f"{files}.json"), json.loads(Path(f"{files}.raw.json").read_text())
         module = import_module(f"chebsplat.stages.{stage}")
@@ -89,19 +103,3 @@ class _Log(logging.FileHandler):
 
     def handleError(self, record: logging.LogRecord) -> None:
         pass
-
-
-@contextmanager
-def alone(path: Path) -> Iterator[None]:
-    """Hold the lock of one artifact; the system releases it when the process ends, however it ends."""
-    import fcntl
-
-    file = path.parents[2] / ".locks" / f"{path.parent.name}-{path.name}"
-    file.parent.mkdir(exist_ok=True)
-    with file.open("w") as handle:
-        try:
-            fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except BlockingIOError:
-            say(f"{path.parent.name}: another run is making it; waiting")
-            fcntl.flock(handle, fcntl.LOCK_EX)
-        yield

@@ -106,7 +106,7 @@ def rehearsed(n_threads: int, semantic: bool) -> Iterator[None]:
     with open(FOLDER / LOCK, "w") as lock:
         try:
             fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except BlockingIOError:
+        except OSError:  # another process has it, or the file system knows no locks
             yield
             return
         new = partial(get_context("spawn").Process, target=alone, daemon=True)

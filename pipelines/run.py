@@ -10,14 +10,15 @@ import shutil
 import subprocess
 import sys
 import time
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
 from chebsplat.formats import disk
 from chebsplat.formats.files import atomic_write
-from chebsplat.pipelines import children, job, store, summary
+from chebsplat.pipelines import children, cluster, job, leases, store, summary
 from chebsplat.pipelines.plan import Plan, Step
 from chebsplat.pipelines.store import say
 from chebsplat.pipelines.tables import aligned
@@ -44,7 +45,7 @@ def device_of(wanted: str) -> str:
     return device
 
 
-def execute(plans: list[Plan], stage: str | None, cores: int, device: str = "cpu") -> int:
+def execute(plans: list[Plan], stage: str | None, cores: int, device: str = "cpu", on: str = cluster.LOCAL) -> int:
     """Bring plans up to date, up to `stage`; prints where the last artifact (the report's page) is on stdout."""
     asked = [plan for plan in plans if plan.asked]
     steps = {step.key: step for plan in asked for step in wanted_steps(plan, stage, plans)}
@@ -57,7 +58,7 @@ def execute(plans: list[Plan], stage: str | None, cores: int, device: str = "cpu
     try:
         if stale:
             say(f"  to run: {' '.join(step.stage for step in stale)}   fresh: {len(steps) - len(stale)}")
-            code = snakemake(stale, cores, device=device).code
+            code = snakemake(stale, cores, device=device, on=on).code
     finally:  # a run that is stopped names what it has finished
         for plan in plans:
             store.link(plan.title, plan.targets)
@@ -91,48 +92,65 @@ def wanted_steps(plan: Plan, stage: str | None, others: Iterable[Plan] = ()) -> 
     return [step for step in by_path.values() if step.key in needed]
 
 
-def snakemake(steps: list[Step], cores: int, threads: int | None = None, device: str = "cpu") -> Outcome:
+def snakemake(
+    steps: list[Step], cores: int, threads: int | None = None, device: str = "cpu", on: str = cluster.LOCAL
+) -> Outcome:
     """Run these steps; logs of those that fail stay in `work/.plans`.
 
     Args: threads: of one job, so that cores // threads run at once; `evaluate`, where it measures frames per second,
-          then runs alone. None: every job may use all cores.
+          then runs alone. None: every job may use all cores. on: of `cluster.profile`.
     """
     state = git_state(HERE)
     entries = [entry(step, state, device) for step in steps]
     for item in entries:
-        timed = item["stage"] == "evaluate" and item["config"]["evaluate"]["timing_repeats"] > 0
-        item["threads"] = 1 if threads is None else cores if timed else threads
-    plan = write_plan(entries)
-    folder, words = plan.parent, plan.parent / "snakemake.log"
-    arguments = ["--workflow-profile", "none", "--profile", str(HERE / "profiles/default"), "--cores", str(cores)]
-    arguments += ["--snakefile", str(HERE / "Snakefile"), "--directory", str(store.work()), "--config", f"plan={plan}"]
-    keep = False
-    try:
+        timed = item["stage"] == "evaluate" and item["config"]["evaluate"]["timing_repeats"] > 0 and on == cluster.LOCAL
+        item["threads"] = (1 if on == cluster.LOCAL else cores) if threads is None else cores if timed else threads
+    with plan_of(entries, on) as plan:
+        folder, words = plan.parent, plan.parent / "snakemake.log"
+        arguments = ["--workflow-profile", "none", "--profile", str(cluster.profile(on))]
+        arguments += ["--cores", str(cores)] if on == cluster.LOCAL else cluster.arguments(plan, on, cores, threads)
+        arguments += ["--snakefile", str(HERE / "Snakefile"), "--directory", str(store.work())]
+        arguments += ["--config", f"plan={plan}"]
         environment = {"CHEBSPLAT_THREADS": str(threads or cores), "CHEBSPLAT_WORK": str(store.work())}
-        keep = children.snakemake(words, store.work() / ".snakemake/cache", arguments, environment) != 0
-        return failures(steps, folder, words) if keep else Outcome()
-    finally:
-        if not keep:
-            shutil.rmtree(folder, ignore_errors=True)
+        code: int | None = None
+        try:
+            code = children.snakemake(words, store.work() / ".snakemake/cache", arguments, environment)
+            return failures(steps, folder, words) if code else Outcome()
+        finally:
+            if code != 0 and on != cluster.LOCAL:
+                cluster.withdraw(plan, on)
+            if not code:
+                shutil.rmtree(folder, ignore_errors=True)
 
 
-def write_plan(entries: list[dict[str, Any]]) -> Path:
-    """The plan of a run, in a folder of its own with each job's config; as long as this process lives, `clean-stale`
-    spares what it names.
+@contextmanager
+def plan_of(entries: list[dict[str, Any]], on: str = cluster.LOCAL) -> Iterator[Path]:
+    """The plan of a run, in a folder of its own with each job's config; as long as the block runs, `clean-stale` on any
+    machine spares what it names.
     """
-    raw = {f"{item['stage']}-{item['key']}.raw.json": item.pop("raw") for item in entries}
-    text = json.dumps({"steps": entries}, indent=1)
+    text = json.dumps([leases.here(), entries])
     folder = store.work() / ".plans" / f"{hashlib.sha256(text.encode()).hexdigest()[:16]}-{os.getpid()}"
+    lease = store.run_lease(folder)
+    try:
+        with leases.held(lease):
+            yield write_plan(folder, entries, cluster.jobs_of(entries, on))
+    finally:
+        if not folder.exists():
+            shutil.rmtree(lease, ignore_errors=True)
+
+
+def write_plan(folder: Path, entries: list[dict[str, Any]], jobs: dict[str, dict[str, Any]]) -> Path:
+    """The file of a plan, in `folder`, which is made anew."""
     shutil.rmtree(folder, ignore_errors=True)
     folder.mkdir(parents=True)
     for item in entries:
-        file = folder / f"{item['stage']}-{item['key']}"
+        file = folder / cluster.name_of(item)
         file.with_suffix(".json").write_text(json.dumps(item["config"], indent=1))
         file.with_suffix(".exit").write_text(job.CODE.format(0))
-    for name, hashes in raw.items():
-        (folder / name).write_text(json.dumps(hashes))
+        file.with_suffix(".raw.json").write_text(json.dumps(item["raw"]))
+    steps = [{name: value for name, value in item.items() if name != "raw"} for item in entries]
     plan = folder / "plan.json"
-    atomic_write(plan, text)
+    atomic_write(plan, json.dumps({"steps": steps, "jobs": jobs}, indent=1))
     return plan
 
 
@@ -192,9 +210,10 @@ def entry(step: Step, state: dict[str, Any], device: str = "cpu") -> dict[str, A
     }
 
 
-def job_command(plan: Path, step: dict[str, Any]) -> str:
-    """The shell line that the Snakefile runs for a step."""
-    return shlex.join([sys.executable, "-P", "-m", "chebsplat.pipelines.cli", "job", str(plan), step["key"]])
+def job_command(plan: Path, of_job: dict[str, Any]) -> str:
+    """The shell line that the Snakefile runs for a job: its steps one after the other."""
+    command = [sys.executable, "-P", "-m", "chebsplat.pipelines.cli", "job", *["--elsewhere"] * of_job["elsewhere"]]
+    return " && ".join(shlex.join([*command, str(plan), key]) for key in of_job["keys"])
 
 
 def seconds(steps: list[Step], ran: set[str]) -> None:

@@ -15,6 +15,7 @@ from chebsplat.errors import ConfigError, InputError
 from chebsplat.formats import artifact
 from chebsplat.formats.files import atomic_write
 from chebsplat.formats.manifest import parse_manifest
+from chebsplat.pipelines import leases
 
 
 def work() -> Path:
@@ -28,6 +29,16 @@ def make_work() -> None:
         work().mkdir(parents=True, exist_ok=True)
     except (FileExistsError, NotADirectoryError, FileNotFoundError):
         raise ConfigError(f"{work()} is no folder and cannot become one; set CHEBSPLAT_WORK to a folder") from None
+
+
+def locks(base: Path) -> Path:
+    """Where a work folder's leases lie."""
+    return base / ".locks"
+
+
+def run_lease(plans: Path) -> Path:
+    """The lease that a run holds as long as the folder of its plan is needed."""
+    return locks(plans.parents[1]) / f"run-{plans.name}"
 
 
 def artifact_path(stage: str, key: str) -> Path:
@@ -121,13 +132,13 @@ def unnamed(without: Container[Path] = ()) -> list[tuple[Path, int]]:
         keys = [entry["key"] for entry in parse_manifest(path).inputs.values()]
         waiting += [by_key[key] for key in keys if key in by_key]
     leftovers = [p for p in sorted(base.glob("store/*/*")) if _real(p) not in named and not _in_use(p, running)]
-    leftovers += [p for p in sorted(base.glob(".plans/*")) if not _owner_lives(p)]
+    leftovers += [p for p in sorted(base.glob(".plans/*")) if not is_under_way(p)]
     return [(p, sum(f.stat().st_size for f in p.rglob("*") if f.is_file())) for p in leftovers]
 
 
 def sweep() -> None:
     """Remove what Snakemake remembers of earlier runs, and their locks; nothing while a run is under way."""
-    if not any(map(_owner_lives, work().glob(".plans/*"))):
+    if not any(map(is_under_way, work().glob(".plans/*"))):
         for name in (".snakemake", ".done", ".locks"):
             shutil.rmtree(work() / name, ignore_errors=True)
 
@@ -142,7 +153,7 @@ def _running(base: Path) -> set[Path]:
     found: set[Path] = set()
     for plan in base.glob(".plans/*/plan.json"):
         try:
-            if _owner_lives(plan.parent):
+            if is_under_way(plan.parent):
                 for step in json.loads(plan.read_text())["steps"]:
                     found |= {Path(step["path"]), *map(Path, step["inputs"].values())}
         except FileNotFoundError:  # it has just ended
@@ -153,26 +164,31 @@ def _running(base: Path) -> set[Path]:
     return found
 
 
+def is_under_way(plans: Path) -> bool:
+    """Whether the run that a folder of `.plans` belongs to goes on, here or on another machine."""
+    return _owner_lives(plans) or leases.is_held(run_lease(plans))
+
+
 def _in_use(path: Path, running: set[Path]) -> bool:
     """A hidden folder of a running process or of a run under way, or younger than an hour."""
     if not path.name.startswith("."):
         return False
-    if path.name.startswith(".tmp-") and _owner_lives(path):
-        return True
+    if path.name.startswith(".tmp-"):  # .tmp-<key>-<process>, of this machine or of one that a run has sent its jobs to
+        return _owner_lives(path) or path.with_name(path.name.split("-")[1]) in running
     if not path.name.startswith(".part-"):
         return False
     return path.with_name(path.name[len(".part-") :]) in running or time.time() - path.lstat().st_mtime < 3600
 
 
 def remove_half(path: Path) -> None:
-    """Remove what killed processes have left of an artifact; its lock must be held."""
+    """Remove what killed processes have left of an artifact; its lease must be held."""
     for half in path.parent.glob(f".tmp-{path.name}-*"):
         if not _owner_lives(half):
             shutil.rmtree(half, ignore_errors=True)
 
 
 def _owner_lives(path: Path) -> bool:
-    """Whether the process whose number ends the folder's name still runs."""
+    """Whether the process of this machine whose number ends the folder's name still runs."""
     owner = path.name.rsplit("-", 1)[-1]
     if not owner.isdecimal():
         return False

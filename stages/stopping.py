@@ -161,9 +161,14 @@ def watch_lifeline() -> None:
         threading.Thread(target=_watch, daemon=True).start()
 
 
+def stop(reason: str) -> None:
+    """Ask this process to end, from any of its threads."""
+    if _asked is not None:
+        _asked.reason = reason
+    signal.pthread_kill(threading.main_thread().ident or 0, signal.SIGTERM)
+
+
 def _watch() -> None:
     while os.read(0, 1):
         pass
-    if _asked is not None:
-        _asked.reason = "its run has ended"
-    signal.pthread_kill(threading.main_thread().ident or 0, signal.SIGTERM)
+    stop("its run has ended")

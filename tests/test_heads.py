@@ -41,6 +41,22 @@ for number in range(int(sys.argv[3])):
 
     heads.extend(root / "basis-shared", build)
 """
+# As COUNTING, where the file system knows no locks, on four machines, and with a lease of what follows a revision.
+LOCKLESS = """
+import fcntl, sys
+from chebsplat.pipelines import leases
+
+def refused(*_):
+    raise OSError("no locks here")
+
+fcntl.flock = fcntl.lockf = refused
+leases.EVERY, leases.EXPIRES = 0.1, 3.0
+leases.here = lambda: f"machine-{int(sys.argv[2]) % 4}"
+""" + COUNTING.replace(
+    "        with artifact",
+    """\
+        with leases.held(root / f".locks/{len(lineage)}"), artifact""",
+)
 EXTENDING = """
 import sys
 from pathlib import Path
@@ -98,6 +114,18 @@ def test_processes_that_are_killed_lose_no_update_and_leave_no_half_revision(tmp
     killed = race(COUNTING, tmp_path, 4, 6, n_kills=8, pause=0.25, watch=lambda: read_all(tmp_path))
     assert killed >= 1
     nothing_is_lost(tmp_path, 4, 6)
+
+
+@pytest.mark.slow
+def test_eight_hundred_updates_without_locks_of_the_file_system_by_killed_processes_are_all_there(tmp_path):
+    def newest():
+        if (tmp_path / "basis-shared").is_dir():
+            count = len(os.listdir(tmp_path / "basis-shared"))
+            artifact.verify(tmp_path / f"basis-shared/{count}") if count else None
+
+    killed = race(LOCKLESS, tmp_path, 8, 100, n_kills=24, pause=2.0, watch=newest)
+    assert killed >= 8
+    nothing_is_lost(tmp_path, 8, 100)
 
 
 def trained(path, key, seed):

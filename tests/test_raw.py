@@ -35,7 +35,7 @@ def planned(stage, *arguments):
     planner = Planner()
     step = next(step for step in planner.plan(*map(str, arguments)).steps if step.stage == stage)
     planner.save()
-    return step, write_plan([entry(step, {})])
+    return step, write_plan(store.work() / f".plans/{stage}", [entry(step, {})], {})
 
 
 def same_size_and_time(path, data):

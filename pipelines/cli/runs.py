@@ -76,6 +76,9 @@ OPTIONS = [
 ]
 
 
+ON = click.option(
+    "--on", default="local", show_default=True, help="local, slurm, or the folder/ of a Snakemake profile"
+)
 ON_DEVICE = click.option("--device", type=click.Choice(DEVICES), default="auto", show_default=True)
 
 
@@ -89,15 +92,18 @@ def with_scene(command: Any) -> Any:
 @click.command()
 @with_scene
 @click.option("--stage", help="stop after this stage")
-@click.option("--cores", type=click.IntRange(1), default=os.cpu_count())
+@click.option("--cores", type=click.IntRange(1), help="default: all; on a cluster, 4 of a node for each job")
 @ON_DEVICE
-def run(stage: str | None, cores: int, device: str, **choice: Any) -> int:
+@ON
+def run(stage: str | None, cores: int | None, device: str, on: str, **choice: Any) -> int:
     """Bring a scene up to date; recompute only what is stale."""
+    from chebsplat.pipelines import cluster
     from chebsplat.pipelines.run import device_of, execute
 
-    used = device_of(device)
+    used, where = device_of(device), cluster.checked(on)
+    cores = cores or (os.cpu_count() or 1 if where == cluster.LOCAL else 4)
     chosen = plans(**choice, running=True, device=used, also=stage)
-    return execute(chosen, checked_stage(stage or None, chosen), cores, used)
+    return execute(chosen, checked_stage(stage or None, chosen), cores, used, where)
 
 
 @click.command()
@@ -119,19 +125,26 @@ def plan(device: str, **choice: Any) -> None:
 
 @click.command()
 @click.argument("name")
-@click.option("--cores", type=click.IntRange(1), default=os.cpu_count(), help="shared by the jobs that run at once")
+@click.option(
+    "--cores", type=click.IntRange(1), help="shared by the jobs that run at once; default: all, or of 100 jobs"
+)
 @click.option("--threads", type=click.IntRange(1), default=2, show_default=True, help="of each job")
 @click.option("--out", type=click.Path(path_type=Path), help="default: build/studies/NAME")
 @click.option("--plan", "only_plan", is_flag=True, help="say what would run, and stop")
 @click.option("--no-run", is_flag=True, help="write the tables of what is there, and run nothing")
 @ON_DEVICE
-def study(name: str, cores: int, threads: int, out: Path | None, only_plan: bool, no_run: bool, device: str) -> int:
+@ON
+def study(
+    name: str, cores: int | None, threads: int, out: Path | None, only_plan: bool, no_run: bool, device: str, on: str
+) -> int:
     """Run a study (of pipelines/configs/studies, or a .toml): its table, figure and page; goes on where it stopped."""
+    from chebsplat.pipelines import cluster
     from chebsplat.pipelines.run import Outcome, device_of, say
     from chebsplat.pipelines.studies import page, results, transfer
     from chebsplat.pipelines.studies import study as studies
 
-    computing, asked = device_of(device), studies.read_study(name)
+    computing, where, asked = device_of(device), cluster.checked(on), studies.read_study(name)
+    cores = cores or (os.cpu_count() or 1 if where == cluster.LOCAL else 100 * threads)
     runs = studies.expand(asked, running=not (only_plan or no_run), device=computing)
     say(f"{name}: {len(runs)} runs, {sum(run.plan.targets['evaluate'].is_dir() for run in runs)} of them done")
     if only_plan:
@@ -139,7 +152,7 @@ def study(name: str, cores: int, threads: int, out: Path | None, only_plan: bool
         return 0
     used = min(threads, cores)
     folder = out or Path("build/studies") / Path(name).stem
-    outcome = Outcome() if no_run else studies.execute(Path(name).stem, runs, cores, used, computing)
+    outcome = Outcome() if no_run else studies.execute(Path(name).stem, runs, cores, used, computing, where)
     rows = [results.row_of(run, outcome.failed) for run in runs]
     command = f"make study={name} cores={cores} threads={used}"
     more = transfer.sections(folder, asked, rows) if asked.sequences else []
@@ -150,13 +163,18 @@ def study(name: str, cores: int, threads: int, out: Path | None, only_plan: bool
 @click.command(hidden=True)
 @click.argument("plan", type=click.Path(path_type=Path))
 @click.argument("key")
-def job(plan: Path, key: str) -> int:
+@click.option("--elsewhere", is_flag=True, help="on a node of a cluster, which no pipe of the run reaches")
+def job(plan: Path, key: str, elsewhere: bool) -> int:
     """One step of a plan, as Snakemake runs it."""
+    from chebsplat.pipelines.cluster import watch_run
     from chebsplat.pipelines.job import run as run_job
     from chebsplat.stages.stopping import watch_lifeline
 
-    watch_lifeline()
-    return run_job(plan, key)
+    if elsewhere:
+        watch_run(plan)
+    else:
+        watch_lifeline()
+    return run_job(plan, key, again=elsewhere)
 
 
 COMMANDS = (run, plan, study, job)

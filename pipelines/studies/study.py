@@ -14,6 +14,7 @@ from pydantic import AfterValidator, Field, model_validator
 from chebsplat.errors import ConfigError
 from chebsplat.formats.files import parse_toml
 from chebsplat.pipelines import store
+from chebsplat.pipelines.cluster import LOCAL
 from chebsplat.pipelines.plan import Plan, Planner, Step, merged, suffix
 from chebsplat.pipelines.run import Outcome, say, snakemake, wanted_steps
 from chebsplat.pipelines.scenes import read_toml, scene_values
@@ -196,23 +197,24 @@ def _knowledge(run: Run) -> list[Step]:
     return [step for step in run.plan.steps if step.stage == "cks"]
 
 
-def execute(name: str, runs: list[Run], cores: int, threads: int, device: str = "cpu") -> Outcome:
+def execute(name: str, runs: list[Run], cores: int, threads: int, device: str = "cpu", on: str = LOCAL) -> Outcome:
     """Compute what is outstanding, cores // threads jobs at once; links in `work/study-NAME` keep its artifacts.
 
     A scene (or sequence) and seed is finished, and measured, before the next begins: a study cut short has compared
-    something. A step that fails costs the runs that need it, and no other.
+    something. A step that fails costs the runs that need it, and no other. On a cluster all are in the queue at once.
     """
     outcome = Outcome()
-    parts: dict[tuple, list[Run]] = {}
+    parts: dict[str, list[Run]] = {}
     for run in runs:
-        parts.setdefault((run.sequence or run.scene, run.seed), []).append(run)
-    for (scene, seed), part in parts.items():
+        title = f"{run.sequence or run.scene}, seed {run.seed}" if on == LOCAL else name
+        parts.setdefault(title, []).append(run)
+    for title, part in parts.items():
         waiting = outstanding(part)
         try:
             if waiting:
-                say(f"  {scene}, seed {seed}: {describe(waiting)}; {cores // threads} at once, {threads} threads each")
+                say(f"  {title}: {describe(waiting)}; {cores // threads} at once, {threads} threads each")
                 with reported(runs, cores // threads, say):
-                    part_outcome = snakemake(waiting, cores, threads, device)
+                    part_outcome = snakemake(waiting, cores, threads, device, on)
                 outcome = Outcome(max(outcome.code, part_outcome.code), outcome.failed | part_outcome.failed)
         finally:  # a study that is stopped names what it has finished
             store.link(f"study-{name}", {run.name: run.plan.targets[LAST] for run in runs})

@@ -1,0 +1,204 @@
+"""A run on a cluster: what its jobs ask for, which steps go there together, and that they end with the run.
+
+Snakemake submits a job, and on its node starts one step after the other, each in a process of its own as on one
+machine. The pipe that ends jobs with their run (stages/stopping.py) does not reach another machine: there, a thread
+watches the run's lease on the shared store.
+"""
+
+from __future__ import annotations
+
+import shutil
+import subprocess
+import threading
+import time
+from dataclasses import dataclass
+from importlib.util import find_spec
+from pathlib import Path
+from typing import Any
+
+import yaml
+
+from chebsplat.errors import ConfigError
+from chebsplat.pipelines import leases, store
+from chebsplat.pipelines.store import say
+from chebsplat.stages.registry import MODEL_FREE
+from chebsplat.stages.stopping import stop
+
+HERE = Path(__file__).parent
+LOCAL, SLURM = "local", "slurm"
+EXTRA = ".venv/bin/python -m uv pip install --python .venv/bin/python --editable '.[slurm]'"
+
+
+@dataclass(frozen=True)
+class Need:
+    """What a stage asks a cluster for."""
+
+    minutes: int
+    mem_mb: int  # doubled at each further attempt
+
+
+# Ample: ten times the seconds that were measured at most, three times the memory, since a job that asks for too little
+# is lost, and one that asks for too much begins a little later.
+NEEDS = {  # measured in 18 scenes on two EPYC cores: seconds (median, most); most memory, in office0
+    "ingest": Need(10, 2000),  # 21, 49; 306 MB
+    "channels": Need(10, 2000),  # 18, 48
+    "sfm": Need(100, 4000),  # 5 with depth, 574 from photos alone; 295 MB with depth
+    "teacher": Need(15, 4000),  # 9, 66; 1088 MB
+    "agree": Need(5, 2000),  # 1, 3; 121 MB
+    "teach": Need(600, 8000),  # 3142
+    "describe": Need(5, 2000),
+    "train": Need(15, 4000),  # and by its steps: 80, 239 for 3000; 693 MB
+    "lift": Need(5, 2000),  # 5, 12; 571 MB
+    "refine": Need(5, 4000),  # 9, 22; 1083 MB
+    "export": Need(5, 2000),  # 1, 2; 138 MB
+    "mesh": Need(10, 4000),
+    "onnx": Need(5, 2000),
+    "cks": Need(5, 2000),
+    "evaluate": Need(5, 2000),  # 5, 27; 646 MB
+    "report": Need(5, 2000),  # 2, 7; 144 MB
+}
+STEP_SECONDS = 0.08  # of a training, at most
+SHORT = 60.0  # seconds of a training that is no job of its own
+
+
+def profile(on: str) -> Path:
+    """The folder of Snakemake's settings for where a run goes: one of ours, or the user's.
+
+    Raises: ConfigError where there is none.
+    """
+    folder = HERE / "profiles" / ("default" if on == LOCAL else on)
+    if on in (LOCAL, SLURM):
+        return folder
+    folder = Path(on).expanduser().absolute()
+    if "/" not in on or not (folder / "config.yaml").is_file():
+        raise ConfigError(f"on={on}: local, slurm, or a folder (with a /) that holds a profile's config.yaml is needed")
+    return folder
+
+
+def checked(on: str) -> str:
+    """`on`, if it can be had here: ConfigError says what is missing, and what adds it."""
+    if on == LOCAL:
+        return on
+    executor = executor_of(on)
+    if find_spec(f"snakemake_executor_plugin_{executor.replace('-', '_')}") is None:
+        advice = EXTRA if executor == SLURM else f"install snakemake-executor-plugin-{executor}"
+        raise ConfigError(f"on={on}: Snakemake's plugin for {executor} is not installed; {advice}")
+    if executor == SLURM and shutil.which("sbatch") is None:
+        raise ConfigError(f"on={on}: there is no sbatch on the PATH; run this where jobs are submitted from")
+    return on
+
+
+def executor_of(on: str) -> str:
+    """The Snakemake plugin that submits jobs. Raises ConfigError where a profile names none."""
+    file = profile(on) / "config.yaml"
+    try:
+        settings = yaml.safe_load(file.read_text(encoding="utf-8"))
+    except (OSError, ValueError, yaml.YAMLError):
+        raise ConfigError(f"{file} cannot be read as YAML; correct it") from None
+    executor = settings.get("executor") if isinstance(settings, dict) else None
+    if not isinstance(executor, str):
+        raise ConfigError(f"{file} names no executor; add the line `executor: slurm`")
+    return executor
+
+
+def arguments(plan: Path, on: str, cores: int, threads: int | None) -> list[str]:
+    """What Snakemake is told of a run beside its profile. Jobs at once: cores // threads, where jobs have threads."""
+    chosen = ["--jobs", str(max(cores // threads, 1))] if threads else []
+    if executor_of(on) == SLURM:
+        chosen += ["--slurm-jobname-prefix", submitted(plan), "--slurm-logdir", str(plan.parent / "slurm")]
+    return chosen
+
+
+def jobs_of(entries: list[dict[str, Any]], on: str) -> dict[str, dict[str, Any]]:
+    """The jobs of a plan, by name: the keys of their steps in order, and what they ask for.
+
+    Choices: on one machine a step is a job. On a cluster steps of seconds go with the one that they follow.
+    """
+    jobs: dict[str, list[dict[str, Any]]] = {}
+    for name, entry in zip(together(entries) if on != LOCAL else map(name_of, entries), entries, strict=True):
+        jobs.setdefault(name, []).append(entry)
+    return {
+        name: {
+            "keys": [entry["key"] for entry in some],
+            "threads": max(entry["threads"] for entry in some),
+            "minutes": sum(map(minutes_of, some)),
+            "mem_mb": max(NEEDS[entry["stage"]].mem_mb for entry in some),
+            "gpus": int(any(entry["device"] == "cuda" for entry in some)),
+            "elsewhere": on != LOCAL,
+        }
+        for name, some in jobs.items()
+    }
+
+
+def name_of(entry: dict[str, Any]) -> str:
+    """A step's name: of its job, its files beside the plan, its marker."""
+    return f"{entry['stage']}-{entry['key']}"
+
+
+def together(entries: list[dict[str, Any]]) -> list[str]:
+    """For each step, in their order, the name of the job that it belongs to: that of the job's first step.
+
+    Choices: four kinds of jobs, and none waits for one that waits for it: what a capture begins, a teacher that runs a
+      model, a training, and what follows that. A short training goes with what follows it. Other steps go alone.
+    """
+    by_path = {entry["path"]: entry for entry in entries}
+
+    def group(entry: dict[str, Any]) -> tuple[str, str]:
+        stage, inputs = entry["stage"], entry["inputs"]
+        if stage == "ingest":
+            return "capture", entry["path"]
+        if stage == "sfm" or (stage == "teacher" and entry["config"]["teacher"]["kind"] in MODEL_FREE):
+            return "capture", inputs["capture"]
+        if stage == "train":
+            return "train", entry["path"]
+        if stage == "cks":
+            return "train", inputs["gaussians"]
+        if before := by_path.get(
+            inputs.get({"describe": "points", "agree": "features", "evaluate": "scene"}.get(stage))
+        ):
+            return group(before)
+        if "gaussians" in inputs:
+            train = by_path.get(inputs["gaussians"])
+            return ("train" if train and seconds_of(train) <= SHORT else "after"), inputs["gaussians"]
+        return stage, entry["path"]
+
+    names: dict[tuple[str, str], str] = {}
+    return [names.setdefault(group(entry), name_of(entry)) for entry in entries]
+
+
+def seconds_of(train: dict[str, Any]) -> float:
+    """How long a training takes, about."""
+    settings = train["config"]["train"]
+    return float(settings["seconds"] or settings["steps"] * STEP_SECONDS)
+
+
+def minutes_of(entry: dict[str, Any]) -> int:
+    """The time that a step asks for."""
+    more = 10 * seconds_of(entry) / 60 if entry["stage"] == "train" else 0
+    return NEEDS[entry["stage"]].minutes + round(more)
+
+
+def submitted(plan: Path) -> str:
+    """What the names of a run's jobs begin with in the cluster's queue."""
+    return f"chebsplat-{plan.parent.name}"
+
+
+def withdraw(plan: Path, on: str) -> None:
+    """Take a run's jobs out of Slurm's queue; those that run are sent SIGTERM. Others see that the run has ended."""
+    if executor_of(on) != SLURM:
+        return
+    listed = subprocess.run(["squeue", "--me", "--noheader", "--format=%i %j"], capture_output=True, text=True)
+    ours = [line.split()[0] for line in listed.stdout.splitlines() if f" {submitted(plan)}" in line]
+    if listed.returncode or (ours and subprocess.run(["scancel", *ours], capture_output=True).returncode):
+        say(f"jobs could not be taken out of the queue; those called {submitted(plan)}... end by themselves")
+
+
+def watch_run(plan: Path) -> None:
+    """Stop this process, a job on a node, when the run of its plan ends: it lets go of its lease, or falls silent."""
+
+    def watch() -> None:
+        while leases.is_held(store.run_lease(plan.parent)):
+            time.sleep(leases.EVERY)
+        stop("its run has ended")
+
+    threading.Thread(target=watch, daemon=True).start()

@@ -1,0 +1,154 @@
+"""A Slurm of its own on 127.0.0.1: munge, slurmctld and some slurmd of Debian's packages, as ordinary processes."""
+
+import os
+import shutil
+import signal
+import socket
+import subprocess
+import time
+from contextlib import contextmanager, suppress
+from pathlib import Path
+
+PROGRAMS = ("munged", "slurmctld", "slurmd", "sbatch", "srun", "squeue", "scancel", "scontrol")
+PLACES = os.pathsep.join((os.environ.get("PATH", ""), "/usr/sbin", "/sbin"))
+MISSING = [name for name in PROGRAMS if shutil.which(name, path=PLACES) is None]
+WHY = f"{', '.join(MISSING)} not found: apt-get install munge slurm-wlm" if MISSING else ""
+
+CONF = """\
+ClusterName=here
+SlurmctldHost={host}(127.0.0.1)
+SlurmctldPort={ports[0]}
+SlurmUser={user}
+SlurmdUser={user}
+AuthType=auth/munge
+AuthInfo=socket={folder}/munge.socket
+StateSaveLocation={folder}/state
+SlurmdSpoolDir={folder}/%n
+SlurmctldPidFile={folder}/slurmctld.pid
+SlurmdPidFile={folder}/%n.pid
+ProctrackType=proctrack/linuxproc
+TaskPlugin=task/none
+MpiDefault=none
+SelectType=select/cons_tres
+SelectTypeParameters=CR_CPU
+SlurmdParameters=config_overrides
+AccountingStorageType=accounting_storage/none
+JobAcctGatherType=jobacct_gather/none
+SlurmdTimeout=10
+ReturnToService=2
+KillWait=10
+SchedulerParameters=batch_sched_delay=0,sched_min_interval=0
+"""
+
+
+class Slurm:
+    """A cluster under way. `environment`: what makes Slurm's commands, here and within jobs, talk to it."""
+
+    def __init__(self, folder, n_nodes, cpus):
+        self.folder, self.processes = folder, {}
+        bound = [socket.socket() for _ in range(n_nodes + 1)]
+        for one in bound:
+            one.bind(("127.0.0.1", 0))
+        ports = [one.getsockname()[1] for one in bound]
+        for one in bound:
+            one.close()
+        host, user = socket.gethostname().split(".")[0], subprocess.check_output(["id", "-un"], text=True).strip()
+        text = CONF.format(host=host, user=user, folder=folder, ports=ports)
+        self.nodes = [f"n{k}" for k in range(1, n_nodes + 1)]
+        for name, port in zip(self.nodes, ports[1:], strict=True):
+            text += f"NodeName={name} NodeHostname={host} NodeAddr=127.0.0.1 Port={port} CPUs={cpus} RealMemory=64000\n"
+        text += f"PartitionName=all Nodes={','.join(self.nodes)} Default=YES MaxTime=INFINITE State=UP\n"
+        (folder / "slurm.conf").write_text(text)
+        for name in ("state", "bin"):
+            (folder / name).mkdir()
+        # Snakemake's plugin takes SLURM_* from what a job runs: its srun has to be told where this cluster is.
+        srun = folder / "bin/srun"
+        srun.write_text(f'#!/bin/sh\nSLURM_CONF={folder}/slurm.conf exec {shutil.which("srun", path=PLACES)} "$@"\n')
+        srun.chmod(0o755)
+        path = os.pathsep.join((str(folder / "bin"), PLACES))
+        self.environment = {"SLURM_CONF": str(folder / "slurm.conf"), "PATH": path}
+
+    def start(self, name, *command):
+        with open(self.folder / f"{name}.words", "ab") as words:
+            self.processes[name] = subprocess.Popen(
+                [shutil.which(command[0], path=PLACES), *command[1:]], env=os.environ | self.environment,
+                stdin=subprocess.DEVNULL, stdout=words, stderr=words, start_new_session=True,
+            )  # fmt: skip
+
+    def start_node(self, name):
+        self.start(name, "slurmd", "-D", "-N", name, "-f", self.folder / "slurm.conf")
+
+    def start_all(self):
+        key = self.folder / "munge.key"
+        key.write_bytes(os.urandom(128))
+        key.chmod(0o600)
+        places = {"socket": "munge.socket", "key-file": key.name, "pid-file": "munge.pid", "log-file": "munge.log",
+                  "seed-file": "munge.seed"}  # fmt: skip
+        self.start("munge", "munged", "--foreground", "--force",
+                   *(f"--{option}={self.folder / file}" for option, file in places.items()))  # fmt: skip
+        self.wait_for(lambda: (self.folder / "munge.socket").exists(), "munge", 20)
+        self.start("slurmctld", "slurmctld", "-D", "-c", "-f", self.folder / "slurm.conf")
+        for name in self.nodes:
+            self.start_node(name)
+        self.wait_for(lambda: self.states().count("idle") == len(self.nodes), "slurmctld", 60)
+
+    def wait_for(self, condition, name, seconds):
+        until = time.monotonic() + seconds
+        while not condition():
+            assert time.monotonic() < until, (self.folder / f"{name}.words").read_text()[-2000:]
+            time.sleep(0.1)
+
+    def ask(self, *command):
+        done = subprocess.run(command, env=os.environ | self.environment, capture_output=True, text=True)
+        return done.stdout.splitlines()
+
+    def states(self):
+        return self.ask("sinfo", "--noheader", "--Node", "--format=%t")
+
+    def fell(self, node):
+        """Kill a node with all that runs on it, as a power cut would."""
+        process = self.processes.pop(node)
+        doomed = [process.pid, *descendants(process.pid)]
+        for number in doomed:
+            with suppress(ProcessLookupError):
+                os.kill(number, signal.SIGKILL)
+        process.wait()
+        return doomed
+
+    def stop_all(self):
+        for process in reversed(self.processes.values()):
+            doomed = descendants(process.pid)
+            process.terminate()
+            try:
+                process.wait(15)
+            except subprocess.TimeoutExpired:
+                process.kill()
+                process.wait()
+            for number in doomed:
+                with suppress(ProcessLookupError):
+                    os.kill(number, signal.SIGKILL)
+
+
+def descendants(number):
+    """Processes that a process has started, and those that they have."""
+    parents = {}
+    for folder in Path("/proc").glob("[0-9]*"):
+        with suppress(OSError):
+            parents[int(folder.name)] = int((folder / "stat").read_text().rpartition(")")[2].split()[1])
+    found, waiting = [], [number]
+    while waiting:
+        parent = waiting.pop()
+        children = [child for child, of in parents.items() if of == parent]
+        found += children
+        waiting += children
+    return found
+
+
+@contextmanager
+def slurm(folder, n_nodes=3, cpus=1):
+    cluster = Slurm(folder, n_nodes, cpus)
+    try:
+        cluster.start_all()
+        yield cluster
+    finally:
+        cluster.stop_all()

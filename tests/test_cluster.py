@@ -1,0 +1,124 @@
+"""On a real Slurm: the bytes of one machine, a node that falls costs time alone, and little of it is spent waiting."""
+
+import csv
+import os
+import subprocess
+import sys
+import time
+
+import pytest
+from shared import ROOT
+from slurm_nodes import MISSING, WHY, slurm
+from soak.tiny import contents, different, hidden
+
+from chebsplat.pipelines import leases
+
+pytestmark = [
+    pytest.mark.slow,
+    pytest.mark.xdist_group("cluster"),
+    pytest.mark.skipif(bool(MISSING), reason=WHY),
+]
+STUDY = """
+title = "Toys"
+about = "Runs of the toy scene that time nothing."
+scenes = ["toy"]
+seeds = {seeds}
+baseline = "features-only"
+budgets.steps = {budgets}
+
+[settings]
+sfm = {{ max_points = 200 }}
+describe = {{ n_regions = 12 }}
+train = {{ n_densify = 1, report_every = 6 }}
+teacher = {{ kind = "labels" }}
+evaluate = {{ timing_repeats = 0 }}
+
+[variants.full]
+[variants.features-only]
+ablation = "features-only"
+"""
+
+
+@pytest.fixture(scope="module")
+def cluster(tmp_path_factory):
+    with slurm(tmp_path_factory.mktemp("slurm")) as nodes:
+        yield nodes
+
+
+def studied(folder, work, on, cluster, **values):
+    """A study under way in the store `work`."""
+    folder.mkdir(exist_ok=True)
+    (folder / "toys.toml").write_text(STUDY.format(**values))
+    command = [sys.executable, "-P", "-m", "chebsplat.pipelines.cli", "study", folder / "toys.toml", "--on", on]
+    command += ["--cores", "3", "--threads", "1", "--out", folder / on]
+    environment = os.environ | cluster.environment | {"CHEBSPLAT_WORK": str(work)}
+    pipes = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE}
+    return subprocess.Popen(command, cwd=ROOT, env=environment, text=True, **pipes)
+
+
+def finished(process):
+    """Seconds until a study has ended well."""
+    began = time.monotonic()
+    _, error = process.communicate()
+    assert process.returncode == 0, error
+    return time.monotonic() - began
+
+
+def holders(work):
+    """How many have ended well of those that have held the lease of each artifact, and how many there were."""
+    locks = [path for path in (work / ".locks").iterdir() if path.name.partition("-")[0] not in ("run", "names")]
+    return {path.name: (len(list(path.glob("*.over"))), leases.newest_of(path)) for path in locks}
+
+
+def test_a_node_that_falls_costs_time_alone(cluster, tmp_path):
+    values, whole, work = {"seeds": [0], "budgets": [12]}, tmp_path / "local", tmp_path / "work"
+    finished(studied(tmp_path / "study", whole, "local", cluster, **values))
+    running = studied(tmp_path / "study", work, "slurm", cluster, **values)
+    try:
+        while not list(work.glob("store/train/.tmp-*")):  # a node is training
+            assert running.poll() is None, running.communicate()
+            time.sleep(0.05)
+        fallen = next(line.split()[0] for line in cluster.ask("squeue", "--noheader", "--states=R", "--format=%N"))
+        cluster.fell(fallen)
+        cluster.wait_for(lambda: cluster.ask("squeue", "--noheader", "--states=PD", "--format=%i"), "slurmctld", 60)
+        for number in cluster.ask("squeue", "--noheader", "--states=PD", "--format=%i"):
+            cluster.ask("scontrol", "update", f"JobId={number}", "StartTime=now")  # Slurm would wait two minutes
+        finished(running)
+    finally:
+        running.kill()
+        cluster.start_node(fallen)
+    assert different(work, contents(whole), finished=True) == ""
+    assert not hidden(work)
+    made = holders(work)
+    assert {over for over, _ in made.values()} == {1}  # none was made twice
+    assert 1 <= sum(count > 1 for _, count in made.values()) <= 2  # what the node was at
+    cluster.wait_for(lambda: cluster.states().count("idle") == 3, "slurmctld", 60)
+
+
+def test_sixty_jobs_take_little_longer_than_on_one_machine(cluster, tmp_path):
+    values, seconds = {"seeds": [0, 1], "budgets": [12, 18, 24]}, {}
+    for on in ("local", "slurm"):
+        seconds[on] = finished(studied(tmp_path / "study", tmp_path / on, on, cluster, **values))
+    n_jobs = len(contents_of := holders(tmp_path / "slurm"))
+    assert n_jobs >= 60 and set(contents_of.values()) == {(1, 1)}
+    assert different(tmp_path / "slurm", contents(tmp_path / "local"), finished=True) == ""
+    rows = [["steps", *seconds, "ratio"], [n_jobs, *(f"{s:.1f}" for s in seconds.values())]]
+    rows[1].append(f"{seconds['slurm'] / seconds['local']:.2f}")
+    (ROOT / "build").mkdir(exist_ok=True)
+    with open(ROOT / "build/cluster.csv", "w", newline="") as file:
+        csv.writer(file).writerows(rows)
+    assert seconds["slurm"] <= 1.5 * seconds["local"], rows
+
+
+def test_a_run_that_is_stopped_or_killed_takes_its_jobs_with_it(cluster, tmp_path):
+    for how in ("terminate", "kill"):
+        work = tmp_path / how
+        running = studied(tmp_path / "study", work, "slurm", cluster, seeds=[0], budgets=[12])
+        while not list(work.glob("store/*/.tmp-*")):
+            assert running.poll() is None, running.communicate()
+            time.sleep(0.05)
+        getattr(running, how)()
+        running.communicate()
+        cluster.wait_for(lambda: not cluster.ask("squeue", "--noheader"), "slurmctld", 90)
+        assert not hidden(work)
+        contents(work)
