@@ -23,7 +23,7 @@ CLUSTER := $(if $(filter-out local,$(on)),slurm)
 
 # `make scene=office0` needs no target: naming a scene, a sequence, a study or a benchmark means running it.
 .DEFAULT_GOAL := $(if $(study),study,$(if $(bench),bench-$(bench),$(if $(scene)$(sequence),run,help)))
-.PHONY: help run study slurm cluster-test view plan verify clean-stale setup test test-all gpu malformed soak stability bench text-model nouns knowledge calibration teacher teacher-quality lint lock
+.PHONY: help run study slurm cluster-test view plan verify status clean-stale setup test test-all gpu malformed soak stability bench text-model nouns knowledge calibration teacher teacher-quality lint lock
 
 run: $(READY) $(CLUSTER)  ## make scene=NAME|FOLDER [stage=] [set=a.b=c,...] [ablation=] [basis=NAME@REVISION|none] [cores=] [device=] [on=slurm]; or sequence=NAME
 	@[ '$(stage)' != mesh ] || $(PY) -c 'import pymeshlab' 2>/dev/null || \
@@ -48,8 +48,11 @@ plan: $(READY)  ## make plan scene=NAME (or study=NAME): what would run, what is
 verify: $(READY)  ## make verify scene=NAME|FOLDER: recompute every digest of its artifacts, or (dir=) of one artifact
 	@$(CHEBSPLAT) verify $(if $(scene),'$(scene)') $(dir)
 
-clean-stale: $(READY)  ## list artifacts that nothing names; yes=1 removes them
-	@$(CHEBSPLAT) clean-stale $(if $(yes),--yes)
+status: $(READY)  ## what runs, waits and has failed, with the end of the log
+	@$(CHEBSPLAT) status
+
+clean-stale: $(READY)  ## list artifacts that nothing names; yes=1 removes them [args="--keep-newer 7d"]
+	@$(CHEBSPLAT) clean-stale $(if $(yes),--yes) $(args)
 
 help:  ## list the targets
 	@grep -hE '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed -E 's/:.*## /\t/' | expand -t 18

@@ -78,7 +78,7 @@ def claim(folder: Path) -> str:
     """The folder's name, from now on its own."""
     file = record("any")
     file.parent.mkdir(parents=True, exist_ok=True)
-    with leases.held(store.locks(store.work()) / "names"):
+    with leases.held(store.lease(store.work(), "names")):
         name = name_of(folder)
         if not record(name).exists():
             atomic_write(record(name), json.dumps({"source": str(folder)}) + "\n")

@@ -6,6 +6,7 @@ import json
 import os
 import shutil
 import time
+from collections import Counter
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -92,6 +93,42 @@ def only_of(chosen: list[Path]) -> list[tuple[Path, int]]:
     """Artifacts, with bytes, that nothing would name without the links in `chosen`."""
     before = {path for path, _ in store.unnamed()}
     return [(path, size) for path, size in store.unnamed(set(chosen)) if path not in before]
+
+
+def usage() -> tuple[list[tuple[str, int, int]], list[tuple[str, int, int]]]:
+    """What artifacts take: (stage, how many, bytes), and (folder of links, bytes, of it alone), the largest first.
+
+    What a folder takes is what its links name, and all that this was made of.
+    """
+    paths = [path for path in store.work().glob("store/*/*") if not path.name.startswith(".")]
+    manifests = {path.name: _manifest(path) for path in paths}
+    sizes = {key: _size(manifest) for key, manifest in manifests.items()}
+    stages: dict[str, list[int]] = {}
+    for path in paths:
+        stages.setdefault(path.parent.name, []).append(sizes[path.name])
+    reached = {title: _made_of(title, manifests) for title in titles()}
+    times = Counter(key for keys in reached.values() for key in keys)
+    scenes = [
+        (title, sum(sizes[key] for key in keys), sum(sizes[key] for key in keys if times[key] == 1))
+        for title, keys in reached.items()
+    ]
+    by_size = sorted(((stage, len(found), sum(found)) for stage, found in stages.items()), key=lambda row: -row[2])
+    return by_size, sorted(scenes, key=lambda row: -row[1])
+
+
+def _made_of(title: str, manifests: dict[str, Any]) -> set[str]:
+    """Keys of the artifacts in the store that a folder's links lead to, directly and as inputs."""
+    found: set[str] = set()
+    waiting = [Path(os.path.realpath(link)).name for link in links(store.work() / title).values()]
+    while waiting:
+        key = waiting.pop()
+        if key in found or key not in manifests:
+            continue
+        found.add(key)
+        inputs = manifests[key].get("inputs") if isinstance(manifests[key], dict) else None
+        entries = inputs.values() if isinstance(inputs, dict) else ()
+        waiting += [str(entry["key"]) for entry in entries if isinstance(entry, dict) and "key" in entry]
+    return found
 
 
 def others(folder: Path) -> list[str]:

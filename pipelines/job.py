@@ -62,7 +62,7 @@ def make(plan: Path, key: str) -> None:
     inputs = {role: Path(path) for role, path in step["inputs"].items()}
     if store.is_fresh(out):
         return
-    lease = store.locks(out.parents[2]) / f"{stage}-{key}"
+    lease = store.lease(out.parents[2], f"{stage}-{key}")
 
     def wait(machine: str) -> None:
         say(f"{stage}: another run is making it on {machine}; waiting")

@@ -103,6 +103,19 @@ def said(folder: Path, number: int) -> str:
         return ""
 
 
+def holder(folder: Path) -> tuple[str, float] | None:
+    """The machine of who seems to hold a lease, at one look, and for how many seconds, by the clock of the file system.
+    None: nobody, or a process of this machine that is dead.
+    """
+    if not (number := newest_of(folder)) or not Watch(folder).is_alive(number):
+        return None
+    try:
+        taken_at, beaten = (os.lstat(folder / name).st_mtime for name in (f"{number}", f"{number}.beat"))
+    except OSError:  # it lets go just now
+        return None
+    return said(folder, number).rpartition(" ")[2], max(beaten - taken_at, 0.0)
+
+
 def is_held(folder: Path) -> bool:
     """Whether someone holds a lease now. A holder elsewhere is watched until its beat moves, at most for EXPIRES."""
     watch = Watch(folder)

@@ -31,14 +31,14 @@ def make_work() -> None:
         raise ConfigError(f"{work()} is no folder and cannot become one; set CHEBSPLAT_WORK to a folder") from None
 
 
-def locks(base: Path) -> Path:
-    """Where a work folder's leases lie."""
-    return base / ".locks"
+def lease(base: Path, name: str) -> Path:
+    """The lease of a work folder on what is called so: an artifact's stage and key, a run."""
+    return base / ".leases" / name
 
 
 def run_lease(plans: Path) -> Path:
     """The lease that a run holds as long as the folder of its plan is needed."""
-    return locks(plans.parents[1]) / f"run-{plans.name}"
+    return lease(plans.parents[1], f"run-{plans.name}")
 
 
 def artifact_path(stage: str, key: str) -> Path:
@@ -136,10 +136,19 @@ def unnamed(without: Container[Path] = ()) -> list[tuple[Path, int]]:
     return [(p, sum(f.stat().st_size for f in p.rglob("*") if f.is_file())) for p in leftovers]
 
 
+def age(path: Path) -> float:
+    """Seconds since an artifact was finished, or a leftover was last changed, by the clock of the file system."""
+    clock = work() / ".cache/.clock"
+    clock.parent.mkdir(exist_ok=True)
+    clock.touch()
+    done = path / "artifact.json"
+    return clock.stat().st_mtime - (done if done.is_file() else path).lstat().st_mtime
+
+
 def sweep() -> None:
     """Remove what Snakemake remembers of earlier runs, and their locks; nothing while a run is under way."""
     if not any(map(is_under_way, work().glob(".plans/*"))):
-        for name in (".snakemake", ".done", ".locks"):
+        for name in (".snakemake", ".leases", ".locks", ".done"):  # earlier versions had the last two
             shutil.rmtree(work() / name, ignore_errors=True)
 
 

@@ -9,6 +9,8 @@ import time
 from contextlib import contextmanager, suppress
 from pathlib import Path
 
+from soak.tiny import command_line
+
 PROGRAMS = ("munged", "slurmctld", "slurmd", "sbatch", "srun", "squeue", "scancel", "scontrol")
 PLACES = os.pathsep.join((os.environ.get("PATH", ""), "/usr/sbin", "/sbin"))
 MISSING = [name for name in PROGRAMS if shutil.which(name, path=PLACES) is None]
@@ -105,43 +107,54 @@ class Slurm:
     def states(self):
         return self.ask("sinfo", "--noheader", "--Node", "--format=%t")
 
+    def node_of(self, key):
+        """The node that makes an artifact; None: not one."""
+        for node in self.nodes:
+            if any(f" {key} " in command_line(number) for number in self.at_work(node)):
+                return node
+        return None
+
+    def at_work(self, node=""):
+        """Processes of jobs on a node, or on all, and of the slurmstepd above them, which leave the slurmd's tree."""
+        found = set()
+        for folder in Path("/proc").glob("[0-9]*"):
+            with suppress(OSError):
+                words = (folder / "environ").read_bytes()
+                if f"SLURMD_NODENAME={node}".encode() in words and f"{self.folder}/bin".encode() in words:
+                    found.add(int(folder.name))
+        for number in list(found):
+            with suppress(OSError):
+                above = parent_of(number)
+                if "slurmstepd" in command_line(above):
+                    found.add(above)
+        return found
+
     def fell(self, node):
         """Kill a node with all that runs on it, as a power cut would."""
         process = self.processes.pop(node)
-        doomed = [process.pid, *descendants(process.pid)]
-        for number in doomed:
-            with suppress(ProcessLookupError):
-                os.kill(number, signal.SIGKILL)
+        process.kill()
+        kill_all(self.at_work(node))
         process.wait()
-        return doomed
 
     def stop_all(self):
         for process in reversed(self.processes.values()):
-            doomed = descendants(process.pid)
             process.terminate()
             try:
                 process.wait(15)
             except subprocess.TimeoutExpired:
                 process.kill()
                 process.wait()
-            for number in doomed:
-                with suppress(ProcessLookupError):
-                    os.kill(number, signal.SIGKILL)
+        kill_all(self.at_work())
 
 
-def descendants(number):
-    """Processes that a process has started, and those that they have."""
-    parents = {}
-    for folder in Path("/proc").glob("[0-9]*"):
-        with suppress(OSError):
-            parents[int(folder.name)] = int((folder / "stat").read_text().rpartition(")")[2].split()[1])
-    found, waiting = [], [number]
-    while waiting:
-        parent = waiting.pop()
-        children = [child for child, of in parents.items() if of == parent]
-        found += children
-        waiting += children
-    return found
+def parent_of(number):
+    return int(Path(f"/proc/{number}/stat").read_text().rpartition(")")[2].split()[1])
+
+
+def kill_all(numbers):
+    for number in numbers:
+        with suppress(ProcessLookupError):
+            os.kill(number, signal.SIGKILL)
 
 
 @contextmanager

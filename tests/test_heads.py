@@ -55,7 +55,7 @@ leases.here = lambda: f"machine-{int(sys.argv[2]) % 4}"
 """ + COUNTING.replace(
     "        with artifact",
     """\
-        with leases.held(root / f".locks/{len(lineage)}"), artifact""",
+        with leases.held(root / f".leases/{len(lineage)}"), artifact""",
 )
 EXTENDING = """
 import sys

@@ -134,7 +134,7 @@ def test_an_ignored_signal_stays_ignored():
 
 def test_what_runs_leave_beside_the_store_is_swept_when_none_is_under_way(tmp_path, monkeypatch):
     monkeypatch.setenv("CHEBSPLAT_WORK", str(tmp_path))
-    for name in (".snakemake/log", ".done", ".locks", f".plans/abc-{os.getpid()}"):
+    for name in (".snakemake/log", ".leases", ".done", f".plans/abc-{os.getpid()}"):
         (tmp_path / name).mkdir(parents=True)
     store.sweep()
     assert (tmp_path / ".snakemake/log").is_dir()

@@ -138,9 +138,9 @@ def study(
     name: str, cores: int | None, threads: int, out: Path | None, only_plan: bool, no_run: bool, device: str, on: str
 ) -> int:
     """Run a study (of pipelines/configs/studies, or a .toml): its table, figure and page; goes on where it stopped."""
-    from chebsplat.pipelines import cluster
+    from chebsplat.pipelines import cluster, store
     from chebsplat.pipelines.run import Outcome, device_of, say
-    from chebsplat.pipelines.studies import page, results, transfer
+    from chebsplat.pipelines.studies import kept, page, results, transfer
     from chebsplat.pipelines.studies import study as studies
 
     computing, where, asked = device_of(device), cluster.checked(on), studies.read_study(name)
@@ -153,10 +153,17 @@ def study(
     used = min(threads, cores)
     folder = out or Path("build/studies") / Path(name).stem
     outcome = Outcome() if no_run else studies.execute(Path(name).stem, runs, cores, used, computing, where)
+    command = f"make study={name} cores={cores} threads={used}" + (f" on={on}" if where != cluster.LOCAL else "")
+    whole = not outcome.failed and all(store.is_fresh(run.plan.targets[studies.LAST]) for run in runs)
+    now = kept.identity(asked, runs, command) if whole else ""
+    if whole and kept.is_current(folder, now):
+        print((folder / page.NAME).absolute())
+        return outcome.code
     rows = [results.row_of(run, outcome.failed) for run in runs]
-    command = f"make study={name} cores={cores} threads={used}"
     more = transfer.sections(folder, asked, rows) if asked.sequences else []
     print(page.write(folder, asked, runs, rows, command, more).absolute())
+    if whole:
+        kept.keep(folder, now)
     return outcome.code
 
 

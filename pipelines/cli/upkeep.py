@@ -2,11 +2,28 @@
 
 from __future__ import annotations
 
+import re
 import sys
+from typing import Any
 
 import click
 
 from chebsplat.errors import ChebsplatError
+
+UNITS = {"m": 60, "h": 3600, "d": 86400, "w": 604800}
+
+
+class Age(click.ParamType):
+    """A length of time, in seconds."""
+
+    name = "age"
+
+    def convert(self, value: Any, param: click.Parameter | None, context: click.Context | None) -> float:
+        if isinstance(value, float):
+            return value
+        if not (found := re.fullmatch(r"(\d{1,6})([mhdw])", value)):
+            self.fail(f"{value!r} is no age such as 30m, 12h, 7d or 4w", param, context)
+        return float(found[1]) * UNITS[found[2]]
 
 
 @click.command("ls")
@@ -74,11 +91,12 @@ def verify(scenes: tuple[str, ...]) -> int:
 
 @click.command("clean-stale")
 @click.option("--yes", is_flag=True, help="remove what is listed")
-def clean_stale(yes: bool) -> None:
+@click.option("--keep-newer", type=Age(), default=0.0, help="spare what is younger: 30m, 12h, 7d, 4w")
+def clean_stale(yes: bool, keep_newer: float) -> None:
     """List the artifacts that no scene names any more, and leftovers of killed runs."""
     from chebsplat.pipelines import store
 
-    leftovers = store.unnamed()
+    leftovers = [(path, size) for path, size in store.unnamed() if not keep_newer or store.age(path) >= keep_newer]
     show_sizes(leftovers, yes or not leftovers, "yes=1 (--yes) removes them")
     if yes:
         for path, _ in leftovers:
@@ -86,4 +104,31 @@ def clean_stale(yes: bool) -> None:
         store.sweep()
 
 
-COMMANDS = (list_scenes, rm, verify, clean_stale)
+@click.command()
+def status() -> None:
+    """Say what runs, waits and has failed, with seconds and the end of the log, here and on a cluster."""
+    from chebsplat.pipelines import status as runs
+    from chebsplat.pipelines import store
+
+    said = False
+    for line in runs.lines():
+        print(line)
+        said = True
+    if not said:
+        print(f"nothing runs in {store.work()}, and nothing has failed", file=sys.stderr)
+
+
+@click.command()
+def du() -> None:
+    """Say what the artifacts take, by stage and by scene or study."""
+    from chebsplat.pipelines import inventory
+    from chebsplat.pipelines.tables import show_rows
+
+    stages, scenes = inventory.usage()
+    show_rows([("stage", "artifacts", "MB"), *((name, str(n), f"{size / 1e6:.1f}") for name, n, size in stages)])
+    print()
+    rows = [(name, f"{size / 1e6:.1f}", f"{alone / 1e6:.1f}") for name, size, alone in scenes]
+    show_rows([("scene or study", "MB", "of it alone"), *rows])
+
+
+COMMANDS = (list_scenes, rm, verify, status, du, clean_stale)

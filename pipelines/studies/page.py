@@ -27,6 +27,7 @@ from chebsplat.pipelines.studies.tables import (
 )
 
 PAGE = Path(__file__).with_name("page.html")  # a jinja2 template; it fetches nothing from anywhere
+NAME = "study.html"
 PICTURE = "error-against-time.png"
 STABILITY = Path("build/bench/stability.csv")  # of `make stability`
 NARROW = 1100  # pixels of a screen; the comparison's tables take more
@@ -80,8 +81,8 @@ def write(
     )
     if len(page) > LARGEST:
         raise DataFailure(f"the page would have {len(page) / 1e6:.0f} MB; name fewer scenes or variants in the study")
-    (out / "study.html").write_text(page)
-    return out / "study.html"
+    (out / NAME).write_text(page)
+    return out / NAME
 
 
 def settings_of(study: Study) -> dict[str, float]:

@@ -208,16 +208,17 @@ def execute(name: str, runs: list[Run], cores: int, threads: int, device: str = 
     for run in runs:
         title = f"{run.sequence or run.scene}, seed {run.seed}" if on == LOCAL else name
         parts.setdefault(title, []).append(run)
+    links = {run.name: run.plan.targets[LAST] for run in runs}
     for title, part in parts.items():
-        waiting = outstanding(part)
-        try:
-            if waiting:
+        if waiting := outstanding(part):
+            try:
                 say(f"  {title}: {describe(waiting)}; {cores // threads} at once, {threads} threads each")
                 with reported(runs, cores // threads, say):
                     part_outcome = snakemake(waiting, cores, threads, device, on)
                 outcome = Outcome(max(outcome.code, part_outcome.code), outcome.failed | part_outcome.failed)
-        finally:  # a study that is stopped names what it has finished
-            store.link(f"study-{name}", {run.name: run.plan.targets[LAST] for run in runs})
+            finally:  # a study that is stopped names what it has finished
+                store.link(f"study-{name}", links)
+    store.link(f"study-{name}", links)
     return outcome
 
 

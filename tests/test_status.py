@@ -1,0 +1,106 @@
+"""What is told of runs and of what they leave: states, ends of logs, ages, sizes."""
+
+import json
+import os
+
+import pytest
+from click.testing import CliRunner
+from shared import finish
+
+from chebsplat.pipelines import cluster, job, leases, store
+from chebsplat.pipelines.cli import main
+from chebsplat.pipelines.plan import Planner
+from chebsplat.pipelines.run import entry, plan_of
+
+pytestmark = pytest.mark.usefixtures("quick_plans")
+
+
+def told(*arguments):
+    done = CliRunner().invoke(main, list(arguments))
+    assert done.exit_code == 0, done.stderr
+    return done.stdout
+
+
+def test_status_tells_what_runs_waits_and_has_failed_with_the_end_of_its_log():
+    plan = Planner(running=True).plan("toy")
+    entries = {step.stage: entry(step, {}) | {"threads": 1} for step in plan.steps}
+    with plan_of(list(entries.values())) as file:
+        base = file.parent / cluster.name_of(entries["sfm"])
+        base.with_suffix(".exit").write_text(job.CODE.format(4))
+        base.with_suffix(".log").write_text("\n".join(f"line {k}" for k in range(9)))
+        base = file.parent / cluster.name_of(entries["teacher"])
+        base.with_suffix(".log").write_text("begun")
+        plan.steps = [step for step in plan.steps if step.stage == "ingest"]
+        finish(plan)
+        elsewhere = store.lease(store.work(), cluster.name_of(entries["describe"]))
+        elsewhere.mkdir(parents=True)
+        (elsewhere / "1").symlink_to("boot 1 2 token node7")
+        (elsewhere / "1.beat").touch()
+        os.utime(elsewhere / "1.beat", (2e9, 2e9))
+        os.utime(elsewhere / "1", (2e9 - 42, 2e9 - 42), follow_symlinks=False)
+        lines = told("status").splitlines()
+        n_waiting = len(entries) - 3
+        assert lines[0].endswith(f"1 done, 1 runs, {n_waiting} waits, 1 failed")
+        assert any(line.split()[:2] == ["failed", "sfm"] and "exit code 4" in line for line in lines)
+        assert "    line 8" in lines and "    line 3" not in lines
+        assert any(line.split()[:2] == ["runs", "describe"] and line.endswith("42 s on node7") for line in lines)
+        assert "1 teacher" in lines[-1]
+    lines = told("status").splitlines()
+    assert ", over: " in lines[0] and f"{n_waiting - 1} not begun, 2 failed" in lines[0]
+    assert any(line.split()[:2] == ["failed", "teacher"] and "killed" in line for line in lines)
+
+
+def test_status_of_a_store_where_nothing_runs_says_so_and_of_a_damaged_plan_too():
+    assert told("status") == ""
+    folder = store.work() / ".plans/abc-1"
+    folder.mkdir(parents=True)
+    (folder / "plan.json").write_text("{")
+    assert f"remove {folder}" in told("status")
+
+
+def test_what_is_young_is_spared_by_the_clock_of_the_file_system():
+    plan = Planner(running=True).plan("toy")
+    finish(plan)
+    old = plan.targets["sfm"] / "artifact.json"
+    now = old.stat().st_mtime
+    os.utime(old, (now - 8 * 86400, now - 8 * 86400))
+    spared = told("clean-stale", "--keep-newer", "7d")
+    assert str(plan.targets["sfm"]) in spared and "in 1 folders" in spared
+    assert f"in {len(plan.steps)} folders" in told("clean-stale")
+    told("clean-stale", "--keep-newer", "7d", "--yes")
+    assert [step.stage for step in plan.steps if not step.fresh] == ["sfm"]
+    wrong = CliRunner().invoke(main, ["clean-stale", "--keep-newer", "soon"])
+    assert wrong.exit_code == 2 and "7d" in wrong.stderr
+
+
+def test_du_counts_what_scenes_share_in_each_and_apart_what_is_one_s_alone():
+    for settings in ("", "train.steps=5"):
+        plan = Planner(running=True).plan("toy", settings)
+        finish(plan)
+        for step in plan.steps:
+            if "weight" not in (manifest := json.loads((step.path / "artifact.json").read_text()))["files"]:
+                (step.path / "weight").write_bytes(bytes(10**6))
+                manifest["files"]["weight"] = {"bytes": 10**6, "sha256": "0" * 64}
+                (step.path / "artifact.json").write_text(json.dumps(manifest))
+        store.link(plan.title, {"report": plan.targets["report"]})
+    rows = [line.split() for line in told("du").splitlines()]
+    assert ["train", "2", "2.0"] in rows and ["ingest", "1", "1.0"] in rows
+    scenes = {row[0]: [float(cell) for cell in row[1:]] for row in rows if row and row[0].startswith("toy")}
+    n_steps = {name: whole for name, (whole, _) in scenes.items()}
+    assert set(n_steps) == {"toy", "toy@train.steps=5"}
+    assert scenes["toy"] == scenes["toy@train.steps=5"]
+    whole, alone = scenes["toy"]
+    assert 0 < alone < whole <= len(plan.steps)
+
+
+def test_a_run_under_way_on_another_machine_keeps_what_it_makes_from_clean_stale(monkeypatch):
+    plan = Planner(running=True).plan("toy")
+    finish(plan)
+    with plan_of([entry(step, {}) | {"threads": 1} for step in plan.steps]) as file:
+        elsewhere = file.parent.with_name(file.parent.name.rpartition("-")[0] + "-999999999")
+        os.rename(file.parent, elsewhere)
+        os.rename(store.run_lease(file.parent), store.run_lease(elsewhere))
+        assert store.unnamed() == []
+        os.rename(store.run_lease(elsewhere), store.run_lease(file.parent))
+        assert len(store.unnamed()) == len(plan.steps) + 1
+    assert not leases.is_held(store.run_lease(file.parent))
