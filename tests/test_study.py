@@ -451,3 +451,32 @@ ablation = "features-only"
         assert all(seen["shown"])
         first = "photo | features-only"
         assert seen["layers"] == {first: 2, first.replace("photo", "true labels"): 4}
+
+
+def test_a_study_that_is_done_is_written_again_only_where_something_has_changed(tmp_path):
+    from click.testing import CliRunner
+
+    from chebsplat.pipelines.cli import main
+
+    file, out = tmp_path / "toys.toml", tmp_path / "out"
+    text = 'title = "T"\nabout = "A"\nscenes = ["toy"]\nseeds = [0]\nbaseline = "less"\n[variants]\nfull = {}\n'
+    file.write_text(text + 'less = { ablation = "features-only" }\n')
+    for run in expand(read_study(str(file)), running=True):
+        finish(run)
+
+    def written(*more):
+        done = CliRunner().invoke(main, ["study", str(file), "--out", str(out), "--cores", "2", *more])
+        assert done.exit_code == 0, done.stderr
+        assert done.stdout == f"{out / 'study.html'}\n"
+        return (out / "study.html").stat().st_mtime_ns
+
+    first = written()
+    assert written() == first
+    (out / "results.csv").unlink()
+    second = written()
+    assert second > first and (out / "results.csv").is_file()
+    third = written("--threads", "1")  # the page names its command
+    assert third > second
+    file.write_text(file.read_text().replace('"A"', '"B"'))
+    assert written("--threads", "1") > third
+    assert "B" in (out / "study.html").read_text()
