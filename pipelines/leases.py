@@ -32,7 +32,8 @@ def here() -> str:
     """What tells the processes of this machine, as it has been started, from those of any other."""
     try:
         booted = Path("/proc/sys/kernel/random/boot_id").read_text().strip()
-        return f"{booted}-{os.stat('/proc/self/ns/pid').st_ino}"  # containers count processes apart
+        # containers count processes apart; machines that were cloned while they ran have one boot
+        return f"{socket.gethostname()}-{booted}-{os.stat('/proc/self/ns/pid').st_ino}"
     except OSError:
         return f"{uuid.getnode():x}"
 

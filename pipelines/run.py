@@ -35,10 +35,14 @@ class Outcome:
     failed: dict[str, tuple[int, str, Path]] = field(default_factory=dict)
 
 
-def device_of(wanted: str) -> str:
-    """What `--device` means to all jobs of a run; says once why it is not the GPU that is there."""
+def device_of(wanted: str, on: str = cluster.LOCAL) -> str:
+    """What `--device` means to all jobs of a run; says once why it is not the GPU that is there. Whether a cluster's
+    nodes have one is for them to say: a job that asks in vain ends with exit code 2.
+    """
     from chebsplat.stages.device import resolve
 
+    if on != cluster.LOCAL and wanted == "cuda":
+        return wanted
     device, why = resolve(wanted)
     if why:
         say(why)

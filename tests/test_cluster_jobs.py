@@ -7,7 +7,7 @@ import pytest
 from chebsplat.errors import ConfigError
 from chebsplat.pipelines import cluster, job, leases, sequences, store
 from chebsplat.pipelines.plan import Planner
-from chebsplat.pipelines.run import entry, write_plan
+from chebsplat.pipelines.run import device_of, entry, write_plan
 from chebsplat.pipelines.studies.study import checked_study, expand, outstanding
 from chebsplat.stages.registry import STAGES
 
@@ -72,6 +72,13 @@ def test_jobs_ask_for_the_most_that_a_step_needs_for_the_time_of_all_and_for_a_g
     first = next(one for name, one in made.items() if name.startswith("ingest"))
     assert first["gpus"] == 0
     assert first["minutes"] == cluster.NEEDS["ingest"].minutes + cluster.NEEDS["sfm"].minutes
+
+
+def test_a_gpu_of_nodes_is_not_looked_for_where_jobs_are_submitted(monkeypatch):
+    monkeypatch.setattr("chebsplat.stages.device.missing", lambda: "no GPU answers")
+    assert device_of("cuda", "slurm") == "cuda"
+    with pytest.raises(ConfigError, match="no GPU answers"):
+        device_of("cuda")
 
 
 def test_another_attempt_leaves_what_settings_or_data_do_not_allow_as_it_is(monkeypatch):

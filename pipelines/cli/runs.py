@@ -100,7 +100,8 @@ def run(stage: str | None, cores: int | None, device: str, on: str, **choice: An
     from chebsplat.pipelines import cluster
     from chebsplat.pipelines.run import device_of, execute
 
-    used, where = device_of(device), cluster.checked(on)
+    where = cluster.checked(on)
+    used = device_of(device, where)
     cores = cores or (os.cpu_count() or 1 if where == cluster.LOCAL else 4)
     chosen = plans(**choice, running=True, device=used, also=stage)
     return execute(chosen, checked_stage(stage or None, chosen), cores, used, where)
@@ -143,7 +144,8 @@ def study(
     from chebsplat.pipelines.studies import kept, page, results, transfer
     from chebsplat.pipelines.studies import study as studies
 
-    computing, where, asked = device_of(device), cluster.checked(on), studies.read_study(name)
+    where, asked = cluster.checked(on), studies.read_study(name)
+    computing = device_of(device, where)
     cores = cores or (os.cpu_count() or 1 if where == cluster.LOCAL else 100 * threads)
     runs = studies.expand(asked, running=not (only_plan or no_run), device=computing)
     say(f"{name}: {len(runs)} runs, {sum(run.plan.targets['evaluate'].is_dir() for run in runs)} of them done")
