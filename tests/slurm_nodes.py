@@ -7,6 +7,7 @@ import socket
 import subprocess
 import time
 from contextlib import contextmanager, suppress
+from importlib.util import find_spec
 from pathlib import Path
 
 from soak.tiny import command_line
@@ -14,7 +15,9 @@ from soak.tiny import command_line
 PROGRAMS = ("munged", "slurmctld", "slurmd", "sbatch", "srun", "squeue", "scancel", "scontrol")
 PLACES = os.pathsep.join((os.environ.get("PATH", ""), "/usr/sbin", "/sbin"))
 MISSING = [name for name in PROGRAMS if shutil.which(name, path=PLACES) is None]
-WHY = f"{', '.join(MISSING)} not found: apt-get install munge slurm-wlm" if MISSING else ""
+WHY = f"{', '.join(MISSING)} not found: apt-get install --no-install-recommends munge slurm-wlm"
+if not MISSING and find_spec("snakemake_executor_plugin_slurm") is None:
+    MISSING, WHY = ["the extra slurm"], "Snakemake's plugin for Slurm is not installed: make cluster-test does"
 
 CONF = """\
 ClusterName=here

@@ -18,10 +18,12 @@ EVERY = 1.0  # seconds between looks at what is finished
 
 
 class Progress:
-    """Which runs of a study are measured, and how long the others will take. at_once: jobs that run side by side."""
+    """Which runs of a study are measured, and how long the others will take. at_once: jobs that run side by side; None:
+    a cluster's queue decides, and nobody knows how long.
+    """
 
-    def __init__(self, runs: Sequence[Run], at_once: int, say: Callable[[str], None]):
-        self.n_runs, self.at_once, self.say = len(runs), max(at_once, 1), say
+    def __init__(self, runs: Sequence[Run], at_once: int | None, say: Callable[[str], None]):
+        self.n_runs, self.at_once, self.say = len(runs), at_once, say
         self.seconds: dict[str, float] = {}  # of finished steps, by key
         steps = {run.name: run.steps for run in runs}
         self.steps = list({step.key: step for some in steps.values() for step in some}.values())
@@ -36,11 +38,13 @@ class Progress:
             self.say(done if left is None else f"{done}; about {estimate_text(left)} left")
 
     def left(self) -> float | None:
-        """Seconds until all is done; None as long as there is a stage that has never been finished.
+        """Seconds until all is done; None as long as there is a stage that has never been finished, and on a cluster.
 
         Choices: a training takes as long as others by its steps, or its budget of seconds; any other step as long as
           the mean of its stage.
         """
+        if self.at_once is None:
+            return None
         spent: defaultdict[tuple, float] = defaultdict(float)
         amount: defaultdict[tuple, float] = defaultdict(float)
         waiting = [step for step in self.steps if not self._finished(step)]
@@ -54,7 +58,7 @@ class Progress:
             if not amount[kind]:
                 return None
             total += units * spent[kind] / amount[kind]
-        return total / self.at_once
+        return total / max(self.at_once, 1)
 
     def _finished(self, step: Step) -> bool:
         if step.key not in self.seconds:
@@ -81,7 +85,7 @@ def estimate_text(seconds: float) -> str:
 
 
 @contextmanager
-def reported(runs: Sequence[Run], at_once: int, say: Callable[[str], None]) -> Iterator[None]:
+def reported(runs: Sequence[Run], at_once: int | None, say: Callable[[str], None]) -> Iterator[None]:
     """Say which runs are finished while the block runs, each when it is."""
     progress, over = Progress(runs, at_once, say), threading.Event()
 

@@ -213,7 +213,7 @@ def execute(name: str, runs: list[Run], cores: int, threads: int, device: str = 
         if waiting := outstanding(part):
             try:
                 say(f"  {title}: {describe(waiting)}; {cores // threads} at once, {threads} threads each")
-                with reported(runs, cores // threads, say):
+                with reported(runs, cores // threads if on == LOCAL else None, say):
                     part_outcome = snakemake(waiting, cores, threads, device, on)
                 outcome = Outcome(max(outcome.code, part_outcome.code), outcome.failed | part_outcome.failed)
             finally:  # a study that is stopped names what it has finished
