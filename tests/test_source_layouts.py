@@ -336,7 +336,7 @@ def test_a_sources_own_points_become_the_scenes(scene, tmp_path, colored):
     record = Capture(**fields, is_test=np.arange(16) % 8 == 0, points=points, point_colors=colors)
     with artifact.publish(tmp_path / "c", Manifest("chebsplat.capture/1", KEY, "test")) as tmp:
         write_capture(tmp, record)
-    config = {"sfm": {"max_points": 100_000}}
+    config = {"sfm": {"max_points": 100_000, "dense": "off"}}
     assert run_stage("sfm", tmp_path / "out", {"capture": tmp_path / "c"}, config) == 0
     found = read_points(tmp_path / "out")
     facts = artifact.read_manifest(tmp_path / "out").facts
