@@ -95,6 +95,13 @@ def only_of(chosen: list[Path]) -> list[tuple[Path, int]]:
     return [(path, size) for path, size in store.unnamed(set(chosen)) if path not in before]
 
 
+def untouched(age: float) -> list[Path]:
+    """Folders of scenes and studies whose artifacts are all older than so many seconds."""
+    found = {title: links(store.work() / title) for title in titles()}
+    ours = {title: paths for title, paths in found.items() if set(paths) & set(STAGES) or title.startswith("study-")}
+    return [store.work() / title for title, paths in ours.items() if min(map(store.age, paths.values())) >= age]
+
+
 def usage() -> tuple[list[tuple[str, int, int]], list[tuple[str, int, int]]]:
     """What artifacts take: (stage, how many, bytes), and (folder of links, bytes, of it alone), the largest first.
 

@@ -73,6 +73,24 @@ def test_what_is_young_is_spared_by_the_clock_of_the_file_system():
     assert wrong.exit_code == 2 and "7d" in wrong.stderr
 
 
+def test_scenes_that_nothing_was_added_to_for_long_are_given_up_with_what_they_alone_name():
+    plans = [Planner(running=True).plan("toy", settings) for settings in ("", "train.steps=5")]
+    for plan in plans:
+        finish(plan)
+        store.link(plan.title, plan.targets)
+    for path in plans[0].targets.values():
+        now = (path / "artifact.json").stat().st_mtime
+        os.utime(path / "artifact.json", (now - 8 * 86400, now - 8 * 86400))
+    assert told("clean-stale", "--older-than", "9d", "--yes").split()[-2:] == ["0", "folders"]
+    listed = told("clean-stale", "--older-than", "7d")
+    only = set(plans[0].targets.values()) - set(plans[1].targets.values())
+    assert 0 < len(only) < len(plans[0].steps)  # the other one's are made of some of them, though they are as old
+    assert str(store.work() / "toy") in listed and f"in {len(only)} folders; yes=1" in listed
+    told("clean-stale", "--older-than", "7d", "--yes")
+    assert not (store.work() / "toy").exists() and (store.work() / plans[1].title).is_dir()
+    assert not any(path.exists() for path in only) and all(path.exists() for path in plans[1].targets.values())
+
+
 def test_du_counts_what_scenes_share_in_each_and_apart_what_is_one_s_alone():
     for settings in ("", "train.steps=5"):
         plan = Planner(running=True).plan("toy", settings)

@@ -1,10 +1,13 @@
 """A study says how far it is, and how long the rest takes."""
 
 import json
+import threading
 from types import SimpleNamespace
 
 import pytest
 
+from chebsplat.errors import DataFailure
+from chebsplat.pipelines.studies import progress as progresses
 from chebsplat.pipelines.studies.progress import Progress, estimate_text, reported
 
 
@@ -53,6 +56,23 @@ def test_every_run_is_told_once_when_it_is_done(runs):
     progress.look()
     progress.look()
     assert told == ["  run 2 of 3 is done: run-1; about 22 s left", "  run 3 of 3 is done: run-2"]
+
+
+def test_what_shows_the_runs_is_written_while_they_go_on_and_a_failure_of_that_is_told(runs, monkeypatch):
+    monkeypatch.setattr(progresses, "EVERY", 0.01)
+    monkeypatch.setattr(progresses, "REFRESH", 0.02)
+    told, written = [], threading.Event()
+
+    def refresh():
+        written.set()
+        raise DataFailure("no room")
+
+    with reported(runs, 1, told.append, refresh):
+        assert not written.wait(0.2)  # nothing new
+        for one in runs[0].steps:
+            finish(one, 1.0)
+        assert written.wait(20)
+    assert told[0].startswith("  run 1 of 3 is done") and told[1:] == ["  the page could not be written: no room"]
 
 
 def test_a_damaged_manifest_counts_as_not_done(runs):

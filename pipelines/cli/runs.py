@@ -154,18 +154,23 @@ def study(
         return 0
     used = min(threads, cores)
     folder = out or Path("build/studies") / Path(name).stem
-    outcome = Outcome() if no_run else studies.execute(Path(name).stem, runs, cores, used, computing, where)
     command = f"make study={name} cores={cores} threads={used}" + (f" on={on}" if where != cluster.LOCAL else "")
+
+    def write(failed: dict[str, tuple[int, str, Path]]) -> Path:
+        rows = [results.row_of(run, failed) for run in runs]
+        more = transfer.sections(folder, asked, rows) if asked.sequences else []
+        return page.write(folder, asked, runs, rows, command, more).absolute()
+
+    outcome = Outcome()
+    if not no_run:
+        outcome = studies.execute(Path(name).stem, runs, cores, used, computing, where, lambda: write({}))
     whole = not outcome.failed and all(store.is_fresh(run.plan.targets[studies.LAST]) for run in runs)
     now = kept.identity(asked, runs, command) if whole else ""
-    if whole and kept.is_current(folder, now):
-        print((folder / page.NAME).absolute())
-        return outcome.code
-    rows = [results.row_of(run, outcome.failed) for run in runs]
-    more = transfer.sections(folder, asked, rows) if asked.sequences else []
-    print(page.write(folder, asked, runs, rows, command, more).absolute())
-    if whole:
-        kept.keep(folder, now)
+    if not (whole and kept.is_current(folder, now)):
+        write(outcome.failed)
+        if whole:
+            kept.keep(folder, now)
+    print((folder / page.NAME).absolute())
     return outcome.code
 
 

@@ -92,13 +92,21 @@ def verify(scenes: tuple[str, ...]) -> int:
 @click.command("clean-stale")
 @click.option("--yes", is_flag=True, help="remove what is listed")
 @click.option("--keep-newer", type=Age(), default=0.0, help="spare what is younger: 30m, 12h, 7d, 4w")
-def clean_stale(yes: bool, keep_newer: float) -> None:
+@click.option("--older-than", type=Age(), help="give up scenes and studies, too, that nothing was added to for so long")
+def clean_stale(yes: bool, keep_newer: float, older_than: float | None) -> None:
     """List the artifacts that no scene names any more, and leftovers of killed runs."""
-    from chebsplat.pipelines import store
+    from chebsplat.pipelines import folders, inventory, store
 
-    leftovers = [(path, size) for path, size in store.unnamed() if not keep_newer or store.age(path) >= keep_newer]
-    show_sizes(leftovers, yes or not leftovers, "yes=1 (--yes) removes them")
+    old = [] if older_than is None else inventory.untouched(older_than)
+    leftovers = store.unnamed(set(old))
+    leftovers = [(path, size) for path, size in leftovers if not keep_newer or store.age(path) >= keep_newer]
+    for folder in old:
+        print(f"           {folder}")
+    show_sizes(leftovers, yes or not (leftovers or old), "yes=1 (--yes) removes them")
     if yes:
+        for folder in old:
+            inventory.unlink(folder)
+            folders.release(folder.name.partition("@")[0])
         for path, _ in leftovers:
             store.remove(path)
         store.sweep()

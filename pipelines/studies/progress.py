@@ -4,17 +4,20 @@ from __future__ import annotations
 
 import json
 import threading
+import time
 from collections import defaultdict
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from typing import TYPE_CHECKING
 
+from chebsplat.errors import ChebsplatError
 from chebsplat.pipelines.plan import Step
 
 if TYPE_CHECKING:
     from chebsplat.pipelines.studies.study import Run
 
 EVERY = 1.0  # seconds between looks at what is finished
+REFRESH = 300.0  # seconds at least between two writings of a study's page while it runs
 
 
 class Progress:
@@ -29,13 +32,15 @@ class Progress:
         self.steps = list({step.key: step for some in steps.values() for step in some}.values())
         self.waiting = {name: some[-1] for name, some in steps.items() if not self._finished(some[-1])}
 
-    def look(self) -> None:
-        """Say which runs have been finished since the last look."""
-        for name in [name for name, last in self.waiting.items() if self._finished(last)]:
+    def look(self) -> bool:
+        """Say which runs have been finished since the last look; whether there is one."""
+        finished = [name for name, last in self.waiting.items() if self._finished(last)]
+        for name in finished:
             del self.waiting[name]
             done = f"  run {self.n_runs - len(self.waiting)} of {self.n_runs} is done: {name}"
             left = self.left() if self.waiting else None
             self.say(done if left is None else f"{done}; about {estimate_text(left)} left")
+        return bool(finished)
 
     def left(self) -> float | None:
         """Seconds until all is done; None as long as there is a stage that has never been finished, and on a cluster.
@@ -85,13 +90,22 @@ def estimate_text(seconds: float) -> str:
 
 
 @contextmanager
-def reported(runs: Sequence[Run], at_once: int | None, say: Callable[[str], None]) -> Iterator[None]:
-    """Say which runs are finished while the block runs, each when it is."""
+def reported(
+    runs: Sequence[Run], at_once: int | None, say: Callable[[str], None], refresh: Callable[[], object] = lambda: None
+) -> Iterator[None]:
+    """Say which runs are finished while the block runs, each when it is, and `refresh` what shows them now and then."""
     progress, over = Progress(runs, at_once, say), threading.Event()
 
     def watch() -> None:
+        shown, is_new = time.monotonic(), False
         while not over.wait(EVERY):
-            progress.look()
+            is_new |= progress.look()
+            if is_new and time.monotonic() - shown >= REFRESH:
+                try:
+                    refresh()
+                except (ChebsplatError, OSError) as error:
+                    say(f"  the page could not be written: {error}")
+                shown, is_new = time.monotonic(), False
 
     thread = threading.Thread(target=watch, daemon=True)
     thread.start()

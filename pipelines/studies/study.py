@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import itertools
 import os
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Annotated, Any
@@ -197,8 +197,17 @@ def _knowledge(run: Run) -> list[Step]:
     return [step for step in run.plan.steps if step.stage == "cks"]
 
 
-def execute(name: str, runs: list[Run], cores: int, threads: int, device: str = "cpu", on: str = LOCAL) -> Outcome:
-    """Compute what is outstanding, cores // threads jobs at once; links in `work/study-NAME` keep its artifacts.
+def execute(
+    name: str,
+    runs: list[Run],
+    cores: int,
+    threads: int,
+    device: str = "cpu",
+    on: str = LOCAL,
+    refresh: Callable[[], object] = lambda: None,
+) -> Outcome:
+    """Compute what is outstanding, cores // threads jobs at once; links in `work/study-NAME` keep its artifacts, and
+    `refresh` shows now and then what there is.
 
     A scene (or sequence) and seed is finished, and measured, before the next begins: a study cut short has compared
     something. A step that fails costs the runs that need it, and no other. On a cluster all are in the queue at once.
@@ -213,7 +222,7 @@ def execute(name: str, runs: list[Run], cores: int, threads: int, device: str = 
         if waiting := outstanding(part):
             try:
                 say(f"  {title}: {describe(waiting)}; {cores // threads} at once, {threads} threads each")
-                with reported(runs, cores // threads if on == LOCAL else None, say):
+                with reported(runs, cores // threads if on == LOCAL else None, say, refresh):
                     part_outcome = snakemake(waiting, cores, threads, device, on)
                 outcome = Outcome(max(outcome.code, part_outcome.code), outcome.failed | part_outcome.failed)
             finally:  # a study that is stopped names what it has finished
