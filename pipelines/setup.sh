@@ -67,6 +67,12 @@ $py -m uv pip install --quiet --python $py --no-deps --editable .
 site=$($py -c 'import sysconfig; print(sysconfig.get_path("purelib"))')
 ln -sfn ../libusb_package/libusb-1.0.so "$site/open3d/libusb-1.0.so.0"
 
+# What a bare system lacks is named now, not by the first stage.
+if ! why=$($py -c 'import open3d' 2>&1); then
+  echo "setup: open3d cannot be imported: ${why##*$'\n'} (Debian, Ubuntu: apt install libegl1 libgl1 libgomp1)" >&2
+  exit 2
+fi
+
 if ! has_gpu; then
   $py -c 'import sys, torch; sys.exit(f"setup: a CUDA torch ({torch.__version__}) on a machine without a GPU" if torch.version.cuda else 0)'
 fi
