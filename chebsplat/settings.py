@@ -76,6 +76,12 @@ class TrainSection(Section):
     seconds: float | None = number(None, "of training, instead of steps: the schedule follows the clock", 0.1, 604_800)
     seed: int = seed("of the order of views and of all that is drawn in training")
     start: str | None = setting(None, "a 3DGS PLY that training goes on from, instead of the points")
+    opacity: float | None = number(
+        None,
+        "of a point's Gaussian at the start, 3DGS's is 0.1; default: 0.7 where depth is measured, else 0.3",
+        1e-3,
+        0.999,
+    )
     # what is built
     semantics: bool = setting(True, "false: colour only")
     features: Literal["trained", "lifted"] = setting(
@@ -158,8 +164,8 @@ class TrainSection(Section):
     # rates
     # 3DGS's are of 30,000 steps; a training of fewer goes further in each, of fewer than 1000 as far as one of 1000
     lr_means: float | None = number(None, "of centres, in scene sizes; default: 1.6e-4 (30,000 / steps)^0.61", 0, 10)
-    lr_scales: float | None = number(None, "of log scales; default: 5e-3 (30,000 / steps)^0.32", 0, 10)
-    lr_quats: float | None = number(None, "of rotations; default: 1e-3 (30,000 / steps)^0.32", 0, 10)
+    lr_scales: float | None = number(None, "of log scales; default: 5e-3 (30,000 / steps)^0.52", 0, 10)
+    lr_quats: float | None = number(None, "of rotations; default: 1e-3 (30,000 / steps)^0.52", 0, 10)
     lr_opacities: float = number(5e-2, "learning rate of opacities before the sigmoid", 0, 10)
     lr_sh0: float | None = number(None, "of SH band 0; default: 2.5e-3 (30,000 / steps)^0.41", 0, 10)
     lr_sh: float | None = number(None, "of SH bands 1 to 3; default: 1.25e-4 (30,000 / steps)^0.41", 0, 10)

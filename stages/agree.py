@@ -31,12 +31,15 @@ def run(job: Job) -> None:
     from chebsplat.formats.features import read_features
     from chebsplat.formats.points import read_points
     from chebsplat.labels.agreement import between, far_pairs
+    from chebsplat.stages.thinning import even
 
     settings, capture = job.config.agree, read_capture(job.inputs["capture"])
     points, features = read_points(job.inputs["points"]), read_features(job.inputs["features"])
     views = training_views(capture, points, features)
-    rng, n = np.random.default_rng(settings.seed), len(points.means)
-    chosen = np.sort(rng.choice(n, min(settings.n_points, n), replace=False))
+    rows = even(points)
+    chosen = np.sort(
+        np.random.default_rng(settings.seed).choice(rows, min(settings.n_points, len(rows)), replace=False)
+    )
     said = labels_of(job, capture, points, features, views, chosen)
     eyes = centers(points.cam_from_world)[[place for _, place, _ in views]]
     row, first, second = far_pairs(points.means[chosen], eyes, said >= 0).T

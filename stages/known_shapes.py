@@ -15,6 +15,7 @@ if TYPE_CHECKING:
 
     from chebsplat.formats.features import Features
     from chebsplat.formats.knowledge import Knowledge
+    from chebsplat.formats.points import Points
 
 log = logging.getLogger("chebsplat")
 LEAST_SURE = 0.5  # of up, by the cameras
@@ -27,6 +28,22 @@ class Cloud(NamedTuple):
     means: np.ndarray
     normals: np.ndarray
     covariances: np.ndarray
+
+
+def measured(points: Points) -> Cloud:
+    """The surface that points of depth show, as evenly as knowledge was taught it."""
+    import numpy as np
+
+    from chebsplat.splats.gaussians import local_shape
+    from chebsplat.stages.thinning import even
+
+    kept = even(points)
+    if len(kept) == len(points.means):
+        return Cloud(points.means, points.normals, points.covariances)
+    means = points.means[kept]
+    covariances, normals = local_shape(means, N_NEIGHBORS)
+    normals[np.einsum("ni,ni->n", normals, points.normals[kept]) < 0] *= -1
+    return Cloud(means, normals, covariances)
 
 
 def shown(

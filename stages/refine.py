@@ -76,7 +76,7 @@ def known(job: Job, gaussians: Gaussians, unit: float) -> np.ndarray | None:
     from chebsplat.formats.points import read_points
     from chebsplat.lifting.carry import carry
     from chebsplat.splats.gaussians import surface_of
-    from chebsplat.stages.known_shapes import Cloud, known_shapes, shown
+    from chebsplat.stages.known_shapes import known_shapes, measured, shown
 
     if "knowledge" not in job.inputs:
         return None
@@ -90,7 +90,7 @@ def known(job: Job, gaussians: Gaussians, unit: float) -> np.ndarray | None:
         return None
     try:
         if capture is None or capture.depth is not None:
-            source, cloud = "points", Cloud(points.means, points.normals, points.covariances)
+            source, cloud = "points", measured(points)
         else:
             test = {name for name, is_test in zip(capture.names, capture.is_test, strict=True) if is_test}
             rows = [row for row, name in enumerate(cameras.names) if name not in test]

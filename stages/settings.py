@@ -68,7 +68,10 @@ class IngestSection(Section):
 
 
 class SfmSection(Section):
-    max_points: int = number(20_000, "initial Gaussians, at most", 16, 2_000_000)
+    max_points: int = number(36_000, "initial Gaussians, at most", 16, 2_000_000)
+    spacing: Literal["color", "even"] = setting(
+        "color", "of points of measured depth: closer where colours change, or as far apart everywhere"
+    )
     n_neighbors: int = number(16, "neighbours that give a point its normal and covariance", 4, 64)
     peak_threshold: float = number(0.001, "of SIFT: lower finds more features, and worse ones", 1e-6, 1)
     max_features: int = number(8192, "of a view: the largest are kept; matching takes their square", 64, 100_000)

@@ -9,7 +9,7 @@ from chebsplat.errors import DataFailure
 from chebsplat.stages.command import Job, command
 from chebsplat.stages.dense import MOST, swept, wants_more
 from chebsplat.stages.pose_check import wants_adjustment
-from chebsplat.stages.thinning import thin
+from chebsplat.stages.thinning import by_color, edge_of, thin
 
 if TYPE_CHECKING:
     import numpy as np
@@ -19,6 +19,9 @@ if TYPE_CHECKING:
 
 
 log = logging.getLogger("chebsplat")
+Cloud = dict[str, Any]  # the fields of `Points` but the local shape, and seen_from [N]: the view that a point is from
+CANDIDATES = 16  # pixels with depth that are looked at, for each point that is wanted
+EVEN = 0.55  # of the points wanted: there whatever the colours are, for shape is read off these
 
 
 def run(job: Job) -> None:
@@ -44,18 +47,19 @@ def run(job: Job) -> None:
         cloud = from_source(capture, settings)
     elif given:
         job.left_out("feature matching", "poses and depth are given: points come from depth")
-        cloud = from_depth(job, capture, settings)
+        _, cloud = reduced(from_depth(job, capture, settings), settings.max_points, settings.spacing)
     else:
         from chebsplat.stages import reconstruction
 
         cloud = reconstruction.reconstruct(job, capture, settings, adjusted)
         if "poses_kept" in cloud["notes"] and capture.depth is not None:
-            cloud = filled(cloud, from_depth(job, capture, settings, cloud["cam_from_world"]), settings.max_points)
+            measured = from_depth(job, capture, settings, cloud["cam_from_world"])
+            cloud = filled(cloud, measured, settings.max_points, settings.spacing)
     depths = None
     if len(cloud["means"]) >= 16 and wants_more(job, capture, cloud, settings):
         more = swept(job, capture, cloud)
         depths = more.pop("depths")
-        cloud = filled(cloud, more, min(MOST, settings.max_points), "n_swept")
+        cloud = filled(cloud, more, min(MOST, settings.max_points), name="n_swept")
     means = cloud["means"]
     if len(means) < 16:
         raise DataFailure(f"only {len(means)} points were found, at least 16 are needed; add views with more overlap")
@@ -81,31 +85,53 @@ def run(job: Job) -> None:
     )
 
 
-def filled(cloud: dict[str, Any], more: dict[str, Any], count: int, name: str = "n_from_depth") -> dict[str, Any]:
-    """A cloud with the points of another one of the same views between its own, at most `count`, one a voxel.
+def filled(cloud: Cloud, more: Cloud, count: int, spacing: str = "even", name: str = "n_from_depth") -> Cloud:
+    """A cloud with the points of another one of the same views between its own, at most `count`, one a cube.
 
     Args:    name: of the note that counts those that were added.
-    Choices: triangulated points show where the photos have texture, those of depth what lies between; a voxel with both
+    Choices: triangulated points show where the photos have texture, those of depth what lies between; a cube with both
       keeps the triangulated one.
     """
     import numpy as np
 
-    kept = thin(np.concatenate([cloud["means"], more["means"]]), count)
+    own = len(cloud["means"])
+    both = cloud | {key: np.concatenate([cloud[key], more[key]]) for key in ("means", "colors", "seen_from")}
+    kept, found = reduced(both, count, spacing)
+    found["notes"] |= {name: int((kept >= own).sum())}
+    return found
+
+
+def reduced(cloud: Cloud, count: int, spacing: str) -> tuple[np.ndarray, Cloud]:
+    """Which points of a cloud are kept, at most `count`, and the cloud of these.
+
+    Args: spacing: even: one point a cube of one size; color: of cubes that are the smaller the more their points'
+          colours differ, and the mean of these colours.
+    """
+    import numpy as np
+
+    colors, tracks, notes = cloud["colors"], cloud["tracks"], dict(cloud["notes"])
+    if spacing == "color" and len(cloud["means"]) > count:
+        edge = edge_of(cloud["means"], int(EVEN * count))
+        kept, cube = by_color(cloud["means"], colors, count, edge)
+        sums = np.stack([np.bincount(cube, colors[:, k]) for k in range(3)], 1)
+        colors = (sums / np.bincount(cube)[:, None]).round().astype(np.uint8)
+        notes |= {"largest": edge, "from": cloud["means"].min(0).tolist()}
+    else:
+        kept = thin(cloud["means"], count)
+        colors = colors[kept]
     row = np.full(len(cloud["means"]), -1)
-    own = kept[kept < len(row)]
-    row[own] = np.arange(len(own))
-    tracks = cloud["tracks"][row[cloud["tracks"][:, 0]] >= 0]
-    both = {name: np.concatenate([cloud[name], more[name]])[kept] for name in ("means", "colors", "seen_from")}
-    notes = cloud["notes"] | {name: len(kept) - len(own)}
-    return cloud | both | {"tracks": np.stack([row[tracks[:, 0]], tracks[:, 1]], 1), "notes": notes}
+    row[kept] = np.arange(len(kept))
+    tracks = tracks[row[tracks[:, 0]] >= 0]
+    tracks = np.stack([row[tracks[:, 0]], tracks[:, 1]], 1)
+    same = {key: cloud[key][kept] for key in ("means", "seen_from")}
+    return kept, cloud | same | {"colors": colors, "tracks": tracks, "notes": notes}
 
 
-def from_depth(job: Job, capture: Capture, settings: SfmSection, poses: np.ndarray | None = None) -> dict[str, Any]:
-    """Points back-projected from the depth of training views, thinned to one a voxel.
+def from_depth(job: Job, capture: Capture, settings: SfmSection, poses: np.ndarray | None = None) -> Cloud:
+    """Points back-projected from the depth of training views, CANDIDATES times as many as are wanted, in random order.
 
     Args: poses [V, 4, 4]: of the capture's views where they were adjusted; their depth goes with them.
-    Choices: test views give no points; pixels are drawn evenly over views, and the voxel is chosen by bisection so
-    that about `max_points` remain; each voxel keeps its first point.
+    Choices: test views give no points; pixels are drawn evenly over views.
     """
     import numpy as np
 
@@ -114,7 +140,7 @@ def from_depth(job: Job, capture: Capture, settings: SfmSection, poses: np.ndarr
     assert capture.cam_from_world is not None and capture.depth is not None
     rng, poses = np.random.default_rng(settings.seed), capture.cam_from_world if poses is None else poses
     used = np.flatnonzero(~capture.is_test)
-    per_view = max(4 * settings.max_points // max(len(used), 1), 16)
+    per_view = max(CANDIDATES * settings.max_points // max(len(used), 1), 16)
     means, colors, seen = [], [], []
     for view, status in job.progress.track(used, len(used), "depth"):
         depth, image = capture.depth[view], capture.images[view]
@@ -130,20 +156,20 @@ def from_depth(job: Job, capture: Capture, settings: SfmSection, poses: np.ndarr
     points = np.concatenate(means)
     if len(points) == 0:
         raise DataFailure("no training view has a pixel with depth; ingest the source without depth instead")
-    kept = thin(points, settings.max_points)
+    order = rng.permutation(len(points))
     return {
         "names": list(capture.names),
         "Ks": capture.Ks,
         "cam_from_world": poses,
-        "means": points[kept],
-        "colors": np.concatenate(colors)[kept],
-        "seen_from": np.concatenate(seen)[kept],
+        "means": points[order],
+        "colors": np.concatenate(colors)[order],
+        "seen_from": np.concatenate(seen)[order],
         "tracks": np.zeros((0, 2), np.int32),
         "notes": {"how": "depth", "n_candidates": len(points)},
     }
 
 
-def from_source(capture: Capture, settings: SfmSection) -> dict[str, Any]:
+def from_source(capture: Capture, settings: SfmSection) -> Cloud:
     """The source's own points that a training view has in its image, thinned to one a voxel.
 
     Choices: a point is taken as seen from the nearest such view, which turns its normal; walls in between are not

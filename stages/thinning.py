@@ -1,4 +1,4 @@
-"""Fewer points, evenly in space: one a cube."""
+"""Fewer points: one a cube, of cubes all alike, or the smaller the more the colours within them differ."""
 
 from __future__ import annotations
 
@@ -6,6 +6,11 @@ from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
     import numpy as np
+
+    from chebsplat.formats.points import Points
+
+LEVELS = 4  # sizes of cubes that colours choose among, each half of the one before
+NOISE = 1e-3  # what colours of one surface differ by: squared, of channels in [0, 1], summed over the three
 
 
 def thin(points: np.ndarray, count: int) -> np.ndarray:
@@ -17,24 +22,97 @@ def thin(points: np.ndarray, count: int) -> np.ndarray:
     return np.sort(cubes(points, count)[0])
 
 
+def even(points: Points) -> np.ndarray:
+    """Indices of points that lie as far apart wherever they are: of those that are closer where colours change, the
+    first in each of the largest cubes; all others.
+    """
+    import numpy as np
+
+    if "largest" not in points.notes:
+        return np.arange(len(points.means))
+    flat = cells(points.means, points.notes["largest"], points.notes["from"])
+    return np.sort(np.unique(flat, return_index=True)[1])
+
+
 def cubes(points: np.ndarray, count: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """At most `count` cubes that hold points [N, 3], of the smallest edge that allows it: the first point of each, the
     cube of every point [N], and how many points each holds.
     """
     import numpy as np
 
-    origin = points.min(0)
+    flat = cells(points, edge_of(points, count))
+    _, first, cube, held = np.unique(flat, return_index=True, return_inverse=True, return_counts=True)
+    return first, cube, held
+
+
+def cells(points: np.ndarray, edge: float, origin: np.ndarray | list[float] | None = None) -> np.ndarray:
+    """A number [N] for each cube of an edge that holds points [N, 3]. Cubes of half the edge lie within these.
+
+    Args: origin [3]: a corner of cubes, not beyond any point; None: the least coordinates.
+    """
+    import numpy as np
+
+    place = np.floor((points - (points.min(0) if origin is None else np.array(origin))) / edge).astype(np.int64)
+    sides = place.max(0) + 1
+    numbers: np.ndarray = (place[:, 0] * sides[1] + place[:, 1]) * sides[2] + place[:, 2]
+    return numbers
+
+
+def edge_of(points: np.ndarray, count: int) -> float:
+    """The smallest edge of cubes, `count` at most, that hold all points [N, 3]."""
+    import numpy as np
+
     size = float(np.ptp(points, axis=0).max()) or 1.0
-
-    def flat(edge: float) -> np.ndarray:
-        cells = np.floor((points - origin) / edge).astype(np.int64)
-        sides = cells.max(0) + 1
-        numbers: np.ndarray = (cells[:, 0] * sides[1] + cells[:, 1]) * sides[2] + cells[:, 2]
-        return numbers
-
     low, high = size / 4096, size
     for _ in range(24):
         middle = (low * high) ** 0.5
-        low, high = (middle, high) if len(np.unique(flat(middle))) > count else (low, middle)
-    _, first, cube, held = np.unique(flat(high), return_index=True, return_inverse=True, return_counts=True)
-    return first, cube, held
+        low, high = (middle, high) if len(np.unique(cells(points, middle))) > count else (low, middle)
+    return high
+
+
+def by_color(points: np.ndarray, colors: np.ndarray, count: int, edge: float) -> tuple[np.ndarray, np.ndarray]:
+    """At most `count` cubes that hold points [N, 3], the smaller the more the colours u8 [N, 3] within them differ: the
+    first point of each, in order, and the cube of every point [N].
+
+    Args: edge: of the largest cubes, which are not more than `count`.
+
+    Choices: cubes are halved while the squares by which their points' colours differ from their mean, and NOISE for
+      each point, sum to more than a bound, the least that keeps to `count`. Where pixels have given the points, that
+      sum is the error of pictures in which each cube has one colour.
+    """
+    import numpy as np
+
+    values = colors / 255.0
+    cube_of: list[np.ndarray] = []
+    errors, parents, firsts = [], [], []
+    for level in range(LEVELS):
+        _, first, cube, held = np.unique(
+            cells(points, edge / 2**level), return_index=True, return_inverse=True, return_counts=True
+        )
+        sums = np.stack([np.bincount(cube, values[:, k]) for k in range(3)])
+        squares = np.bincount(cube, (values**2).sum(1))
+        errors.append(squares - (sums**2).sum(0) / held + NOISE * held)
+        parents.append(cube_of[-1][first] if cube_of else np.zeros(0, np.int64))
+        cube_of.append(cube)
+        firsts.append(first)
+    errors[-1][:] = 0.0
+
+    def whole(bound: float) -> list[np.ndarray]:
+        """Which cubes of each level there are, and stay as they are."""
+        kept, halved = [], np.zeros(0, bool)
+        for error, parent in zip(errors, parents, strict=True):
+            there = halved[parent] if len(parent) else np.ones(len(error), bool)
+            halved = there & (error > bound)
+            kept.append(there & ~halved)
+        return kept
+
+    low, high = 0.0, max(float(error.max()) for error in errors)
+    for _ in range(40):
+        middle = (low + high) / 2
+        low, high = (middle, high) if sum(level.sum() for level in whole(middle)) > count else (low, middle)
+    chosen = np.empty(len(points), np.int64)  # of each point, the first one in its cube
+    for cube, first, stays in zip(cube_of, firsts, whole(high), strict=True):
+        inside = stays[cube]
+        chosen[inside] = first[cube[inside]]
+    kept, leaf = np.unique(chosen, return_inverse=True)
+    return kept, leaf

@@ -125,13 +125,21 @@ def model_of(
     from chebsplat.training.model import SceneModel
 
     torch.manual_seed(train.seed)
-    initial = (
-        started(Path(train.start), train)
-        if train.start
-        else initial_gaussians(points.means, points.colors, points.covariances)
-    )
+    if train.start:
+        initial = started(Path(train.start), train)
+    else:
+        opacity = start_opacity(points) if train.opacity is None else train.opacity
+        initial = initial_gaussians(points.means, points.colors, points.covariances, opacity)
     raw = {name: value.to(device) for name, value in initial.items()}
     return SceneModel(raw, describe, train, None if features is None else features.features.shape[-1], backend)
+
+
+def start_opacity(points: Points) -> float:
+    """Of the Gaussians that start at these points.
+
+    Choices: where depth is measured there is a surface at each point; matched and swept ones are less sure of it.
+    """
+    return 0.7 if points.notes.get("how") == "depth" or "n_from_depth" in points.notes else 0.3
 
 
 def started(ply: Path, train: TrainSection) -> dict[str, Tensor]:

@@ -42,7 +42,7 @@ def local_shape(means: np.ndarray, n_neighbors: int, floor: float = 0.05) -> tup
 
 
 def initial_gaussians(
-    means: np.ndarray, colors: np.ndarray, covariances: np.ndarray, opacity: float = 0.1, shrink: float = 1.0
+    means: np.ndarray, colors: np.ndarray, covariances: np.ndarray, opacity: float = 0.1
 ) -> dict[str, Tensor]:
     """Raw parameters (float32) of Gaussians that start from points.
 
@@ -54,7 +54,7 @@ def initial_gaussians(
     values, axes = np.linalg.eigh(np.asarray(covariances, np.float64))
     axes[np.linalg.det(axes) < 0, :, 0] *= -1
     quats = Rotation.from_matrix(axes).as_quat(scalar_first=True) if len(axes) else np.zeros((0, 4))
-    log_scales = 0.5 * np.log(np.clip(values, 1e-14, None)) + np.log(shrink)
+    log_scales = 0.5 * np.log(np.clip(values, 1e-14, None))
     n = len(means)
     raw = {
         "means": means,

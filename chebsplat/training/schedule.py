@@ -42,8 +42,8 @@ def rates(settings: TrainSection) -> dict[str, float]:
     sh = by_steps(settings.lr_sh, 1.25e-4, 0.41, steps)
     return {
         "means": by_steps(settings.lr_means, 1.6e-4, 0.61, steps),
-        "log_scales": by_steps(settings.lr_scales, 5e-3, 0.32, steps),
-        "quats": by_steps(settings.lr_quats, 1e-3, 0.32, steps),
+        "log_scales": by_steps(settings.lr_scales, 5e-3, 0.52, steps),
+        "quats": by_steps(settings.lr_quats, 1e-3, 0.52, steps),
         "logit_opacities": settings.lr_opacities,
         "sh0": by_steps(settings.lr_sh0, 2.5e-3, 0.41, steps),
         "sh1": sh,
