@@ -33,6 +33,7 @@ BENCHMARKS = {
         "backends", "a training without the shape branch: seconds, PSNR by backend", ("sfm", "teacher"), LABELS
     ),
     "cost": Benchmark("cost", "whole trainings beside plain 3DGS: what each part costs", ("sfm", "teacher")),
+    "scale": Benchmark("scale", "how a training grows: seconds, memory, disk by Gaussians, pixels, views", ("sfm",)),
     "knowledge": Benchmark(
         "knowledge", "what the knowledge space costs a training: regulariser and update", ("sfm", "teacher"), LABELS
     ),

@@ -64,6 +64,31 @@ def remembered(read: Callable[[int], Tensor], budget: int) -> Callable[[int], Te
     return recall
 
 
+class Stored:
+    """Arrays [V, ...] of views, indexed as a tensor would be, that are read when their view is looked at: `read(view)`
+    is a tensor, and what fits into `budget` bytes stays in memory.
+    """
+
+    def __init__(self, read: Callable[[int], Tensor], count: int, budget: int):
+        self.read = remembered(read, budget)
+        self.shape = (count, *self.read(0).shape)
+
+    def __getitem__(self, index: int) -> Tensor:
+        return self.read(index)
+
+    def to(self, device: str | torch.device) -> Stored:
+        """The same arrays, each taken to a device when it is read."""
+        return Stored(lambda index: self.read(index).to(device), self.shape[0], 0)
+
+
+def stacked(read: Callable[[int], Tensor], count: int, budget: int) -> Tensor | Stored:
+    """Arrays [V, ...] of views in memory where they fit into `budget` bytes, otherwise as they are looked at."""
+    first = read(0)
+    if count * first.nbytes > budget:
+        return Stored(read, count, budget)
+    return torch.stack([first, *(read(index) for index in range(1, count))])
+
+
 class TaughtLabels(NamedTuple):
     """What a teacher takes a view's cells for: classes i64 [h, w], -1 where it says nothing; confidence [h, w] in
     [0, 1]; class_codes [L, C] that features of a label are near; complete: whether every cell has a label.
@@ -77,16 +102,16 @@ class TaughtLabels(NamedTuple):
 
 @dataclass
 class Views:
-    """Training views. images [V, H, W, 3] u8; masks [V, H, W] bool or None; features: view index -> [h, w, C]; labels:
-    view index -> `TaughtLabels` of these h × w cells, None where the teacher has none; depth: view index and factor ->
-    z-depths [H, W] at 1/factor, scene units, nan where unknown.
+    """Training views. images [V, H, W, 3] u8; masks [V, H, W] bool or None, both as tensors or stored; features: view
+    index -> [h, w, C]; labels: view index -> `TaughtLabels` of these h × w cells, None where the teacher has none;
+    depth: view index and factor -> z-depths [H, W] at 1/factor, scene units, nan where unknown.
     """
 
     names: list[str]
-    images: Tensor
+    images: Tensor | Stored
     Ks: Tensor
     viewmats: Tensor
-    masks: Tensor | None = None
+    masks: Tensor | Stored | None = None
     features: Callable[[int], Tensor] | None = None
     labels: Callable[[int], TaughtLabels] | None = None
     depth: Callable[[int, int], Tensor] | None = None

@@ -71,8 +71,8 @@ def measured_spread(capture: Capture, points: Points) -> float:
         seen = np.zeros((len(points.means), len(points.names)), bool)
         seen[points.tracks[:, 0], points.tracks[:, 1]] = True
         seen = seen[:, used]
-    images = capture.images[:][[row[points.names[k]] for k in used]]
-    return exposure_spread(images, points.Ks[used], points.cam_from_world[used], points.means, seen)
+    photos = (capture.images[row[points.names[k]]] for k in used)
+    return exposure_spread(photos, points.Ks[used], points.cam_from_world[used], points.means, seen)
 
 
 def reached(models: CameraModels, views: Views, points: Points) -> np.ndarray:

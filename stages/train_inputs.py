@@ -25,6 +25,7 @@ if TYPE_CHECKING:
     from chebsplat.views import TaughtLabels, Views
 
 FEATURE_BYTES = 64 << 20  # of features that are kept in memory; what is beyond is read when its view is looked at
+PHOTO_BYTES, MASK_BYTES = 2 << 30, 512 << 20  # of photos and masks likewise
 
 
 def training_views(capture: Capture, points: Points, features: Features | None, with_depth: bool = False) -> Views:
@@ -34,7 +35,7 @@ def training_views(capture: Capture, points: Points, features: Features | None, 
     """
     import torch
 
-    from chebsplat.views import Views, remembered
+    from chebsplat.views import Views, remembered, stacked
 
     row = {name: view for view, name in enumerate(capture.names)}
     unknown = [name for name in points.names if name not in row]
@@ -44,7 +45,7 @@ def training_views(capture: Capture, points: Points, features: Features | None, 
     if not used:
         raise DataFailure("no training view is registered")
     names = [points.names[k] for k in used]
-    images, masks = capture.images[:], capture.loss_mask
+    images, masks = capture.images, capture.loss_mask
     chosen = [row[name] for name in names]
     of = labels_of = None
     if features is not None:
@@ -64,10 +65,10 @@ def training_views(capture: Capture, points: Points, features: Features | None, 
     depth_of = measured_depth(capture, points, used) if with_depth else None
     return Views(
         names,
-        torch.from_numpy(images[chosen]),
+        stacked(lambda k: torch.from_numpy(images[chosen[k]]), len(chosen), PHOTO_BYTES),
         torch.from_numpy(points.Ks[used]).float(),
         torch.from_numpy(points.cam_from_world[used]).float(),
-        None if masks is None else torch.from_numpy(masks[:][chosen]),
+        None if masks is None else stacked(lambda k: torch.from_numpy(masks[chosen[k]]), len(chosen), MASK_BYTES),
         of,
         labels_of,
         depth_of,

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 import torch
 
-from chebsplat.views import remembered
+from chebsplat.views import Views, remembered, stacked
 
 
 @pytest.mark.parametrize("budget", [0, 3, 100])
@@ -21,3 +21,23 @@ def test_no_more_views_are_kept_than_the_budget_holds(budget):
             assert (recall(index) == index).all()
     kept = min(budget, 10)
     assert len(reads) == kept + 5 * (10 - kept)
+
+
+@pytest.mark.parametrize("budget", [0, 5 * 4 * 6 * 3 - 1, 10**6])
+def test_photos_that_do_not_fit_are_read_when_they_are_looked_at(budget):
+    photos = torch.randint(0, 255, (5, 4, 6, 3), dtype=torch.uint8)
+    reads = []
+
+    def read(index):
+        reads.append(index)
+        return photos[index]
+
+    held = stacked(read, 5, budget)
+    assert isinstance(held, torch.Tensor) == (budget >= photos.nbytes) and tuple(held.shape) == (5, 4, 6, 3)
+    reads.clear()
+    cameras = torch.eye(3).repeat(5, 1, 1), torch.eye(4).repeat(5, 1, 1)
+    whole, stored = (Views(list("abcde"), images, *cameras) for images in (photos, held))
+    for index, factor in ((3, 1), (0, 2), (3, 2)):
+        assert torch.equal(whole.target(index, factor)[0], stored.to("cpu").target(index, factor)[0])
+        assert stored.camera(index, factor).width == 6 // factor
+    assert bool(reads) == (budget < photos.nbytes)

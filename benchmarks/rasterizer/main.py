@@ -9,6 +9,8 @@ from __future__ import annotations
 import importlib.util
 import os
 import platform
+import subprocess
+import sys
 import time
 from collections.abc import Callable, Sequence
 from pathlib import Path
@@ -101,7 +103,13 @@ def machine() -> list[str]:
 def main(arguments: Sequence[str]) -> None:
     parser = shared.parser("raster", __doc__)
     parser.add_argument("--rounds", type=int, default=15)
+    parser.add_argument("--yardstick", default=os.environ.get("YARDSTICK"), type=Path, metavar="FOLDER",
+                        help="of yardstick.py, to run beside ours (default: $YARDSTICK)")  # fmt: skip
     options = parser.parse_args(arguments)
+    if options.yardstick:
+        for n in (1, 2):
+            command = [sys.executable, "-P", str(options.yardstick / "yardstick.py"), "--beside", "chebsplat"]
+            subprocess.run([*command, "--threads", str(n), "--rounds", str(options.rounds)], check=True)
     options.out.mkdir(parents=True, exist_ok=True)
     began = time.perf_counter()
 

@@ -5,6 +5,7 @@ The scene's own colours are those of the mean view: maps belong to photos, and n
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from typing import Any
 
 import numpy as np
@@ -56,27 +57,31 @@ class Exposure:
 
 
 def exposure_spread(
-    images: np.ndarray, Ks: np.ndarray, cam_from_world: np.ndarray, points: np.ndarray, seen: np.ndarray | None = None
+    images: Iterable[np.ndarray],
+    Ks: np.ndarray,
+    cam_from_world: np.ndarray,
+    points: np.ndarray,
+    seen: np.ndarray | None = None,
 ) -> float:
     """How much photos of the same points differ in colour: the standard deviation over views of its logarithm.
 
-    Args: images u8 [V, H, W, 3]; Ks [V, 3, 3] pixels; cam_from_world [V, 4, 4]; points [N, 3]; seen: bool [N, V], or
-      None: by all views that have the point within their frame.
+    Args: images: u8 [H, W, 3] of V views; Ks [V, 3, 3] pixels; cam_from_world [V, 4, 4]; points [N, 3]; seen: bool
+      [N, V], or None: by all views that have the point within their frame.
     Choices: of a view the median over points, each against its own median over views, so that walls in between and
       highlights count little; colours are means over 8 × 8 pixels. 0 where no three views see enough of the same.
     """
-    n_views, height, width, _ = images.shape
-    side = min(CELL, height, width)
     chosen = np.linspace(0, len(points) - 1, min(len(points), MOST_POINTS)).astype(int)
-    logs = np.full((len(chosen), n_views, 3), np.nan)
-    for view in range(n_views):
+    logs = np.full((len(chosen), len(Ks), 3), np.nan)
+    for view, image in enumerate(images):
+        height, width = image.shape[:2]
+        side = min(CELL, height, width)
         camera = points[chosen] @ cam_from_world[view, :3, :3].T + cam_from_world[view, :3, 3]
         front = camera[:, 2] > 1e-3
         u, v = ((camera / np.where(front, camera[:, 2], 1)[:, None]) @ Ks[view].T)[:, :2].T
         inside = front & (u >= 0) & (u < width // side * side) & (v >= 0) & (v < height // side * side)
         if seen is not None:
             inside &= seen[chosen, view]
-        cells = images[view, : height // side * side, : width // side * side].astype(np.float64)
+        cells = image[: height // side * side, : width // side * side].astype(np.float64)
         cells = cells.reshape(height // side, side, width // side, side, 3).mean((1, 3))
         logs[inside, view] = np.log(cells[(v[inside] / side).astype(int), (u[inside] / side).astype(int)] + 4)
     logs = logs[np.isfinite(logs[..., 0]).sum(1) >= 3]
