@@ -141,7 +141,7 @@ def study(
     """Run a study (of pipelines/configs/studies, or a .toml): its table, figure and page; goes on where it stopped."""
     from chebsplat.pipelines import cluster, store
     from chebsplat.pipelines.run import Outcome, device_of, say
-    from chebsplat.pipelines.studies import kept, page, results, transfer
+    from chebsplat.pipelines.studies import kept, page, reaching, results, transfer
     from chebsplat.pipelines.studies import study as studies
 
     where, asked = cluster.checked(on), studies.read_study(name)
@@ -158,7 +158,7 @@ def study(
 
     def write(failed: dict[str, tuple[int, str, Path]]) -> Path:
         rows = [results.row_of(run, failed) for run in runs]
-        more = transfer.sections(folder, asked, rows) if asked.sequences else []
+        more = transfer.sections(folder, asked, rows) if asked.sequences else reaching.sections(asked, rows)
         return page.write(folder, asked, runs, rows, command, more).absolute()
 
     outcome = Outcome()
