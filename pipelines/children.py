@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
+import multiprocessing
 import os
 import signal
 import subprocess
 import sys
 import time
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager, suppress
 from pathlib import Path
 from types import FrameType
@@ -82,3 +83,24 @@ def end(process: subprocess.Popen[bytes]) -> None:
             time.sleep(0.02)
         os.killpg(process.pid, signal.SIGKILL)
     process.wait()
+
+
+def in_turn(command: Callable[[list[str]], None], calls: list[list[str]]) -> int:
+    """Call a command of ours once for each list of arguments, until one fails; returns its exit code, or 0.
+
+    Each has a process of its own, forked from one that has imported what nearly all of them import and done nothing
+    else: a step then begins 1.3 seconds of a processor sooner, which on a cluster pays for what a job costs.
+    """
+    context = multiprocessing.get_context("forkserver")
+    context.set_forkserver_preload(["torch", "numba", "zarr"])
+    for arguments in calls:
+        process = context.Process(target=command, args=(arguments,))
+        process.start()
+        try:
+            process.join()
+        finally:
+            process.terminate()  # does nothing to one that has ended
+            process.join(PATIENCE)
+        if process.exitcode:
+            return process.exitcode if process.exitcode > 0 else 128 - process.exitcode
+    return 0

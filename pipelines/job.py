@@ -28,9 +28,6 @@ def run(plan: Path, key: str, again: bool = False) -> int:
 
     Args: again: it may be another attempt, with more memory. What settings or data do not allow is not tried again.
     """
-    # Snakemake sets OMP_NUM_THREADS to the one thread that a rule declares; a stage may use all cores of the run.
-    if threads := os.environ.get("CHEBSPLAT_THREADS"):
-        os.environ |= {"OMP_NUM_THREADS": threads, "NUMBA_NUM_THREADS": threads}
     step, files = read_step(plan, key)
     if again and (earlier := int(Path(f"{files}.exit").read_text())) in FINAL:
         return earlier
@@ -43,6 +40,14 @@ def run(plan: Path, key: str, again: bool = False) -> int:
     with Path(f"{files}.exit").open("r+") as handle:
         handle.write(CODE.format(code))
     return code
+
+
+def use_threads() -> None:
+    """To be called before torch and Numba are imported. Snakemake sets OMP_NUM_THREADS to the one thread that a rule
+    declares; a stage may use all cores of the run.
+    """
+    if threads := os.environ.get("CHEBSPLAT_THREADS"):
+        os.environ |= {"OMP_NUM_THREADS": threads, "NUMBA_NUM_THREADS": threads}
 
 
 def read_step(plan: Path, key: str) -> tuple[dict[str, Any], Path]:

@@ -217,7 +217,7 @@ def entry(step: Step, state: dict[str, Any], device: str = "cpu") -> dict[str, A
 def job_command(plan: Path, of_job: dict[str, Any]) -> str:
     """The shell line that the Snakefile runs for a job: its steps one after the other."""
     command = [sys.executable, "-P", "-m", "chebsplat.pipelines.cli", "job", *["--elsewhere"] * of_job["elsewhere"]]
-    return " && ".join(shlex.join([*command, str(plan), key]) for key in of_job["keys"])
+    return shlex.join([*command, str(plan), *of_job["keys"]])
 
 
 def seconds(steps: list[Step], ran: set[str]) -> None:

@@ -50,7 +50,8 @@ def studied(folder, work, on, cluster, **values):
     folder.mkdir(exist_ok=True)
     (folder / "toys.toml").write_text(STUDY.format(**values))
     command = [sys.executable, "-P", "-m", "chebsplat.pipelines.cli", "study", folder / "toys.toml", "--on", on]
-    command += ["--cores", "3", "--threads", "1", "--out", folder / on]
+    command += ["--threads", "1", "--out", folder / on]
+    command += ["--cores", "3"] if on == "local" else []  # the cluster has three
     environment = os.environ | cluster.environment | {"CHEBSPLAT_WORK": str(work)}
     pipes = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE}
     return subprocess.Popen(command, cwd=ROOT, env=environment, text=True, **pipes)

@@ -1,11 +1,13 @@
 """What goes to a cluster: which steps together, what they ask for, and what is said where there is no cluster."""
 
+import os
+import sys
 from graphlib import TopologicalSorter
 
 import pytest
 
 from chebsplat.errors import ConfigError
-from chebsplat.pipelines import cluster, job, leases, sequences, store
+from chebsplat.pipelines import children, cluster, job, leases, sequences, store
 from chebsplat.pipelines.plan import Planner
 from chebsplat.pipelines.run import device_of, entry, write_plan
 from chebsplat.pipelines.studies.study import checked_study, expand, outstanding
@@ -130,3 +132,23 @@ def test_a_job_on_a_node_stops_when_its_run_lets_go(monkeypatch, tmp_path):
         cluster.watch_run(plan)
         assert not told.wait(0.3)
     assert told.wait(5)
+
+
+def _step(arguments):
+    name, code, file = arguments
+    with open(file, "a") as told:
+        told.write(f"{name} {os.getpid()} {'torch' in sys.modules}\n")
+    if code == "9":
+        os.kill(os.getpid(), 9)
+    sys.exit(int(code))
+
+
+@pytest.mark.parametrize(("codes", "code"), [("00", 0), ("03", 3), ("30", 3), ("09", 137)])
+def test_steps_of_a_job_have_processes_of_their_own_and_end_with_the_first_that_fails(codes, code, tmp_path):
+    told = tmp_path / "told"
+    calls = [[f"step{k}", one, str(told)] for k, one in enumerate(codes)]
+    assert children.in_turn(_step, calls) == code
+    lines = [line.split() for line in told.read_text().splitlines()]
+    assert [name for name, _, _ in lines] == ["step0", "step1"][: 1 if codes[0] != "0" else 2]
+    assert len({process for _, process, _ in lines} | {str(os.getpid())}) == len(lines) + 1
+    assert {there for _, _, there in lines} == {"True"}  # imported before the step was

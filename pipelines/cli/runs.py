@@ -176,19 +176,30 @@ def study(
 
 @click.command(hidden=True)
 @click.argument("plan", type=click.Path(path_type=Path))
-@click.argument("key")
+@click.argument("keys", nargs=-1, required=True)
 @click.option("--elsewhere", is_flag=True, help="on a node of a cluster, which no pipe of the run reaches")
-def job(plan: Path, key: str, elsewhere: bool) -> int:
-    """One step of a plan, as Snakemake runs it."""
+def job(plan: Path, keys: tuple[str, ...], elsewhere: bool) -> int:
+    """Steps of a plan, one after the other until one fails, as Snakemake runs them."""
+    from chebsplat.pipelines import job as jobs
+    from chebsplat.pipelines.children import in_turn
     from chebsplat.pipelines.cluster import watch_run
-    from chebsplat.pipelines.job import run as run_job
     from chebsplat.stages.stopping import watch_lifeline
 
+    jobs.use_threads()
+    if len(keys) > 1:
+        return in_turn(_main, [["job", *["--elsewhere"] * elsewhere, str(plan), key] for key in keys])
     if elsewhere:
         watch_run(plan)
     else:
         watch_lifeline()
-    return run_job(plan, key, again=elsewhere)
+    return jobs.run(plan, keys[0], again=elsewhere)
+
+
+def _main(arguments: list[str]) -> None:
+    """Our command in a process that was forked for it."""
+    from chebsplat.pipelines.cli import main
+
+    main(arguments, prog_name="chebsplat")
 
 
 COMMANDS = (run, plan, study, job)
