@@ -87,6 +87,9 @@ class TrainSection(Section):
     features: Literal["trained", "lifted"] = setting(
         "trained", "of Gaussians; lifted: colour alone is trained, and the teacher's features are lifted afterwards"
     )
+    feature_start: Literal["lifted", "zero"] = setting(
+        "lifted", "of trained features: what the teacher's views say of the Gaussians at the start; zero: nothing"
+    )
     encoder: Literal["points", "transformer", "mlp", "off"] = setting(
         "points",
         "of points: taught over many rooms, frozen, used once the scene is trained; transformer: the paper's, of "

@@ -21,6 +21,7 @@ if TYPE_CHECKING:
     from chebsplat.formats.points import Points
     from chebsplat.settings import DescribeSection, TrainSection
     from chebsplat.shape.regions import Regions
+    from chebsplat.stages.progress import Progress
     from chebsplat.training.model import SceneModel
     from chebsplat.views import TaughtLabels, Views
 
@@ -133,6 +134,29 @@ def model_of(
         initial = initial_gaussians(points.means, points.colors, points.covariances, opacity)
     raw = {name: value.to(device) for name, value in initial.items()}
     return SceneModel(raw, describe, train, None if features is None else features.features.shape[-1], backend)
+
+
+def start_features(model: SceneModel, capture: Capture, points: Points, features: Features, progress: Progress) -> int:
+    """Features begin as what the teacher says of the Gaussians where they are, by one pass over the training views.
+
+    Returns: of how many Gaussians anything is said.
+    Choices: means of the views, without steps towards their median: training follows.
+    """
+    import torch
+
+    from chebsplat.formats.cameras import Cameras
+    from chebsplat.stages.lift import lifted_from
+    from chebsplat.stages.settings import LiftSection
+
+    cameras = Cameras(points.names, points.Ks, points.cam_from_world, *capture.size)
+    parameters = {name: value.detach().cpu().numpy() for name, value in model.raw.items()}
+    try:
+        lifted = lifted_from(capture, cameras, parameters, features, LiftSection(median_steps=0), progress)
+    except DataFailure:
+        return 0
+    with torch.no_grad():
+        model.raw["features"].copy_(torch.from_numpy(lifted.features))
+    return int(lifted.features.any(1).sum())
 
 
 def start_opacity(points: Points) -> float:

@@ -8,12 +8,18 @@ from shared import KEY, run_stage
 from chebsplat.errors import ConfigError, DataFailure, InputError
 from chebsplat.formats import artifact
 from chebsplat.formats.capture import SCHEMA, read_capture, write_capture
+from chebsplat.formats.features import read_features
 from chebsplat.formats.gaussians import read_gaussians
 from chebsplat.formats.lifted import read_lifted
 from chebsplat.formats.manifest import Manifest
 from chebsplat.formats.ply import write_ply
+from chebsplat.formats.points import read_points
 from chebsplat.formats.scene import read_scene
+from chebsplat.labels.decode import decode_labels
+from chebsplat.stages.config import build
 from chebsplat.stages.lift_ply import lift_ply
+from chebsplat.stages.progress import Progress
+from chebsplat.stages.train_inputs import model_of, start_features, training_views
 
 ROLES = {"capture": "ingest", "gaussians": "train", "features": "teacher"}
 
@@ -90,3 +96,30 @@ def test_the_command_is_a_stage_without_a_file_and_a_use_with_one():
     assert {p.name for p in main.resolve_command(context, ["lift", "a.ply"])[1].params} >= {"ply", "capture", "out"}
     listed = main.list_commands(context)
     assert listed.count("lift") == 1
+
+
+def test_features_of_a_training_start_as_what_the_views_say_of_its_gaussians(up_to_teacher):
+    capture, points = read_capture(up_to_teacher / "ingest"), read_points(up_to_teacher / "sfm")
+    features, config = read_features(up_to_teacher / "teacher"), build({}, "toy")
+    model = model_of(points, features, config.train, config.describe)
+    views = training_views(capture, points, features)
+    start_features(model, capture, points, features, Progress(False))
+    begun = model.raw["features"]
+    assert begun.requires_grad and begun.detach().any(1).float().mean() > 0.9
+    shares = []
+    for k in range(len(views.names)):
+        taught = views.features(k)
+        rendered = model.render(views.camera(k, 1), 0, masked=False, grid=taught.shape[:2]).features
+        maps = rendered.detach().numpy(), taught.numpy()
+        named, wanted = (decode_labels(each.reshape(-1, each.shape[-1]), features.label_embeddings) for each in maps)
+        shares.append((named == wanted).mean())
+    assert np.median(shares) > 0.75  # in some views the teacher is wrong about a whole wall, which the others outvote
+
+
+def test_features_start_at_nothing_where_no_view_says_anything(up_to_teacher):
+    capture, points = read_capture(up_to_teacher / "ingest"), read_points(up_to_teacher / "sfm")
+    features, config = read_features(up_to_teacher / "teacher"), build({}, "toy")
+    features.pseudo_labels = np.full_like(features.pseudo_labels, -1)
+    model = model_of(points, features, config.train, config.describe)
+    assert start_features(model, capture, points, features, Progress(False)) == 0
+    assert not model.raw["features"].any()
