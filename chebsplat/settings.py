@@ -87,8 +87,10 @@ class TrainSection(Section):
     features: Literal["trained", "lifted"] = setting(
         "trained", "of Gaussians; lifted: colour alone is trained, and the teacher's features are lifted afterwards"
     )
-    feature_start: Literal["lifted", "zero"] = setting(
-        "lifted", "of trained features: what the teacher's views say of the Gaussians at the start; zero: nothing"
+    feature_start: Literal["lifted", "zero"] | None = setting(
+        None,
+        "of trained features: what the teacher's views say of the Gaussians at the start, or nothing; default: lifted "
+        "from 40 views on",
     )
     encoder: Literal["points", "transformer", "mlp", "off"] = setting(
         "points",

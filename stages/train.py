@@ -14,11 +14,11 @@ from chebsplat.stages.photo_models import camera_models, facts, reached
 from chebsplat.stages.resume import Saves
 from chebsplat.stages.stopping import deferred
 from chebsplat.stages.train_inputs import (
+    begin_features,
     described,
     first_regions,
     knowledge,
     model_of,
-    start_features,
     training_views,
     with_feature_loss,
     within_cap,
@@ -63,11 +63,10 @@ def run(job: Job) -> None:
     torch.set_num_threads(n_threads())  # sums of torch depend on it; the same bytes are promised for the same number
     model = model_of(points, features, train, job.config.describe, job.device)
     n_initial = len(model)
-    lifts = features is not None and train.feature_start == "lifted"
-    if features is not None and lifts and not start_features(model, capture, points, features, job.progress):
-        job.left_out("lifted start of features", "no training view says anything of a Gaussian")
     regions, described_values = first_regions(descriptors if points is given and not train.start else None)
     views = training_views(capture, points, features, bool(train.weight_depth)).to(job.device)
+    if features is not None:
+        begin_features(job, model, capture, points, features, len(views.names))
     models = camera_models(job, capture, points, views)
     trainer = Trainer(
         model,

@@ -136,6 +136,20 @@ def model_of(
     return SceneModel(raw, describe, train, None if features is None else features.features.shape[-1], backend)
 
 
+def begin_features(
+    job: Job, model: SceneModel, capture: Capture, points: Points, features: Features, n_views: int
+) -> None:
+    """Features begin lifted where `starts_lifted` says so; otherwise at nothing, and it is noted."""
+    from chebsplat.training.schedule import starts_lifted
+
+    given = job.config.train.feature_start
+    if not starts_lifted(job.config.train, n_views):
+        why = f"of {n_views} training views it costs colour" if given is None else f"train.feature_start is {given}"
+        job.left_out("lifted start of features", why)
+    elif not start_features(model, capture, points, features, job.progress):
+        job.left_out("lifted start of features", "no training view says anything of a Gaussian")
+
+
 def start_features(model: SceneModel, capture: Capture, points: Points, features: Features, progress: Progress) -> int:
     """Features begin as what the teacher says of the Gaussians where they are, by one pass over the training views.
 

@@ -236,11 +236,13 @@ def test_the_features_rate_fits_the_number_of_steps(tiny_trainer, settings, rate
 
 def test_features_are_taught_in_one_step_of_so_many_unless_views_are_few(tiny_trainer):
     from chebsplat.settings import TrainSection
-    from chebsplat.training.schedule import feature_every, rates
+    from chebsplat.training.schedule import feature_every, rates, starts_lifted
 
     settings = TrainSection(steps=1000)
     assert [feature_every(settings, n) for n in (1, 10, 20, 40, 300)] == [1, 1, 2, 4, 4]
     assert feature_every(TrainSection(feature_every=7), 10) == 7
+    assert [starts_lifted(settings, n) for n in (10, 39, 40)] == [False, False, True]
+    assert starts_lifted(TrainSection(feature_start="lifted"), 2)
     assert rates(TrainSection(steps=1000, feature_every=4))["features"] == pytest.approx(4e-2)
     made = tiny_trainer(steps=8, densify="off", prune=False, sh_prune=False, feature_every=3)
     steps, changed = made.steps(), []
