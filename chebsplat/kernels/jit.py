@@ -123,7 +123,9 @@ def _compiled(**options: Any) -> Callable[[Callable[..., Any]], Any]:
 
 # No fast-math but contraction: NaN and infinity keep their meaning. Not reassociation either, for kernels just compiled
 # then differ in the last bit from the same ones read from the cache.
-kernel: Any = _compiled(parallel=True, fastmath={"contract", "nsz"})
+# Threads share what prange says and nothing else: to wake them for np.zeros takes ten times as long as to fill it.
+PRANGE_ALONE = dict.fromkeys(("comprehension", "inplace_binop", "setitem", "numpy", "stencil", "fusion"), False)
+kernel: Any = _compiled(parallel=PRANGE_ALONE, fastmath={"contract", "nsz"})
 inline: Any = _compiled(fastmath={"contract", "nsz"}, inline="always")
 lanes: Any = _compiled(fastmath={"contract"})  # of explicit vectors and their scalars
 serial: Any = _compiled()

@@ -1,4 +1,4 @@
-"""Vectors of 16 float32 as values inside numba kernels.
+"""Vectors of float32, of 16 and less, as values inside numba kernels.
 
 numba's loops vectorise only when LLVM proves that nothing aliases; these say it. LLVM splits a vector wider than the
 machine's registers, so the same source runs on AVX-512 (one register), AVX2 (two), SSE and NEON (four); only a machine
@@ -23,21 +23,25 @@ FLOAT, INT = ir.FloatType(), ir.IntType(32)
 
 
 class Vector(types.Type):
-    """16 values: `kind` is float32 or bool."""
+    """`count` values: `kind` is float32 or bool."""
 
-    def __init__(self, kind: str):
-        self.kind = kind
-        super().__init__(f"simd.{kind}x16")
+    def __init__(self, kind: str, count: int):
+        self.kind, self.count = kind, count
+        super().__init__(f"simd.{kind}x{count}")
+
+    def as_mask(self) -> Vector:
+        """The type of its comparisons."""
+        return Vector("bool", self.count)
 
 
 @register_model(Vector)
 class _VectorModel(models.PrimitiveModel):
     def __init__(self, manager: Any, vector: Vector):
         element = FLOAT if vector.kind == "float32" else ir.IntType(1)
-        super().__init__(manager, vector, ir.VectorType(element, 16))
+        super().__init__(manager, vector, ir.VectorType(element, vector.count))
 
 
-F16, M16 = Vector("float32"), Vector("bool")
+F16 = Vector("float32", 16)
 WIDE = ir.VectorType(FLOAT, 16)
 # 2^f on [-½, ½] to 2e-8, by Chebyshev interpolation
 _nodes = 0.5 * np.cos((np.arange(7) + 0.5) * np.pi / 7)
@@ -72,45 +76,58 @@ def shuffle(builder: Any, a: Any, b: Any, order: list[int]) -> Any:
 
 
 def _call(builder: Any, name: str, *values: Any) -> Any:
-    kind = ir.FunctionType(WIDE, [WIDE] * len(values))
-    return builder.call(cgutils.get_or_insert_function(builder.module, kind, f"llvm.{name}.v16f32"), values)
+    vector = values[0].type
+    kind, full = ir.FunctionType(vector, [vector] * len(values)), f"llvm.{name}.v{vector.count}f32"
+    return builder.call(cgutils.get_or_insert_function(builder.module, kind, full), values)
 
 
 def _constant(value: float) -> ir.Constant:
     return ir.Constant(WIDE, [float(np.float32(value))] * 16)
 
 
-@intrinsic
-def splat(_typing, scalar):
-    """All lanes equal to `scalar`."""
-    return signature(F16, types.float32), lambda context, builder, sig, args: broadcast(builder, args[0])
+def splat_of(count: int) -> Any:
+    """Makes vectors of `count` lanes that are all equal to a scalar."""
+    vector = Vector("float32", count)
+
+    @intrinsic
+    def splat(_typing, scalar):
+        return signature(vector, types.float32), lambda context, builder, sig, args: broadcast(builder, args[0], count)
+
+    return splat
 
 
-@intrinsic
-def load(_typing, array, index):
-    """array.flat[index : index + 16]."""
+def load_of(count: int) -> Any:
+    """Reads array.flat[index : index + count]."""
+    vector, plain = Vector("float32", count), ir.VectorType(FLOAT, count)
 
-    def build(context, builder, sig, args):
-        return builder.load(address(context, builder, sig.args[0], args[0], args[1], WIDE), align=4)
+    @intrinsic
+    def load(_typing, array, index):
+        def build(context, builder, sig, args):
+            return builder.load(address(context, builder, sig.args[0], args[0], args[1], plain), align=4)
 
-    return signature(F16, array, types.intp), build
+        return signature(vector, array, types.intp), build
+
+    return load
+
+
+splat, load = splat_of(16), load_of(16)
 
 
 @intrinsic
 def store(_typing, array, index, value):
-    """array.flat[index : index + 16] = value."""
+    """array.flat[index : index + count of value] = value."""
 
     def build(context, builder, sig, args):
-        builder.store(args[2], address(context, builder, sig.args[0], args[0], args[1], WIDE), align=4)
+        builder.store(args[2], address(context, builder, sig.args[0], args[0], args[1], args[2].type), align=4)
         return context.get_dummy_value()
 
-    return signature(types.none, array, types.intp, F16), build
+    return signature(types.none, array, types.intp, value), build
 
 
 @intrinsic
 def fma(_typing, a, b, c):
     """a b + c."""
-    return signature(F16, F16, F16, F16), lambda context, builder, sig, args: multiply_add(builder, *args)
+    return signature(a, a, a, a), lambda context, builder, sig, args: multiply_add(builder, *args)
 
 
 @intrinsic
@@ -120,19 +137,19 @@ def fnma(_typing, a, b, c):
     def build(context, builder, sig, args):
         return multiply_add(builder, builder.fneg(args[0]), *args[1:])
 
-    return signature(F16, F16, F16, F16), build
+    return signature(a, a, a, a), build
 
 
 @intrinsic
 def magnitude(_typing, value):
     """|value|."""
-    return signature(F16, F16), lambda context, builder, sig, args: _call(builder, "fabs", args[0])
+    return signature(value, value), lambda context, builder, sig, args: _call(builder, "fabs", args[0])
 
 
 def _binary(name: str) -> Any:
     @intrinsic
     def apply(_typing, a, b):
-        return signature(F16, F16, F16), lambda context, builder, sig, args: getattr(builder, name)(*args)
+        return signature(a, a, a), lambda context, builder, sig, args: getattr(builder, name)(*args)
 
     return apply
 
@@ -140,7 +157,7 @@ def _binary(name: str) -> Any:
 def _compare(symbol: str) -> Any:
     @intrinsic
     def apply(_typing, a, b):
-        return signature(M16, F16, F16), lambda context, builder, sig, args: builder.fcmp_ordered(symbol, *args)
+        return signature(a.as_mask(), a, a), lambda context, builder, sig, args: builder.fcmp_ordered(symbol, *args)
 
     return apply
 
@@ -148,7 +165,7 @@ def _compare(symbol: str) -> Any:
 def _operate(function: Any, apply: Any) -> None:
     @overload(function, inline="always")
     def implement(a, b):
-        if a == F16 and b == F16:
+        if isinstance(a, Vector) and a == b and a.kind == "float32":
             return lambda a, b: apply(a, b)
         return None
 
@@ -167,7 +184,7 @@ for _function, _symbol in ((operator.lt, "<"), (operator.le, "<="), (operator.gt
 @intrinsic
 def where(_typing, mask, a, b):
     """a where the mask holds, else b."""
-    return signature(F16, M16, F16, F16), lambda context, builder, sig, args: builder.select(*args)
+    return signature(a, mask, a, a), lambda context, builder, sig, args: builder.select(*args)
 
 
 @intrinsic
@@ -175,9 +192,9 @@ def bits(_typing, mask):
     """The mask as an integer, lane 0 in the lowest bit."""
 
     def build(context, builder, sig, args):
-        return builder.zext(builder.bitcast(args[0], ir.IntType(16)), ir.IntType(32))
+        return builder.zext(builder.bitcast(args[0], ir.IntType(mask.count)), ir.IntType(32))
 
-    return signature(types.int32, M16), build
+    return signature(types.int32, mask), build
 
 
 @intrinsic
@@ -185,11 +202,11 @@ def scale_by_power(_typing, value, shifted):
     """value · 2^k, where `shifted` is k + 1.5·2²³, which holds k in its low bits; no over- or underflow."""
 
     def build(context, builder, sig, args):
-        whole = ir.VectorType(INT, 16)
-        power = builder.shl(builder.bitcast(args[1], whole), ir.Constant(whole, [23] * 16))
-        return builder.bitcast(builder.add(builder.bitcast(args[0], whole), power), WIDE)
+        whole = ir.VectorType(INT, value.count)
+        power = builder.shl(builder.bitcast(args[1], whole), ir.Constant(whole, [23] * value.count))
+        return builder.bitcast(builder.add(builder.bitcast(args[0], whole), power), args[0].type)
 
-    return signature(F16, F16, F16), build
+    return signature(value, value, value), build
 
 
 @intrinsic
@@ -197,12 +214,12 @@ def total(_typing, value):
     """Sum of the lanes, as a tree."""
 
     def build(context, builder, sig, args):
-        name = "llvm.vector.reduce.fadd.v16f32"
-        kind = ir.FunctionType(FLOAT, [FLOAT, WIDE])
+        name = f"llvm.vector.reduce.fadd.v{value.count}f32"
+        kind = ir.FunctionType(FLOAT, [FLOAT, args[0].type])
         function = cgutils.get_or_insert_function(builder.module, kind, name)
         return builder.call(function, [ir.Constant(FLOAT, 0.0), args[0]], fastmath=["reassoc"])
 
-    return signature(types.float32, F16), build
+    return signature(types.float32, value), build
 
 
 @intrinsic

@@ -61,12 +61,12 @@ def from_lanes(_typing, out, out_at, out_step, a, a_at):
         for c in range(4):
             at = builder.add(a_at, a_at.type(16 * c))
             rows.append(builder.load(address(context, builder, sig.args[3], a, at, WIDE), align=4))
-        for half in (0, 8):  # lanes half .. half + 7, as (lane, c mod 2)
-            order = [half + lane + k for lane in range(8) for k in (0, 16)]
+        for first in (0, 8):  # lanes first .. first + 7, as (lane, c mod 2)
+            order = [first + lane + k for lane in range(8) for k in (0, 16)]
             even, odd = shuffle(builder, rows[0], rows[1], order), shuffle(builder, rows[2], rows[3], order)
             for lane in range(8):
                 four_channels = [2 * lane, 2 * lane + 1, 16 + 2 * lane, 17 + 2 * lane]
-                at = builder.add(out_at, builder.mul(out_step, out_step.type(half + lane)))
+                at = builder.add(out_at, builder.mul(out_step, out_step.type(first + lane)))
                 value = shuffle(builder, even, odd, four_channels)
                 builder.store(value, address(context, builder, sig.args[0], out, at, four), align=4)
         return context.get_dummy_value()
@@ -74,38 +74,76 @@ def from_lanes(_typing, out, out_at, out_step, a, a_at):
     return signature(types.none, out, types.intp, types.intp, a, types.intp), build
 
 
+@intrinsic
+def hits_among(_typing, masks, at, n, bit, first, hits, count):
+    """Which of masks[at : at + min(n, 16)] have a bit set: numbered from `first`, into hits[count:] without a gap.
+
+    Args: masks u16, 16 more than n; hits u32, of which 16 from `count` on are written. Returns: count after.
+    """
+    words, flags = ir.VectorType(INT, 16), ir.VectorType(ir.IntType(1), 16)
+    narrow = ir.VectorType(ir.IntType(16), 16)
+
+    def filled(builder, scalar):
+        one = builder.insert_element(ir.Constant(words, ir.Undefined), builder.trunc(scalar, INT), INT(0))
+        return shuffle(builder, one, one, [0] * 16)
+
+    def build(context, builder, sig, args):
+        masks, at, n, bit, first, hits, count = args
+        counted = ir.Constant(words, list(range(16)))
+        given = builder.load(address(context, builder, sig.args[0], masks, at, narrow), align=2)
+        held = builder.trunc(builder.lshr(given, builder.trunc(filled(builder, bit), narrow)), flags)
+        held = builder.and_(held, builder.icmp_signed("<", counted, filled(builder, n)))
+        kind = ir.FunctionType(words, [words, flags, words])
+        compress = cgutils.get_or_insert_function(builder.module, kind, "llvm.experimental.vector.compress.v16i32")
+        numbers = builder.add(counted, filled(builder, first))
+        packed = builder.call(compress, [numbers, held, ir.Constant(words, ir.Undefined)])
+        builder.store(packed, address(context, builder, sig.args[5], hits, count, words), align=4)
+        return builder.add(count, builder.zext(builder.ctpop(builder.bitcast(held, ir.IntType(16))), count.type))
+
+    at = types.intp
+    return signature(at, masks, at, at, at, at, hits, at), build
+
+
 @intrinsic(prefer_literal=True)
-def multiply(_typing, out, out_at, order, order_at, out_step, a, a_at, a_row, a_step, b, b_at, b_step, depth, rows,
-             width, add):  # fmt: skip
+def multiply(_typing, out, out_at, order, order_at, out_step, a, a_at, a_row, a_step, by, by_at, by_kind, b, b_at,
+             b_step, depth, rows, width, add):  # fmt: skip
     """out[order[i], :width] (+)= Σ_k a[i, k] b[k, :width] for i < rows, k < depth; the sums stay in registers.
 
-    Args: rows, width (4, 8 or 16) and add (0 or 1) are literals. Row i of out is at out_at + order[order_at + i]
-      out_step, element (i, k) of a at a_at + i a_row + k a_step, row k of b at b_at + k b_step; depth is at least 1.
+    Args: by_kind, rows, width (4, 8 or 16) and add (0 or 1) are literals. Row i of out is at out_at +
+      order[order_at + i] out_step, element (i, k) of a at a_at + i a_row + k a_step, row k of b at b_at + k b_step;
+      depth is at least 1. Where a is read, by[by_at + i] stands for i if by_kind is 1, by[by_at + k] for k if it is 2.
     """
-    n, wide, adds = rows.literal_value, width.literal_value, add.literal_value
+    n, wide, adds, kind = rows.literal_value, width.literal_value, add.literal_value, by_kind.literal_value
     vector = ir.VectorType(FLOAT, wide)
 
     def build(context, builder, sig, args):
-        out, out_at, order, order_at, out_step, a, a_at, a_row, a_step, b, b_at, b_step, depth = args[:13]
+        out, out_at, order, order_at, out_step, a, a_at, a_row, a_step, by, by_at, _, b, b_at, b_step, depth = args[:16]
         integer = depth.type
-        targets = []
+
+        def entry(kind, array, at):
+            value = builder.load(address(context, builder, kind, array, at, context.get_value_type(kind.dtype)))
+            return value if value.type == integer else builder.zext(value, integer)
+
+        targets, starts = [], []
         for i in range(n):
-            entry = address(context, builder, sig.args[2], order, builder.add(order_at, integer(i)), integer)
-            offset = builder.add(out_at, builder.mul(builder.load(entry), out_step))
+            number = entry(sig.args[2], order, builder.add(order_at, integer(i)))
+            offset = builder.add(out_at, builder.mul(number, out_step))
             targets.append(address(context, builder, sig.args[0], out, offset, vector))
+            row = entry(sig.args[9], by, builder.add(by_at, integer(i))) if kind == 1 else integer(i)
+            starts.append(builder.add(a_at, builder.mul(a_row, row)))
         start = [builder.load(t, align=4) if adds else ir.Constant(vector, [0.0] * wide) for t in targets]
         before, loop, after = builder.block, builder.append_basic_block("products"), builder.append_basic_block("end")
         builder.branch(loop)
         builder.position_at_end(loop)
         k, sums = builder.phi(integer), [builder.phi(vector) for _ in range(n)]
         row = builder.add(b_at, builder.mul(k, b_step))
-        factor = builder.load(address(context, builder, sig.args[9], b, row, vector), align=4)
-        column = builder.add(a_at, builder.mul(k, a_step))
+        factor = builder.load(address(context, builder, sig.args[12], b, row, vector), align=4)
+        column = builder.mul(entry(sig.args[9], by, builder.add(by_at, k)) if kind == 2 else k, a_step)
         sums_after = []
         for i in range(n):
-            offset = builder.add(column, builder.mul(a_row, integer(i)))
-            entry = builder.load(address(context, builder, sig.args[5], a, offset, FLOAT))
-            sums_after.append(multiply_add(builder, broadcast(builder, entry, wide), factor, sums[i]))
+            where = builder.add(starts[i], column)
+            value = builder.load(address(context, builder, sig.args[5], a, where, FLOAT))
+            sums_after.append(multiply_add(builder, broadcast(builder, value, wide), factor, sums[i]))
         following = builder.add(k, integer(1))
         k.add_incoming(integer(0), before)
         k.add_incoming(following, loop)
@@ -118,6 +156,5 @@ def multiply(_typing, out, out_at, order, order_at, out_step, a, a_at, a_row, a_
             builder.store(sums_after[i], targets[i], align=4)
         return context.get_dummy_value()
 
-    at = types.intp
-    sizes = (rows, width, add)
-    return signature(types.none, out, at, order, at, at, a, at, at, at, b, at, at, at, *sizes), build
+    at, sizes = types.intp, (rows, width, add)
+    return signature(types.none, out, at, order, at, at, a, at, at, at, by, at, by_kind, b, at, at, at, *sizes), build

@@ -30,11 +30,12 @@ from chebsplat.rasterize.cells import (
 
 
 @lanes
-def slopes(chosen, grads, count, cell, depth, out):
-    """out[m] = dL/d(weight m) by lane: the image's gradients [cells, depth, 16] times a Gaussian's row of `chosen`."""
-    at, step = LANES * cell * grads.shape[1], chosen.shape[1]
+def slopes(shapes, rows, grads, count, cell, depth, out):
+    """out[m] = dL/d(weight m) by lane: the image's gradients [cells, depth, 16] times the channels of rows[m]."""
+    at, step = LANES * cell * grads.shape[1], shapes.shape[1]
     for m in range(0, count, BLOCK):
-        multiply(out, LANES * m, IN_ORDER, 0, LANES, chosen, m * step, step, 1, grads, at, LANES, depth, 8, 16, 0)
+        multiply(out, LANES * m, IN_ORDER, 0, LANES, shapes, SHAPE, step, 1, rows, m, 1, grads, at, LANES, depth,
+                 8, LANES, 0)  # fmt: skip
 
 
 @lanes
@@ -64,16 +65,16 @@ def record_colors(weights, tall_grads, channels, count, cell, slots, records):
     for m in range(0, count, BLOCK):
         c = 0
         while c + 16 <= channels:
-            multiply(records, N_GEOMETRY + c, slots, m, step, weights, LANES * m, LANES, 1, tall_grads, at + c,
-                     row, LANES, 8, 16, 1)  # fmt: skip
+            multiply(records, N_GEOMETRY + c, slots, m, step, weights, LANES * m, LANES, 1, slots, 0, 0,
+                     tall_grads, at + c, row, LANES, 8, 16, 1)  # fmt: skip
             c += 16
         if c + 8 <= channels:
-            multiply(records, N_GEOMETRY + c, slots, m, step, weights, LANES * m, LANES, 1, tall_grads, at + c,
-                     row, LANES, 8, 8, 1)  # fmt: skip
+            multiply(records, N_GEOMETRY + c, slots, m, step, weights, LANES * m, LANES, 1, slots, 0, 0,
+                     tall_grads, at + c, row, LANES, 8, 8, 1)  # fmt: skip
             c += 8
         if c < channels:
-            multiply(records, N_GEOMETRY + c, slots, m, step, weights, LANES * m, LANES, 1, tall_grads, at + c,
-                     row, LANES, 8, 4, 1)  # fmt: skip
+            multiply(records, N_GEOMETRY + c, slots, m, step, weights, LANES * m, LANES, 1, slots, 0, 0,
+                     tall_grads, at + c, row, LANES, 8, 4, 1)  # fmt: skip
 
 
 @lanes
@@ -120,7 +121,8 @@ def record_geometry(g, count, cell, slots, records):
     """records[slots[m], :6] += Σ_lanes g (1, x, y, x², xy, y²), offsets from the tile's middle."""
     at = LANES * SHAPE * cell
     for m in range(0, count, BLOCK):
-        multiply(records, 0, slots, m, records.shape[1], g, LANES * m, LANES, 1, MOMENTS, at, SHAPE, LANES, 8, 8, 1)
+        multiply(records, 0, slots, m, records.shape[1], g, LANES * m, LANES, 1, slots, 0, 0, MOMENTS, at, SHAPE, LANES,
+                 8, 8, 1)  # fmt: skip
 
 
 @lanes

@@ -2,8 +2,8 @@
 
 At an offset d from a Gaussian's mean, (u, v) = W d and log₂ α = log₂ opacity − u² − v², with W = [[p, q], [0, r]] (see
 `ellipses`). A tile holds 16 cells and, for each of its Gaussians, a row of `shapes`: p, q, r, then u and v at the
-middle of the tile, then log₂ opacity. Sweeping a cell lists the Gaussians that contribute to it, with α and the weight
-α T by lane; what remains are products of small dense matrices, whose sums stay in registers.
+middle of the tile, log₂ opacity, and from SHAPE on the channels. Sweeping a cell lists the Gaussians that contribute to
+it, with α and the weight α T by lane; what remains are products of small dense matrices, whose sums stay in registers.
 """
 
 from __future__ import annotations
@@ -13,22 +13,35 @@ import math
 import numpy as np
 
 from chebsplat.kernels.jit import inline, lanes
-from chebsplat.kernels.simd import bits, fma, fnma, load, magnitude, scale_by_power, splat, store, total, where
-from chebsplat.rasterize.blocks import multiply
+from chebsplat.kernels.simd import (
+    bits,
+    fma,
+    fnma,
+    load,
+    load_of,
+    magnitude,
+    scale_by_power,
+    splat,
+    splat_of,
+    store,
+    total,
+    where,
+)
+from chebsplat.rasterize.blocks import hits_among, multiply
 
 LANES = 16
-SHAPE = 8  # floats of a row of shapes, and of a splat before its channels
+load_1, load_4, splat_1 = load_of(1), load_of(4), splat_of(1)
+SHAPE = 8  # floats of a row of shapes, and of a splat, before its channels
 N_GEOMETRY = 8  # floats of a record before its channels (see `cell_adjoint`)
-SLACK = 4  # rows of four floats or more that hold 16
+SLACK = 2  # rows of SHAPE floats or more that hold 16
 BLOCK = 8  # rows of a product kept in registers at once
-AHEAD = 3  # Gaussians whose α are computed together with one
-T_MIN, ALPHA_MIN = np.float32(1e-4), np.float32(1 / 255)
+T_MIN, LOG2_ALPHA_MIN = np.float32(1e-4), np.float32(math.log2(1 / 255))
 REACH = np.float32(math.log2(255) + 1e-3)  # beyond the ellipse α = 1/255, with slack for rounding
-LN2, FAINT, NEVER = np.float32(math.log(2)), np.float32(-20), np.float32(np.inf)
+LN2, NEVER = np.float32(math.log(2)), np.float32(np.inf)
 ZERO, ONE, TWO, SHIFT = np.float32(0), np.float32(1), np.float32(2), np.float32(1.5 * 2**23)
-# Offsets of the lanes from their cell's middle, and of the cells from their tile's.
-LANE_X = (np.arange(LANES) % 4 - 1.5).astype(np.float32)
-LANE_Y = (np.arange(LANES) // 4 - 1.5).astype(np.float32)
+# Offsets of the lanes from their cell's first pixel and middle, and of the cells' middles from their tile's.
+IN_X, IN_Y = (np.arange(LANES) % 4).astype(np.float32), (np.arange(LANES) // 4).astype(np.float32)
+LANE_X, LANE_Y = IN_X - np.float32(1.5), IN_Y - np.float32(1.5)
 CELL_X, CELL_Y = 4 * LANE_X, 4 * LANE_Y
 _x, _y = CELL_X[:, None] + LANE_X, CELL_Y[:, None] + LANE_Y
 MOMENTS = np.stack([_x**0, _x, _y, _x**2, _x * _y, _y**2, 0 * _x, 0 * _x], -1)  # [cells, lanes, SHAPE]
@@ -51,6 +64,12 @@ def whole(channels):
 
 
 @inline
+def corner(cell):
+    """x and y of a cell's first pixel in its tile."""
+    return 4 * (cell & 3), 4 * (cell >> 2)
+
+
+@inline
 def _larger(a, b):
     return where(a > b, a, b)
 
@@ -68,89 +87,91 @@ def reach(shapes, k):
 
 
 @lanes
+def begin(states, width, height):
+    """Fill the states [cells, 2, 16] of a tile of which the image holds width × height pixels: T, which is 1, and
+    the least log₂ α that is seen, which is infinite outside the image, and once a pixel is done.
+    """
+    for cell in range(LANES):
+        left, top = corner(cell)
+        inside_x = load(IN_X, 0) < splat(np.float32(width - left))
+        inside_y = load(IN_Y, 0) < splat(np.float32(height - top))
+        least = where(inside_x, where(inside_y, splat(LOG2_ALPHA_MIN), splat(NEVER)), splat(NEVER))
+        store(states, 2 * LANES * cell, splat(ONE))
+        store(states, 2 * LANES * cell + LANES, least)
+
+
+@lanes
+def is_done(states, cell):
+    """Whether no pixel of a cell takes more."""
+    return bits(load(states, 2 * LANES * cell + LANES) < splat(NEVER)) == 0
+
+
+@lanes
 def listed(masks, at, n, cell, hits):
-    """Which of masks[at : at + n] hold this cell, into `hits`, with AHEAD valid rows after them; returns how many."""
+    """Which of masks[at : at + n] hold this cell, into `hits`; both have 16 more. Returns how many."""
     count = 0
-    for k in range(n):
-        hits[count] = k
-        count += (masks[at + k] >> cell) & 1
-    for k in range(AHEAD):
-        hits[count + k] = 0
+    for k in range(0, n, LANES):
+        count = hits_among(masks, at + k, n - k, cell, k, hits, count)
     return count
 
 
 @inline
-def _alpha(shapes, k, x, y, dx, dy, ceiling):
-    """α of Gaussian k at the lanes of the cell whose middle is (dx, dy) from the tile's: 2^power, at most `ceiling`."""
-    p, q, r = shapes[k, 0], shapes[k, 1], shapes[k, 2]
-    u = fma(splat(p), x, fma(splat(q), y, splat(shapes[k, 3] + p * dx + q * dy)))
-    v = fma(splat(r), y, splat(shapes[k, 4] + r * dy))
-    power = _larger(splat(shapes[k, 5]) - fma(u, u, v * v), splat(FAINT))
+def _exp2(power):
+    """2^power, for -100 <= power <= 100; anything below."""
     shifted = power + splat(SHIFT)
     f = power - (shifted - splat(SHIFT))
     series = fma(f, fma(f, fma(f, fma(f, fma(f, splat(E5), splat(E4)), splat(E3)), splat(E2)), splat(E1)), splat(E0))
-    alpha = scale_by_power(series, shifted)
-    return where(alpha < ceiling, alpha, ceiling)
+    return scale_by_power(series, shifted)
 
 
 @lanes
 def sweep(shapes, hits, n, cell, max_alpha, states, alphas, weights, rows):
     """Composite one cell front to back, α and α T of what contributes into rows [16] of `alphas` and `weights`.
 
-    Args: hits [n + AHEAD] rows of `shapes`; states [cells, 2, 16]: transmittance, and the T at which a pixel is done,
-      which is infinite once it is, or outside the image; alphas holds AHEAD more rows than the others.
+    Args: hits [n] rows of `shapes`; states as `begin` fills them; alphas, weights and rows have room for n.
     Returns: how many contribute; rows[:count] says which.
+    Choices: no branch on whether a Gaussian contributes: the next one's row takes its place where it does not.
     """
-    x, y, dx, dy = load(LANE_X, 0), load(LANE_Y, 0), CELL_X[cell], CELL_Y[cell]
-    t, done_at = load(states, 2 * LANES * cell), load(states, 2 * LANES * cell + LANES)
-    count, n_open = 0, 1
-    for first in range(0, n, AHEAD + 1):
-        for j in range(first, first + AHEAD + 1):  # none waits for another, as the transmittances below do
-            store(alphas, LANES * j, _alpha(shapes, hits[j], x, y, dx, dy, splat(max_alpha)))
-        for j in range(first, min(first + AHEAD + 1, n)):
-            alpha = load(alphas, LANES * j)  # what is stored below never passes row j
-            visible = alpha >= splat(ALPHA_MIN)
-            if bits(visible) == 0:
-                continue
-            alpha = where(visible, alpha, splat(ZERO))
-            after = fnma(alpha, t, t)
-            is_open = after > done_at
-            alpha = where(is_open, alpha, splat(ZERO))
-            store(alphas, LANES * count, alpha)
-            store(weights, LANES * count, alpha * t)
-            rows[count] = hits[j]
-            count += 1
-            t, done_at = where(is_open, after, t), where(is_open, done_at, splat(NEVER))
-            n_open = bits(is_open)
-            if n_open == 0:
+    x, y = load(LANE_X, 0) + splat(CELL_X[cell]), load(LANE_Y, 0) + splat(CELL_Y[cell])
+    t, least = load(states, 2 * LANES * cell), load(states, 2 * LANES * cell + LANES)
+    count = 0
+    for j in range(n):
+        k = hits[j]
+        u = fma(splat(shapes[k, 0]), x, fma(splat(shapes[k, 1]), y, splat(shapes[k, 3])))
+        v = fma(splat(shapes[k, 2]), y, splat(shapes[k, 4]))
+        power = fnma(u, u, fnma(v, v, splat(shapes[k, 5])))
+        seen, alpha = power >= least, _exp2(power)
+        alpha = where(seen, where(alpha < splat(max_alpha), alpha, splat(max_alpha)), splat(ZERO))
+        after = fnma(alpha, t, t)
+        closing = after <= splat(T_MIN)
+        if bits(closing) != 0:  # those pixels are done, without this Gaussian
+            alpha, after = where(closing, splat(ZERO), alpha), where(closing, t, after)
+            least = where(closing, splat(NEVER), least)
+            if bits(least < splat(NEVER)) == 0:
                 break
-        if n_open == 0:
-            break
+        store(alphas, LANES * count, alpha)
+        store(weights, LANES * count, alpha * t)
+        rows[count] = k
+        count += bits(seen) != 0
+        t = after
     store(states, 2 * LANES * cell, t)
-    store(states, 2 * LANES * cell + LANES, done_at)
+    store(states, 2 * LANES * cell + LANES, least)
     return count
 
 
 @lanes
-def gather(splats, ranks, start, rows, count, chosen):
-    """chosen[m] = the channels of splat ranks[start + rows[m]], 16 floats at a time: `chosen` needs SLACK more rows."""
-    step = chosen.shape[1]
-    for m in range(count):
-        at = np.int64(ranks[start + rows[m]]) * splats.shape[1] + SHAPE
-        for d in range(0, step, LANES):
-            store(chosen, m * step + d, load(splats, at + d))
-
-
-@lanes
-def accumulate(chosen, weights, count, cell, sums):
-    """sums[cell, c] += Σ_m chosen[m, c] weights[m]: [cells, channels, 16], channels a multiple of four."""
-    channels, step = sums.shape[1], chosen.shape[1]
+def accumulate(shapes, rows, weights, count, cell, sums):
+    """sums[cell, c] += Σ_m shapes[rows[m], SHAPE + c] weights[m]: [cells, channels, 16], channels in fours."""
+    channels, step = sums.shape[1], shapes.shape[1]
     for c in range(0, channels - 7, BLOCK):
         at = LANES * (cell * channels + c)
-        multiply(sums, at, IN_ORDER, 0, LANES, chosen, c, 1, step, weights, 0, LANES, count, 8, 16, 1)
+        multiply(sums, at, IN_ORDER, 0, LANES, shapes, SHAPE + c, 1, step, rows, 0, 2, weights, 0, LANES, count,
+                 8, LANES, 1)  # fmt: skip
     if channels % BLOCK != 0:
-        at = LANES * (cell * channels + channels - 4)
-        multiply(sums, at, IN_ORDER, 0, LANES, chosen, channels - 4, 1, step, weights, 0, LANES, count, 4, 16, 1)
+        c = channels - 4
+        at = LANES * (cell * channels + c)
+        multiply(sums, at, IN_ORDER, 0, LANES, shapes, SHAPE + c, 1, step, rows, 0, 2, weights, 0, LANES, count,
+                 4, LANES, 1)  # fmt: skip
 
 
 @lanes
@@ -174,19 +195,36 @@ def accumulate_means(splats, column, ranks, start, rows, shares, count, cell, su
 
 @lanes
 def copy(a, a_at, n, b, b_at):
-    """b[b_at : b_at + n] = a[a_at : a_at + n] of flat arrays."""
+    """b.flat[b_at : b_at + n] = a.flat[a_at : a_at + n]."""
     k = 0
     while k + LANES <= n:
         store(b, b_at + k, load(a, a_at + k))
         k += LANES
+    while k + 4 <= n:
+        store(b, b_at + k, load_4(a, a_at + k))
+        k += 4
     while k < n:
-        b[b_at + k] = a[a_at + k]
+        store(b, b_at + k, load_1(a, a_at + k))
         k += 1
 
 
 @lanes
+def copy_whole(a, a_at, n, b, b_at):
+    """As `copy`, but in whole vectors: up to 15 more."""
+    for k in range(0, n, LANES):
+        store(b, b_at + k, load(a, a_at + k))
+
+
+@lanes
+def clear(a, at, n):
+    """a.flat[at : at + n] = 0."""
+    for k in range(at, at + n):
+        store(a, k, splat_1(ZERO))
+
+
+@lanes
 def is_finite(a, at, n):
-    """Whether all of a.flat[at : at + n] is finite; n a multiple of 16."""
+    """Whether all of a.flat[at : at + n] is finite; n a multiple of LANES."""
     sums = splat(ZERO)
     for k in range(0, n, LANES):
         sums = fma(load(a, at + k), splat(ZERO), sums)

@@ -11,9 +11,9 @@ import numpy as np
 from chebsplat.kernels.jit import kernel, prange, serial
 from chebsplat.rasterize import cells
 from chebsplat.rasterize.binning import TILE
-from chebsplat.rasterize.cells import AHEAD, LANES, SHAPE, ZERO
+from chebsplat.rasterize.cells import LANES, SHAPE, ZERO
 from chebsplat.rasterize.lift import MAX_ALPHA, binned
-from chebsplat.rasterize.tiles import begin, fill_shapes, spread
+from chebsplat.rasterize.tiles import fill_shapes, spread
 
 COVERED = (0.7, 0.9)  # of the light, which part of it tells the depth
 
@@ -23,18 +23,19 @@ def _depth_tile(splats, ranks, start, stop, left, top, low, high, depth, covered
     """One tile of `_depths`."""
     n, (height, width) = stop - start, depth.shape
     states = np.empty((LANES, 2, LANES), np.float32)
-    begin(states, width - left, height - top)
-    shapes, masks = np.empty((n, SHAPE), np.float32), np.empty(n, np.uint16)
-    alphas, weights = np.empty((n + AHEAD + 1, LANES), np.float32), np.empty((n + 1, LANES), np.float32)
-    hits, rows = np.empty(n + AHEAD + 1, np.int64), np.empty(n, np.int64)
+    cells.begin(states, width - left, height - top)
+    shapes, masks = np.empty((n, SHAPE), np.float32), np.empty(n + LANES, np.uint16)
+    alphas, weights = np.empty((n + 1, LANES), np.float32), np.empty((n + 1, LANES), np.float32)
+    hits, rows = np.empty(n + LANES, np.uint32), np.empty(n + 1, np.uint32)
     fill_shapes(splats, ranks, start, n, left, top, shapes)
     for k in range(n):
         masks[k] = cells.reach(shapes, k)
     for cell in range(LANES):
+        column, row = cells.corner(cell)
         count = cells.listed(masks, 0, n, cell, hits)
         count = cells.sweep(shapes, hits, count, cell, MAX_ALPHA, states, alphas, weights, rows)
         for lane in range(LANES):
-            x, y = left + 4 * (cell & 3) + (lane & 3), top + 4 * (cell >> 2) + (lane >> 2)
+            x, y = left + column + (lane & 3), top + row + (lane >> 2)
             if x >= width or y >= height:
                 continue
             u, v = np.float32(x + 0.5), np.float32(y + 0.5)

@@ -71,6 +71,16 @@ def _jacobian(point, viewmat, K, width, height, out, jacobian):
 
 
 @inline
+def _squared(jacobian):
+    """Sum of squares of a [2, 3]."""
+    total = 0.0
+    for i in range(2):
+        for k in range(3):
+            total += jacobian[i, k] * jacobian[i, k]
+    return total
+
+
+@inline
 def _cross(a, b, out):
     out[0], out[1], out[2] = a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]
 
@@ -112,19 +122,24 @@ def project(means, quats, scales, viewmat, K, width, height, near_plane, far_pla
                 depth += viewmat[2, k] * means[i, k]
             if not (depth > near_plane and depth < far_plane):
                 continue
+            _jacobian(means[i], viewmat, K, width, height, camera, jacobian)
+            u, v = jacobian[0, 0] * camera[0] + K[0, 2], jacobian[1, 1] * camera[1] + K[1, 2]
+            size = max(max(abs(scales[i, 0]), abs(scales[i, 1])), abs(scales[i, 2]))
+            steepest = size * size * _squared(jacobian)  # at least the covariance's largest eigenvalue, without ε
+            farthest = EXTENT * math.sqrt(steepest + eps2d) + 2  # at least `reach` below
+            if u + farthest < 0 or u - farthest > width or v + farthest < 0 or v - farthest > height:
+                continue
             largest = max(max(abs(quats[i, 0]), abs(quats[i, 1])), max(abs(quats[i, 2]), abs(quats[i, 3])))
             sums = 1.0 * quats[i, 0] + quats[i, 1] + quats[i, 2] + quats[i, 3]
             if not (largest > 1e-12 and math.isfinite(largest) and math.isfinite(sums - sums)):
                 continue
             _rotation(quats[i], unit, rotation)
-            _jacobian(means[i], viewmat, K, width, height, camera, jacobian)
             _matmul(jacobian, turn, screen, 2, 3, 3)
             _matmul(screen, rotation, factor, 2, 3, 3)
             for k in range(3):
                 factor[0, k] *= scales[i, k]
                 factor[1, k] *= scales[i, k]
             a, b, c, determinant, area = _ellipse(factor, eps2d, cross)
-            u, v = jacobian[0, 0] * camera[0] + K[0, 2], jacobian[1, 1] * camera[1] + K[1, 2]
             biggest = 0.5 * (a + c) + math.sqrt(0.25 * (a - c) * (a - c) + b * b)
             if not (determinant > 0 and determinant < LARGEST * LARGEST and biggest < LARGEST):
                 continue

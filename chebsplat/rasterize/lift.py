@@ -14,8 +14,8 @@ from chebsplat.kernels.jit import kernel, lanes, prange, serial
 from chebsplat.kernels.simd import load, splat, store, where
 from chebsplat.rasterize import binning, cell_adjoint, cells, ellipses, tiles
 from chebsplat.rasterize.binning import TILE, band_start
-from chebsplat.rasterize.cells import AHEAD, LANES, SHAPE, ZERO
-from chebsplat.rasterize.tiles import begin, fill_shapes, spread
+from chebsplat.rasterize.cells import LANES, SHAPE, ZERO
+from chebsplat.rasterize.tiles import fill_shapes, spread
 
 MAX_ALPHA, NEAR, FAR, EPS2D = np.float32(0.99), 0.01, 1e10, 0.3  # as `reference.rasterize` has them
 
@@ -46,10 +46,10 @@ def _lift_tile(splats, ranks, pair, start, stop, left, top, width, height, value
     """One tile of `_lift`: adds to the records of its pairs."""
     n, across = stop - start, counts.shape[1]
     states = np.empty((LANES, 2, LANES), np.float32)
-    begin(states, width - left, height - top)
-    shapes, masks = np.empty((n, SHAPE), np.float32), np.empty(n, np.uint16)
-    alphas, weights = np.empty((n + AHEAD + 1, LANES), np.float32), np.empty((n + 1, LANES), np.float32)
-    hits, rows = np.empty(n + AHEAD + 1, np.int64), np.empty(n, np.int64)
+    cells.begin(states, width - left, height - top)
+    shapes, masks = np.empty((n, SHAPE), np.float32), np.empty(n + LANES, np.uint16)
+    alphas, weights = np.empty((n + 1, LANES), np.float32), np.empty((n + 1, LANES), np.float32)
+    hits, rows = np.empty(n + LANES, np.uint32), np.empty(n + 1, np.uint32)
     shares, slots = np.empty(n, np.float32), np.empty(n, np.int64)
     fill_shapes(splats, ranks, start, n, left, top, shapes)
     for k in range(n):

@@ -4,9 +4,9 @@ A tile of 16×16 pixels is 16 cells of 4×4 (see `cells`). Forward tests a tile'
 once, in chunks until every pixel is done, then sweeps cell by cell. Backward repeats the sweep, so that only the
 cells' bit masks are kept between the two.
 
-Channels come in two kinds: `colors` by pixel, and `cell_colors`, of which only the mean over each cell is rendered. A
-Gaussian's part in that mean is the sum of its 16 weights, so a cell channel costs a sixteenth of the products of the
-other kind, forward and backward.
+Channels come in two kinds: `colors` by pixel, and `cell_colors`, of which only the mean over each cell of 4×4 pixels is
+rendered. A Gaussian's part in that mean is the sum of its 16 weights, so a cell channel costs a sixteenth of the
+products of the other kind, forward and backward.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ from chebsplat.kernels.jit import inline, kernel, prange, serial
 from chebsplat.rasterize import cells
 from chebsplat.rasterize.binning import TILE
 from chebsplat.rasterize.blocks import from_lanes, prefetch
-from chebsplat.rasterize.cells import AHEAD, LANES, NEVER, ONE, SHAPE, SLACK, T_MIN
+from chebsplat.rasterize.cells import LANES, ONE, SHAPE, SLACK
 
 AHEAD_OF_CACHE = 16  # rows between asking for one and using it
 CHUNK = 128  # Gaussians of a tile between two looks at whether it is done
@@ -62,8 +62,8 @@ def pack(order, means2d, whitening, opacities, colors, cell_colors):
 
 @serial
 def fill_shapes(splats, ranks, start, n, left, top, shapes):
-    """Fill the tile's rows of shapes (see `cells`)."""
-    stop, step = len(ranks) - 1, splats.shape[1]
+    """Fill the tile's rows of shapes (see `cells`), and up to SLACK more, with the channels that they have room for."""
+    stop, step, depth = len(ranks) - 1, splats.shape[1], shapes.shape[1] - SHAPE
     for k in range(n):
         following = np.int64(ranks[min(start + k + AHEAD_OF_CACHE, stop)]) * step
         for d in range(0, step, LANES):
@@ -73,24 +73,7 @@ def fill_shapes(splats, ranks, start, n, left, top, shapes):
         dx, dy = np.float32(left + TILE // 2) - splats[m, 0], np.float32(top + TILE // 2) - splats[m, 1]
         shapes[k, 0], shapes[k, 1], shapes[k, 2] = p, q, r
         shapes[k, 3], shapes[k, 4], shapes[k, 5] = p * dx + q * dy, r * dy, splats[m, 5]
-
-
-@serial
-def begin(states, width, height):
-    """All pixels inside the image open, those outside done."""
-    for cell in range(LANES):
-        for lane in range(LANES):
-            x, y = 4 * (cell & 3) + (lane & 3), 4 * (cell >> 2) + (lane >> 2)
-            states[cell, 0, lane] = ONE
-            states[cell, 1, lane] = T_MIN if x < width and y < height else NEVER
-
-
-@serial
-def _is_done(states, cell):
-    n_open = 0
-    for lane in range(LANES):
-        n_open += states[cell, 1, lane] != NEVER
-    return n_open == 0
+        cells.copy_whole(splats, np.int64(m) * step + SHAPE, depth, shapes, k * shapes.shape[1] + SHAPE)
 
 
 @serial
@@ -102,47 +85,48 @@ def n_pixels_inside(cell, width, height):
 
 @serial
 def _forward_tile(
-    splats, ranks, start, stop, left, top, channels, max_alpha, masks, render, means, transmittance
+    splats, ranks, start, stop, left, top, width, height, channels, max_alpha, masks, render, means, transmittance
 ):  # fmt: skip
-    """One tile of `forward`, into the flat render. Returns how many of its pairs were looked at."""
-    height, width = transmittance.shape
+    """One tile of `forward`, into flat render and transmittance. Returns how many of its pairs were looked at."""
     states, depth = np.empty((LANES, 2, LANES), np.float32), cells.padded(channels)
-    begin(states, width - left, height - top)
+    cells.begin(states, width - left, height - top)
     sums, column = np.zeros((LANES, depth, LANES), np.float32), cell_column(channels)
     mean_sums, shares = np.zeros((LANES, splats.shape[1] - column), np.float32), np.empty(CHUNK, np.float32)
-    shapes, chosen = np.empty((CHUNK, SHAPE), np.float32), np.empty((CHUNK + SLACK, depth), np.float32)
-    alphas, weights = np.empty((CHUNK + AHEAD, LANES), np.float32), np.empty((CHUNK, LANES), np.float32)
-    hits, rows = np.empty(CHUNK + AHEAD + 1, np.int64), np.empty(CHUNK, np.int64)
-    done, first = 0, start
-    while done != 0xFFFF and first < stop:
+    shapes = np.empty((CHUNK + SLACK, SHAPE + depth), np.float32)
+    alphas, weights = np.empty((CHUNK, LANES), np.float32), np.empty((CHUNK, LANES), np.float32)
+    hits, rows = np.empty(CHUNK + LANES, np.uint32), np.empty(CHUNK, np.uint32)
+    done, n_done, first = np.zeros(LANES, np.bool_), 0, start
+    while n_done < LANES and first < stop:
         n = min(CHUNK, stop - first)
         fill_shapes(splats, ranks, first, n, left, top, shapes)
         for k in range(n):
             masks[first + k] = cells.reach(shapes, k)
         for cell in range(LANES):
-            if (done >> cell) & 1:
+            if done[cell]:
                 continue
             count = cells.listed(masks, first, n, cell, hits)
             count = cells.sweep(shapes, hits, count, cell, max_alpha, states, alphas, weights, rows)
             if count > 0:
-                cells.gather(splats, ranks, first, rows, count, chosen)
-                cells.accumulate(chosen, weights, count, cell, sums)
+                cells.accumulate(shapes, rows, weights, count, cell, sums)
                 if means.shape[2] > 0:
                     cells.sum_lanes(weights, count, shares)
                     cells.accumulate_means(splats, column, ranks, first, rows, shares, count, cell, mean_sums)
-            if _is_done(states, cell):
-                done |= 1 << cell
+            done[cell] = cells.is_done(states, cell)
+            n_done += done[cell]
         first += n
     pixels = np.empty(LANES * channels + LANES, np.float32)
     for cell in range(LANES):
+        x, y = cells.corner(cell)
+        x, y = left + x, top + y
+        n = min(4, width - x)
+        if n <= 0 or y >= height:
+            continue
         for c in range(depth - 4, -1, -4):  # what the last four spill into the next pixel, the first four mend
             from_lanes(pixels, c, channels, sums, LANES * (cell * depth + c))
-        for row in range(4):
-            x, y = left + 4 * (cell & 3), top + 4 * (cell >> 2) + row
-            if y < height and x < width:
-                n = min(4, width - x)
-                transmittance[y, x : x + n] = states[cell, 0, 4 * row : 4 * row + n]
-                cells.copy(pixels, 4 * row * channels, n * channels, render, (y * width + x) * channels)
+        for row in range(min(4, height - y)):
+            cells.copy(states, 2 * LANES * cell + 4 * row, n, transmittance, (y + row) * width + x)
+            cells.copy(pixels, 4 * row * channels, n * channels, render, ((y + row) * width + x) * channels)
+    for cell in range(LANES):
         n_inside = n_pixels_inside(cell, width - left, height - top)
         if n_inside > 0:
             x, y = left // 4 + (cell & 3), top // 4 + (cell >> 2)
@@ -155,19 +139,21 @@ def _forward_tile(
 def forward(splats, tile_starts, ranks, channels, cell_channels, width, height, max_alpha):
     """Composite front to back the splats of `pack`, listed by `binning.bin_gaussians`.
 
-    Returns: render [H, W, D], means [⌈H/4⌉, ⌈W/4⌉, E] over the cells, transmittance [H, W]; masks u16 [P] of the cells
-      each pair may reach, and used [tiles], the pairs that were looked at before all pixels were done: for `backward`.
+    Returns: render [H, W, D], means [⌈H/4⌉, ⌈W/4⌉, E] over the cells, transmittance [H, W]; masks u16 [P + 16] of
+      the cells each pair may reach, and used [tiles], the pairs that were looked at before all pixels were done: for
+      `backward`.
     """
     columns, n_tiles = (width + TILE - 1) // TILE, len(tile_starts) - 1
     render = np.empty(height * width * channels, np.float32)
     means = np.empty(((height + 3) // 4, (width + 3) // 4, cell_channels), np.float32)
-    transmittance = np.empty((height, width), np.float32)
-    masks, used = np.empty(len(ranks), np.uint16), np.zeros(n_tiles, np.int64)
+    transmittance = np.empty(height * width, np.float32)
+    masks, used = np.empty(len(ranks) + LANES, np.uint16), np.zeros(n_tiles, np.int64)
     for j in prange(16 * ((n_tiles + 15) // 16)):
         tile = spread(j, n_tiles)
         if tile < n_tiles:
             used[tile] = _forward_tile(
                 splats, ranks, tile_starts[tile], tile_starts[tile + 1], (tile % columns) * TILE,
-                (tile // columns) * TILE, channels, max_alpha, masks, render, means, transmittance,
+                (tile // columns) * TILE, width, height, channels, max_alpha, masks, render, means, transmittance,
             )  # fmt: skip
-    return render.reshape((height, width, channels)), means, transmittance, masks, used
+    shape = height, width
+    return render.reshape((*shape, channels)), means, transmittance.reshape(shape), masks, used

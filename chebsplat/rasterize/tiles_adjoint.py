@@ -12,53 +12,54 @@ from chebsplat.kernels.jit import kernel, prange, serial
 from chebsplat.rasterize import cell_adjoint, cells
 from chebsplat.rasterize.binning import TILE, band_start
 from chebsplat.rasterize.blocks import prefetch, to_lanes
-from chebsplat.rasterize.cells import AHEAD, BLOCK, LANES, N_GEOMETRY, SHAPE, SLACK, ZERO
-from chebsplat.rasterize.tiles import AHEAD_OF_CACHE, begin, cell_column, fill_shapes, n_pixels_inside, spread
+from chebsplat.rasterize.cells import BLOCK, LANES, N_GEOMETRY, SHAPE, SLACK
+from chebsplat.rasterize.tiles import AHEAD_OF_CACHE, cell_column, fill_shapes, n_pixels_inside, spread
 
 
 @serial
 def _backward_tile(
-    splats, ranks, pair, masks, start, n, left, top, channels, max_alpha, grad, grad_means, grad_alpha, absolute, base,
-    spare, records,
+    splats, ranks, pair, masks, start, n, left, top, width, height, channels, max_alpha, grad, grad_means, grad_alpha,
+    absolute, base, spare, records,
 ):  # fmt: skip
     """One tile of `backward`: adds to the records of its pairs. Returns whether the gradient is finite.
 
     `base` is the first pair's number, `spare` a row of records that takes what fills up a block.
     """
-    height, width = grad_alpha.shape
     depth = channels + 1  # alpha is a channel in which every Gaussian is 1
     states = np.empty((LANES, 2, LANES), np.float32)
-    begin(states, width - left, height - top)
+    cells.begin(states, width - left, height - top)
     row, finite = LANES * channels + LANES, True  # of tall_grads: a cell's pixels, and a margin
     grads = np.empty((LANES, cells.padded(channels) + 4, LANES), np.float32)
-    tall_grads, column = np.empty(LANES * row, np.float32), cell_column(channels)
+    tall_grads, column = np.zeros(LANES * row, np.float32), cell_column(channels)
     mean_grads = np.zeros((LANES, splats.shape[1] - column), np.float32)
     for cell in range(LANES):
-        x, at = left + 4 * (cell & 3), cell * row
-        for y in range(top + 4 * (cell >> 2), top + 4 * (cell >> 2) + 4):
-            inside = max(min(4, width - x), 0) * channels if y < height else 0
-            cells.copy(grad, (y * width + x) * channels, inside, tall_grads, at)
-            tall_grads[at + inside : at + 4 * channels] = ZERO
+        x, y = cells.corner(cell)
+        x, y, at, in_lanes = left + x, top + y, cell * row, LANES * (grads.shape[1] * cell + channels)
+        n_wide = max(min(4, width - x), 0)
+        for k in range(4):
+            inside = n_wide if y + k < height else 0
+            cells.copy(grad, ((y + k) * width + x) * channels, inside * channels, tall_grads, at)
             at += 4 * channels
-        tall_grads[at : (cell + 1) * row] = ZERO
         for c in range(0, channels, 4):
             to_lanes(grads, LANES * (grads.shape[1] * cell + c), tall_grads, cell * row + c, channels)
-        for lane in range(LANES):
-            x, y = left + 4 * (cell & 3) + (lane & 3), top + 4 * (cell >> 2) + (lane >> 2)
-            grads[cell, channels, lane] = grad_alpha[y, x] if y < height and x < width else ZERO
+        for k in range(4):  # after `to_lanes`, whose last four channels may reach into this one
+            inside = n_wide if y + k < height else 0
+            cells.copy(grad_alpha, (y + k) * width + x, inside, grads, in_lanes + 4 * k)
+            cells.clear(grads, in_lanes + 4 * k + inside, 4 - inside)
         finite &= cells.is_finite(tall_grads, cell * row, row)
-        finite &= cells.is_finite(grads, LANES * (grads.shape[1] * cell + channels), LANES)
+        finite &= cells.is_finite(grads, in_lanes, LANES)
+    for cell in range(LANES):
         n_inside = n_pixels_inside(cell, width - left, height - top)
         if n_inside > 0:
             x, y = left // 4 + (cell & 3), top // 4 + (cell >> 2)
             for c in range(grad_means.shape[2]):
                 mean_grads[cell, c] = grad_means[y, x, c] / np.float32(n_inside)
         finite &= cells.is_finite(mean_grads, cell * mean_grads.shape[1], mean_grads.shape[1])
-    room = (n + AHEAD + BLOCK) // BLOCK * BLOCK
-    shapes, chosen = np.empty((n, SHAPE), np.float32), np.zeros((room + SLACK, cells.padded(depth)), np.float32)
+    room = (n + BLOCK) // BLOCK * BLOCK
+    shapes = np.empty((n + SLACK, SHAPE + cells.padded(depth)), np.float32)
     alphas, weights = np.empty((room, LANES), np.float32), np.empty((room, LANES), np.float32)
     g, slots, shares = np.empty((room, LANES), np.float32), np.empty(room, np.int64), np.empty(n, np.float32)
-    hits, rows = np.empty(n + AHEAD + 1, np.int64), np.empty(n, np.int64)
+    hits, rows = np.empty(n + LANES, np.uint32), np.empty(room, np.uint32)
     fill_shapes(splats, ranks, start, n, left, top, shapes)
     for cell in range(LANES):
         count = cells.listed(masks, start, n, cell, hits)
@@ -68,9 +69,8 @@ def _backward_tile(
         for m in range(count):
             slots[m] = pair[start + rows[m]] - base
         for m in range(count, (count + BLOCK - 1) // BLOCK * BLOCK):
-            slots[m] = spare
-        cells.gather(splats, ranks, start, rows, count, chosen)
-        cell_adjoint.slopes(chosen, grads, count, cell, depth, g)
+            slots[m], rows[m] = spare, 0
+        cell_adjoint.slopes(shapes, rows, grads, count, cell, depth, g)
         if grad_means.shape[2] > 0:
             cell_adjoint.add_slopes_of_means(splats, column, ranks, start, rows, count, cell, mean_grads, g)
             cells.sum_lanes(weights, count, shares)
@@ -101,7 +101,7 @@ def backward(
       gradient is finite.
     """
     height, width, channels = grad.shape
-    flat = grad.reshape(-1)
+    flat, flat_alpha = grad.reshape(-1), grad_alpha.reshape(-1)
     columns, rows = (width + TILE - 1) // TILE, (height + TILE - 1) // TILE
     finite, bands, shown = np.ones(len(tile_starts) - 1, np.bool_), len(pair_starts), len(order)
     room = 0
@@ -123,8 +123,8 @@ def backward(
                     cell_adjoint.clear(records, pair[k] - base)
                 finite[tile] = _backward_tile(
                     splats, ranks, pair, masks, tile_starts[tile], used[tile], (tile % columns) * TILE,
-                    (tile // columns) * TILE, channels, max_alpha, flat, grad_means, grad_alpha, absolute, base,
-                    n_pairs + tile - first_tile, records,
+                    (tile // columns) * TILE, width, height, channels, max_alpha, flat, grad_means, flat_alpha,
+                    absolute, base, n_pairs + tile - first_tile, records,
                 )  # fmt: skip
         for m in prange(shown):
             following = np.int64(order[min(m + AHEAD_OF_CACHE, shown - 1)]) * channels
