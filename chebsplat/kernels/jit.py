@@ -1,4 +1,4 @@
-"""The door to numba: how kernels are compiled, and where they are kept.
+"""The door to numba: how kernels are compiled, where they are kept, and the memory that they work in.
 
 The folder is named for our kernels' source, so that an edited helper is never served stale. It lies in the user's
 cache; CHEBSPLAT_CACHE moves it.
@@ -6,6 +6,7 @@ cache; CHEBSPLAT_CACHE moves it.
 
 from __future__ import annotations
 
+import ctypes
 import fcntl
 import hashlib
 import logging
@@ -23,6 +24,19 @@ from numba.core.caching import FunctionCache
 
 log = logging.getLogger("chebsplat")
 EVERY = 10.0  # seconds between two lines on what is being compiled
+KEPT = {-3: 32 << 20, -1: 64 << 20}  # bytes, by malloc.h's M_MMAP_THRESHOLD and M_TRIM_THRESHOLD
+
+
+def _keep_freed_memory() -> None:
+    """Let a step's arrays take what the last step's left: memory that went back to the system comes page by page, which
+    is a third of a small step's time. Only glibc is asked, and what the user says to it is left alone.
+    """
+    if any(name in os.environ for name in ("MALLOC_MMAP_THRESHOLD_", "MALLOC_TRIM_THRESHOLD_")):
+        return
+    library = ctypes.CDLL(None)
+    if hasattr(library, "mallopt"):
+        for option, size in KEPT.items():
+            library.mallopt(option, size)
 
 
 def _folders() -> list[Path]:
@@ -48,6 +62,7 @@ def _writable(folder: Path) -> bool:
     return True
 
 
+_keep_freed_memory()
 FOLDER = next(filter(_writable, _folders()), None)
 settings: Any = numba.config
 # open3d brings a TBB that numba refuses with a warning: OpenMP comes first.
