@@ -113,10 +113,12 @@ def rehearsed(n_threads: int, semantic: bool) -> Iterator[None]:
         beside = [new(args=(5, *parts)) for parts in ((adjoints,), (colors, losses))]
         behind = [new(args=(10, afterwards))] if semantic else []
         started = [*beside, *behind]
-        for process in started:
+        for process in beside:
             process.start()
         try:
             rasterizer()
+            for process in behind:  # what follows a training needs some of the rasterizer's, too: it is kept by now
+                process.start()
             for process in beside:
                 process.join()
             yield
@@ -124,8 +126,9 @@ def rehearsed(n_threads: int, semantic: bool) -> Iterator[None]:
                 (FOLDER / MARK).touch()
         finally:
             for process in started:
-                process.kill()
-                process.join()
+                if process.pid is not None:
+                    process.kill()
+                    process.join()
 
 
 def alone(niceness: int, *parts: Callable[[], None]) -> None:

@@ -11,7 +11,7 @@ import math
 
 import numpy as np
 
-from chebsplat.kernels.jit import inline, kernel, prange
+from chebsplat.kernels.jit import body, inline, kernel, prange
 
 HALF_LOG2E = 0.5 * math.log2(math.e)
 LN2 = math.log(2.0)
@@ -99,6 +99,53 @@ def _ellipse(factor, eps2d, cross):
     return a + eps2d, b, c + eps2d, determinant, math.sqrt(area)
 
 
+@body
+def _project(
+    means, quats, scales, viewmat, turn, K, width, height, near_plane, far_plane, eps2d, first, last,
+    means2d, covariances, whitening, conics, depths, radii, compensations,
+):  # fmt: skip
+    """`project` of the Gaussians from `first` up to `last`, into what it returns."""
+    unit, camera, cross = np.empty(4), np.empty(3), np.empty(3)
+    rotation, jacobian, screen, factor = np.empty((3, 3)), np.empty((2, 3)), np.empty((2, 3)), np.empty((2, 3))
+    for i in range(first, last):
+        depth = viewmat[2, 3]
+        for k in range(3):
+            depth += viewmat[2, k] * means[i, k]
+        if not (depth > near_plane and depth < far_plane):
+            continue
+        _jacobian(means[i], viewmat, K, width, height, camera, jacobian)
+        u, v = jacobian[0, 0] * camera[0] + K[0, 2], jacobian[1, 1] * camera[1] + K[1, 2]
+        size = max(max(abs(scales[i, 0]), abs(scales[i, 1])), abs(scales[i, 2]))
+        steepest = size * size * _squared(jacobian)  # at least the covariance's largest eigenvalue, without ε
+        farthest = EXTENT * math.sqrt(steepest + eps2d) + 2  # at least `reach` below
+        if u + farthest < 0 or u - farthest > width or v + farthest < 0 or v - farthest > height:
+            continue
+        largest = max(max(abs(quats[i, 0]), abs(quats[i, 1])), max(abs(quats[i, 2]), abs(quats[i, 3])))
+        sums = 1.0 * quats[i, 0] + quats[i, 1] + quats[i, 2] + quats[i, 3]
+        if not (largest > 1e-12 and math.isfinite(largest) and math.isfinite(sums - sums)):
+            continue
+        _rotation(quats[i], unit, rotation)
+        _matmul(jacobian, turn, screen, 2, 3, 3)
+        _matmul(screen, rotation, factor, 2, 3, 3)
+        for k in range(3):
+            factor[0, k] *= scales[i, k]
+            factor[1, k] *= scales[i, k]
+        a, b, c, determinant, area = _ellipse(factor, eps2d, cross)
+        biggest = 0.5 * (a + c) + math.sqrt(0.25 * (a - c) * (a - c) + b * b)
+        if not (determinant > 0 and determinant < LARGEST * LARGEST and biggest < LARGEST):
+            continue
+        reach = min(math.ceil(EXTENT * math.sqrt(biggest)), 2.0**30)
+        if not (u + reach > 0 and u - reach < width and v + reach > 0 and v - reach < height):
+            continue
+        means2d[i, 0], means2d[i, 1], depths[i], radii[i] = u, v, depth, int(reach)
+        covariances[i, 0], covariances[i, 1], covariances[i, 2] = a, b, c
+        over = 1.0 / determinant
+        conics[i, 0], conics[i, 1], conics[i, 2] = c * over, -b * over, a * over
+        compensations[i] = area * math.sqrt(over)
+        p, under = math.sqrt(HALF_LOG2E * c * over), 1.0 / c
+        whitening[i, 0], whitening[i, 1], whitening[i, 2] = p, -p * b * under, math.sqrt(HALF_LOG2E * under)
+
+
 @kernel
 def project(means, quats, scales, viewmat, K, width, height, near_plane, far_plane, eps2d):
     """Ellipses of one view.
@@ -113,128 +160,11 @@ def project(means, quats, scales, viewmat, K, width, height, near_plane, far_pla
     whitening, conics = np.zeros((n, 3), np.float32), np.zeros((n, 3), np.float32)
     depths, radii, compensations = np.zeros(n, np.float32), np.zeros(n, np.int32), np.zeros(n, np.float32)
     turn = np.ascontiguousarray(viewmat[:3, :3])
+    out = means2d, covariances, whitening, conics, depths, radii, compensations
     for part in prange(PARTS):
-        unit, camera, cross = np.empty(4), np.empty(3), np.empty(3)
-        rotation, jacobian, screen, factor = np.empty((3, 3)), np.empty((2, 3)), np.empty((2, 3)), np.empty((2, 3))
-        for i in range(part * n // PARTS, (part + 1) * n // PARTS):
-            depth = viewmat[2, 3]
-            for k in range(3):
-                depth += viewmat[2, k] * means[i, k]
-            if not (depth > near_plane and depth < far_plane):
-                continue
-            _jacobian(means[i], viewmat, K, width, height, camera, jacobian)
-            u, v = jacobian[0, 0] * camera[0] + K[0, 2], jacobian[1, 1] * camera[1] + K[1, 2]
-            size = max(max(abs(scales[i, 0]), abs(scales[i, 1])), abs(scales[i, 2]))
-            steepest = size * size * _squared(jacobian)  # at least the covariance's largest eigenvalue, without ε
-            farthest = EXTENT * math.sqrt(steepest + eps2d) + 2  # at least `reach` below
-            if u + farthest < 0 or u - farthest > width or v + farthest < 0 or v - farthest > height:
-                continue
-            largest = max(max(abs(quats[i, 0]), abs(quats[i, 1])), max(abs(quats[i, 2]), abs(quats[i, 3])))
-            sums = 1.0 * quats[i, 0] + quats[i, 1] + quats[i, 2] + quats[i, 3]
-            if not (largest > 1e-12 and math.isfinite(largest) and math.isfinite(sums - sums)):
-                continue
-            _rotation(quats[i], unit, rotation)
-            _matmul(jacobian, turn, screen, 2, 3, 3)
-            _matmul(screen, rotation, factor, 2, 3, 3)
-            for k in range(3):
-                factor[0, k] *= scales[i, k]
-                factor[1, k] *= scales[i, k]
-            a, b, c, determinant, area = _ellipse(factor, eps2d, cross)
-            biggest = 0.5 * (a + c) + math.sqrt(0.25 * (a - c) * (a - c) + b * b)
-            if not (determinant > 0 and determinant < LARGEST * LARGEST and biggest < LARGEST):
-                continue
-            reach = min(math.ceil(EXTENT * math.sqrt(biggest)), 2.0**30)
-            if not (u + reach > 0 and u - reach < width and v + reach > 0 and v - reach < height):
-                continue
-            means2d[i, 0], means2d[i, 1], depths[i], radii[i] = u, v, depth, int(reach)
-            covariances[i, 0], covariances[i, 1], covariances[i, 2] = a, b, c
-            over = 1.0 / determinant
-            conics[i, 0], conics[i, 1], conics[i, 2] = c * over, -b * over, a * over
-            compensations[i] = area * math.sqrt(over)
-            p, under = math.sqrt(HALF_LOG2E * c * over), 1.0 / c
-            whitening[i, 0], whitening[i, 1], whitening[i, 2] = p, -p * b * under, math.sqrt(HALF_LOG2E * under)
-    return means2d, covariances, whitening, conics, depths, radii, compensations
-
-
-@kernel
-def project_adjoint(
-    means, quats, scales, viewmat, K, width, height, eps2d, radii, grad_means2d, moments, grad_compensations
-):
-    """Gradients [N, 3], [N, 4], [N, 3] to means, quats and scales; zero rows where culled.
-
-    Args: grad_means2d [N, 2]; moments [N, 3]: uu, uv, vv of Σ g (W d)(W d)ᵀ over a Gaussian's pixels;
-      grad_compensations [N].
-    The gradient to the factor F of Σ is 2 / (½ log₂e) Wᵀ M (W F): W F is bounded, while gradients to Σ itself would
-    have to cancel over the needle's length. The compensation is |f × g| / √det of F's rows f and g; its gradient is
-    taken at the unit normal f × g / |f × g|, which stays bounded as the ellipse flattens.
-    """
-    n = len(means)
-    to_means, to_scales = np.zeros((n, 3), np.float32), np.zeros((n, 3), np.float32)
-    to_quats = np.zeros((n, 4), np.float32)
-    turn = np.ascontiguousarray(viewmat[:3, :3])
-    for part in prange(PARTS):
-        unit, camera, normal, across = np.empty(4), np.empty(3), np.empty(3), np.empty((2, 3))
-        rotation, jacobian, screen = np.empty((3, 3)), np.empty((2, 3)), np.empty((2, 3))
-        axes, factor = np.empty((2, 3)), np.empty((2, 3))
-        by_axes, by_screen, by_rotation = np.empty((2, 3)), np.empty((2, 3)), np.empty((3, 3))
-        by_jacobian, by_scales, by_quat = np.empty((2, 3)), np.empty(3), np.empty(4)
-        for i in range(part * n // PARTS, (part + 1) * n // PARTS):
-            if radii[i] == 0:
-                continue
-            length = _rotation(quats[i], unit, rotation)
-            _jacobian(means[i], viewmat, K, width, height, camera, jacobian)
-            _matmul(jacobian, turn, screen, 2, 3, 3)
-            _matmul(screen, rotation, axes, 2, 3, 3)
-            # F = A S, A = P R, P = J V: down to A, to the scales, and on to R and P.
-            for k in range(3):
-                factor[0, k], factor[1, k] = axes[0, k] * scales[i, k], axes[1, k] * scales[i, k]
-            a, b, c, determinant, area = _ellipse(factor, eps2d, normal)
-            under = 1.0 / c
-            p, r = math.sqrt(HALF_LOG2E * c / determinant), math.sqrt(HALF_LOG2E * under)
-            q = -p * b * under
-            uu, uv, vv = 2 / HALF_LOG2E * moments[i, 0], 2 / HALF_LOG2E * moments[i, 1], 2 / HALF_LOG2E * moments[i, 2]
-            for k in range(3):
-                s = 1.0 * scales[i, k]
-                axis_u, axis_v = p * axes[0, k] + q * axes[1, k], r * axes[1, k]
-                top, low = s * (uu * axis_u + uv * axis_v), s * (uv * axis_u + vv * axis_v)
-                by_scales[k] = top * axis_u + low * axis_v
-                by_axes[0, k], by_axes[1, k] = s * p * top, s * (q * top + r * low)
-            if grad_compensations[i] != 0 and area > 0:
-                weight = grad_compensations[i] / (determinant * math.sqrt(determinant))
-                for k in range(3):
-                    normal[k] /= area
-                _cross(factor[1], normal, across[0])
-                _cross(normal, factor[0], across[1])
-                spread = eps2d * (a + c - eps2d)  # det − |f × g|²; a and c have ε inside
-                for k in range(3):
-                    top = weight * (spread * across[0, k] - eps2d * area * factor[0, k])
-                    low = weight * (spread * across[1, k] - eps2d * area * factor[1, k])
-                    by_scales[k] += top * axes[0, k] + low * axes[1, k]
-                    by_axes[0, k] += top * scales[i, k]
-                    by_axes[1, k] += low * scales[i, k]
-            _matmul(by_axes, rotation.T, by_screen, 2, 3, 3)
-            _matmul(screen.T, by_axes, by_rotation, 3, 2, 3)
-            _matmul(by_screen, turn.T, by_jacobian, 2, 3, 3)
-            x, y, near, fx, fy = camera[0], camera[1], 1.0 / camera[2], K[0, 0], K[1, 1]
-            slope_x, slope_y = _clamped(x * near, K[0, 2], fx, width), _clamped(y * near, K[1, 2], fy, height)
-            by_x, by_y = fx * near * grad_means2d[i, 0], fy * near * grad_means2d[i, 1]
-            by_z = -(by_x * x + by_y * y) * near
-            steep_x, steep_y = fx * near * near, fy * near * near
-            by_z += steep_x * (slope_x * by_jacobian[0, 2] - by_jacobian[0, 0])
-            by_z += steep_y * (slope_y * by_jacobian[1, 2] - by_jacobian[1, 1])
-            if slope_x == x * near:
-                by_x -= steep_x * by_jacobian[0, 2]
-                by_z += steep_x * slope_x * by_jacobian[0, 2]
-            if slope_y == y * near:
-                by_y -= steep_y * by_jacobian[1, 2]
-                by_z += steep_y * slope_y * by_jacobian[1, 2]
-            for k in range(3):
-                to_means[i, k] = viewmat[0, k] * by_x + viewmat[1, k] * by_y + viewmat[2, k] * by_z
-                to_scales[i, k] = by_scales[k]
-            _rotation_adjoint(unit, length, by_rotation, by_quat)
-            for k in range(4):
-                to_quats[i, k] = by_quat[k]
-    return to_means, to_quats, to_scales
+        first, last = part * n // PARTS, (part + 1) * n // PARTS
+        _project(means, quats, scales, viewmat, turn, K, width, height, near_plane, far_plane, eps2d, first, last, *out)
+    return out
 
 
 @inline
@@ -250,3 +180,99 @@ def _rotation_adjoint(unit, length, by, out):
     shrink = 1.0 / length
     for k in range(4):
         out[k] = (out[k] - along * unit[k]) * shrink
+
+
+@body
+def _project_adjoint(
+    means, quats, scales, viewmat, turn, K, width, height, eps2d, radii, grad_means2d, moments, grad_compensations,
+    first, last, to_means, to_quats, to_scales,
+):  # fmt: skip
+    """`project_adjoint` of the Gaussians from `first` up to `last`, into what it returns.
+
+    The gradient to the factor F of Σ is 2 / (½ log₂e) Wᵀ M (W F): W F is bounded, while gradients to Σ itself would
+    have to cancel over the needle's length. The compensation is |f × g| / √det of F's rows f and g; its gradient is
+    taken at the unit normal f × g / |f × g|, which stays bounded as the ellipse flattens.
+    """
+    unit, camera, normal, across = np.empty(4), np.empty(3), np.empty(3), np.empty((2, 3))
+    rotation, jacobian, screen = np.empty((3, 3)), np.empty((2, 3)), np.empty((2, 3))
+    axes, factor = np.empty((2, 3)), np.empty((2, 3))
+    by_axes, by_screen, by_rotation = np.empty((2, 3)), np.empty((2, 3)), np.empty((3, 3))
+    by_jacobian, by_scales, by_quat = np.empty((2, 3)), np.empty(3), np.empty(4)
+    for i in range(first, last):
+        if radii[i] == 0:
+            continue
+        length = _rotation(quats[i], unit, rotation)
+        _jacobian(means[i], viewmat, K, width, height, camera, jacobian)
+        _matmul(jacobian, turn, screen, 2, 3, 3)
+        _matmul(screen, rotation, axes, 2, 3, 3)
+        # F = A S, A = P R, P = J V: down to A, to the scales, and on to R and P.
+        for k in range(3):
+            factor[0, k], factor[1, k] = axes[0, k] * scales[i, k], axes[1, k] * scales[i, k]
+        a, b, c, determinant, area = _ellipse(factor, eps2d, normal)
+        under = 1.0 / c
+        p, r = math.sqrt(HALF_LOG2E * c / determinant), math.sqrt(HALF_LOG2E * under)
+        q = -p * b * under
+        uu, uv, vv = 2 / HALF_LOG2E * moments[i, 0], 2 / HALF_LOG2E * moments[i, 1], 2 / HALF_LOG2E * moments[i, 2]
+        for k in range(3):
+            s = 1.0 * scales[i, k]
+            axis_u, axis_v = p * axes[0, k] + q * axes[1, k], r * axes[1, k]
+            top, low = s * (uu * axis_u + uv * axis_v), s * (uv * axis_u + vv * axis_v)
+            by_scales[k] = top * axis_u + low * axis_v
+            by_axes[0, k], by_axes[1, k] = s * p * top, s * (q * top + r * low)
+        if grad_compensations[i] != 0 and area > 0:
+            weight = grad_compensations[i] / (determinant * math.sqrt(determinant))
+            for k in range(3):
+                normal[k] /= area
+            _cross(factor[1], normal, across[0])
+            _cross(normal, factor[0], across[1])
+            spread = eps2d * (a + c - eps2d)  # det − |f × g|²; a and c have ε inside
+            for k in range(3):
+                top = weight * (spread * across[0, k] - eps2d * area * factor[0, k])
+                low = weight * (spread * across[1, k] - eps2d * area * factor[1, k])
+                by_scales[k] += top * axes[0, k] + low * axes[1, k]
+                by_axes[0, k] += top * scales[i, k]
+                by_axes[1, k] += low * scales[i, k]
+        _matmul(by_axes, rotation.T, by_screen, 2, 3, 3)
+        _matmul(screen.T, by_axes, by_rotation, 3, 2, 3)
+        _matmul(by_screen, turn.T, by_jacobian, 2, 3, 3)
+        x, y, near, fx, fy = camera[0], camera[1], 1.0 / camera[2], K[0, 0], K[1, 1]
+        slope_x, slope_y = _clamped(x * near, K[0, 2], fx, width), _clamped(y * near, K[1, 2], fy, height)
+        by_x, by_y = fx * near * grad_means2d[i, 0], fy * near * grad_means2d[i, 1]
+        by_z = -(by_x * x + by_y * y) * near
+        steep_x, steep_y = fx * near * near, fy * near * near
+        by_z += steep_x * (slope_x * by_jacobian[0, 2] - by_jacobian[0, 0])
+        by_z += steep_y * (slope_y * by_jacobian[1, 2] - by_jacobian[1, 1])
+        if slope_x == x * near:
+            by_x -= steep_x * by_jacobian[0, 2]
+            by_z += steep_x * slope_x * by_jacobian[0, 2]
+        if slope_y == y * near:
+            by_y -= steep_y * by_jacobian[1, 2]
+            by_z += steep_y * slope_y * by_jacobian[1, 2]
+        for k in range(3):
+            to_means[i, k] = viewmat[0, k] * by_x + viewmat[1, k] * by_y + viewmat[2, k] * by_z
+            to_scales[i, k] = by_scales[k]
+        _rotation_adjoint(unit, length, by_rotation, by_quat)
+        for k in range(4):
+            to_quats[i, k] = by_quat[k]
+
+
+@kernel
+def project_adjoint(
+    means, quats, scales, viewmat, K, width, height, eps2d, radii, grad_means2d, moments, grad_compensations
+):
+    """Gradients [N, 3], [N, 4], [N, 3] to means, quats and scales; zero rows where culled.
+
+    Args: grad_means2d [N, 2]; moments [N, 3]: uu, uv, vv of Σ g (W d)(W d)ᵀ over a Gaussian's pixels;
+      grad_compensations [N].
+    """
+    n = len(means)
+    to_means, to_scales = np.zeros((n, 3), np.float32), np.zeros((n, 3), np.float32)
+    to_quats = np.zeros((n, 4), np.float32)
+    turn = np.ascontiguousarray(viewmat[:3, :3])
+    for part in prange(PARTS):
+        first, last = part * n // PARTS, (part + 1) * n // PARTS
+        _project_adjoint(
+            means, quats, scales, viewmat, turn, K, width, height, eps2d, radii, grad_means2d, moments,
+            grad_compensations, first, last, to_means, to_quats, to_scales,
+        )  # fmt: skip
+    return to_means, to_quats, to_scales

@@ -14,10 +14,10 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from chebsplat.kernels.jit import inline, kernel, prange
+from chebsplat.kernels.jit import body, kernel, prange
 
 
-@inline
+@body
 def _basis(means, eye, i, degree, out):
     """Fill basis values of the bands up to `degree`, seen from `eye`: as `sh.basis`."""
     x, y, z = means[i, 0] - eye[0], means[i, 1] - eye[1], means[i, 2] - eye[2]
@@ -39,7 +39,7 @@ def _basis(means, eye, i, degree, out):
         out[15] = -c * x * (x * x - 3 * y * y)
 
 
-@inline
+@body
 def _kept(bands, n_held, i, v, degree):
     """The highest band that counts for Gaussian i, row v of the masks: it has it, and so for all bands below."""
     top = 0
@@ -48,7 +48,7 @@ def _kept(bands, n_held, i, v, degree):
     return top
 
 
-@inline
+@body
 def _band(values, first, band, i, c):
     """What one band adds to channel c of Gaussian i."""
     total = 0.0
@@ -76,7 +76,7 @@ def _forward(sh0, sh1, sh2, sh3, bands, index, means, eye, degree):
     return out
 
 
-@inline
+@body
 def _to_band(values, first, g, out, i, c):
     for k in range(out.shape[1]):
         out[i, k, c] = values[first + k] * g
