@@ -21,7 +21,7 @@ Agreement = Annotated[float, Ge(-1.001), Le(1.001)]
 
 
 class Notes(TypedDict):
-    start: Literal["trained", "lifted"]
+    start: Literal["trained", "lifted", "both"]
     smooth: bool
     strength: Annotated[float, Ge(0), Le(1e6)]
     familiar: NotRequired[Annotated[float, Ge(0), Le(1)]]

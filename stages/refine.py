@@ -25,7 +25,7 @@ def run(job: Job) -> None:
     from chebsplat.formats.gaussians import read_gaussians
     from chebsplat.formats.lifted import read_lifted
     from chebsplat.formats.refined import Refined, write_refined
-    from chebsplat.lifting.blend import blend, calibrate, confidence, effective, familiar, reliable, trusted
+    from chebsplat.lifting.blend import blend, calibrate, confidence, effective, familiar, reliable, start, trusted
     from chebsplat.lifting.smoothing import affinities, smooth
     from chebsplat.splats.gaussians import surface_of
 
@@ -38,12 +38,11 @@ def run(job: Job) -> None:
         raise InputError(
             f"{job.inputs['lifted']} is of {len(lifted.features)} Gaussians, not {len(p['means'])}; lift again"
         )
-    started, features = settings.start, p.get("fused", p.get("features"))
-    if started == "trained" and features is None:
+    trained = p.get("fused", p.get("features"))
+    started = settings.start if trained is not None else "lifted"
+    if started != settings.start:
         job.left_out("trained features", "the scene was trained without; the lifted ones are refined")
-        started = "lifted"
-    if started == "lifted" or features is None:
-        features = lifted.features
+    features = start(started, lifted.features, trained)
     unit = scene_unit(job, p["means"])
     near = affinities(p["means"], *surface_of(p), unit)
     knowledge = known(job, gaussians, unit)

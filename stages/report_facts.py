@@ -96,7 +96,7 @@ class Reported(TypedDict):
 
 
 class Refined(Facts):
-    start: Literal["trained", "lifted"]
+    start: Literal["trained", "lifted", "both"]
     smooth: bool
     strength: float
     familiar: NotRequired[float]

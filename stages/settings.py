@@ -159,7 +159,9 @@ class LiftSection(Section):
 class RefineSection(Section):
     """docs/method.md, section 13."""
 
-    start: Literal["trained", "lifted"] = setting("trained", "features that are refined; lifted where none are trained")
+    start: Literal["trained", "lifted", "both"] = setting(
+        "both", "features that are refined, both: midway between their directions; lifted where none are trained"
+    )
     smooth: Literal["auto", "on", "off"] = setting(
         "auto", "bilateral smoothing; auto: where half the training views agree better with it with the other half"
     )

@@ -5,7 +5,7 @@ import math
 import numpy as np
 import pytest
 
-from chebsplat.lifting.blend import LEAST, STRENGTHS, blend, calibrate, confidence, effective, familiar, reliable
+from chebsplat.lifting.blend import LEAST, STRENGTHS, blend, calibrate, confidence, effective, familiar, reliable, start
 from chebsplat.lifting.carry import carry
 from chebsplat.lifting.smoothing import N_NEIGHBORS, REACH, Affinities, affinities, room_unit, smooth
 
@@ -100,6 +100,13 @@ def test_affinities_refuse_a_unit_that_is_none(scene):
 def test_views_that_err_alike_count_for_fewer():
     n = np.array([0, 1, 2, 6, 10_000])
     np.testing.assert_allclose(effective(n), [0, 1, 2 / 1.2, 3, 5], rtol=1e-3)
+
+
+def test_what_is_refined_lies_midway_between_trained_and_lifted_and_is_as_long_as_the_trained():
+    trained, lifted = np.array([[3.0, 0], [0, 2], [0, 0]], np.float32), np.array([[0, 0.1], [0, 0], [1, 0]], np.float32)
+    np.testing.assert_allclose(start("both", lifted, trained), [[3 / 2**0.5] * 2, [0, 2], [0, 0]], rtol=1e-6)
+    assert start("trained", lifted, trained) is trained
+    assert start("lifted", lifted, trained) is lifted and start("both", lifted, None) is lifted
 
 
 def test_the_blend_counts_knowledge_as_so_many_views():

@@ -116,6 +116,20 @@ def calibrate(
     return Calibration(curve["on"][0.0] > curve["off"][0.0], strength, curve)
 
 
+def start(which: str, lifted: np.ndarray, trained: np.ndarray | None) -> np.ndarray:
+    """What is refined: lifted or trained features [N, C], or, for `both`, their mean direction, as long as the trained.
+
+    Choices: training fits features to pictures, single views' errors too; lifting asks all views alike, and knows no
+      picture. They err differently, so that their mean errs less.
+    """
+    if trained is None or which == "lifted":
+        return lifted
+    if which == "trained":
+        return trained
+    lengths = np.linalg.norm(trained, axis=1, keepdims=True)
+    return np.asarray(lengths * unit(unit(trained) + unit(lifted)), np.float32)
+
+
 def confidence(
     features: np.ndarray,
     n_views: np.ndarray,
