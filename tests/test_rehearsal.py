@@ -76,5 +76,5 @@ def test_what_compiles_beside_a_training_ends_with_it(tmp_path, monkeypatch):
     monkeypatch.setattr(jit, "FOLDER", tmp_path)
     with pytest.raises(KeyboardInterrupt), rehearsal.rehearsed(2, True):
         pass
-    assert len(started) == 3 and not any(process.is_alive() for process in started)
+    assert len(started) == 2 and not any(process.is_alive() for process in started)
     assert not (tmp_path / rehearsal.MARK).exists()
