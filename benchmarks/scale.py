@@ -10,7 +10,6 @@ from __future__ import annotations
 import json
 import math
 import os
-import resource
 import subprocess
 import sys
 import tempfile
@@ -101,7 +100,7 @@ def measured(capture: Path, n_gaussians: int, steps: int) -> dict[str, float]:
     for _ in range(steps):
         next(rounds)
     seconds = (time.perf_counter() - began) / steps
-    return {"step_ms": 1e3 * seconds, "peak_gb": resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 2**20}
+    return {"step_ms": 1e3 * seconds, "peak_gb": shared.peak_memory() / 2**30}
 
 
 def main(arguments: Sequence[str]) -> int:
@@ -120,7 +119,7 @@ def main(arguments: Sequence[str]) -> int:
         for n_gaussians, size, n_views in GROWTH[name]:
             with tempfile.TemporaryDirectory(prefix="scale-") as folder:
                 capture, stored = enlarged(options.work, size, n_views, Path(folder))
-                command = [sys.executable, "-P", "-m", "benchmarks", "scale", "--work", str(options.work)]
+                command = [sys.executable, "-m", "benchmarks", "scale", "--work", str(options.work)]
                 command += ["--steps", str(options.steps), "--case", str(capture), str(n_gaussians)]
                 done = subprocess.run(command, stdout=subprocess.PIPE, text=True, check=True)
             found = json.loads(done.stdout)

@@ -177,8 +177,7 @@ def memory(what: str, folder: Path, n_views: int) -> int:
         read = remembered(lambda k: torch.from_numpy(stored[k]), FEATURE_BYTES)
         for k in np.random.default_rng(0).permutation(n_views).tolist():
             read(k).float()
-    status = Path("/proc/self/status").read_text()  # ru_maxrss would be at least that of the process that started this
-    return int(next(line for line in status.splitlines() if line.startswith("VmHWM")).split()[1]) * 1024
+    return shared.peak_memory()
 
 
 def memories(scratch: Path) -> list[dict]:
