@@ -68,32 +68,37 @@ def losses() -> None:
     feature_distance(features, torch.rand(HEIGHT // 4, WIDTH // 4, CHANNELS)).backward()
 
 
-def afterwards() -> None:
-    """Lifting and descriptors of points, which follow a training."""
+def lifting() -> None:
+    """A lift of features, which a training starts from and is followed by."""
     import numpy as np
 
     from chebsplat.lifting.observations import estimate, gathered
     from chebsplat.rasterize.lift import lift
-    from chebsplat.shape.point_inputs import point_inputs
 
     rng = np.random.default_rng(0)
-    means, flat = rng.normal((0, 0, 3), 1, (4 * N, 3)), np.ones((4 * N, 3), np.float32)
+    means, flat = rng.normal((0, 0, 3), 1, (4 * N, 3)).astype(np.float32), np.ones((4 * N, 3), np.float32)
     quats, K = rng.normal(size=(4 * N, 4)).astype(np.float32), np.array([[30.0, 0, 16], [0, 30, 16], [0, 0, 1]])
-    gaussians = means.astype(np.float32), quats, 0.1 * flat, 0.5 * flat[:, 0]
     cells = np.ones((HEIGHT // 4, WIDTH // 4, CHANNELS), np.float32)
-    said = lift(gaussians, np.eye(4), K, (WIDTH, HEIGHT), cells, cells[..., 0])
+    said = lift((means, quats, 0.1 * flat, 0.5 * flat[:, 0]), np.eye(4), K, (WIDTH, HEIGHT), cells, cells[..., 0])
     estimate(gathered(4 * N, CHANNELS, [said]), 1)
-    shapes = np.tile(np.eye(3), (4 * N, 1, 1))
+
+
+def descriptors() -> None:
+    """Descriptors of points, which follow a training."""
+    import numpy as np
+
+    from chebsplat.shape.point_inputs import point_inputs
+
+    means, shapes = np.random.default_rng(0).normal(0, 1, (4 * N, 3)), np.tile(np.eye(3), (4 * N, 1, 1))
     point_inputs(means, np.tile([0.0, 0, 1], (4 * N, 1)), shapes, up=np.array([0, 0, 1.0]))
 
 
 @contextmanager
 def rehearsed(n_threads: int, semantic: bool) -> Iterator[None]:
-    """Within, what a training needs has been compiled; what follows a semantic one may still be.
+    """Within, what a training needs has been compiled; what follows a semantic one has been when the block ends.
 
-    Choices: the kernels of a picture here, the others in processes of their own, which end with the block at the
-      latest. Nothing is done where all is kept already or nothing can be, where another process is at it, and with one
-      thread alone.
+    Choices: the kernels of a picture and of a lift, which uses them, here, the others in processes of their own.
+      Nothing is done where all is kept already or nothing can be, where another process is at it, and with one thread.
     """
     import fcntl
     from multiprocessing import get_context
@@ -111,17 +116,21 @@ def rehearsed(n_threads: int, semantic: bool) -> Iterator[None]:
             return
         new = partial(get_context("spawn").Process, target=alone, daemon=True)
         beside = [new(args=(5, *parts)) for parts in ((adjoints,), (colors, losses))]
-        behind = [new(args=(10, afterwards))] if semantic else []
+        behind = [new(args=(5, descriptors))] if semantic else []
         started = [*beside, *behind]
         for process in beside:
             process.start()
         try:
             rasterizer()
-            for process in behind:  # what follows a training needs some of the rasterizer's, too: it is kept by now
-                process.start()
+            if semantic:
+                lifting()
             for process in beside:
                 process.join()
+            for process in behind:
+                process.start()
             yield
+            for process in behind:
+                process.join()
             if semantic and all(process.exitcode == 0 for process in started):
                 (FOLDER / MARK).touch()
         finally:
