@@ -105,6 +105,7 @@ calibration: $(READY)  ## calibrate queries of the embedded teacher on generated
 
 teacher: text-model  ## train, export and measure the embedded teacher: seeds fixed; about half an hour on 4 cores
 	@OMP_WAIT_POLICY=PASSIVE $(PY) -m chebsplat.teachers.train $(args)
+	@$(CHEBSPLAT) channels --force --out teachers/embedded.channels
 	@$(PY) -m chebsplat.teachers.quality
 
 teacher-quality: text-model  ## measure the shipped embedded teacher on held-out rooms and the houses: teachers/quality.md

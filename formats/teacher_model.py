@@ -55,6 +55,11 @@ class TeacherModel:
         """The TOML beside the model."""
         return self.path.with_suffix(".toml")
 
+    @property
+    def channels(self) -> Path:
+        """The folder of its channel map, `channels/1`, where it brings one."""
+        return self.path.with_suffix(".channels")
+
     def verify(self) -> None:
         """Raises InputError if the encoder is not the file whose checksum was recorded."""
         if self.sha256 is not None and (found := sha256_file(self.path)) != self.sha256:

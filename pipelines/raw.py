@@ -60,12 +60,14 @@ def _of_teacher(settings: dict[str, Any]) -> list[Path]:
 
 
 def _of_channels(settings: dict[str, Any]) -> list[Path]:
-    """The model's files, and the reference images; none of a scene's."""
+    """The model's files, its channel map's where it brings one, and the reference images; none of a scene's."""
     from chebsplat.formats.teacher_model import read_teacher
     from chebsplat.stages.channels import reference_files
 
     images = reference_files(Path(settings["reference"])) if settings["reference"] else []
-    return [*read_teacher(Path(settings["model"])).files(), *images]
+    teacher = read_teacher(Path(settings["model"]))
+    brought = sorted(teacher.channels.iterdir()) if teacher.channels.is_dir() else []
+    return [*teacher.files(), *brought, *images]
 
 
 def _named(path: str, setting: str) -> Path:

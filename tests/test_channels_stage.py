@@ -1,6 +1,7 @@
 """The channels are the teacher's: every scene of a teacher shares them, and nothing of a scene changes them."""
 
 import hashlib
+import shutil
 
 import numpy as np
 import pytest
@@ -10,8 +11,11 @@ from tiny_teachers import color_reference, color_teacher, write_settings, write_
 from chebsplat.formats.artifact import read_manifest
 from chebsplat.formats.channels import SCHEMA, read_channels
 from chebsplat.formats.images import SUFFIXES
+from chebsplat.formats.teacher_model import EMBEDDED, read_teacher
 from chebsplat.pipelines.plan import Planner
-from chebsplat.stages.channels import generated
+from chebsplat.stages import channels
+from chebsplat.stages.channels import generated, shipped
+from chebsplat.stages.settings import ChannelsSection
 
 
 @pytest.fixture
@@ -63,6 +67,50 @@ def test_a_teacher_without_a_table_is_reduced_by_energy_alone(tmp_path, tiny):
     facts = read_manifest(tmp_path / "out", SCHEMA).facts
     assert "vocabulary" in facts["left_out"]
     assert facts["n_words"] == 0
+
+
+def test_a_map_beside_its_teacher_is_taken_as_long_as_it_is_of_the_same_files_and_settings(tmp_path, tiny):
+    model, reference = tiny
+    _, computed = reduced(tmp_path, model, reference)
+    brought = model.with_suffix(".channels")
+    (tmp_path / "out").rename(brought)
+    settings = model.with_suffix(".toml")
+    for is_taken in (True, False):
+        code, found = reduced(tmp_path, model, reference)
+        assert code == 0
+        facts = read_manifest(tmp_path / "out", SCHEMA).facts
+        assert ("reference images" in facts.get("left_out", {})) == is_taken
+        assert (facts["n_channels"], facts["n_images"]) == (3, 2)
+        assert np.array_equal(found.matrix, computed.matrix) and found.notes["digest"] == facts["digest"]
+        shutil.rmtree(tmp_path / "out")
+        settings.write_text(settings.read_text() + "# another teacher from here on")
+    _, fewer = reduced(tmp_path, model, reference, n_channels=2)
+    assert fewer.matrix.shape == (6, 2)
+
+
+def test_a_damaged_map_beside_its_teacher_is_named(tmp_path, tiny, capsys):
+    model, reference = tiny
+    reduced(tmp_path, model, reference)
+    brought = model.with_suffix(".channels")
+    (tmp_path / "out").rename(brought)
+    (brought / "channels.safetensors").write_bytes(b"?")
+    assert reduced(tmp_path, model, reference)[0] == 3
+    assert str(brought / "channels.safetensors") in capsys.readouterr().err
+
+
+def test_the_embedded_teacher_brings_its_map():
+    teacher = read_teacher(EMBEDDED)
+    assert shipped(teacher, ChannelsSection()) == teacher.channels
+    assert shipped(teacher, ChannelsSection(n_channels=8)) is None
+
+
+@pytest.mark.slow
+def test_the_map_that_ships_is_what_its_stage_computes(tmp_path, monkeypatch):
+    monkeypatch.setattr(channels, "shipped", lambda *_: None)
+    assert run_stage("channels", tmp_path / "out", {}, {}) == 0
+    computed, brought = read_channels(tmp_path / "out"), read_channels(read_teacher(EMBEDDED).channels)
+    assert np.abs(computed.matrix - brought.matrix).max() < 1e-5
+    assert computed.notes == brought.notes
 
 
 @pytest.mark.parametrize("bad", ["empty folder", "not an image", "other channels", "zero word", "closed set"])
