@@ -17,6 +17,7 @@ from benchmarks import shared
 from benchmarks.scene import trainer_from
 from chebsplat.pipelines.plan import merged
 from chebsplat.pipelines.scenes import read_toml
+from chebsplat.settings import MOST_STEPS
 from chebsplat.stages.config import Config
 from chebsplat.training.trainer import Trainer
 
@@ -30,7 +31,7 @@ def begun(work: Path, ablation: str, steps: int) -> Trainer:
 
 def main(arguments: Sequence[str]) -> None:
     parser = shared.parser("cost", __doc__, work=True)
-    parser.add_argument("--steps", type=int, default=Config().train.steps)
+    parser.add_argument("--steps", type=int, default=MOST_STEPS)
     parser.add_argument("--ablations", nargs="*", default=[])
     options = parser.parse_args(arguments)
     print(f"chebsplat {chebsplat.__version__}, torch {torch.__version__} on {torch.get_num_threads()} threads; "

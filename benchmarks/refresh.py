@@ -45,7 +45,7 @@ def main(arguments: Sequence[str]) -> None:
     options = parser.parse_args(arguments)
     train = {"encoder": "transformer", "n_densify": 0, "refresh_every": 1_000_000}
     trainer = trainer_from(options.work, Config.model_validate({"train": train}))
-    begin = round(trainer.settings.encode_from * trainer.settings.steps)
+    begin = round(trainer.settings.encode_from * trainer.schedule.steps)
     before, spent, began = torch.zeros(0), 0.0, 0.0
     rows: list[dict[str, Any]] = []
     for _ in trainer.steps():

@@ -10,6 +10,7 @@ from typing import Any, Literal
 
 from pydantic import BaseModel, ConfigDict, Field, model_validator
 
+MOST_STEPS = 3000  # of a training that is not told how many
 DESCRIPTOR_BYTES = 4 << 30  # of one scene's descriptors, at most
 
 
@@ -72,7 +73,12 @@ class DescribeSection(Section):
 class TrainSection(Section):
     """docs/method.md, sections 3 to 8."""
 
-    steps: int = number(3000, "of training; the schedule's fractions are of these", 1, 1_000_000)
+    steps: int | None = number(
+        None,
+        "of training; the schedule's fractions are of these; default: 1000 to 3000, by the pixels of the photos",
+        1,
+        1_000_000,
+    )
     seconds: float | None = number(None, "of training, instead of steps: the schedule follows the clock", 0.1, 604_800)
     seed: int = seed("of the order of views and of all that is drawn in training")
     start: str | None = setting(None, "a 3DGS PLY that training goes on from, instead of the points")

@@ -21,6 +21,7 @@ import yaml
 from chebsplat.errors import ConfigError
 from chebsplat.pipelines import leases, store
 from chebsplat.pipelines.store import say
+from chebsplat.settings import MOST_STEPS
 from chebsplat.stages.registry import MODEL_FREE
 from chebsplat.stages.stopping import stop
 
@@ -169,7 +170,7 @@ def together(entries: list[dict[str, Any]]) -> list[str]:
 def seconds_of(train: dict[str, Any]) -> float:
     """How long a training takes, about."""
     settings = train["config"]["train"]
-    return float(settings["seconds"] or settings["steps"] * STEP_SECONDS)
+    return float(settings["seconds"] or (settings["steps"] or MOST_STEPS) * STEP_SECONDS)
 
 
 def minutes_of(entry: dict[str, Any]) -> int:

@@ -254,6 +254,20 @@ def test_features_are_taught_in_one_step_of_so_many_unless_views_are_few(tiny_tr
     assert changed == [False, False, True, False, False, True, False, False]
 
 
+def test_a_training_that_is_not_told_has_steps_by_the_pixels_of_its_photos(tiny_trainer):
+    from chebsplat.settings import TrainSection
+    from chebsplat.training.schedule import n_steps
+
+    found = [n_steps(TrainSection(), n_views * 320 * 240) for n_views in (1, 46, 47, 70, 100, 139, 140, 5000)]
+    assert found == [1000, 1000, 1000, 1500, 2200, 3000, 3000, 3000]
+    assert n_steps(TrainSection(steps=7), 10**9) == 7
+    made = tiny_trainer(steps=None, n_densify=0)
+    assert made.schedule.last_step(0, 0.0) == made.settings.steps == 1000
+    told = tiny_trainer(steps=1000, n_densify=0)
+    rates = [[group["rate"] for group in one.optimizer.param_groups] for one in (made, told)]
+    assert rates[0] == rates[1]
+
+
 def test_rates_follow_the_number_of_steps_unless_they_are_given():
     from chebsplat.settings import TrainSection
     from chebsplat.training.schedule import rates

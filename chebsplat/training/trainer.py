@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import time
 from collections.abc import Iterator
 from typing import Any
@@ -20,7 +21,7 @@ from chebsplat.training.laps import Laps
 from chebsplat.training.losses import depth_distance, photometric
 from chebsplat.training.model import Rendered, SceneModel
 from chebsplat.training.population import Population, broken
-from chebsplat.training.schedule import Schedule, adam, feature_every
+from chebsplat.training.schedule import Schedule, adam, feature_every, n_steps
 from chebsplat.training.semantic_loss import semantic_loss
 from chebsplat.views import Views
 
@@ -56,7 +57,8 @@ class Trainer:
         cameras: CameraModels | None = None,
     ):
         self.feature_every = feature_every(settings, len(views.names))
-        settings = settings.model_copy(update={"feature_every": self.feature_every})
+        known = {"feature_every": self.feature_every, "steps": n_steps(settings, math.prod(views.images.shape[:3]))}
+        settings = settings.model_copy(update=known)
         self.model, self.views, self.settings, self.extent = model, views, settings, extent
         given = basis if basis and model.shape is not None else {}
         self.basis = {name: value.to(model.device) for name, value in given.items()}

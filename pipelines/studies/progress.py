@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING
 
 from chebsplat.errors import ChebsplatError
 from chebsplat.pipelines.plan import Step
+from chebsplat.settings import MOST_STEPS
 
 if TYPE_CHECKING:
     from chebsplat.pipelines.studies.study import Run
@@ -45,8 +46,8 @@ class Progress:
     def left(self) -> float | None:
         """Seconds until all is done; None as long as there is a stage that has never been finished, and on a cluster.
 
-        Choices: a training takes as long as others by its steps, or its budget of seconds; any other step as long as
-          the mean of its stage.
+        Choices: a training takes as long as others by its steps (the most, where they are not given), or its budget of
+          seconds; any other step as long as the mean of its stage.
         """
         if self.at_once is None:
             return None
@@ -79,7 +80,7 @@ def measure(step: Step) -> tuple[tuple[str, bool], float]:
     """(what a step's time compares with, in how many units)."""
     settings = step.sections["train"] if step.stage == "train" else {}
     by_clock = settings.get("seconds") is not None
-    return (step.stage, by_clock), float(settings["seconds" if by_clock else "steps"] if settings else 1)
+    return (step.stage, by_clock), float(settings["seconds" if by_clock else "steps"] or MOST_STEPS if settings else 1)
 
 
 def estimate_text(seconds: float) -> str:
