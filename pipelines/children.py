@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+import json
 import multiprocessing
 import os
 import signal
 import subprocess
 import sys
 import time
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from pathlib import Path
 from types import FrameType
@@ -19,13 +20,16 @@ from chebsplat.stages.stopping import LIFELINE, PATIENCE
 # theirs, is the lifeline (stages/stopping.py): without a run it ends at once, and its jobs stop by themselves. Its
 # cache lies beside its other files, not in the home folder, which may be full or read-only.
 SNAKEMAKE = """
-import os, sys, threading
+import json, os, subprocess, sys, threading
 def watch():
     while os.read(0, 1):
         pass
     os._exit(143)
 threading.Thread(target=watch, daemon=True).start()
 sys.stderr = open(sys.argv.pop(1), "w", 1)
+beside = json.loads(sys.argv.pop(1))
+if beside:
+    subprocess.Popen(beside, stderr=subprocess.DEVNULL)
 import platformdirs, snakemake.common
 own = type("Own", (platformdirs.PlatformDirs,), {"user_cache_dir": sys.argv.pop(1)})
 snakemake.common.APPDIRS = own("snakemake", "snakemake")
@@ -34,17 +38,21 @@ main()
 """
 
 
-def snakemake(words: Path, cache: Path, arguments: list[str], environment: Mapping[str, str]) -> int:
+def snakemake(
+    words: Path, cache: Path, arguments: list[str], environment: Mapping[str, str], beside: Sequence[str] = ()
+) -> int:
     """Run Snakemake; returns its exit code when it and all that it has started are gone.
 
-    Args: words: a file for what it says; cache: a folder for its own; environment: variables beside our own.
+    Args: words: a file for what it says; cache: a folder for its own; environment: variables beside our own; beside: a
+      command of ours that runs meanwhile, and watches the lifeline.
     """
     reader, writer = os.pipe()
     with open(reader, "rb") as lifeline, open(writer, "wb") as held:
         environment = {LIFELINE: str(os.fstat(reader).st_ino), "PYTHONSAFEPATH": "1", **environment}
         # -P and PYTHONSAFEPATH: a module where the user stands, or in the work folder, is never run. A session of its
         # own: a terminal's Ctrl-C reaches the run alone, which ends its jobs in good order.
-        process = subprocess.Popen([sys.executable, "-P", "-c", SNAKEMAKE, str(words), str(cache), *arguments],
+        process = subprocess.Popen([sys.executable, "-P", "-c", SNAKEMAKE, str(words), json.dumps(beside), str(cache),
+                                    *arguments],
                                    stdin=lifeline, stdout=subprocess.DEVNULL, start_new_session=True,
                                    env=os.environ | environment)  # fmt: skip
         try:

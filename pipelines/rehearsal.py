@@ -1,18 +1,19 @@
 """Compiling what a training needs, side by side: the first one on a machine waits half as long for its first step.
 
 Numba compiles a kernel when it first meets a kind of arguments, one after the other on one core. Here each part of a
-training meets tiny ones, in a process of its own; what it compiles is kept, and found by the training.
+training meets tiny ones, in a process of its own; what it compiles is kept, and found by the training. A run begins
+with it: what comes before a training leaves processors idle.
 """
 
 from __future__ import annotations
 
 import os
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from functools import partial
+from pathlib import Path
 
 N, WIDTH, HEIGHT, CHANNELS = 8, 32, 32, 32
-MARK, LOCK = "rehearsed", ".rehearsal"
 
 
 def rasterizer() -> None:
@@ -93,55 +94,73 @@ def descriptors() -> None:
     point_inputs(means, np.tile([0.0, 0, 1], (4 * N, 1)), shapes, up=np.array([0, 0, 1.0]))
 
 
+NEEDED = (rasterizer, adjoints, colors, losses)  # of any training
+SEMANTIC = (lifting, descriptors)  # of one that is taught features
+
+
 @contextmanager
 def rehearsed(n_threads: int, semantic: bool) -> Iterator[None]:
     """Within, what a training needs has been compiled; what follows a semantic one has been when the block ends.
 
     Choices: the kernels of a picture and of a lift, which uses them, here, the others in processes of their own.
-      Nothing is done where all is kept already or nothing can be, where another process is at it, and with one thread.
+      Nothing is done where all is kept already or nothing can be, and with one thread.
     """
-    import fcntl
     from multiprocessing import get_context
 
     from chebsplat.kernels.jit import FOLDER
 
-    if FOLDER is None or n_threads < 2 or (FOLDER / MARK).exists():
+    if FOLDER is None or n_threads < 2 or all(is_kept(part) for part in (*NEEDED, *SEMANTIC * semantic)):
         yield
         return
-    with open(FOLDER / LOCK, "w") as lock:
-        try:
-            fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except OSError:  # another process has it, or the file system knows no locks
-            yield
-            return
-        new = partial(get_context("spawn").Process, target=alone, daemon=True)
-        beside = [new(args=(5, *parts)) for parts in ((adjoints,), (colors, losses))]
-        behind = [new(args=(5, descriptors))] if semantic else []
-        started = [*beside, *behind]
+    new = partial(get_context("spawn").Process, target=alone, daemon=True)
+    beside = [new(args=(5, *parts)) for parts in ((adjoints,), (colors, losses))]
+    behind = [new(args=(5, descriptors))] if semantic else []
+    for process in beside:
+        process.start()
+    try:
+        once(rasterizer)
+        if semantic:
+            once(lifting)
         for process in beside:
+            process.join()
+        for process in behind:
             process.start()
-        try:
-            rasterizer()
-            if semantic:
-                lifting()
-            for process in beside:
+        yield
+        for process in behind:
+            process.join()
+    finally:
+        for process in (*beside, *behind):
+            if process.pid is not None:
+                process.kill()
                 process.join()
-            for process in behind:
-                process.start()
-            yield
-            for process in behind:
-                process.join()
-            if semantic and all(process.exitcode == 0 for process in started):
-                (FOLDER / MARK).touch()
-        finally:
-            for process in started:
-                if process.pid is not None:
-                    process.kill()
-                    process.join()
 
 
 def alone(niceness: int, *parts: Callable[[], None]) -> None:
     """Rehearse parts in a process of its own, which gives way to others."""
     os.nice(niceness)
     for part in parts:
-        part()
+        once(part)
+
+
+def once(part: Callable[[], None]) -> None:
+    """Rehearse a part unless that was done; another process that is at it is waited for, where files can be locked."""
+    import fcntl
+
+    with open(_mark(part).with_suffix(".lock"), "w") as lock:
+        with suppress(OSError):
+            fcntl.flock(lock, fcntl.LOCK_EX)
+        if not is_kept(part):
+            part()
+            _mark(part).touch()
+
+
+def is_kept(part: Callable[[], None]) -> bool:
+    """Whether what a part needs was compiled, and is kept."""
+    return _mark(part).exists()
+
+
+def _mark(part: Callable[[], None]) -> Path:
+    from chebsplat.kernels.jit import FOLDER
+
+    assert FOLDER is not None
+    return FOLDER / f"rehearsed-{part.__name__}"

@@ -118,7 +118,8 @@ def snakemake(
         environment = {"CHEBSPLAT_THREADS": str(threads or cores), "CHEBSPLAT_WORK": str(store.work())}
         code: int | None = None
         try:
-            code = children.snakemake(words, store.work() / ".snakemake/cache", arguments, environment)
+            beside = rehearsal_command(entries) if on == cluster.LOCAL and cores > 1 else []
+            code = children.snakemake(words, store.work() / ".snakemake/cache", arguments, environment, beside)
             return failures(steps, folder, words) if code else Outcome()
         finally:
             if code != 0 and on != cluster.LOCAL:
@@ -212,6 +213,15 @@ def entry(step: Step, state: dict[str, Any], device: str = "cpu") -> dict[str, A
         "raw": step.raw,
         "device": STAGES[step.stage].device(device, step.sections),
     }
+
+
+def rehearsal_command(entries: list[dict[str, Any]]) -> list[str]:
+    """What compiles kernels while these steps run: nothing, if no training on the processor is among them."""
+    trained = [entry for entry in entries if entry["stage"] == "train" and entry["device"] != "cuda"]
+    if not trained:
+        return []
+    semantic = any("features" in entry["inputs"] for entry in trained)
+    return [sys.executable, "-P", "-m", "chebsplat.pipelines.cli", "rehearse", *["--semantic"] * semantic]
 
 
 def job_command(plan: Path, of_job: dict[str, Any]) -> str:

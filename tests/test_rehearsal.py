@@ -4,6 +4,7 @@ import fcntl
 import os
 import subprocess
 import sys
+from concurrent.futures import ThreadPoolExecutor
 
 import pytest
 from shared import ROOT
@@ -36,28 +37,48 @@ def test_a_training_finds_all_its_kernels_compiled(tmp_path):
     environment = os.environ | {"CHEBSPLAT_CACHE": str(tmp_path / "kept")}
     first, second = (subprocess.run(command, capture_output=True, text=True, env=environment) for _ in range(2))
     assert first.returncode == 0, first.stderr
-    assert int(first.stdout.split()[0]) > 50 and rehearsal.MARK in first.stdout
+    assert int(first.stdout.split()[0]) > 50 and "rehearsed-descriptors" in first.stdout
     assert second.stdout.split()[0] == "0", second.stderr
 
 
-def test_nothing_is_rehearsed_twice_nor_by_two_nor_on_one_thread(tmp_path, monkeypatch):
-    def never():
+def kept(folder, *parts):
+    for part in parts:
+        (folder / f"rehearsed-{part.__name__}").touch()
+
+
+def test_nothing_is_rehearsed_twice_nor_on_one_thread_nor_where_nothing_is_kept(tmp_path, monkeypatch):
+    def rasterizer():
         raise AssertionError("rehearsed")
 
-    monkeypatch.setattr(rehearsal, "rasterizer", never)
+    monkeypatch.setattr(rehearsal, "NEEDED", (rasterizer, *rehearsal.NEEDED[1:]))
+    monkeypatch.setattr(rehearsal, "rasterizer", rasterizer)
     monkeypatch.setattr(jit, "FOLDER", tmp_path)
     with rehearsal.rehearsed(1, True):
         pass
-    with open(tmp_path / rehearsal.LOCK, "w") as held:
-        fcntl.flock(held, fcntl.LOCK_EX)
-        with rehearsal.rehearsed(2, True):
-            pass
-    (tmp_path / rehearsal.MARK).touch()
+    kept(tmp_path, *rehearsal.NEEDED)
+    with rehearsal.rehearsed(2, False):
+        pass
+    kept(tmp_path, *rehearsal.SEMANTIC)
     with rehearsal.rehearsed(2, True):
         pass
     monkeypatch.setattr(jit, "FOLDER", None)
     with rehearsal.rehearsed(2, True):
         pass
+
+
+def test_what_another_process_rehearses_is_waited_for(tmp_path, monkeypatch):
+    def rasterizer():
+        raise AssertionError("rehearsed")
+
+    monkeypatch.setattr(jit, "FOLDER", tmp_path)
+    with open(tmp_path / "rehearsed-rasterizer.lock", "w") as held, ThreadPoolExecutor(1) as pool:
+        fcntl.flock(held, fcntl.LOCK_EX)
+        waiting = pool.submit(rehearsal.once, rasterizer)
+        with pytest.raises(TimeoutError):
+            waiting.result(0.2)
+        kept(tmp_path, rasterizer)
+        fcntl.flock(held, fcntl.LOCK_UN)
+        waiting.result(10)
 
 
 def test_what_compiles_beside_a_training_ends_with_it(tmp_path, monkeypatch):
@@ -74,4 +95,4 @@ def test_what_compiles_beside_a_training_ends_with_it(tmp_path, monkeypatch):
     with pytest.raises(KeyboardInterrupt), rehearsal.rehearsed(2, True):
         pass
     assert len(started) == 2 and not any(process.is_alive() for process in started)
-    assert not (tmp_path / rehearsal.MARK).exists()
+    assert not rehearsal.is_kept(rehearsal.NEEDED[0])

@@ -195,6 +195,21 @@ def job(plan: Path, keys: tuple[str, ...], elsewhere: bool) -> int:
     return jobs.run(plan, keys[0], again=elsewhere)
 
 
+@click.command(hidden=True)
+@click.option("--semantic", is_flag=True)
+def rehearse(semantic: bool) -> int:
+    """Compile what a training needs, as long as the run lasts that this is of."""
+    import os
+
+    from chebsplat.pipelines.rehearsal import rehearsed
+    from chebsplat.stages.stopping import watch_lifeline
+
+    watch_lifeline()
+    os.nice(5)
+    with rehearsed(2, semantic):
+        return 0
+
+
 def _main(arguments: list[str]) -> None:
     """Our command in a process that was forked for it."""
     from chebsplat.pipelines.cli import main
@@ -202,4 +217,4 @@ def _main(arguments: list[str]) -> None:
     main(arguments, prog_name="chebsplat")
 
 
-COMMANDS = (run, plan, study, job)
+COMMANDS = (run, plan, study, job, rehearse)
