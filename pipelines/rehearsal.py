@@ -7,10 +7,12 @@ with it: what comes before a training leaves processors idle.
 
 from __future__ import annotations
 
+import fcntl
 import os
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager, suppress
-from functools import partial
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import ExitStack, contextmanager, suppress
+from multiprocessing import get_context
+from multiprocessing.process import BaseProcess
 from pathlib import Path
 
 N, WIDTH, HEIGHT, CHANNELS = 8, 32, 32, 32
@@ -94,45 +96,49 @@ def descriptors() -> None:
     point_inputs(means, np.tile([0.0, 0, 1], (4 * N, 1)), shapes, up=np.array([0, 0, 1.0]))
 
 
-NEEDED = (rasterizer, adjoints, colors, losses)  # of any training
+NEEDED = (colors, losses, adjoints, rasterizer)  # of any training
 SEMANTIC = (lifting, descriptors)  # of one that is taught features
+SIDE_BY_SIDE = (rasterizer, lifting), (adjoints,), (losses, colors)  # a lift has the kernels of a picture in it
 
 
 @contextmanager
 def rehearsed(n_threads: int, semantic: bool) -> Iterator[None]:
     """Within, what a training needs has been compiled; what follows a semantic one has been when the block ends.
 
-    Choices: the kernels of a picture and of a lift, which uses them, here, the others in processes of their own.
-      Nothing is done where all is kept already or nothing can be, and with one thread.
+    Choices: nothing is done where all is kept already or nothing can be, and with one thread. Where another process is
+      at it, this one takes what is left to take, and waits for the rest.
     """
-    from multiprocessing import get_context
-
     from chebsplat.kernels.jit import FOLDER
 
     if FOLDER is None or n_threads < 2 or all(is_kept(part) for part in (*NEEDED, *SEMANTIC * semantic)):
         yield
         return
-    new = partial(get_context("spawn").Process, target=alone, daemon=True)
-    beside = [new(args=(5, *parts)) for parts in ((adjoints,), (colors, losses))]
-    behind = [new(args=(5, descriptors))] if semantic else []
-    for process in beside:
-        process.start()
-    try:
-        once(rasterizer)
-        if semantic:
-            once(lifting)
-        for process in beside:
-            process.join()
-        for process in behind:
-            process.start()
-        yield
-        for process in behind:
-            process.join()
-    finally:
-        for process in (*beside, *behind):
-            if process.pid is not None:
-                process.kill()
+    before, behind = (*NEEDED, *SEMANTIC[:1] * semantic), SEMANTIC[1:] * semantic
+    with ExitStack() as processes:
+        if not any(is_locked(part) for part in before):
+            chains = [[part for part in chain if part in before] for chain in SIDE_BY_SIDE]
+            for process in [processes.enter_context(beside(chain)) for chain in chains]:
                 process.join()
+        for part in before:
+            once(part)
+        followers = [processes.enter_context(beside([part])) for part in behind]
+        yield
+        for process in followers:
+            process.join()
+
+
+@contextmanager
+def beside(parts: Sequence[Callable[[], None]]) -> Iterator[BaseProcess]:
+    """A process that rehearses parts, and ends with the block; forked from one that is ready to compile."""
+    context = get_context("forkserver")
+    context.set_forkserver_preload(["chebsplat.pipelines.compiler"])
+    process = context.Process(target=alone, args=(5, *parts), daemon=True)
+    process.start()
+    try:
+        yield process
+    finally:
+        process.kill()
+        process.join()
 
 
 def alone(niceness: int, *parts: Callable[[], None]) -> None:
@@ -144,14 +150,24 @@ def alone(niceness: int, *parts: Callable[[], None]) -> None:
 
 def once(part: Callable[[], None]) -> None:
     """Rehearse a part unless that was done; another process that is at it is waited for, where files can be locked."""
-    import fcntl
-
-    with open(_mark(part).with_suffix(".lock"), "w") as lock:
+    with open(_lock(part), "w") as lock:
         with suppress(OSError):
             fcntl.flock(lock, fcntl.LOCK_EX)
         if not is_kept(part):
             part()
             _mark(part).touch()
+
+
+def is_locked(part: Callable[[], None]) -> bool:
+    """Whether another process is at a part."""
+    with open(_lock(part), "w") as lock:
+        try:
+            fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError:
+            return True
+        except OSError:  # a file system without locks
+            pass
+    return False
 
 
 def is_kept(part: Callable[[], None]) -> bool:
@@ -164,3 +180,7 @@ def _mark(part: Callable[[], None]) -> Path:
 
     assert FOLDER is not None
     return FOLDER / f"rehearsed-{part.__name__}"
+
+
+def _lock(part: Callable[[], None]) -> Path:
+    return _mark(part).with_suffix(".lock")

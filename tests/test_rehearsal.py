@@ -20,25 +20,23 @@ from chebsplat.kernels import jit
 from chebsplat.pipelines import rehearsal
 if __name__ == "__main__":
     with rehearsal.rehearsed(2, True):
-        here = jit.compilation.kernels
         made = tiny_trainer(steps=30, encoder="points", weight_depth=1.0, depth_every=2)
         for _ in made.steps():
             pass
         made.finish()
-        assert jit.compilation.kernels == here, jit.compilation.kernels - here
-    print(here, sorted(path.name for path in jit.FOLDER.iterdir() if path.is_file()))
+        assert jit.compilation.kernels == 0, jit.compilation.kernels
+    print(sorted(path.name for path in jit.FOLDER.iterdir() if path.is_file()))
 """
 
 
-@pytest.mark.slow  # everything is compiled twice
+@pytest.mark.slow  # everything is compiled
 def test_a_training_finds_all_its_kernels_compiled(tmp_path):
     (tmp_path / "trains.py").write_text(TRAINS)
     command = [sys.executable, str(tmp_path / "trains.py"), str(ROOT)]
     environment = os.environ | {"CHEBSPLAT_CACHE": str(tmp_path / "kept")}
-    first, second = (subprocess.run(command, capture_output=True, text=True, env=environment) for _ in range(2))
-    assert first.returncode == 0, first.stderr
-    assert int(first.stdout.split()[0]) > 50 and "rehearsed-descriptors" in first.stdout
-    assert second.stdout.split()[0] == "0", second.stderr
+    for _ in range(2):
+        ran = subprocess.run(command, capture_output=True, text=True, env=environment)
+        assert ran.returncode == 0 and "rehearsed-descriptors" in ran.stdout, ran.stderr
 
 
 def kept(folder, *parts):
@@ -81,18 +79,26 @@ def test_what_another_process_rehearses_is_waited_for(tmp_path, monkeypatch):
         waiting.result(10)
 
 
-def test_what_compiles_beside_a_training_ends_with_it(tmp_path, monkeypatch):
-    started = []
+BREAKS_OFF = """
+import signal, sys, time
+from chebsplat.kernels import jit
+from chebsplat.pipelines import rehearsal
+if __name__ == "__main__":
+    lock = jit.FOLDER / "rehearsed-pause.lock"
+    try:
+        with rehearsal.beside([signal.pause]) as process:
+            until = time.monotonic() + 60
+            while not (lock.exists() and rehearsal.is_locked(signal.pause)) and time.monotonic() < until:
+                time.sleep(0.05)
+            print(process.is_alive())
+            raise KeyboardInterrupt
+    except KeyboardInterrupt:
+        print(process.is_alive(), rehearsal.is_kept(signal.pause), rehearsal.is_locked(signal.pause))
+"""
 
-    def failing():
-        from multiprocessing import active_children
 
-        started.extend(active_children())
-        raise KeyboardInterrupt
-
-    monkeypatch.setattr(rehearsal, "rasterizer", failing)
-    monkeypatch.setattr(jit, "FOLDER", tmp_path)
-    with pytest.raises(KeyboardInterrupt), rehearsal.rehearsed(2, True):
-        pass
-    assert len(started) == 2 and not any(process.is_alive() for process in started)
-    assert not rehearsal.is_kept(rehearsal.NEEDED[0])
+def test_what_compiles_beside_a_training_ends_with_it(tmp_path):
+    (tmp_path / "breaks_off.py").write_text(BREAKS_OFF)
+    environment = os.environ | {"CHEBSPLAT_CACHE": str(tmp_path / "kept")}
+    ran = subprocess.run([sys.executable, tmp_path / "breaks_off.py"], capture_output=True, text=True, env=environment)
+    assert ran.stdout.split() == ["True", "False", "False", "False"], ran.stderr

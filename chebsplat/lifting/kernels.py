@@ -28,7 +28,8 @@ def place(ids, weights, sums, view, cursors, views, to_weights, to_means):
 @serial
 def _direction(means, lengths, factors, first, last, chosen, out):
     """out = Σ factor · b / |b| over the chosen rows; returns Σ factor."""
-    out[:] = 0.0
+    for c in range(len(out)):
+        out[c] = 0.0
     total = 0.0
     for row in range(first, last):
         if chosen[row - first]:
@@ -40,6 +41,14 @@ def _direction(means, lengths, factors, first, last, chosen, out):
 
 
 @serial
+def _length(direction):
+    square = 0.0
+    for c in range(len(direction)):
+        square += direction[c] * direction[c]
+    return math.sqrt(square)
+
+
+@serial
 def _average(means, weights, lengths, first, last, chosen, steps, floor, factors, direction, out):
     """Mean of the chosen rows, after `steps` towards the geometric median of their directions; returns r of the mean.
 
@@ -48,12 +57,13 @@ def _average(means, weights, lengths, first, last, chosen, steps, floor, factors
     for row in range(first, last):
         factors[row - first] = weights[row]
     total = _direction(means, lengths, factors, first, last, chosen, direction)
-    out[:] = np.float32(0)
+    for c in range(len(out)):
+        out[c] = np.float32(0)
     if total == 0:
         return 0.0
-    agreement = math.sqrt((direction**2).sum()) / total
+    agreement = _length(direction) / total
     for _ in range(steps):
-        size = max(math.sqrt((direction**2).sum()), 1e-12)
+        size = max(_length(direction), 1e-12)
         for row in range(first, last):
             cosine = 0.0
             for c in range(len(direction)):
@@ -61,7 +71,8 @@ def _average(means, weights, lengths, first, last, chosen, steps, floor, factors
             cosine /= lengths[row - first] * size
             factors[row - first] = weights[row] / max(math.sqrt(max(2 - 2 * cosine, 0.0)), floor)
         _direction(means, lengths, factors, first, last, chosen, direction)
-    direction[:] = 0.0
+    for c in range(len(out)):
+        direction[c] = 0.0
     total = 0.0
     for row in range(first, last):
         if chosen[row - first]:

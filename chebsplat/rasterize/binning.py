@@ -119,8 +119,8 @@ def _deal(order, boxes, columns, rows):
     n, tiles, bands = len(order), columns * rows, min(BANDS, rows)
     cursors, tile_starts = np.zeros((PARTS, tiles), np.int32), np.zeros(tiles + 1, np.int64)
     pair_starts, band_of = np.zeros((bands, n + 1), np.int32), np.empty(rows, np.int64)
-    for band in range(bands):
-        band_of[band_start(band, rows) : band_start(band + 1, rows)] = band
+    for y in range(rows):
+        band_of[y] = ((y + 1) * bands - 1) // rows  # the last that starts here or before
     for part in prange(PARTS):
         for m in range(_share(part, n), _share(part + 1, n)):
             x0, x1, y0, y1 = boxes[order[m], 0], boxes[order[m], 1], boxes[order[m], 2], boxes[order[m], 3]

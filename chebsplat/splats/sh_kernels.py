@@ -82,6 +82,13 @@ def _to_band(values, first, g, out, i, c):
         out[i, k, c] = values[first + k] * g
 
 
+@body
+def _clear(out, i):
+    for k in range(out.shape[1]):
+        for c in range(3):
+            out[i, k, c] = np.float32(0)
+
+
 @kernel
 def _backward(sh1, sh2, sh3, bands, index, means, eye, degree, out, grad, for_bands):
     """Gradients to sh0, to each band and, if asked for, to the masks [V, 3] (straight through closed ones too)."""
@@ -90,13 +97,13 @@ def _backward(sh1, sh2, sh3, bands, index, means, eye, degree, out, grad, for_ba
     to_sh2, to_sh3 = np.empty(sh2.shape, np.float32), np.empty(sh3.shape, np.float32)
     to_bands = np.zeros((len(index) if for_bands else 0, 3), np.float32)
     for i in prange(n):
-        to_sh0[i] = np.float32(0)
+        _clear(to_sh0, i)
         if i < n_held[0]:
-            to_sh1[i] = np.float32(0)
+            _clear(to_sh1, i)
         if i < n_held[1]:
-            to_sh2[i] = np.float32(0)
+            _clear(to_sh2, i)
         if i < n_held[2]:
-            to_sh3[i] = np.float32(0)
+            _clear(to_sh3, i)
     for v in prange(len(index)):
         i, values = index[v], np.empty(16)
         top = _kept(bands, n_held, i, v, degree)

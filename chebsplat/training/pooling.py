@@ -34,7 +34,8 @@ def feature_distance(render, target, share, by_channel):
         mean = np.empty(channels, np.float32)
         for j in range(columns):
             left, right = _span(j, columns, width)
-            mean[:] = np.float32(0)
+            for c in range(channels):
+                mean[c] = np.float32(0)
             for y in range(top, bottom):
                 for x in range(left, right):
                     for c in range(channels):

@@ -84,7 +84,8 @@ def _blur_rows(slopes):
     for y in prange(height):
         row = np.zeros(length + 6 * HALF, np.float32)
         for k in range(n):
-            row[3 * HALF : 3 * HALF + length] = slopes[y, k]
+            for x in range(length):
+                row[x + 3 * HALF] = slopes[y, k, x]
             for t in range(WINDOW):
                 tap = TAPS[t]
                 for x in range(length):
