@@ -37,6 +37,7 @@ class Measured(TypedDict):
     macc: NotRequired[Share | None]
     oa: NotRequired[Share | None]
     boundary_miou: NotRequired[Share | None]
+    rarest_miou: NotRequired[Share | None]
     point_miou: NotRequired[Share | None]
     iou: NotRequired[dict[str, Share | None]]
 

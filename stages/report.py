@@ -166,7 +166,7 @@ def summary_rows(figures: dict[str, Any], by_degree: list[int] | None, trained: 
         rows.insert(3, ["PSNR at poses refined on the test photos, dB", f"{figures['image_aligned']['psnr']:.2f}", ""])
     segmentation = figures.get("segmentation") or {}
     names = {"miou": "mIoU", "macc": "mAcc", "oa": "OA", "boundary_miou": "mIoU in the boundary band",
-             "point_miou": "mIoU of 3D points"}  # fmt: skip
+             "rarest_miou": "mIoU of the five rarest classes", "point_miou": "mIoU of 3D points"}  # fmt: skip
     for key, name in names.items():
         if key in segmentation.get("scene", {}):
             teacher = segmentation.get("teacher")

@@ -93,6 +93,7 @@ def test_labels_on_paper():
     assert found["scene"]["miou"] == pytest.approx((1 / 2 + 1 / 3) / 2)
     assert found["scene"]["macc"] == found["scene"]["oa"] == 0.5
     assert found["scene"]["boundary_miou"] == pytest.approx((0 + 1 / 2) / 2)
+    assert found["scene"]["rarest_miou"] == pytest.approx((1 / 2 + 1 / 3) / 2)  # of both that are there
     assert found["scene"]["iou"] == {"wall": 0.5, "floor": pytest.approx(1 / 3), "lamp": None}
     assert found["teacher"]["miou"] == found["teacher"]["boundary_miou"] == 1
     # a second view, wall alone and right, of unknown pixels: sums are taken first, so wall is 3/4 and floor 1/3
@@ -100,10 +101,17 @@ def test_labels_on_paper():
     assert replica_gt.measure([seen, more], task)["scene"]["miou"] == pytest.approx((3 / 4 + 1 / 3) / 2)
 
 
+def test_the_rarest_classes_are_those_of_fewest_pixels():
+    np.testing.assert_array_equal(labels.rarest(np.array([9, 0, 3, 8, 1, 7, 3, 100])), [4, 2, 6, 5, 3])
+    assert len(labels.rarest(np.zeros(4))) == 0
+
+
 def test_where_nothing_is_known_nothing_is_measured():
     task = Task(["wall"], np.eye(1), ["wall"])
     found = labels.measure([view([[0, 0]], 1, truth=np.array([[-1, -1]]))], task)["scene"]
-    assert found == dict.fromkeys(("miou", "macc", "oa", "boundary_miou", "point_miou")) | {"iou": {"wall": None}}
+    assert found == dict.fromkeys(("miou", "macc", "oa", "boundary_miou", "rarest_miou", "point_miou")) | {
+        "iou": {"wall": None}
+    }
 
 
 def test_points_on_paper():

@@ -132,7 +132,9 @@ def test_views_of_a_scene_count_for_less_where_they_are_less_sure_of_labels_than
     assert familiar(sure, sure, labels) == familiar(sure, between, labels) == 1
     shares = [1 / (1 + np.exp(-0.1 / np.hypot(1, 0.9) / 0.1)), 1.0]  # of two labels; the third is far from both
     assert familiar(between, sure, labels) == pytest.approx((shares[0] / shares[1]) ** 6, rel=5e-3)
-    assert familiar(sure[:0], sure[:0], labels) == 1
+    assert familiar(sure[:0], sure[:0], labels) == familiar(0 * sure, sure, labels) == 1
+    half_seen = np.where(np.arange(5)[:, None] < 2, between, 0)
+    assert familiar(half_seen, sure, labels) == familiar(between, sure, labels)  # whom none sees says nothing
 
 
 def test_confidence_grows_with_votes_that_agree_and_falls_where_they_do_not():
@@ -180,8 +182,8 @@ def test_calibration_trusts_knowledge_as_far_as_views_are_noisy():
         found = calibrate(halves, n_views, near, wrong)
         assert set(found.curve["off"]) == set(STRENGTHS)
         assert not found.smooth  # nobody has a neighbour: a tie
-        assert found.strength >= LEAST
         evidence = effective(n_views.sum(0)) * reliable(halves, n_views)
+        assert found.strength >= max(LEAST, evidence.mean() / 2)
         chosen[spread] = found.strength / (evidence.mean() + found.strength)  # its share of a vote
     assert chosen[0.02] < 0.5 < chosen[1.0]
 
@@ -192,6 +194,8 @@ def test_calibration_treats_both_halves_alike_and_ignores_what_one_half_does_not
     there = calibrate(halves, n_views, near, truth)
     assert turned[:2] == there[:2]
     np.testing.assert_allclose(list(turned.curve["on"].values()), list(there.curve["on"].values()), rtol=1e-12)
+    many = calibrate(halves, 100 * n_views, near, truth)  # agree wholly, and may err alike
+    assert many.strength >= effective(np.array([400])).item() / 2 * reliable(halves, n_views).mean()
     none = calibrate(halves, n_views * np.array([[1], [0]]), near, truth)
     assert none[:2] == (False, 0.0)
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from typing import NamedTuple
 
 import numpy as np
@@ -13,7 +14,9 @@ STRENGTHS = (0.0, 0.5, 1.0, 2.0, 4.0, 8.0)  # views that knowledge may count for
 ALIKE = 0.2  # correlation of the errors of two views of a thing
 SURE = 3  # power of its length by which knowledge counts
 AGREED = 6  # power by which views count of how far their halves agree, and of how sure they are beside shape
-LEAST = 1.0  # strength: what a teacher gets wrong alike in both halves counts as right when they are asked
+# What a teacher gets wrong alike in both halves counts as right when they are asked, however many views there are.
+LEAST = 1.0  # strength
+LEAST_SHARE = 0.5  # strength, in mean evidence of a Gaussian that is seen
 
 
 class Calibration(NamedTuple):
@@ -73,15 +76,18 @@ def reliable(halves: np.ndarray, half_views: np.ndarray) -> np.ndarray:
 def familiar(lifted: np.ndarray, knowledge: np.ndarray, embeddings: np.ndarray) -> float:
     """σ^AGREED, σ = min(c / c', 1): what a scene's views count for that are sure of labels by c, where shape is by c'.
 
-    Args: lifted [N, C], what the views say of Gaussians; knowledge [N, C]; embeddings [L, C] of the scene's labels.
-    Returns: in (0, 1]; 1 without Gaussians.
+    Args: lifted [N, C], what the views say of Gaussians, zero where none sees one; knowledge [N, C]; embeddings [L, C]
+          of the scene's labels.
+    Returns: in (0, 1]; 1 where no view sees a Gaussian.
     Choices: c and c' are mean confidences of `decode`. Views that agree may agree in what none of them knows: a teacher
       shown a world that it was not taught is between labels, wherever it looks from. Of a scene, not of a Gaussian:
-      small things have no sure label in either, and are the views' to tell.
+      small things have no sure label in either, and are the views' to tell. Gaussians that no view sees are not asked:
+      few photos leave many, which says nothing of the teacher.
     """
-    if len(lifted) == 0:
+    seen = lifted.any(1)
+    if not seen.any():
         return 1.0
-    sure, beside = (float(decode(rows, embeddings)[1].mean()) for rows in (lifted, knowledge))
+    sure, beside = (float(decode(rows[seen], embeddings)[1].mean()) for rows in (lifted, knowledge))
     return min(sure / beside, 1.0) ** AGREED
 
 
@@ -92,9 +98,10 @@ def calibrate(
 
     Args: halves [2, N, C], features by each half of the training views; half_views [2, N] how many of them see each;
           near: affinities of the Gaussians; knowledge [N, C], or None: only smoothing is decided.
-    Returns: whether smoothing alone makes the halves agree better, and the strength from LEAST up at which they agree
-      best. Agreement is the cosine between what is made of one half (smoothed, blended by its own views) and the other
-      half's mean features, averaged over the Gaussians that both see, by the other half's views, both ways alike.
+    Returns: whether smoothing alone makes the halves agree better, and the strength at which they agree best, of those
+      from LEAST and from LEAST_SHARE of the mean evidence up. Agreement is the cosine between what is made of one half
+      (smoothed, blended by its own views) and the other half's mean features, averaged over the Gaussians that both
+      see, by the other half's views, both ways alike.
     Choices: no test view is looked at, and no label. On ties, and without a Gaussian that both halves see, what changes
       less wins. The strength is that for features as they are: what smoothing has made of a half is no longer evidence
       of its views alone, and asks for less.
@@ -111,7 +118,9 @@ def calibrate(
                 result = made[own] if knowledge is None else blend(made[own], evidence, knowledge, k)
                 agreed += float(weights[other] @ cosines(result, halves[other]))
             curve[name][k] = agreed / max(float(weights.sum()), 1.0)
-    tried = [k for k in strengths if k >= LEAST] if weights.any() else []
+    evidence, seen = effective(half_views.sum(0)) * reliability, half_views.any(0)
+    least = max(LEAST, LEAST_SHARE * float(evidence[seen].mean())) if weights.any() else math.inf
+    tried = [k for k in strengths if k >= least]
     strength = max(tried, key=lambda k: (curve["off"][k], -k), default=0.0)
     return Calibration(curve["on"][0.0] > curve["off"][0.0], strength, curve)
 

@@ -36,6 +36,7 @@ FIGURES = (
     Figure("macc", "mAcc, %", 1, 100),
     Figure("oa", "OA, %", 1, 100),
     Figure("boundary_miou", "boundary mIoU, %", 1, 100),
+    Figure("rarest_miou", "mIoU of the five rarest classes, %", 1, 100),
     Figure("point_miou", "mIoU of 3D points, %", 1, 100),
     Figure("psnr", "PSNR, dB", 2),
     Figure("psnr_fit", "PSNR after a colour fit, dB", 2),
@@ -111,7 +112,7 @@ def row_of(run: Run, failed: dict[str, tuple[int, str, Path]]) -> Row:
 
 def segmented(scene: dict[str, Any], teacher: dict[str, Any]) -> Row:
     """The columns that figures of a scene and of its teacher fill; a protocol measures some of them."""
-    row: Row = {key: scene.get(key) for key in ("miou", "macc", "oa", "boundary_miou", "point_miou")}
+    row: Row = {key: scene.get(key) for key in ("miou", "macc", "oa", "boundary_miou", "rarest_miou", "point_miou")}
     if row["miou"] is not None and teacher.get("miou") is not None:
         row |= {"miou_teacher": teacher["miou"], "miou_gain": row["miou"] - teacher["miou"]}
     return row

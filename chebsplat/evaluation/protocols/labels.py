@@ -2,7 +2,8 @@
 
 Split: the source's own, otherwise every 8th view from the first. Classes: the scene's own names; a label whose name is
 no class is wrong wherever it is predicted. One confusion matrix over all test views: mIoU over classes that occur in
-truth or prediction, mAcc over those in the truth, OA; mIoU within 5 pixels of a boundary; the same for the teacher.
+truth or prediction, mAcc over those in the truth, OA; mIoU within 5 pixels of a boundary, and over the five classes
+with the fewest pixels; the same for the teacher.
 3D point mIoU, where depth and poses say where pixels lie: over points of the test views' surfaces (40,000 pixels a view
 on a regular grid, of which one a cell is kept: `surface.thinned`), the scene's label is that of its Gaussians there,
 without rendering; where it has none, it is wrong. The teacher's is the label of the pixel that the point comes from.
@@ -23,6 +24,7 @@ from chebsplat.labels.decode import decode_labels
 NAME = "labels"
 TEST_EVERY, TEST_OFFSET, ADJUSTABLE, OWN_SPLIT, ON_TRAINING, TRUTH = 8, 0, True, True, False, "labels"
 
+N_RAREST = 5  # classes whose mean IoU is told apart: what means over a scene hardly show
 PER_VIEW = 40_000  # pixels of a view that become points, about, on a regular grid
 
 
@@ -69,6 +71,11 @@ def _mean(values: np.ndarray) -> float | None:
     return None if np.isnan(values).all() else float(np.nanmean(values))
 
 
+def rarest(pixels: np.ndarray) -> np.ndarray:
+    """Of classes with so many pixels of truth each, the N_RAREST with the fewest, those with none aside."""
+    return np.argsort(np.where(pixels > 0, pixels, np.inf), kind="stable")[: min(N_RAREST, int((pixels > 0).sum()))]
+
+
 def _figures(whole: np.ndarray, edges: np.ndarray, classes: list[str]) -> dict[str, Any]:
     scores = segmentation(whole)
     return {
@@ -76,5 +83,6 @@ def _figures(whole: np.ndarray, edges: np.ndarray, classes: list[str]) -> dict[s
         "macc": _mean(np.array([scores.macc])),
         "oa": _mean(np.array([scores.oa])),
         "boundary_miou": _mean(segmentation(edges).iou[:-1]),
+        "rarest_miou": _mean(scores.iou[rarest(whole.sum(1)[:-1])]),
         "iou": {name: None if np.isnan(v) else float(v) for name, v in zip(classes, scores.iou, strict=False)},
     }
