@@ -9,9 +9,10 @@ from __future__ import annotations
 
 import fcntl
 import os
+import threading
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import ExitStack, contextmanager, suppress
-from multiprocessing import get_context
+from multiprocessing import get_context, parent_process
 from multiprocessing.process import BaseProcess
 from pathlib import Path
 
@@ -142,10 +143,18 @@ def beside(parts: Sequence[Callable[[], None]]) -> Iterator[BaseProcess]:
 
 
 def alone(niceness: int, *parts: Callable[[], None]) -> None:
-    """Rehearse parts in a process of its own, which gives way to others."""
+    """Rehearse parts in a process of its own, which gives way to others and ends with the one that asked for it."""
+    threading.Thread(target=_end_with_parent, daemon=True).start()
     os.nice(niceness)
     for part in parts:
         once(part)
+
+
+def _end_with_parent() -> None:
+    parent = parent_process()
+    if parent is not None:
+        parent.join()  # however it ends
+        os._exit(1)
 
 
 def once(part: Callable[[], None]) -> None:

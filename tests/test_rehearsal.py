@@ -4,6 +4,7 @@ import fcntl
 import os
 import subprocess
 import sys
+import time
 from concurrent.futures import ThreadPoolExecutor
 
 import pytest
@@ -80,7 +81,7 @@ def test_what_another_process_rehearses_is_waited_for(tmp_path, monkeypatch):
 
 
 BREAKS_OFF = """
-import signal, sys, time
+import os, signal, sys, time
 from chebsplat.kernels import jit
 from chebsplat.pipelines import rehearsal
 if __name__ == "__main__":
@@ -90,15 +91,29 @@ if __name__ == "__main__":
             until = time.monotonic() + 60
             while not (lock.exists() and rehearsal.is_locked(signal.pause)) and time.monotonic() < until:
                 time.sleep(0.05)
-            print(process.is_alive())
+            print(lock, process.is_alive(), flush=True)
+            if sys.argv[1] == "killed":
+                os.kill(os.getpid(), signal.SIGKILL)
             raise KeyboardInterrupt
     except KeyboardInterrupt:
-        print(process.is_alive(), rehearsal.is_kept(signal.pause), rehearsal.is_locked(signal.pause))
+        print(process.is_alive(), rehearsal.is_kept(signal.pause))
 """
 
 
-def test_what_compiles_beside_a_training_ends_with_it(tmp_path):
+@pytest.mark.parametrize("how", ["stopped", "killed"])
+def test_what_compiles_beside_a_training_ends_with_it(how, tmp_path):
     (tmp_path / "breaks_off.py").write_text(BREAKS_OFF)
+    command = [sys.executable, str(tmp_path / "breaks_off.py"), how]
     environment = os.environ | {"CHEBSPLAT_CACHE": str(tmp_path / "kept")}
-    ran = subprocess.run([sys.executable, tmp_path / "breaks_off.py"], capture_output=True, text=True, env=environment)
-    assert ran.stdout.split() == ["True", "False", "False", "False"], ran.stderr
+    ran = subprocess.run(command, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL, text=True, env=environment)
+    lock, *rest = ran.stdout.split()
+    assert rest == (["True"] if how == "killed" else ["True", "False", "False"])
+    until = time.monotonic() + 5
+    with open(lock, "w") as held:
+        while True:  # the lock goes with the process that held it
+            try:
+                fcntl.flock(held, fcntl.LOCK_EX | fcntl.LOCK_NB)
+                break
+            except BlockingIOError:
+                assert time.monotonic() < until
+                time.sleep(0.05)
