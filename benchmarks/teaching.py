@@ -43,7 +43,7 @@ def score(features: np.ndarray, rooms: Sequence[Room], embeddings: np.ndarray) -
 
 
 def made(folder: Path, seeds: Sequence[int], settings: KnowledgeSection, matrix: np.ndarray) -> list[list[Room]]:
-    """The rooms of these seeds, as depth has them and worn; kept in the folder."""
+    """The rooms of these seeds, as `rooms_of` gives them; kept in the folder."""
     folder.mkdir(parents=True, exist_ok=True)
     with ProcessPoolExecutor(torch.get_num_threads(), mp_context=get_context("spawn")) as pool:
         list(pool.map(prepare, *zip(*((folder, seed, settings, matrix) for seed in seeds), strict=True)))
@@ -80,7 +80,8 @@ def main(arguments: Sequence[str]) -> None:
     variants: list[tuple[str, dict[str, Any]]] = [(f"{n} rooms", {"n_rooms": n}) for n in options.rooms]
     variants += [(f"{n} radii", {"n_scales": n}) for n in (1, 2)]
     variants += [(f"{n} radii, no descriptor", {"n_scales": n, "described": False}) for n in (1, 4)]
-    variants += [("half as wide", {"hidden": 16}), ("no worn rooms", {"worn": False})]
+    variants += [("half as wide", {"hidden": 16}), ("twice as wide", {"hidden": 64})]
+    variants += [("no worn rooms", {"kinds": (0, 2)}), ("no half-seen rooms", {"kinds": (0, 1)})]
     for name, variant in variants:
         encoder, seconds = taught(rooms[:most], variant, options.steps, embeddings)
         seen = variant.get("n_scales", 4), variant.get("described", True)
@@ -95,8 +96,8 @@ def taught(
 ) -> tuple[PointEncoder, float]:
     """An encoder that was taught so in these rooms, and the seconds of teaching."""
     n_scales, described = variant.get("n_scales", 4), variant.get("described", True)
-    kinds = (0, 1) if variant.get("worn", True) else (0,)
-    chosen = [room[kind] for kind in kinds for room in rooms[: variant.get("n_rooms", len(rooms))]]
+    kinds, n_rooms = variant.get("kinds", (0, 1, 2)), variant.get("n_rooms", len(rooms))
+    chosen = [room[kind] for kind in kinds for room in rooms[:n_rooms]]
     lessons = [lesson_of(narrowed(room, n_scales, described), embeddings) for room in chosen]
     torch.manual_seed(0)
     width = lessons[0].cloud.descriptors.shape[1]

@@ -181,11 +181,11 @@ class KnowledgeSection(Section):
     """What scenes start from: a point encoder, taught once a teacher over generated rooms."""
 
     model: Text | None = setting(None, ".onnx of the teacher; default: the embedded one")
-    n_rooms: int = number(64, "generated rooms to teach on", 1, 900)
-    n_held_out: int = number(6, "rooms that the card's figures are of; six kinds of room take turns", 1, 100)
+    n_rooms: int = number(80, "generated rooms to teach on", 1, 900)
+    n_held_out: int = number(8, "rooms that the card's figures are of; eight kinds of room take turns", 1, 100)
     n_views: int = number(40, "photos of a room", 2, 1000)
     n_points: int = number(14_500, "points of a room, drawn within 0.62 to 1.38 of it", 100, 200_000)
-    steps: int = number(4000, "of teaching", 1, 1_000_000)
+    steps: int = number(6000, "of teaching", 1, 1_000_000)
     seed: int = seed("of what is drawn in teaching")
 
 

@@ -49,18 +49,18 @@ def run(job: Job) -> None:
         raise ConfigError(f"{teacher.settings}: output is {teacher.output}; knowledge is taught in features")
     if channels.notes.get("digest") != digest(teacher):
         raise InputError(f"{job.inputs['channels']} is of another teacher than {teacher.path}; pass its own")
-    clean, worn = zip(*prepared(job, settings, channels.matrix), strict=True)
+    clean, worn, few = zip(*prepared(job, settings, channels.matrix), strict=True)
     taught_on, tested_on = slice(settings.n_rooms), slice(settings.n_rooms, None)
     words, embeddings = vocabulary(teacher, list(CLASS_NAMES), channels.matrix)
     named = found(list(CLASS_NAMES), words)
     if -1 in named:
         job.left_out("figures on rooms held out", f"the teacher has no word for {CLASS_NAMES[named.index(-1)]}")
     classes = embeddings if -1 in named else embeddings[named]
-    lessons = [lesson_of(room, classes) for room in (*clean[taught_on], *worn[taught_on])]
+    lessons = [lesson_of(room, classes) for room in (*clean[taught_on], *worn[taught_on], *few[taught_on])]
     if bare := sum(bool((lesson.n_views < LEAST_VIEWS).all()) for lesson in lessons):
         raise DataFailure(f"{bare} rooms have no point that {LEAST_VIEWS} photos see; raise knowledge.n_views")
     encoder = taught(job, settings, lessons)
-    held_out = {"held_out": clean, "held_out_worn": worn} if -1 not in named else {}
+    held_out = {"held_out": clean, "held_out_worn": worn, "held_out_few": few} if -1 not in named else {}
     card = settings.model_dump(mode="json", exclude={"model", "seed"})
     card |= {name: measured(encoder, rooms[tested_on], classes) for name, rooms in held_out.items()}
     job.facts |= card
@@ -104,7 +104,7 @@ def vocabulary(teacher: TeacherModel, names: list[str], matrix: np.ndarray) -> t
 
 
 def prepared(job: Job, settings: KnowledgeSection, matrix: np.ndarray) -> list[list[Room]]:
-    """The rooms to teach on, then those held out, clean and worn; made by as many processes as threads are allowed."""
+    """The rooms to teach on, then those held out: clean, worn, half seen. As many processes as threads make them."""
     import multiprocessing
     import os
     from concurrent.futures import ProcessPoolExecutor, as_completed

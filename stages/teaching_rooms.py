@@ -12,7 +12,11 @@ if TYPE_CHECKING:
     from chebsplat.stages.settings import KnowledgeSection
     from chebsplat.stages.teacher_inference import TeacherInference
 
-KINDS = ("shuffled", "office", "jittered room", "shuffled", "room", "jittered office")  # taken in turn by seed
+KINDS = (  # taken in turn by seed
+    "shuffled", "jittered office", "shuffled", "room", "shuffled", "jittered room", "shuffled", "office"
+)  # fmt: skip
+FEW_VIEWS = (3, 15)  # of the photos of a room that is half seen
+STRETCH = (0.85, 1.2)  # of a room of other proportions, along each axis
 WIDTH, HEIGHT = 320, 240
 DENSITY = (0.62, 1.38)  # of the number of points asked for: scenes differ
 N_NEIGHBORS = 16  # that give a point its normal and covariance
@@ -29,12 +33,14 @@ class Room(NamedTuple):
 
 
 def rooms_of(seed: int, settings: KnowledgeSection, network: TeacherInference, matrix: np.ndarray) -> list[Room]:
-    """A room furnished, photographed, seen by the teacher, and described: as depth has it, and worn (`worn`).
+    """A room furnished, photographed, seen by the teacher, and described: as depth has it, worn (`worn`), and as few of
+    its photos show it.
 
     Args: seed: of `synthetic.seeds.KNOWLEDGE`; matrix [C, d]: from the teacher's channels to those of scenes.
     Raises: ValueError on another seed.
     Choices: labels are there to measure by; nothing is taught from them. Points of the worn room are taught what the
-      teacher says of the places that they were moved from.
+      teacher says of the places that they were moved from; points of few photos, what it says in all of them. Every
+      other room that few photos show has other proportions, too: worlds differ in these.
     """
     import numpy as np
 
@@ -52,7 +58,12 @@ def rooms_of(seed: int, settings: KnowledgeSection, network: TeacherInference, m
     mean, n_views = averaged(means, depth, features, K, poses)
     moved, rows, adrift = worn(means, clean.normals, rng)
     seen = np.where(adrift, 0, n_views[rows])
-    return [Room(clean, mean, n_views, named), Room(described(moved, eyes[rows]), mean[rows], seen, named[rows])]
+    rooms = [Room(clean, mean, n_views, named), Room(described(moved, eyes[rows]), mean[rows], seen, named[rows])]
+    few = np.sort(rng.permutation(len(poses))[: int(np.exp(rng.uniform(*np.log(FEW_VIEWS))))])
+    means, eyes, named = surface(depth[few], labels[few], K, poses[few], count, rng)
+    mean, n_views = averaged(means, depth, features, K, poses)
+    stretch = rng.uniform(*STRETCH, 3) if rng.random() < 0.5 else np.ones(3)
+    return [*rooms, Room(described(means * stretch, eyes * stretch), mean, n_views, named)]
 
 
 def described(means: np.ndarray, eyes: np.ndarray) -> PointInputs:
@@ -179,7 +190,7 @@ def kept_as(folder: Path, seed: int) -> Path:
 
 
 def held(folder: Path, seed: int) -> list[Room]:
-    """A room that `prepare` kept, clean and worn."""
+    """A room that `prepare` kept: clean, worn, and half seen."""
     import numpy as np
 
     from chebsplat.shape.point_inputs import PointInputs
@@ -190,5 +201,5 @@ def held(folder: Path, seed: int) -> list[Room]:
                 PointInputs(*(stored[f"{name}{number}"] for name in PointInputs._fields)),
                 *(stored[f"{name}{number}"] for name in Room._fields[1:]),
             )
-            for number in (0, 1)
+            for number in range(3)
         ]

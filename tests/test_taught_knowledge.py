@@ -77,6 +77,33 @@ def test_no_room_of_knowledge_is_one_of_a_scene_a_test_or_the_teacher():
         rooms_of(101, KnowledgeSection(), None, np.eye(3))
 
 
+@pytest.mark.parametrize("stretch", [1.0, 1.2])
+def test_a_half_seen_room_is_what_few_photos_show_and_is_taught_what_all_say(tmp_path, monkeypatch, stretch):
+    from scipy.spatial import cKDTree
+
+    from chebsplat.formats.teacher_model import read_teacher
+    from chebsplat.stages import teaching_rooms
+    from chebsplat.stages.settings import KnowledgeSection
+    from chebsplat.stages.teacher_inference import TeacherInference
+
+    monkeypatch.setattr(teaching_rooms, "FEW_VIEWS", (2, 2.5))
+    monkeypatch.setattr(teaching_rooms, "STRETCH", (stretch, stretch))
+    monkeypatch.setattr(teaching_rooms, "KINDS", ("shuffled",))
+    network = TeacherInference(read_teacher(color_teacher(tmp_path)), 1)
+    settings = KnowledgeSection(n_views=12, n_points=3000)
+    sizes = []
+    for seed in KNOWLEDGE[:2]:
+        whole, _, few = teaching_rooms.rooms_of(seed, settings, network, np.eye(3))
+        sizes.append(max(np.ptp(few.inputs.means, 0)) / max(np.ptp(whole.inputs.means, 0)))
+        if stretch == 1:
+            near, _ = cKDTree(few.inputs.means).query(whole.inputs.means)
+            assert (near > 0.5).mean() > 0.1  # what two photos do not show
+            back, row = cKDTree(whole.inputs.means).query(few.inputs.means)
+            same = back < 0.1
+            assert np.median(np.abs(few.n_views[same] - whole.n_views[row[same]])) <= 1
+    assert (max(sizes) > 1.02) == (stretch > 1)
+
+
 def test_what_ships_is_whole_small_and_says_what_it_was_taught():
     manifest = artifact.verify(SHIPPED, "chebsplat.knowledge/1")
     knowledge = read_knowledge(SHIPPED)
