@@ -1,11 +1,15 @@
 """Kernels are compiled with a word on it, kept where the user says, and a disk that takes nothing costs no run."""
 
 import os
+import shutil
 import subprocess
 import sys
+from pathlib import Path
 
 import pytest
 from soak.disk import namespace
+
+import chebsplat
 
 PROGRAM = """
 import logging, sys
@@ -60,3 +64,25 @@ def test_a_home_folder_that_takes_nothing_costs_no_run(tmp_path, how):
     assert f"{tmp_path}/home/.cache/chebsplat" in done.stderr
     assert "CHEBSPLAT_CACHE names another folder" in done.stderr
     assert "Traceback" not in done.stderr
+
+
+CLONE = """
+import numpy as np
+from chebsplat.kernels import jit
+from chebsplat.shape.fusion_kernels import _product
+_product(np.ones((4, 4), np.float32), np.ones((4, 8), np.float32))
+print(jit.__file__, jit.compilation.kernels)
+"""
+
+
+def test_another_clone_of_the_same_source_finds_what_was_compiled(tmp_path):
+    counts = []
+    for name in ("first", "second"):
+        shutil.copytree(Path(chebsplat.__file__).parent, tmp_path / name / "chebsplat", copy_function=shutil.copy)
+        env = {key: value for key, value in os.environ.items() if key != "NUMBA_CACHE_DIR"}
+        env |= {"CHEBSPLAT_CACHE": str(tmp_path / "kept"), "PYTHONPATH": str(tmp_path / name)}
+        done = subprocess.run([sys.executable, "-P", "-c", CLONE], capture_output=True, text=True, env=env)
+        assert done.stdout.startswith(str(tmp_path / name)), done.stderr
+        counts.append(int(done.stdout.split()[-1]))
+    assert counts[0] > 0
+    assert counts[1] == 0

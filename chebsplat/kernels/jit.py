@@ -20,10 +20,11 @@ from typing import Any
 
 import numba
 from numba.core import event
-from numba.core.caching import FunctionCache
+from numba.core.caching import CompileResultCacheImpl, FunctionCache, _CacheLocator
 
 log = logging.getLogger("chebsplat")
 EVERY = 10.0  # seconds between two lines on what is being compiled
+ROOT = Path(__file__).parents[1]  # of the package
 KEPT = {-3: 32 << 20, -1: 64 << 20}  # bytes, by malloc.h's M_MMAP_THRESHOLD and M_TRIM_THRESHOLD
 
 
@@ -39,12 +40,16 @@ def _keep_freed_memory() -> None:
             library.mallopt(option, size)
 
 
+def _digest() -> str:
+    """Of our kernels' source."""
+    sources = [path.read_bytes() for path in sorted(ROOT.rglob("*.py"))]
+    text = b"".join(source for source in sources if b"numba" in source or b"chebsplat.kernels.jit" in source)
+    return hashlib.sha256(text).hexdigest()[:16]
+
+
 def _folders() -> list[Path]:
     """Folders for compiled kernels, the best first."""
-    root = Path(__file__).parents[1]
-    sources = [path.read_bytes() for path in sorted(root.rglob("*.py"))]
-    text = b"".join(source for source in sources if b"numba" in source or b"chebsplat.kernels.jit" in source)
-    name = f"numba-{hashlib.sha256(text).hexdigest()[:16]}"
+    name = f"numba-{DIGEST}"
     chosen, cache, work = (os.environ.get(key) for key in ("CHEBSPLAT_CACHE", "XDG_CACHE_HOME", "CHEBSPLAT_WORK"))
     user = Path(cache or Path(os.path.expanduser("~")) / ".cache")
     defaults = [Path(chosen or user / "chebsplat") / name] + ([Path(work) / ".cache" / name] if work else [])
@@ -63,6 +68,7 @@ def _writable(folder: Path) -> bool:
 
 
 _keep_freed_memory()
+DIGEST = _digest()
 FOLDER = next(filter(_writable, _folders()), None)
 settings: Any = numba.config
 # open3d brings a TBB that numba refuses with a warning: OpenMP comes first.
@@ -73,8 +79,39 @@ else:
     settings.CACHE_DIR = str(FOLDER)
 
 
+class _ByModule(_CacheLocator):
+    """A kernel's place by its module and source, where numba asks for the file's path and time: another clone of the
+    same source, or one that was moved or checked out again, finds what was compiled.
+    """
+
+    def __init__(self, module: Path, line: int):
+        self.module, self.line = module, line
+
+    @classmethod
+    def from_function(cls, function: Callable[..., Any], file: str) -> _ByModule | None:
+        """None for a kernel of another package, which our source's digest does not cover."""
+        if FOLDER is None or not Path(file).is_relative_to(ROOT):
+            return None
+        return cls(Path(file).relative_to(ROOT), function.__code__.co_firstlineno)
+
+    def get_cache_path(self) -> str:
+        return str(FOLDER / self.module.parent) if FOLDER is not None else ""
+
+    def get_source_stamp(self) -> str:
+        return DIGEST
+
+    def get_disambiguator(self) -> str:
+        return str(self.line)
+
+
+class _KernelFiles(CompileResultCacheImpl):
+    _locator_classes = [_ByModule, *CompileResultCacheImpl._locator_classes]  # noqa: RUF012
+
+
 class _KernelCache(FunctionCache):
     """A kernel's files on disk. A disk that is full costs the keeping, a damaged file another compilation."""
+
+    _impl_class = _KernelFiles
 
     def load_overload(self, signature: Any, context: Any) -> Any:
         try:
@@ -86,6 +123,7 @@ class _KernelCache(FunctionCache):
     def save_overload(self, signature: Any, compiled: Any) -> None:
         try:
             # numba numbers files by an index that it reads first: two processes at once would mix their kernels up.
+            Path(self.cache_path).mkdir(parents=True, exist_ok=True)
             with open(Path(self.cache_path) / ".lock", "w") as lock:
                 fcntl.flock(lock, fcntl.LOCK_EX)
                 super().save_overload(signature, compiled)
