@@ -1,4 +1,4 @@
-"""Points between those that were matched: depth of the photos by a plane sweep, where several views agree on it."""
+"""Points between those that were matched: depth of the photos by a plane sweep, and where several views agree on it."""
 
 from __future__ import annotations
 
@@ -11,14 +11,16 @@ if TYPE_CHECKING:
     import numpy as np
 
     from chebsplat.formats.capture import Capture
+    from chebsplat.stages.progress import Progress
     from chebsplat.stages.settings import SfmSection
 
 log = logging.getLogger("chebsplat")
 
 SIDE = 160  # pixels of the longer side that photos are reduced to
-DEPTHS, NEIGHBORS = 48, 8  # depths that are tried, evenly spaced in 1 / z; views that each is compared with
+DEPTHS, NEIGHBORS = 96, 8  # depths that are tried, evenly spaced in 1 / z; views that each is compared with
+WITNESSES = 64  # views, the nearest, that confirm or deny what a view has found
 NEAR, FAR = 0.7, 5.0  # of the nearest point in a photo (1st percentile), and of the farthest one in any (99th)
-MOST_COST, TOLERANCE, AGREE = 0.5, 0.02, 2  # what counts: cost, relative difference in depth, neighbours of that depth
+MOST_COST, AGREE = 0.5, 2  # what counts: cost, views that confirm a depth
 LEAST = 0.2  # of the points in the cube of a middling one, and three: what few pixels show is seldom there
 MOST = 12_000  # points in all: the first Gaussians, which growth needs room beside
 CELLS = 20  # cells along the longer side of a photo, of which it is asked how many hold a point
@@ -67,54 +69,82 @@ def swept(job: Job, capture: Capture, cloud: dict[str, Any]) -> dict[str, Any]:
     """means, colors and seen_from of points that a plane sweep of the training views finds, as a cloud has them, and
     depths f32 [V, h, w] of the cloud's views, 0 where they do not agree, of photos reduced to SIDE.
 
-    Choices: test views give no points, and have no depth. A pixel counts where two of eight neighbours have its depth
-      within 2 %; its point lies at the mean of what they have. Depths that are tried begin before what is in the photo:
+    Choices: test views give no points, and have no depth. Depths that are tried begin before what is in the photo:
       points behind its edges, beside the camera, would have all of them end there.
     """
     import numpy as np
-    import torch
 
-    from chebsplat.photos.plane_sweep import agreed, rays, swept_depth
-    from chebsplat.stages.view_pairs import apart
+    from chebsplat.cameras import unproject
 
     row = {name: k for k, name in enumerate(capture.names)}
     rows = np.array([row[name] for name in cloud["names"]])
     used = np.flatnonzero(~capture.is_test[rows])
     factor = max(round(max(capture.size) / SIDE), 1)
-    small = torch.stack([_reduced(capture.images[view], factor) for view in rows[used]]) / 255
-    valid = torch.ones(small.shape[:3])
+    small = np.stack([reduced(capture.images[view], factor) for view in rows[used]]) / 255
+    valid = np.ones(small.shape[:3], np.float32)
     if capture.loss_mask is not None:
-        valid = torch.stack([_reduced(capture.loss_mask[view][..., None], factor)[..., 0] for view in rows[used]])
-    poses = torch.from_numpy(cloud["cam_from_world"][used]).float()
-    Ks = torch.from_numpy(cloud["Ks"][used]).float()
+        valid = np.stack([reduced(capture.loss_mask[view][..., None], factor)[..., 0] for view in rows[used]])
+    poses, Ks = cloud["cam_from_world"][used], cloud["Ks"][used].copy()
+    z = [in_photo(K, pose, cloud["means"], capture.size)[:, 2] for K, pose in zip(Ks, poses, strict=True)]
     Ks[:, :2] /= factor
-    cameras = zip(cloud["Ks"][used], cloud["cam_from_world"][used], strict=True)
-    z = [in_photo(*camera, cloud["means"], capture.size)[:, 2] for camera in cameras]
+    found = depth_of_photos(small, valid, Ks, poses, z, job.progress)
+    depths = np.zeros((len(rows), *small.shape[1:3]), np.float32)
+    depths[used] = found
+    means, colors, seen = [np.zeros((0, 3))], [np.zeros((0, 3), np.uint8)], [np.zeros(0, np.int64)]
+    for view, index in enumerate(used):
+        pixels = np.argwhere(found[view] > 0)
+        means.append(unproject(found[view], Ks[view], poses[view], pixels))
+        colors.append((small[view][tuple(pixels.T)] * 255).round().astype(np.uint8))
+        seen.append(np.full(len(pixels), index))
+    points = fused(np.concatenate(means), np.concatenate(colors), np.concatenate(seen))
+    total, count = sum(map(len, means)), len(points["means"])
+    share = total / max(found.size, 1)
+    log.info("%.0f %% of %d photos have a depth by a plane sweep: %d points", 100 * share, len(used), count)
+    job.facts["swept"] = round(share, 3)
+    return points | {"depths": depths}
+
+
+def depth_of_photos(
+    colors: np.ndarray,
+    valid: np.ndarray,
+    Ks: np.ndarray,
+    poses: np.ndarray,
+    z: list[np.ndarray],
+    progress: Progress | None = None,
+) -> np.ndarray:
+    """Depth f32 [V, h, w] of photos, 0 where none is known: by a plane sweep, and by planes where there is no texture.
+
+    Args:    colors f32 [V, h, w, 3] in [0, 1]; valid [V, h, w]: 1 where a pixel counts; Ks [V, 3, 3] in its pixels;
+             poses [V, 4, 4]; z: of each photo, the depths of some points in it.
+    Choices: a pixel counts where AGREE of the other views have its depth, and few see through it; so does what planes
+      add to these.
+    """
+    import numpy as np
+    import torch
+
+    from chebsplat.photos.consistency import agreed
+    from chebsplat.photos.planar import completed
+    from chebsplat.photos.plane_sweep import swept_depth
+    from chebsplat.stages.view_pairs import apart
+
     bounds = np.array([np.percentile(some, (1, 99)) if len(some) else (np.nan, np.nan) for some in z])
     near, far = NEAR * bounds[:, 0], FAR * np.nanmax(bounds[:, 1])
-    cost = apart(cloud["cam_from_world"][used])
-    neighbors = [[int(k) for k in np.argsort(line)[:NEIGHBORS] if np.isfinite(line[k])] for line in cost]
-    depth, costs = torch.full(small.shape[:3], torch.nan), torch.full(small.shape[:3], torch.inf)
-    grey = small.mean(-1)
-    for view, _ in job.progress.track(range(len(used)), len(used), "depth of photos"):
-        if np.isfinite(near[view]) and len(neighbors[view]) >= AGREE:
+    cost = apart(poses)
+    nearest = np.where(np.isfinite(np.sort(cost)), np.argsort(cost), -1)
+    grey, counts = torch.from_numpy(colors.mean(-1)).float(), torch.from_numpy(valid).float()
+    cameras = torch.from_numpy(Ks).float(), torch.from_numpy(poses).float()
+    depth = np.zeros(colors.shape[:3], np.float32)
+    views = range(len(colors))
+    for view, _ in progress.track(views, len(colors), "depth of photos") if progress else ((v, None) for v in views):
+        neighbors = [int(k) for k in nearest[view, :NEIGHBORS] if k >= 0]
+        if np.isfinite(near[view]) and len(neighbors) >= AGREE:
             tried = 1 / torch.linspace(1 / float(near[view]), 1 / float(far), DEPTHS)
-            depth[view], costs[view] = swept_depth(grey, valid, Ks, poses, view, neighbors[view], tried)
-    depths = np.zeros((len(rows), *small.shape[1:3]), np.float32)
-    means, colors, seen = [np.zeros((0, 3))], [np.zeros((0, 3), np.uint8)], [np.zeros(0, np.int64)]
-    for view in range(len(used)):
-        count, mean = agreed(depth, Ks, poses, view, neighbors[view], TOLERANCE)
-        kept = (count >= AGREE) & (costs[view] < MOST_COST) & (valid[view] > 0.9)
-        depths[used[view]] = torch.where(kept, mean, 0).numpy()
-        points = (rays(Ks[view], *grey.shape[1:]) * mean.reshape(-1)).T[kept.reshape(-1)].double().numpy()
-        pose = cloud["cam_from_world"][used[view]]
-        means.append((points - pose[:3, 3]) @ pose[:3, :3])
-        colors.append((small[view][kept] * 255).round().byte().numpy())
-        seen.append(np.full(len(points), used[view]))
-    found = fused(np.concatenate(means), np.concatenate(colors), np.concatenate(seen))
-    total, count_ = sum(map(len, means)), len(found["means"])
-    log.info("a plane sweep of %d photos finds the depth of %d pixels, %d points", len(used), total, count_)
-    return found | {"depths": depths}
+            found, costs = swept_depth(grey, counts, *cameras, view, neighbors, tried)
+            depth[view] = torch.where((costs < MOST_COST) & (counts[view] > 0.9), found, 0).numpy()
+    witnesses = nearest[:, :WITNESSES]
+    depth = agreed(depth, Ks, poses, witnesses, AGREE)
+    whole = np.stack([completed(*photo) for photo in zip(depth, colors, strict=True)])
+    return agreed(np.where(valid > 0.9, whole, 0), Ks, poses, witnesses, AGREE)
 
 
 def fused(means: np.ndarray, colors: np.ndarray, seen_from: np.ndarray) -> dict[str, Any]:
@@ -137,10 +167,10 @@ def fused(means: np.ndarray, colors: np.ndarray, seen_from: np.ndarray) -> dict[
     return {"means": middle, "colors": color.round().astype(np.uint8), "seen_from": seen_from[first[kept]]}
 
 
-def _reduced(image: np.ndarray, factor: int) -> Any:
+def reduced(image: np.ndarray, factor: int) -> np.ndarray:
     """Means of blocks of [H, W, C], f32."""
-    import torch
+    import numpy as np
 
     height, width = (side // factor for side in image.shape[:2])
-    blocks = torch.from_numpy(image[: height * factor, : width * factor]).float()
-    return blocks.reshape(height, factor, width, factor, -1).mean((1, 3))
+    blocks = np.asarray(image[: height * factor, : width * factor], np.float32)
+    return np.asarray(blocks.reshape(height, factor, width, factor, -1).mean((1, 3)))

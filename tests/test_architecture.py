@@ -21,7 +21,7 @@ PACKAGES = {
     "settings": set(),
     "synthetic": set(),
     "labels": set(),
-    "photos": set(),
+    "photos": {"kernels"},
     "splats": {"kernels"},
     "views": set(),
     "rasterize": {"kernels", "splats"},
@@ -85,7 +85,7 @@ def test_a_stage_is_known_by_every_kernel_it_runs_and_every_package_it_loads():
 
     found: dict[str, list] = {}
     code = Code(installed(), found)
-    for stage in ("train", "lift", "refine"):
+    for stage in ("sfm", "train", "lift", "refine"):
         code.stage(stage)
     kernels = [
         path for path in installed()["chebsplat"].rglob("*.py") if "chebsplat.kernels.jit import" in path.read_text()

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import torch
 
-from chebsplat.photos import plane_sweep
+from chebsplat.photos import consistency, plane_sweep
 from chebsplat.stages import dense
 from chebsplat.stages.command import Job
 from chebsplat.stages.config import Config
@@ -73,20 +73,40 @@ def test_a_sweep_finds_depth_between_its_steps(wall):
     assert np.median(cost.numpy()[inner]) < 0.2
 
 
-def test_views_agree_on_true_depth_and_not_on_another(wall):
+def test_views_confirm_true_depth_and_deny_another(wall):
     _, Ks, poses, depths = wall
-    K, pose = torch.from_numpy(Ks).float(), torch.from_numpy(poses).float()
-    true = torch.from_numpy(depths).float()
-    agree, mean = plane_sweep.agreed(true, K, pose, 2, [0, 1, 3, 4], 0.02)
-    assert (agree >= 2).float().mean() > 0.95
-    assert torch.allclose(mean, true[2])
-    wrong = true.clone()
+    true, others = depths.astype(np.float32), np.array([[k for k in range(5) if k != view] for view in range(5)])
+    agree = consistency.agreed(true, Ks, poses, others, 2)
+    np.testing.assert_allclose(agree[2][agree[2] > 0], true[2][agree[2] > 0], rtol=1e-6)
+    assert (agree[2] > 0).mean() > 0.95
+    wrong = true.copy()
     wrong[2] *= 1.2
-    assert (plane_sweep.agreed(wrong, K, pose, 2, [0, 1, 3, 4], 0.02)[0] >= 2).float().mean() < 0.05
-    noisy = true.clone()
+    assert (consistency.agreed(wrong, Ks, poses, others, 2)[2] > 0).mean() < 0.05
+    noisy = true.copy()
     noisy[2] *= 1.01
-    _, mean = plane_sweep.agreed(noisy, K, pose, 2, [0, 1, 3, 4], 0.02)
-    assert ((mean / true[2] - 1).abs() < 0.004).float().mean() > 0.8  # four right ones, and its own
+    mean = consistency.agreed(noisy, Ks, poses, others, 2)[2]
+    assert (np.abs(mean / true[2] - 1) < 0.004).mean() > 0.8  # four right ones, and its own
+
+
+def test_what_other_views_see_through_goes_however_many_share_it(wall):
+    _, Ks, poses, depths = wall
+    others = np.array([[k for k in range(5) if k != view] for view in range(5)])
+    floating = depths.astype(np.float32)
+    corner = np.s_[5:20, 60:90]  # of the wall
+    floating[:2][:, *corner] = 1.6  # two views share a thing in the air; three see the wall behind it
+    kept = consistency.agreed(floating, Ks, poses, others, 1)
+    assert (kept[0][corner] > 0).mean() < 0.3
+    assert (kept[4][corner] > 0).mean() > 0.9  # which hides nothing from these, and denies nothing
+
+
+def test_unknown_depth_and_views_that_compare_with_none_stay_unknown(wall):
+    _, Ks, poses, depths = wall
+    nobody = np.full((5, 1), -1)
+    assert not consistency.agreed(depths.astype(np.float32), Ks, poses, nobody, 1).any()
+    others = np.array([[k for k in range(5) if k != view] for view in range(5)])
+    holes = depths.astype(np.float32)
+    holes[:, :60] = 0
+    assert not consistency.agreed(holes, Ks, poses, others, 1)[:, :60].any()
 
 
 def test_points_beside_the_cameras_leave_a_sweep_where_it_looks(wall, tmp_path):

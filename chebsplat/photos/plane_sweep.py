@@ -10,7 +10,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-WINDOW, SMOOTH = 1, 2  # half widths in pixels: of the patches that are compared, and of the mean over their costs
+WINDOW, SMOOTH = 1, 1  # half widths in pixels: of the patches that are compared, and of the mean over their costs
 FLAT = 1e-4  # variance that patches are given: two without texture are alike
 BRIGHT = 0.3  # weight of a difference in brightness, as a logarithm, beside 1 - correlation
 OUTSIDE = 4.0  # cost of a pixel that the other view does not see
@@ -19,8 +19,15 @@ BEST = 2  # views that must agree, of the neighbours: others may be covered
 
 def box_mean(values: Tensor, half: int) -> Tensor:
     """Mean over a square window of each pixel of [..., H, W], the border repeated."""
-    padded = F.pad(values.reshape(-1, 1, *values.shape[-2:]), (half,) * 4, mode="replicate")
-    return F.avg_pool2d(padded, 2 * half + 1, 1).reshape(values.shape)
+    (height, width), side = values.shape[-2:], 2 * half + 1
+    padded = F.pad(values.reshape(-1, 1, height, width), (half,) * 4, mode="replicate")[:, 0]
+    rows = padded[:, :height].clone()
+    for shift in range(1, side):
+        rows += padded[:, shift : shift + height]
+    total = rows[..., :width].clone()
+    for shift in range(1, side):
+        total += rows[..., shift : shift + width]
+    return total.div_(side**2).reshape(values.shape)
 
 
 def rays(K: Tensor, height: int, width: int) -> Tensor:
@@ -43,7 +50,7 @@ def swept_depth(
     """
     height, width = grey.shape[1:]
     mean, spread = _moments(grey[view])
-    costs = []
+    lowest = torch.full((BEST, len(depths), height, width), OUTSIDE)  # costs, ascending
     for other in neighbors:
         between = poses[other] @ torch.linalg.inv(poses[view])
         at = Ks[other] @ between[:3, :3] @ rays(Ks[view], height, width) * depths[:, None, None]
@@ -61,39 +68,16 @@ def swept_depth(
         correlation = ((covariance + FLAT) / (their_spread * spread + FLAT)).clamp(-1, 1)
         brighter = (their_mean.clamp_min(1e-3) / mean.clamp_min(1e-3)).log().abs().clamp_max(1)
         cost = torch.where(counts, 1 - correlation + BRIGHT * brighter, OUTSIDE)
-        costs.append(box_mean(cost, SMOOTH))
-    volume = torch.stack(costs).sort(0).values[:BEST].mean(0)
+        higher = box_mean(cost, SMOOTH)
+        for rank in lowest:
+            rank[:], higher = torch.minimum(rank, higher), torch.maximum(rank, higher)
+    volume = lowest.mean(0)
     best = volume.min(0)
     middle = best.indices.clamp(1, len(depths) - 2)
     before, here, after = (volume.gather(0, (middle + step)[None])[0] for step in (-1, 0, 1))
-    lowest = (0.5 * (before - after) / (before - 2 * here + after).clamp_min(1e-6)).clamp(-0.5, 0.5)
-    lowest = torch.where(middle == best.indices, lowest, 0)
-    return 1 / (1 / depths[best.indices] + lowest * (1 / depths[1] - 1 / depths[0])), best.values
-
-
-def agreed(
-    depth: Tensor, Ks: Tensor, poses: Tensor, view: int, neighbors: list[int], tolerance: float
-) -> tuple[Tensor, Tensor]:
-    """How many neighbours have, where they see a pixel's point, its depth within a relative tolerance, and the mean of
-    what these and the view itself have, as depth of the view: [H, W] each.
-
-    Args: depth: [V, H, W] of all views.
-    """
-    height, width = depth.shape[1:]
-    own = depth[view].reshape(-1)
-    count, ratios = torch.zeros_like(own), torch.ones_like(own)
-    points = rays(Ks[view], height, width) * own
-    for other in neighbors:
-        between = poses[other] @ torch.linalg.inv(poses[view])
-        x, y, z = Ks[other] @ (between[:3, :3] @ points + between[:3, 3:])
-        column, row = (x / z).floor(), (y / z).floor()
-        inside = (z > 0) & (column >= 0) & (column < width) & (row >= 0) & (row < height)
-        theirs = torch.full_like(z, torch.nan)
-        theirs[inside] = depth[other][row[inside].long(), column[inside].long()]
-        agrees = (theirs / z - 1).abs() < tolerance
-        count += agrees
-        ratios += torch.where(agrees, theirs / z, 0)
-    return count.reshape(height, width), (own * ratios / (1 + count)).reshape(height, width)
+    shift = (0.5 * (before - after) / (before - 2 * here + after).clamp_min(1e-6)).clamp(-0.5, 0.5)
+    shift = torch.where(middle == best.indices, shift, 0)
+    return 1 / (1 / depths[best.indices] + shift * (1 / depths[1] - 1 / depths[0])), best.values
 
 
 def _moments(values: Tensor) -> tuple[Tensor, Tensor]:
