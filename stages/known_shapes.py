@@ -53,14 +53,36 @@ def shown(
 
     Raises: DataFailure where they show too little of one.
     """
-    import numpy as np
-
     from chebsplat.lifting.surface import surface
-    from chebsplat.splats.gaussians import local_shape
 
     means, eyes = surface(parameters, poses, Ks, size, unit)
     if len(means) <= N_NEIGHBORS:
         raise DataFailure(f"the Gaussians show {len(means)} points of a surface; shape cannot be told")
+    return facing(means, eyes)
+
+
+def swept(points: Points, width: int, unit: float) -> Cloud:
+    """The surface that swept depth of photos of this width shows.
+
+    Raises: DataFailure where that is too little of one.
+    """
+    from chebsplat.cameras import resized
+    from chebsplat.lifting.surface import swept_surface
+
+    assert points.depths is not None
+    factor = width // points.depths.shape[2]  # of the blocks of pixels that a swept one stands for
+    means, eyes = swept_surface(points.depths, resized(points.Ks, 1 / factor, 1 / factor), points.cam_from_world, unit)
+    if len(means) <= N_NEIGHBORS:
+        raise DataFailure(f"the photos' depth shows {len(means)} points of a surface; shape cannot be told")
+    return facing(means, eyes)
+
+
+def facing(means: np.ndarray, eyes: np.ndarray) -> Cloud:
+    """Points [P, 3] with the shape of their neighbours, and normals towards the cameras [P, 3] that saw them."""
+    import numpy as np
+
+    from chebsplat.splats.gaussians import local_shape
+
     covariances, normals = local_shape(means, N_NEIGHBORS)
     normals[np.einsum("ni,ni->n", normals, eyes - means) < 0] *= -1
     return Cloud(means, normals, covariances)

@@ -10,8 +10,12 @@ from chebsplat.stages.command import Job, command
 if TYPE_CHECKING:
     import numpy as np
 
+    from chebsplat.formats.capture import Capture
     from chebsplat.formats.gaussians import Gaussians
+    from chebsplat.formats.points import Points
 
+REACH = 0.15  # metres from swept points, where an answer is half as long
+LEAST_TOLD = 0.5  # of the pixels of a capture without depth, which a sweep must have found
 METRIC = ("generated", "replica", "scannet", "seven_scenes")  # sources whose scene unit is the metre
 
 
@@ -39,9 +43,13 @@ def run(job: Job) -> None:
             f"{job.inputs['lifted']} is of {len(lifted.features)} Gaussians, not {len(p['means'])}; lift again"
         )
     trained = p.get("fused", p.get("features"))
-    started = settings.start if trained is not None else "lifted"
-    if started != settings.start:
-        job.left_out("trained features", "the scene was trained without; the lifted ones are refined")
+    started = settings.start
+    if started == "auto":
+        started = "both" if measured_capture(job) else "trained"
+    if trained is None:
+        started = "lifted"
+        if settings.start != started:
+            job.left_out("trained features", "the scene was trained without; the lifted ones are refined")
     features = start(started, lifted.features, trained)
     unit = scene_unit(job, p["means"])
     near = affinities(p["means"], *surface_of(p), unit)
@@ -67,15 +75,17 @@ def run(job: Job) -> None:
 def known(job: Job, gaussians: Gaussians, unit: float) -> np.ndarray | None:
     """What knowledge of shape says of the Gaussians, f32 [N, C]: of the points beside them.
 
-    Choices: points are those of depth. Without it knowledge is left out by default: Gaussians that no depth has placed
-      show a surface on which shape alone is right for half of the pixels, or a quarter with ten views.
+    Choices: points are those of the capture's depth, otherwise of the depth that a sweep of its photos found, and then
+      an answer's length, by which it counts, falls with the distance to them: what no photo's depth shows is the views'
+      to tell. Without either knowledge is left out by default: Gaussians that no depth has placed show a surface on
+      which shape alone is right for half of the pixels, or a quarter with ten views.
     """
     from chebsplat.formats.capture import read_capture
     from chebsplat.formats.features import read_features
     from chebsplat.formats.points import read_points
     from chebsplat.lifting.carry import carry
     from chebsplat.splats.gaussians import surface_of
-    from chebsplat.stages.known_shapes import known_shapes, measured, shown
+    from chebsplat.stages.known_shapes import known_shapes, measured, shown, swept
 
     if "knowledge" not in job.inputs:
         return None
@@ -84,24 +94,61 @@ def known(job: Job, gaussians: Gaussians, unit: float) -> np.ndarray | None:
     points, features = read_points(job.inputs["points"]), read_features(job.inputs["features"])
     p, cameras = gaussians.parameters, gaussians.cameras
     capture = read_capture(job.inputs["capture"]) if "capture" in job.inputs else None
-    if capture is not None and capture.depth is None and job.config.refine.surface == "depth":
-        job.left_out("knowledge of shape", "the capture has no depth, and what Gaussians show without it misleads")
+    source = "rendered depth" if job.config.refine.surface == "rendered" else "swept depth"
+    if capture is None or capture.depth is not None:
+        source = "points"
+    elif source == "swept depth" and (why := untold(capture, points)):
+        job.left_out("knowledge of shape", why)
         return None
     try:
-        if capture is None or capture.depth is not None:
-            source, cloud = "points", measured(points)
+        if source == "points":
+            cloud = measured(points)
+        elif source == "swept depth":
+            cloud = swept(points, cameras.width, unit)
         else:
+            assert capture is not None
             test = {name for name, is_test in zip(capture.names, capture.is_test, strict=True) if is_test}
             rows = [row for row, name in enumerate(cameras.names) if name not in test]
             size = cameras.width, cameras.height
-            source, cloud = "rendered depth", shown(p, cameras.cam_from_world[rows], cameras.Ks[rows], size, unit)
+            cloud = shown(p, cameras.cam_from_world[rows], cameras.Ks[rows], size, unit)
         answers, facts = known_shapes(job.inputs["knowledge"], features, cloud, points.cam_from_world, unit)
     except DataFailure as error:
         job.left_out("knowledge of shape", str(error))
         return None
-    carried, _ = carry(answers, cloud.means, cloud.normals, p["means"], surface_of(p)[0], unit)
+    carried, away = carry(answers, cloud.means, cloud.normals, p["means"], surface_of(p)[0], unit)
+    if source == "swept depth":
+        carried *= 1 / (1 + (away[:, None] / unit / REACH) ** 2)
     job.facts["knowledge"] = facts | {"of": source, "n_points": len(cloud.means)}
     return carried
+
+
+def untold(capture: Capture, points: Points) -> str:
+    """Why shape cannot be told of a capture without depth; "": it can.
+
+    Choices: where fewer than half of the pixels have swept depth, things stand alone that walls surround: shape was
+      right for 70 % of what is near its points, where smoothed features were for 82 % (two rooms, ten photos each).
+    """
+    import numpy as np
+
+    if points.depths is None:
+        return "the capture has no depth, and what Gaussians show without it misleads"
+    row = {name: view for view, name in enumerate(capture.names)}
+    used = [k for k, name in enumerate(points.names) if not capture.is_test[row[name]]]
+    share = float(np.mean(points.depths[used] > 0)) if used else 0.0
+    if share >= LEAST_TOLD:
+        return ""
+    return f"the capture has no depth, and a sweep of its photos finds that of {share:.0%} of their pixels: too little"
+
+
+def measured_capture(job: Job) -> bool:
+    """Whether the capture has depth, or there is none to ask.
+
+    Choices: Gaussians that measured depth has placed are seen by the views that look at them; others lie where they
+      look right to few, and what all views say of that place is of what lies behind, too.
+    """
+    from chebsplat.formats.capture import read_capture
+
+    return "capture" not in job.inputs or read_capture(job.inputs["capture"]).depth is not None
 
 
 def scene_unit(job: Job, means: np.ndarray) -> float:

@@ -159,8 +159,10 @@ class LiftSection(Section):
 class RefineSection(Section):
     """docs/method.md, section 13."""
 
-    start: Literal["trained", "lifted", "both"] = setting(
-        "both", "features that are refined, both: midway between their directions; lifted where none are trained"
+    start: Literal["auto", "trained", "lifted", "both"] = setting(
+        "auto",
+        "features that are refined, both: midway between their directions; auto: both where the capture has depth, "
+        "trained where it has not, lifted where none are trained",
     )
     smooth: Literal["auto", "on", "off"] = setting(
         "auto", "bilateral smoothing; auto: where half the training views agree better with it with the other half"
@@ -172,8 +174,8 @@ class RefineSection(Section):
     )
     surface: Literal["depth", "rendered"] = setting(
         "depth",
-        "whose shape knowledge is asked of: points of the capture's depth, without which knowledge is left out; or, "
-        "where there is none, what the Gaussians show",
+        "whose shape knowledge is asked of: depth of the capture or of a sweep of its photos, and knowledge is left "
+        "out without either; or, where the capture has none, what the Gaussians show",
     )
 
 
@@ -185,7 +187,7 @@ class KnowledgeSection(Section):
     n_held_out: int = number(8, "rooms that the card's figures are of; eight kinds of room take turns", 1, 100)
     n_views: int = number(40, "photos of a room", 2, 1000)
     n_points: int = number(14_500, "points of a room, drawn within 0.62 to 1.38 of it", 100, 200_000)
-    steps: int = number(6000, "of teaching", 1, 1_000_000)
+    steps: int = number(8000, "of teaching", 1, 1_000_000)
     seed: int = seed("of what is drawn in teaching")
 
 

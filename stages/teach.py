@@ -49,20 +49,22 @@ def run(job: Job) -> None:
         raise ConfigError(f"{teacher.settings}: output is {teacher.output}; knowledge is taught in features")
     if channels.notes.get("digest") != digest(teacher):
         raise InputError(f"{job.inputs['channels']} is of another teacher than {teacher.path}; pass its own")
-    clean, worn, few = zip(*prepared(job, settings, channels.matrix), strict=True)
+    clean, worn, few, swept = zip(*prepared(job, settings, channels.matrix), strict=True)
     taught_on, tested_on = slice(settings.n_rooms), slice(settings.n_rooms, None)
     words, embeddings = vocabulary(teacher, list(CLASS_NAMES), channels.matrix)
     named = found(list(CLASS_NAMES), words)
     if -1 in named:
         job.left_out("figures on rooms held out", f"the teacher has no word for {CLASS_NAMES[named.index(-1)]}")
     classes = embeddings if -1 in named else embeddings[named]
-    lessons = [lesson_of(room, classes) for room in (*clean[taught_on], *worn[taught_on], *few[taught_on])]
+    kinds = (clean, worn, few, swept)
+    lessons = [lesson_of(room, classes) for rooms in kinds for room in rooms[taught_on]]
     if bare := sum(bool((lesson.n_views < LEAST_VIEWS).all()) for lesson in lessons):
         raise DataFailure(f"{bare} rooms have no point that {LEAST_VIEWS} photos see; raise knowledge.n_views")
     encoder = taught(job, settings, lessons)
-    held_out = {"held_out": clean, "held_out_worn": worn, "held_out_few": few} if -1 not in named else {}
     card = settings.model_dump(mode="json", exclude={"model", "seed"})
-    card |= {name: measured(encoder, rooms[tested_on], classes) for name, rooms in held_out.items()}
+    if -1 not in named:
+        names = ("held_out", "held_out_worn", "held_out_few", "held_out_swept")
+        card |= {of: measured(encoder, rooms[tested_on], classes) for of, rooms in zip(names, kinds, strict=True)}
     job.facts |= card
     weights = {name: value.numpy() for name, value in encoder.state_dict().items()}
     describe = DescribeSection().model_dump(mode="json")
@@ -104,7 +106,7 @@ def vocabulary(teacher: TeacherModel, names: list[str], matrix: np.ndarray) -> t
 
 
 def prepared(job: Job, settings: KnowledgeSection, matrix: np.ndarray) -> list[list[Room]]:
-    """The rooms to teach on, then those held out: clean, worn, half seen. As many processes as threads make them."""
+    """The rooms to teach on, then those held out: clean, worn, half seen, swept; a process for each thread."""
     import multiprocessing
     import os
     from concurrent.futures import ProcessPoolExecutor, as_completed

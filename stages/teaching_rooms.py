@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, NamedTuple
 if TYPE_CHECKING:
     import numpy as np
 
+    from chebsplat.lifting.surface import Surface
     from chebsplat.shape.point_inputs import PointInputs
     from chebsplat.stages.settings import KnowledgeSection
     from chebsplat.stages.teacher_inference import TeacherInference
@@ -16,11 +17,13 @@ KINDS = (  # taken in turn by seed
     "shuffled", "jittered office", "shuffled", "room", "shuffled", "jittered room", "shuffled", "office"
 )  # fmt: skip
 FEW_VIEWS = (3, 15)  # of the photos of a room that is half seen
+LEAST_SWEPT = 10  # photos of a room whose depth is swept, at least
 STRETCH = (0.85, 1.2)  # of a room of other proportions, along each axis
 WIDTH, HEIGHT = 320, 240
 DENSITY = (0.62, 1.38)  # of the number of points asked for: scenes differ
 N_NEIGHBORS = 16  # that give a point its normal and covariance
 SEEN_WITHIN = (0.03, 0.01)  # metres, and share of the depth: how far a point may lie from what a view sees
+SWEPT_WITHIN = (0.08, 0.02)  # the same of points of swept depth, which is off by more
 
 
 class Room(NamedTuple):
@@ -33,16 +36,18 @@ class Room(NamedTuple):
 
 
 def rooms_of(seed: int, settings: KnowledgeSection, network: TeacherInference, matrix: np.ndarray) -> list[Room]:
-    """A room furnished, photographed, seen by the teacher, and described: as depth has it, worn (`worn`), and as few of
-    its photos show it.
+    """A room furnished, photographed, seen by the teacher, and described: as depth has it, worn (`worn`), as few of its
+    photos show it, and as their sweep does (`swept`).
 
     Args: seed: of `synthetic.seeds.KNOWLEDGE`; matrix [C, d]: from the teacher's channels to those of scenes.
     Raises: ValueError on another seed.
     Choices: labels are there to measure by; nothing is taught from them. Points of the worn room are taught what the
-      teacher says of the places that they were moved from; points of few photos, what it says in all of them. Every
-      other room that few photos show has other proportions, too: worlds differ in these.
+      teacher says of the places that they were moved from; points of few photos, and of a sweep, what it says in all of
+      them. Every other room that few photos show has other proportions, too: worlds differ in these. A sweep that finds
+      nothing leaves the room as depth has it once more.
     """
     import numpy as np
+    from scipy.spatial import cKDTree
 
     from chebsplat.synthetic.seeds import KNOWLEDGE
 
@@ -60,10 +65,16 @@ def rooms_of(seed: int, settings: KnowledgeSection, network: TeacherInference, m
     seen = np.where(adrift, 0, n_views[rows])
     rooms = [Room(clean, mean, n_views, named), Room(described(moved, eyes[rows]), mean[rows], seen, named[rows])]
     few = np.sort(rng.permutation(len(poses))[: int(np.exp(rng.uniform(*np.log(FEW_VIEWS))))])
-    means, eyes, named = surface(depth[few], labels[few], K, poses[few], count, rng)
-    mean, n_views = averaged(means, depth, features, K, poses)
+    some, lookers, called = surface(depth[few], labels[few], K, poses[few], count, rng)
+    mean, n_views = averaged(some, depth, features, K, poses)
     stretch = rng.uniform(*STRETCH, 3) if rng.random() < 0.5 else np.ones(3)
-    return [*rooms, Room(described(means * stretch, eyes * stretch), mean, n_views, named)]
+    rooms.append(Room(described(some * stretch, lookers * stretch), mean, n_views, called))
+    found = swept(images, depth, K, poses, rng)
+    if len(found.means) <= N_NEIGHBORS:
+        return [*rooms, rooms[0]]
+    mean, n_views = averaged(found.means, depth, features, K, poses, SWEPT_WITHIN)
+    _, nearest = cKDTree(means).query(found.means)
+    return [*rooms, Room(described(*found), mean, n_views, named[nearest])]
 
 
 def described(means: np.ndarray, eyes: np.ndarray) -> PointInputs:
@@ -98,6 +109,26 @@ def worn(means: np.ndarray, normals: np.ndarray, rng: np.random.Generator) -> tu
     offset = np.where(adrift, np.abs(rng.normal(0, 0.15, len(kept))), offset)
     noise = rng.uniform(0.001, 0.015) * rng.normal(size=where.shape)
     return means[kept] + offset[:, None] * normal + noise, kept, adrift
+
+
+def swept(images: np.ndarray, depth: np.ndarray, K: np.ndarray, poses: np.ndarray, rng: np.random.Generator) -> Surface:
+    """The surface that a sweep of LEAST_SWEPT or more of the photos finds, as in a scene without depth.
+
+    Args: depth [V, H, W]: true; 200 pixels of each photo bound what is tried, as matched points do.
+    """
+    import numpy as np
+
+    from chebsplat.lifting.surface import swept_surface
+    from chebsplat.stages.dense import SIDE, depth_of_photos, reduced
+
+    least = min(LEAST_SWEPT, len(poses))
+    some = np.sort(rng.permutation(len(poses))[: round(np.exp(rng.uniform(*np.log((least, len(poses))))))])
+    factor = max(round(max(images.shape[1:3]) / SIDE), 1)
+    colors = np.stack([reduced(image, factor) for image in images[some]]) / 255
+    Ks = np.tile(K * [[1 / factor], [1 / factor], [1]], (len(some), 1, 1))
+    z = [rng.choice(seen[np.isfinite(seen)], 200) for seen in depth[some]]
+    found = depth_of_photos(colors, np.ones(colors.shape[:3], np.float32), Ks, poses[some], z)
+    return swept_surface(found, Ks, poses[some])
 
 
 def photographed(seed: int, n_views: int) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
@@ -143,9 +174,17 @@ def surface(
 
 
 def averaged(
-    means: np.ndarray, depth: np.ndarray, features: np.ndarray, K: np.ndarray, poses: np.ndarray
+    means: np.ndarray,
+    depth: np.ndarray,
+    features: np.ndarray,
+    K: np.ndarray,
+    poses: np.ndarray,
+    within: tuple[float, float] = SEEN_WITHIN,
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Mean f32 [N, d] of the unit features of the views that see a point, and how many these are [N]."""
+    """Mean f32 [N, d] of the unit features of the views that see a point, and how many these are [N].
+
+    Args: within: metres, and share of the depth, by which a point may lie off what a view sees.
+    """
     import numpy as np
 
     (height, width), (rows, columns) = depth.shape[1:], features.shape[1:3]
@@ -156,7 +195,7 @@ def averaged(
         u, v = ((camera / z[:, None]) @ K.T)[:, :2].T
         index = np.flatnonzero((camera[:, 2] > 0.05) & (u >= 0) & (u < width) & (v >= 0) & (v < height))
         hit = depth[view][v[index].astype(int), u[index].astype(int)]
-        index = index[np.abs(hit - z[index]) < SEEN_WITHIN[0] + SEEN_WITHIN[1] * z[index]]
+        index = index[np.abs(hit - z[index]) < within[0] + within[1] * z[index]]
         seen = features[view][(v[index] * rows / height).astype(int), (u[index] * columns / width).astype(int)]
         total[index] += seen / np.linalg.norm(seen, axis=1, keepdims=True).clip(1e-6)
         n_views[index] += 1
@@ -190,7 +229,7 @@ def kept_as(folder: Path, seed: int) -> Path:
 
 
 def held(folder: Path, seed: int) -> list[Room]:
-    """A room that `prepare` kept: clean, worn, and half seen."""
+    """A room that `prepare` kept: clean, worn, half seen, and swept."""
     import numpy as np
 
     from chebsplat.shape.point_inputs import PointInputs
@@ -201,5 +240,5 @@ def held(folder: Path, seed: int) -> list[Room]:
                 PointInputs(*(stored[f"{name}{number}"] for name in PointInputs._fields)),
                 *(stored[f"{name}{number}"] for name in Room._fields[1:]),
             )
-            for number in range(3)
+            for number in range(4)
         ]

@@ -5,7 +5,7 @@ import pytest
 import torch
 
 from chebsplat.cameras import centers, common_up, upright
-from chebsplat.lifting.surface import EDGE, fused, lookouts, surface
+from chebsplat.lifting.surface import EDGE, EDGE_SWEPT, fused, lookouts, surface, swept_surface
 from chebsplat.splats.planes import inverse_depths, planes_in_view
 from chebsplat.splats.rotations import rotation_matrices
 from chebsplat.synthetic.path import intrinsics, look_at
@@ -108,3 +108,22 @@ def test_cubes_of_fewer_pixels_than_most_and_empty_views_give_no_points():
     raw, _ = tiles((0, 0, 1.0), (0, 0, 0))
     away = look_at(np.array([0, 0, 1.0]), np.array([1.0, 0, 1.2]))[None]
     assert len(surface(raw, away, K[None], SIZE).means) == 0
+
+
+@pytest.mark.parametrize("unit", [1.0, 30.0])
+def test_points_of_swept_depth_lie_where_the_views_see_them(unit):
+    """Of a wall at z = 2 before two cameras, one of which knows half of it."""
+    depths = np.full((2, SIZE[1], SIZE[0]), 2 * unit, np.float32)
+    depths[1, :, : SIZE[0] // 2] = 0
+    poses = np.tile(np.eye(4), (2, 1, 1))
+    poses[1, 0, 3] = -0.5 * unit  # of a camera half a metre along x
+    found = swept_surface(depths, np.stack([K, K]), poses, unit)
+    np.testing.assert_allclose(found.means[:, 2], 2 * unit, rtol=1e-5)
+    width = 2 * SIZE[0] / K[0, 0] / 2  # of what a view sees, to either side
+    assert found.means[:, 0].min() < (0.1 - width) * unit and found.means[:, 0].max() > (0.4 + width) * unit
+    assert 100 < len(found.means) < 6 * width * width / EDGE_SWEPT**2
+    left = found.means[:, 0] < -0.1 * unit
+    np.testing.assert_allclose(found.eyes[left], 0, atol=1e-6 * unit)
+    assert found.eyes[~left, 0].max() > 0.4 * unit
+    nothing = swept_surface(np.zeros_like(depths), np.stack([K, K]), poses, unit)
+    assert nothing.means.shape == (0, 3)

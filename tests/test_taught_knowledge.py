@@ -93,7 +93,7 @@ def test_a_half_seen_room_is_what_few_photos_show_and_is_taught_what_all_say(tmp
     settings = KnowledgeSection(n_views=12, n_points=3000)
     sizes = []
     for seed in KNOWLEDGE[:2]:
-        whole, _, few = teaching_rooms.rooms_of(seed, settings, network, np.eye(3))
+        whole, _, few, _ = teaching_rooms.rooms_of(seed, settings, network, np.eye(3))
         sizes.append(max(np.ptp(few.inputs.means, 0)) / max(np.ptp(whole.inputs.means, 0)))
         if stretch == 1:
             near, _ = cKDTree(few.inputs.means).query(whole.inputs.means)
@@ -198,3 +198,52 @@ def test_knowledge_of_another_teacher_is_refused(toy):
     features.convention |= {"kind": "onnx", "output": "features", "teacher": "another"}
     with pytest.raises(InputError, match="the scene has another; teach knowledge for it"):
         into_channels(toy["teach"], read_knowledge(toy["teach"]), features)
+
+
+def test_a_swept_room_is_what_its_photos_tell_of_depth(tmp_path, monkeypatch):
+    from scipy.spatial import cKDTree
+
+    from chebsplat.formats.teacher_model import read_teacher
+    from chebsplat.lifting.surface import Surface
+    from chebsplat.stages import teaching_rooms
+    from chebsplat.stages.settings import KnowledgeSection
+    from chebsplat.stages.teacher_inference import TeacherInference
+
+    monkeypatch.setattr(teaching_rooms, "LEAST_SWEPT", 16)
+    network = TeacherInference(read_teacher(color_teacher(tmp_path)), 1)
+    settings = KnowledgeSection(n_views=16, n_points=3000)
+    whole, _, _, swept = teaching_rooms.rooms_of(KNOWLEDGE[1], settings, network, np.eye(3))
+    assert len(swept.n_views) > 1000
+    middle = whole.inputs.means.max(0)  # both are about their own centroids: of floor and walls the corner is common
+    away, _ = cKDTree(whole.inputs.means).query(swept.inputs.means + (middle - swept.inputs.means.max(0)))
+    assert np.median(away) < 0.15  # spacing of the compared points, and of the corner, included
+    assert (swept.n_views > 1).mean() > 0.6
+    monkeypatch.setattr(teaching_rooms, "swept", lambda *_: Surface(np.zeros((0, 3)), np.zeros((0, 3))))
+    again = teaching_rooms.rooms_of(KNOWLEDGE[1], KnowledgeSection(n_views=2, n_points=200), network, np.eye(3))
+    assert again[3] is again[0]
+
+
+@pytest.mark.xdist_group("toy")
+def test_without_measured_depth_knowledge_is_asked_of_swept_depth_or_left_out(toy, tmp_path, monkeypatch):
+    from chebsplat.formats.refined import read_refined
+    from chebsplat.stages import refine
+
+    withheld = TOY | {"ingest": {"depth": "off"}}
+    assert run_stage("ingest", tmp_path / "ingest", {}, withheld) == 0
+    made = {}
+    for name, dense, least in (("enough", "on", 0.1), ("too little", "on", 0.9), ("none", "off", 0.1)):
+        monkeypatch.setattr(refine, "LEAST_TOLD", least)  # the toy's photos tell a fifth
+        inputs, config = {"capture": tmp_path / "ingest"}, withheld | {"sfm": {"max_points": 300, "dense": dense}}
+        assert run_stage("sfm", tmp_path / name / "sfm", inputs, config) == 0
+        inputs = {role: toy[of] for role, of in INPUTS["refine"].items()}
+        inputs |= {"capture": tmp_path / "ingest", "points": tmp_path / name / "sfm"}
+        assert run_stage("refine", tmp_path / name / "refine", inputs, withheld) == 0
+        made[name] = artifact.read_manifest(tmp_path / name / "refine").facts
+    assert read_refined(tmp_path / "enough/refine").notes["start"] == made["enough"]["start"] == "trained"
+    assert made["enough"]["knowledge"]["of"] == "swept depth"
+    left_out = {name: facts.get("left_out", {}).get("knowledge of shape", "") for name, facts in made.items()}
+    assert left_out["enough"] == ""
+    assert "too little" in left_out["too little"]
+    assert "misleads" in left_out["none"]
+    assert artifact.read_manifest(toy["refine"]).facts["start"] == "both"
+    assert artifact.read_manifest(toy["refine"]).facts["knowledge"]["of"] == "points"

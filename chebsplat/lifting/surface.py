@@ -1,6 +1,6 @@
-"""Points on the surface that Gaussians show: rendered depth of many views, fused.
+"""Points on the surface that views show, for scenes without measured depth: depth of many views, fused.
 
-For splats without a depth image: descriptors are of surfaces, and the Gaussians' own centres lie off them.
+It is rendered from Gaussians, whose own centres lie off the surface that descriptors are of, or swept from photos.
 """
 
 from __future__ import annotations
@@ -12,7 +12,7 @@ from typing import NamedTuple
 import numpy as np
 import torch
 
-from chebsplat.cameras import upright
+from chebsplat.cameras import centers, unproject, upright
 from chebsplat.render import SceneRenderer
 from chebsplat.views import View
 
@@ -21,6 +21,7 @@ NEAREST = 0.05  # metres
 EDGE = 0.06  # metres, of the cubes that one point stands for
 N_PIXELS = 600_000  # that are looked at
 LEAST = 0.4  # of the pixels in the cube of a middling pixel, and three: what floats before a view holds fewer
+EDGE_SWEPT, LEAST_SWEPT = 0.08, 0.2  # the same where photos were swept: coarser, and counted only where views agree
 LOOKOUT_SIZE, LOOKOUT_ANGLE = (192, 144), 1.4  # pixels; rad, across
 
 
@@ -60,6 +61,18 @@ def surface(
     return fused(np.concatenate(seen), np.concatenate(eyes), EDGE * unit)
 
 
+def swept_surface(depths: np.ndarray, Ks: np.ndarray, cam_from_world: np.ndarray, unit: float = 1.0) -> Surface:
+    """Points of swept depth [V, h, w], 0: none, at most one in a cube of edge EDGE_SWEPT.
+
+    Args: Ks [V, 3, 3] in its pixels; cam_from_world [V, 4, 4]; unit: scene units of a metre.
+    """
+    seen, eyes = [np.zeros((0, 3))], [np.zeros((0, 3))]
+    for depth, K, pose, eye in zip(depths, Ks, cam_from_world, centers(cam_from_world), strict=True):
+        seen.append(unproject(depth, K, pose, np.argwhere(depth > 0)))
+        eyes.append(np.tile(eye, (len(seen[-1]), 1)))
+    return fused(np.concatenate(seen), np.concatenate(eyes), EDGE_SWEPT * unit, LEAST_SWEPT)
+
+
 def lookouts(means: np.ndarray, opacities: np.ndarray, up: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Views [V, 4, 4] from within a room, and their K [V, 3, 3], for a splat without cameras; of LOOKOUT_SIZE.
 
@@ -85,8 +98,8 @@ def lookouts(means: np.ndarray, opacities: np.ndarray, up: np.ndarray) -> tuple[
     return np.stack(poses), np.tile(K, (len(poses), 1, 1))
 
 
-def fused(points: np.ndarray, eyes: np.ndarray, edge: float) -> Surface:
-    """The mean of the points in each cube of this edge, and of their eyes, where it holds enough of them (LEAST)."""
+def fused(points: np.ndarray, eyes: np.ndarray, edge: float, least: float = LEAST) -> Surface:
+    """The mean of the points in each cube of this edge, and of their eyes, where it holds enough of them (`least`)."""
     if len(points) == 0:
         return Surface(points, eyes)
     cells = np.floor((points - points.min(0)) / edge).astype(np.int64)
@@ -94,5 +107,5 @@ def fused(points: np.ndarray, eyes: np.ndarray, edge: float) -> Surface:
     sums = np.zeros((2, len(count), 3))
     np.add.at(sums[0], cell.ravel(), points)
     np.add.at(sums[1], cell.ravel(), eyes)
-    kept = count >= max(3, LEAST * np.median(count[cell]))
+    kept = count >= max(3, least * np.median(count[cell]))
     return Surface(*(total[kept] / count[kept, None] for total in sums))

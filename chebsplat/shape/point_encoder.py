@@ -72,7 +72,7 @@ class PointEncoder(nn.Module):
         n_descriptors: int,
         n_components: int = 48,
         width: int = 48,
-        hidden: int = 32,
+        hidden: int = 64,
         n_scales: int = len(RADII),
     ):
         super().__init__()
