@@ -185,7 +185,7 @@ class TrainSection(Section):
     )
     lr_encoder: float = number(3e-3, "learning rate of the encoder", 0, 10)
     lr_gates: float = number(1e-2, "learning rate of the printed gates' weights", 0, 10)
-    lr_masks: float = number(5e-2, "learning rate of pruning masks", 0, 10)
+    lr_masks: float = number(5e-2, "learning rate of pruning masks, in up to 3000 steps; lower in more", 0, 10)
     lr_exposure: float = number(5e-3, "learning rate of a photo's colours, from 0 to 1", 0, 10)
     lr_poses: float = number(1.0, "of a photo's pose, in pixels that it moves the picture by", 0, 100)
     lr_sh_masks: float = number(0.4, "learning rate of SH masks; fast, under a weak penalty: docs/results.md", 0, 10)

@@ -174,8 +174,8 @@ class RefineSection(Section):
     )
     surface: Literal["depth", "rendered"] = setting(
         "depth",
-        "whose shape knowledge is asked of: depth of the capture or of a sweep of its photos, and knowledge is left "
-        "out without either; or, where the capture has none, what the Gaussians show",
+        "whose shape knowledge is asked of: the capture's depth, or that of a sweep of its photos; or what Gaussians "
+        "show, where it has none",
     )
 
 

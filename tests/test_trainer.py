@@ -281,3 +281,18 @@ def test_rates_follow_the_number_of_steps_unless_they_are_given():
         assert published[name] < default[name] < short[name]
     assert rates(TrainSection(steps=60))["means"] == short["means"]
     assert rates(TrainSection(steps=1000, lr_means=1.6e-4))["means"] == 1.6e-4
+
+
+def test_pruning_masks_go_no_farther_in_long_trainings_and_nothing_else_slows():
+    from chebsplat.settings import TrainSection
+    from chebsplat.training.schedule import Schedule
+
+    def travel(name, steps):
+        schedule = Schedule(TrainSection(steps=steps))
+        return sum(schedule.rate(name, step / steps, steps) for step in range(1, steps + 1))
+
+    assert travel("prune_logits", 1500) == pytest.approx(travel("prune_logits", 3000) / 2, rel=1e-2)
+    assert travel("prune_logits", 9000) == pytest.approx(travel("prune_logits", 3000), rel=1e-2)
+    assert travel("sh_logits", 9000) == pytest.approx(3 * travel("sh_logits", 3000), rel=1e-2)
+    timed = Schedule(TrainSection(seconds=120.0))  # as many steps as the pace tells
+    assert timed.rate("prune_logits", 0.5, timed.last_step(4000, 60.0)) == pytest.approx(3 / 8 * 0.1**0.5)

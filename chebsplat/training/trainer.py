@@ -92,8 +92,9 @@ class Trainer:
             self.laps.start()
             self.step += 1
             share = self.share  # of a budget in steps, with this one; of one in seconds, what was spent before
+            steps = self.schedule.last_step(self.step, self.seconds)
             for group in self.optimizer.param_groups:
-                group["lr"] = group["rate"] * self.schedule.rate(group["name"], share)
+                group["lr"] = group["rate"] * self.schedule.rate(group["name"], share, steps)
             self.order = self.order or self.order_generator.permutation(len(self.views.names)).tolist()
             figures = self._step(self.order.pop(), share)
             self._adapt(share)
