@@ -99,7 +99,7 @@ def swept(job: Job, capture: Capture, cloud: dict[str, Any]) -> dict[str, Any]:
     points = fused(np.concatenate(means), np.concatenate(colors), np.concatenate(seen))
     total, count = sum(map(len, means)), len(points["means"])
     share = total / max(found.size, 1)
-    log.info("%.0f %% of %d photos have a depth by a plane sweep: %d points", 100 * share, len(used), count)
+    log.info("a sweep of %d photos finds %.0f %% of their pixels' depth, %d points", len(used), 100 * share, count)
     job.facts["swept"] = round(share, 3)
     return points | {"depths": depths}
 

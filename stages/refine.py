@@ -25,6 +25,7 @@ def run(job: Job) -> None:
     Reads `gaussians` and `lifted`, for the scene's unit `capture`, for what knowledge says `knowledge`, `points` and
     `features`, by which the share of labels that change is counted, too. Writes `refined`.
     """
+    from chebsplat.formats.capture import read_capture
     from chebsplat.formats.features import read_features
     from chebsplat.formats.gaussians import read_gaussians
     from chebsplat.formats.lifted import read_lifted
@@ -43,17 +44,18 @@ def run(job: Job) -> None:
             f"{job.inputs['lifted']} is of {len(lifted.features)} Gaussians, not {len(p['means'])}; lift again"
         )
     trained = p.get("fused", p.get("features"))
+    capture = read_capture(job.inputs["capture"]) if "capture" in job.inputs else None
     started = settings.start
-    if started == "auto":
-        started = "both" if measured_capture(job) else "trained"
+    if started == "auto":  # Gaussians that no depth has placed lie where they look right, which lifting asks nothing of
+        started = "both" if capture is None or capture.depth is not None else "trained"
     if trained is None:
         started = "lifted"
         if settings.start != started:
             job.left_out("trained features", "the scene was trained without; the lifted ones are refined")
     features = start(started, lifted.features, trained)
-    unit = scene_unit(job, p["means"])
+    unit = scene_unit(job, capture, p["means"])
     near = affinities(p["means"], *surface_of(p), unit)
-    knowledge = known(job, gaussians, unit)
+    knowledge = known(job, gaussians, capture, unit)
     choice = calibrate(lifted.halves, lifted.half_views, near, knowledge)
     smoothed = choice.smooth if settings.smooth == "auto" else settings.smooth == "on"
     strength = choice.strength
@@ -72,15 +74,14 @@ def run(job: Job) -> None:
     job.facts |= {"n_gaussians": len(features), "unit": unit, **notes} | shares(job, made)
 
 
-def known(job: Job, gaussians: Gaussians, unit: float) -> np.ndarray | None:
+def known(job: Job, gaussians: Gaussians, capture: Capture | None, unit: float) -> np.ndarray | None:
     """What knowledge of shape says of the Gaussians, f32 [N, C]: of the points beside them.
 
     Choices: points are those of the capture's depth, otherwise of the depth that a sweep of its photos found, and then
       an answer's length, by which it counts, falls with the distance to them: what no photo's depth shows is the views'
-      to tell. Without either knowledge is left out by default: Gaussians that no depth has placed show a surface on
-      which shape alone is right for half of the pixels, or a quarter with ten views.
+      to tell. Without either knowledge is left out by default: Gaussians that ten photos have placed show a surface on
+      which shape alone is right for half of them.
     """
-    from chebsplat.formats.capture import read_capture
     from chebsplat.formats.features import read_features
     from chebsplat.formats.points import read_points
     from chebsplat.lifting.carry import carry
@@ -93,7 +94,6 @@ def known(job: Job, gaussians: Gaussians, unit: float) -> np.ndarray | None:
         raise ConfigError(f"knowledge is of points and a teacher; pass --in-{absent[0]}, too")
     points, features = read_points(job.inputs["points"]), read_features(job.inputs["features"])
     p, cameras = gaussians.parameters, gaussians.cameras
-    capture = read_capture(job.inputs["capture"]) if "capture" in job.inputs else None
     source = "rendered depth" if job.config.refine.surface == "rendered" else "swept depth"
     if capture is None or capture.depth is not None:
         source = "points"
@@ -140,23 +140,10 @@ def untold(capture: Capture, points: Points) -> str:
     return f"the capture has no depth, and a sweep of its photos finds that of {share:.0%} of their pixels: too little"
 
 
-def measured_capture(job: Job) -> bool:
-    """Whether the capture has depth, or there is none to ask.
-
-    Choices: Gaussians that measured depth has placed are seen by the views that look at them; others lie where they
-      look right to few, and what all views say of that place is of what lies behind, too.
-    """
-    from chebsplat.formats.capture import read_capture
-
-    return "capture" not in job.inputs or read_capture(job.inputs["capture"]).depth is not None
-
-
-def scene_unit(job: Job, means: np.ndarray) -> float:
+def scene_unit(job: Job, capture: Capture | None, means: np.ndarray) -> float:
     """Scene units of a metre: 1 where the source is metric or has depth, otherwise by the extent; facts say which."""
-    from chebsplat.formats.capture import read_capture
     from chebsplat.lifting.smoothing import room_unit
 
-    capture = read_capture(job.inputs["capture"]) if "capture" in job.inputs else None
     metric = capture is not None and (capture.depth is not None or capture.source.get("kind") in METRIC)
     job.facts["unit_from"] = "source" if metric else "extent"
     return 1.0 if metric else room_unit(means)
