@@ -16,7 +16,7 @@ from chebsplat.formats.artifact import publish
 from chebsplat.formats.capture import Capture, write_capture
 from chebsplat.formats.evaluation import Evaluation, write_evaluation
 from chebsplat.formats.manifest import Manifest
-from chebsplat.pipelines.scenes import names
+from chebsplat.pipelines.scenes import data_of, names
 from chebsplat.pipelines.sequences import scenes_of
 from chebsplat.pipelines.studies.page import write
 from chebsplat.pipelines.studies.pictures import gallery
@@ -346,9 +346,11 @@ def test_every_budget_starts_from_what_the_last_one_taught(there_and_back):
 @pytest.mark.parametrize("name", names("studies"))
 def test_every_study_of_ours_can_be_planned(name):
     found = read_study(name)
-    generated = [scene for scene in found.scenes if not scene.startswith("house")]
+    there = [scene for scene in found.scenes if (needed := data_of(scene)) is None or needed[1].is_dir()]
+    if found.scenes and not there:
+        pytest.skip(f"{', '.join(found.scenes)}: no data (CHEBSPLAT_TEST_DATA)")
     orders = [name for name in found.sequences if not any(scene.startswith("house") for scene in scenes_of(name))]
-    few = found.model_copy(update={"scenes": generated[:1], "sequences": orders[:1], "seeds": found.seeds[:1]})
+    few = found.model_copy(update={"scenes": there[:1], "sequences": orders[:1], "seeds": found.seeds[:1]})
     runs = expand(few)
     assert {run.variant for run in runs} == set(found.variants)
 
