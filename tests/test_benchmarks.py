@@ -1,7 +1,9 @@
 """`python -m benchmarks` lists what there is, and brings the scene that a benchmark measures on up to date first."""
 
 import ast
+import csv
 import subprocess
+import sys
 from types import SimpleNamespace
 
 import pytest
@@ -84,3 +86,38 @@ def test_make_runs_one_by_name(words):
         check=True,
     )
     assert done.stdout.splitlines()[-1].endswith("-m benchmarks cost --steps 9")
+
+
+@pytest.mark.slow
+def test_what_awaits_a_gpu_runs_to_its_end_where_the_cpu_stands_in(tmp_path, monkeypatch):
+    import torch
+
+    from benchmarks import gpu
+    from chebsplat.rasterize import rasterize
+
+    def rasterization(*gaussians, packed):
+        return rasterize(*gaussians)
+
+    monkeypatch.setenv("CHEBSPLAT_WORK", str(tmp_path / "work"))
+    monkeypatch.setitem(sys.modules, "gsplat", SimpleNamespace(rasterization=rasterization))
+    for name, answer in (("get_device_name", "none"), ("max_memory_allocated", 0)):
+        monkeypatch.setattr(torch.cuda, name, lambda answer=answer: answer)
+    for name in ("synchronize", "reset_peak_memory_stats"):
+        monkeypatch.setattr(torch.cuda, name, lambda: None)
+    monkeypatch.setattr(gpu, "resolve", lambda device: None)
+    runs = {name: (ablation, "cpu") for name, (ablation, _) in gpu.RUNS.items()}
+    settings = {
+        "DEVICE": "cpu",
+        "SCENE": "toy",
+        "SETTINGS": "train.steps=20",
+        "SIZES": (500,),
+        "STEPS": 20,
+        "RUNS": runs,
+    }
+    for name, value in settings.items():
+        monkeypatch.setattr(gpu, name, value)
+    assert gpu.main(["--out", str(tmp_path)]) in (0, 1)  # by frames a second, which a busy machine decides
+    rows = list(csv.DictReader((tmp_path / "gpu.csv").read_text().splitlines()))
+    assert len(rows) == len(runs) + 3 + 1
+    assert rows[0]["psnr"] == rows[1]["psnr"] and rows[0]["miou"] and not rows[2]["miou"]
+    assert rows[-1]["same_bytes"] == "True"
