@@ -91,7 +91,7 @@ def main(arguments: Sequence[str]) -> None:
     scene, shipped = Scene(options.work), read_knowledge(SHIPPED)
     words = shipped.embeddings[found(list(CLASS_NAMES), shipped.words)].astype(np.float32)
     rooms = made(options.rooms_in, KNOWLEDGE[: options.rooms], KnowledgeSection(), shipped.matrix)
-    encoders = {name: taught(rooms, variant, options.steps, words)[0] for name, variant in SIZES.items()}
+    encoders = {name: taught(rooms, variant, options.steps, words, 0)[0] for name, variant in SIZES.items()}
     encoders["as shipped"] = PointEncoder.restored(shipped.encoder, shipped.weights)
     told = scene.capture, scene.gaussians.cameras, scene.gaussians.parameters, scene.taught
     lifted, to_lift = timed(lambda: lifted_from(*told, LiftSection(), Progress(False)))
