@@ -296,17 +296,3 @@ def test_pruning_masks_go_no_farther_in_long_trainings_and_nothing_else_slows():
     assert travel("sh_logits", 9000) == pytest.approx(3 * travel("sh_logits", 3000), rel=1e-2)
     timed = Schedule(TrainSection(seconds=120.0))  # as many steps as the pace tells
     assert timed.rate("prune_logits", 0.5, timed.last_step(4000, 60.0)) == pytest.approx(3 / 8 * 0.1**0.5)
-
-
-def test_features_go_as_far_by_the_clock_as_by_steps():
-    from chebsplat.settings import TrainSection
-    from chebsplat.training.schedule import Schedule, rates
-
-    for steps in (400, 1500, 8000):
-        timed = Schedule(TrainSection(steps=1500, seconds=120.0, feature_every=4))
-        of_steps = rates(TrainSection(steps=steps, feature_every=4))["features"]
-        base = rates(timed.settings)["features"]
-        assert base * timed.rate("features", 0.0, steps) == pytest.approx(of_steps)
-        assert timed.rate("means", 0.0, steps) == 1
-    told = Schedule(TrainSection(steps=1500, seconds=120.0, lr_features=1e-2))
-    assert told.rate("features", 0.0, 8000) == Schedule(TrainSection(steps=1500)).rate("features", 0.0, 1500) == 1

@@ -55,15 +55,10 @@ def starts_lifted(settings: TrainSection, n_views: int) -> bool:
     return n_views >= 40 if settings.feature_start is None else settings.feature_start == "lifted"
 
 
-def feature_rate(settings: TrainSection, steps: int) -> float:
-    """The features' learning rate in a training of so many steps: so far in all, however many of them teach."""
-    taught = max(steps // (settings.feature_every or 1), 1)
-    return min(TRAVEL / taught, MOST) if settings.lr_features is None else settings.lr_features
-
-
 def rates(settings: TrainSection) -> dict[str, float]:
     """Learning rate of each raw parameter before any schedule; that of `means` is relative to the scene's extent."""
-    steps = settings.steps or MOST_STEPS
+    features, steps = settings.lr_features, settings.steps or MOST_STEPS
+    taught = max(steps // (settings.feature_every or 1), 1)
     sh = by_steps(settings.lr_sh, 1.25e-4, 0.41, steps)
     return {
         "means": by_steps(settings.lr_means, 1.6e-4, 0.61, steps),
@@ -74,7 +69,7 @@ def rates(settings: TrainSection) -> dict[str, float]:
         "sh1": sh,
         "sh2": sh,
         "sh3": sh,
-        "features": feature_rate(settings, steps),
+        "features": min(TRAVEL / taught, MOST) if features is None else features,
         "prune_logits": settings.lr_masks,
         "sh_logits": settings.lr_sh_masks,
     }
@@ -128,14 +123,8 @@ class Schedule:
 
         Choices: pruning masks go no farther in a long training than in one of MOST_STEPS. A penalty that Adam turns
           into steps of one size closes them for as long as it lasts: 8000 steps left a room 4,832 of 40,000 Gaussians.
-          Features go as far by the clock as by steps: 6000 steps at the rate of 1500 lose 2 points of mIoU. The other
-          rates do not follow the pace: those of 1500 steps serve 6000 as well (docs/results.md, "At equal seconds").
         """
-        slower = 1.0
-        if name == "prune_logits":
-            slower = min(MOST_STEPS / max(steps, 1), 1.0)
-        elif name == "features" and self.settings.lr_features is None:
-            slower = feature_rate(self.settings, steps) / feature_rate(self.settings, self.steps)
+        slower = min(MOST_STEPS / max(steps, 1), 1.0) if name == "prune_logits" else 1.0
         return float(slower * FASTER.get(name, 0.1) ** share)
 
     def degree(self, share: float) -> int:
