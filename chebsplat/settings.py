@@ -133,8 +133,10 @@ class TrainSection(Section):
     )
     grow_farthest: float = number(1.5, "largest one", 1e-6, 1e6)
     # photos
-    exposure: Literal["auto", "on", "off"] = setting(
-        "auto", "learn an affine map of colours for each photo; auto: where photos of the same points differ"
+    exposure: Literal["auto", "measured", "learned", "off"] = setting(
+        "auto",
+        "of photos; measured: what one has alone is undone; learned: a map of colours for each; auto: measured, where "
+        "they differ",
     )
     poses: Literal["given", "refined"] = setting(
         "given", "of photos, as they are; refined: corrected while the scene is trained"

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 from typing import TYPE_CHECKING, Any
 
 from chebsplat.stages.command import Job
@@ -14,7 +15,8 @@ if TYPE_CHECKING:
     from chebsplat.training.camera_models import CameraModels
     from chebsplat.views import Views
 
-LEAST_SPREAD = 0.03  # of the brightness of the same points between photos, above which exposures are learned
+log = logging.getLogger("chebsplat")
+LEAST_SPREAD = 0.05  # stops between the photos' own exposures, from which on they are undone
 
 
 def camera_models(job: Job, capture: Capture, points: Points, views: Views) -> CameraModels:
@@ -26,11 +28,8 @@ def camera_models(job: Job, capture: Capture, points: Points, views: Views) -> C
     from chebsplat.training.poses import Poses
 
     train, exposure, poses = job.config.train, None, None
-    wanted, why = wants_exposure(job, capture, points)
-    if wanted:
+    if train.exposure == "learned":
         exposure = Exposure(len(views.names), train.lr_exposure, train.weight_exposure, job.device)
-    else:
-        job.left_out("exposure by photo", why)
     if train.poses == "refined":
         size = capture.size
         row = {name: k for k, name in enumerate(points.names)}
@@ -42,37 +41,52 @@ def camera_models(job: Job, capture: Capture, points: Points, views: Views) -> C
     return CameraModels(exposure, poses)
 
 
-def wants_exposure(job: Job, capture: Capture, points: Points) -> tuple[bool, str]:
-    """Whether exposures are learned, and why not.
+def exposures(job: Job, capture: Capture, points: Points) -> np.ndarray | None:
+    """What each training photo's exposure [V, 3] differs from its neighbours', to be undone; None where they are left.
 
     Choices: generated views are alike by construction; elsewhere the photos are measured at the points, at the cost of
       a second.
     """
     chosen = job.config.train.exposure
-    if chosen != "auto":
-        return chosen == "on", f"train.exposure is {chosen}"
-    if capture.source.get("kind") == "generated":
-        return False, "views are generated, all alike"
-    spread = measured_spread(capture, points)
-    job.facts["exposure_spread"] = spread
-    return spread >= LEAST_SPREAD, f"colours of the same points differ by {spread:.1%} between photos"
-
-
-def measured_spread(capture: Capture, points: Points) -> float:
-    """Of the training views, by the points' tracks where they have any."""
+    if chosen == "learned":
+        return None
+    if chosen == "off" or (chosen == "auto" and capture.source.get("kind") == "generated"):
+        why = "train.exposure is off" if chosen == "off" else "views are generated, all alike"
+        job.left_out("exposure by photo", why)
+        return None
     import numpy as np
 
-    from chebsplat.training.exposure import exposure_spread
+    from chebsplat.photos.exposures import own_part
+
+    measured, poses = exposures_of(capture, points)
+    known = measured[np.isfinite(measured).all(1)]
+    own = own_part(measured, poses)
+    spread = float(own.std(0).mean())
+    job.facts["exposure_stops"] = {"all": float(known.std(0).mean()) if len(known) else None, "own": spread}
+    if chosen == "auto" and spread < LEAST_SPREAD:
+        job.left_out("exposure by photo", f"photos differ by {spread:.2f} stops from those about them")
+        return None
+    log.info("exposures of photos differ by %.2f stops from those about them: undone", spread)
+    return own
+
+
+def exposures_of(capture: Capture, points: Points) -> tuple[np.ndarray, np.ndarray]:
+    """Exposures of the training views in stops, by the points' tracks where they have any; and these views' poses."""
+    import numpy as np
+
+    from chebsplat.photos.exposures import measured_exposures
 
     row = {name: view for view, name in enumerate(capture.names)}
     used = [k for k, name in enumerate(points.names) if not capture.is_test[row[name]]]
-    seen = None
+    means, seen = points.means, None
     if len(points.tracks):
-        seen = np.zeros((len(points.means), len(points.names)), bool)
+        seen = np.zeros((len(means), len(points.names)), bool)
         seen[points.tracks[:, 0], points.tracks[:, 1]] = True
-        seen = seen[:, used]
+        tracked = np.unique(points.tracks[:, 0])
+        means, seen = means[tracked], seen[tracked][:, used]
     photos = (capture.images[row[points.names[k]]] for k in used)
-    return exposure_spread(photos, points.Ks[used], points.cam_from_world[used], points.means, seen)
+    poses = points.cam_from_world[used]
+    return measured_exposures(photos, points.Ks[used], poses, means, seen), poses
 
 
 def reached(models: CameraModels, views: Views, points: Points) -> np.ndarray:

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 from chebsplat.errors import DataFailure
 from chebsplat.stages.command import Job, command, n_threads
 from chebsplat.stages.measured_depth import with_depth_loss
-from chebsplat.stages.photo_models import camera_models, facts, reached
+from chebsplat.stages.photo_models import camera_models, exposures, facts, reached
 from chebsplat.stages.resume import Saves
 from chebsplat.stages.stopping import deferred
 from chebsplat.stages.train_inputs import (
@@ -64,7 +64,8 @@ def run(job: Job) -> None:
     model = model_of(points, features, train, job.config.describe, job.device)
     n_initial = len(model)
     regions, described_values = first_regions(descriptors if points is given and not train.start else None)
-    views = training_views(capture, points, features, bool(train.weight_depth)).to(job.device)
+    undone = exposures(job, capture, points)
+    views = training_views(capture, points, features, bool(train.weight_depth), undone).to(job.device)
     if features is not None:
         begin_features(job, model, capture, points, features, len(views.names))
     models = camera_models(job, capture, points, views)

@@ -13,6 +13,7 @@ from chebsplat.stages.restored import without_basis
 if TYPE_CHECKING:
     from collections.abc import Callable
 
+    import numpy as np
     from torch import Tensor
 
     from chebsplat.formats.capture import Capture
@@ -29,13 +30,21 @@ FEATURE_BYTES = 64 << 20  # of features that are kept in memory; what is beyond 
 PHOTO_BYTES, MASK_BYTES = 2 << 30, 512 << 20  # of photos and masks likewise
 
 
-def training_views(capture: Capture, points: Points, features: Features | None, with_depth: bool = False) -> Views:
-    """The registered training views, joined by name, with their depth where asked for.
+def training_views(
+    capture: Capture,
+    points: Points,
+    features: Features | None,
+    with_depth: bool = False,
+    exposures: np.ndarray | None = None,
+) -> Views:
+    """The registered training views, joined by name, with their depth where asked for, and without these exposures
+    [V, 3], in stops.
 
     Raises: InputError if artifacts do not belong together.
     """
     import torch
 
+    from chebsplat.photos.exposures import relit
     from chebsplat.views import Views, remembered, stacked
 
     row = {name: view for view, name in enumerate(capture.names)}
@@ -63,10 +72,14 @@ def training_views(capture: Capture, points: Points, features: Features | None, 
         if features.pseudo_labels is not None and features.confidence is not None:
             labels_of = taught_labels(features, [source[name] for name in names])
 
+    def photo(k: int) -> torch.Tensor:
+        image = images[chosen[k]]
+        return torch.from_numpy(image if exposures is None else relit(image, -exposures[k]))
+
     depth_of = measured_depth(capture, points, used) if with_depth else None
     return Views(
         names,
-        stacked(lambda k: torch.from_numpy(images[chosen[k]]), len(chosen), PHOTO_BYTES),
+        stacked(photo, len(chosen), PHOTO_BYTES),
         torch.from_numpy(points.Ks[used]).float(),
         torch.from_numpy(points.cam_from_world[used]).float(),
         None if masks is None else stacked(lambda k: torch.from_numpy(masks[chosen[k]]), len(chosen), MASK_BYTES),

@@ -11,6 +11,7 @@ from chebsplat.errors import ConfigError
 from chebsplat.evaluation.metrics import color_fitted, psnr
 from chebsplat.formats.capture import Capture
 from chebsplat.formats.points import Points
+from chebsplat.photos.exposures import measured_exposures, own_part, relit
 from chebsplat.rasterize import rasterize
 from chebsplat.render import SceneRenderer
 from chebsplat.settings import TrainSection
@@ -21,7 +22,7 @@ from chebsplat.stages.measured_depth import WEIGHT, with_depth_loss
 from chebsplat.stages.sources.disturbed import displaced, recolored
 from chebsplat.stages.train_inputs import training_views
 from chebsplat.training.camera_models import CameraModels
-from chebsplat.training.exposure import Exposure, exposure_spread
+from chebsplat.training.exposure import Exposure
 from chebsplat.training.losses import depth_distance
 from chebsplat.training.poses import Poses, motion, moved, preconditioner, small_twist
 from chebsplat.training.row_adam import RowAdam
@@ -133,17 +134,62 @@ def test_a_row_is_not_moved_by_what_it_remembers():
     assert adam.counts.tolist() == [1, 0] and not adam.moments[:, 1].any()
 
 
-def test_spread_of_exposures_is_that_of_the_gains_and_none_of_photos_alike():
+def test_measured_exposures_are_those_the_photos_were_taken_with():
+    """In linear light, of a wall of many colours; and none is told where two photos share no points."""
     g = np.random.default_rng(0)
     poses = np.tile(np.eye(4), (5, 1, 1))
     poses[:, 2, 3] = 5
-    points, image = g.normal(size=(2000, 3)), np.full((40, 48, 3), 100, np.uint8)
-    gains = np.array([0.8, 0.9, 1.0, 1.1, 1.2])
-    images = np.stack([(image * gain).astype(np.uint8) for gain in gains])
+    points, image = g.normal(size=(2000, 3)), np.repeat(np.repeat(g.integers(90, 200, (5, 6, 3)), 8, 0), 8, 1)
+    stops = np.array([[-0.4, 0.1, 0], [0.2, 0.2, 0.2], [0, 0, 0], [0.1, -0.2, 0], [0.1, -0.1, -0.2]])
+    images = np.stack([relit(image.astype(np.uint8), own) for own in stops])
     Ks = np.tile(K.double().numpy(), (5, 1, 1))
-    assert exposure_spread(images, Ks, poses, points) == pytest.approx(np.log(gains).std(), rel=0.1)
-    assert exposure_spread(images[[2] * 5], Ks, poses, points) == 0
-    assert exposure_spread(images, Ks, poses, points, np.zeros((2000, 5), bool)) == 0
+    assert measured_exposures(images, Ks, poses, points) == pytest.approx(stops, abs=0.02)
+    assert measured_exposures(images[[2] * 5], Ks, poses, points) == pytest.approx(0, abs=1e-9)
+    seen = np.zeros((2000, 5), bool)
+    assert np.isnan(measured_exposures(images, Ks, poses, points, seen)).all()
+    seen[:, :4] = True
+    some = measured_exposures(images, Ks, poses, points, seen)
+    assert np.isnan(some[4]).all() and some[:4] == pytest.approx(stops[:4] - stops[:4].mean(0), abs=0.02)
+
+
+def test_a_photo_relit_and_back_is_the_same_but_for_what_was_cut_off():
+    image = np.random.default_rng(0).integers(60, 150, (8, 8, 3)).astype(np.uint8)
+    back = relit(relit(image, np.array([0.5, 0.3, -0.3])), -np.array([0.5, 0.3, -0.3]))
+    assert np.abs(back.astype(int) - image).max() <= 1
+    assert (relit(np.full((1, 1, 3), 250, np.uint8), np.ones(3)) == 255).all()
+    assert np.array_equal(relit(image, np.zeros(3)), image)
+
+
+def ring(n):
+    """Cameras about the origin that look at it."""
+    poses = np.tile(np.eye(4), (n, 1, 1))
+    for k, angle in enumerate(np.linspace(0, 2 * np.pi, n, endpoint=False)):
+        poses[k, :3, :3] = [[np.cos(angle), 0, np.sin(angle)], [0, 1, 0], [-np.sin(angle), 0, np.cos(angle)]]
+        poses[k, 2, 3] = 3
+    return poses
+
+
+def test_exposures_that_drift_along_the_path_are_shared_and_those_of_single_photos_their_own():
+    g, poses, angle = np.random.default_rng(0), ring(40), np.linspace(0, 2 * np.pi, 40, endpoint=False)[:, None]
+    drift = 0.3 * np.sin(angle) * np.array([1, 0.9, 1.2])
+    assert np.abs(own_part(drift, poses)).max() < 0.01
+    noise = g.normal(size=(40, 1)) * 0.2 + g.normal(size=(40, 3)) * 0.02
+    own = own_part(drift + noise, poses)
+    assert (own - noise + noise.mean(0)).std() < 0.55 * noise.std()
+    alone = np.full((40, 3), np.nan)
+    assert not own_part(alone, poses).any() and not own_part(np.zeros((40, 3)), np.tile(np.eye(4), (40, 1, 1))).any()
+    some = np.where(np.arange(40)[:, None] == 7, np.nan, drift + noise)
+    assert not own_part(some, poses)[7].any() and own_part(some, poses)[8].any()
+
+
+def test_an_exposure_that_no_neighbour_shares_is_undone_in_training(tmp_path):
+    """One photo of eight is half as bright, and is trained on as bright as the others."""
+    capture, points = photographed("colmap", [1, 1, 1, 0.5, 1, 1, 1, 1])
+    points.cam_from_world[:, 0, 3] = np.linspace(-0.2, 0.2, 8)
+    job = Job({}, config.build({}, "test"), tmp_path, tmp_path)
+    undone = photo_models.exposures(job, capture, points)
+    photos = training_views(capture, points, None, exposures=undone).images.float()
+    assert photos.mean((1, 2, 3)).std() < 3 and capture.images[3].max() == 50
 
 
 def trained(made):
@@ -293,18 +339,18 @@ def photographed(kind, gains):
     ("kind", "gains", "chosen", "wanted", "why"),
     [
         ("generated", [0.5, 1, 1.5, 2], "auto", False, "generated"),
-        ("colmap", [0.8, 1, 1.2, 1.4], "auto", True, "differ by"),
-        ("colmap", [1, 1, 1, 1], "auto", False, "differ by 0.0%"),
-        ("colmap", [1, 1, 1, 1], "on", True, "train.exposure is on"),
-        ("colmap", [0.8, 1, 1.2, 1.4], "off", False, "train.exposure is off"),
+        ("colmap", [0.8, 1.4, 0.7, 1.2], "auto", True, ""),
+        ("colmap", [1, 1, 1, 1], "auto", False, "differ by 0.00 stops"),
+        ("colmap", [1, 1, 1, 1], "measured", True, ""),
+        ("colmap", [0.8, 1.4, 0.7, 1.2], "off", False, "train.exposure is off"),
     ],
 )
-def test_exposures_are_learned_where_photos_of_the_same_points_differ(tmp_path, kind, gains, chosen, wanted, why):
+def test_exposures_are_undone_where_photos_of_the_same_points_differ(tmp_path, kind, gains, chosen, wanted, why):
     job = Job({}, config.build({"train": {"exposure": chosen}}, "test"), tmp_path, tmp_path)
     capture, points = photographed(kind, gains)
-    found, reason = photo_models.wants_exposure(job, capture, points)
-    assert found == wanted and why in reason
-    assert ("exposure_spread" in job.facts) == (chosen == "auto" and kind != "generated")
+    found = photo_models.exposures(job, capture, points)
+    assert (found is not None) == wanted and why in job.facts.get("left_out", {}).get("exposure by photo", "")
+    assert ("exposure_stops" in job.facts) == (chosen != "off" and kind != "generated")
 
 
 def test_what_is_not_learned_of_photos_is_left_out_with_its_reason(tmp_path):
@@ -312,6 +358,7 @@ def test_what_is_not_learned_of_photos_is_left_out_with_its_reason(tmp_path):
     job = Job({}, config.build({"train": {"poses": "given"}}, "test"), tmp_path, tmp_path)
     models = photo_models.camera_models(job, capture, points, training_views(capture, points, None))
     assert models == CameraModels(None, None) and photo_models.facts(models) == {}
+    assert photo_models.exposures(job, capture, points) is None
     assert job.facts["left_out"]["exposure by photo"] == "views are generated, all alike"
     assert job.facts["left_out"]["pose refinement"] == "train.poses is given"
     found = photo_models.reached(models, training_views(capture, points, None), points)

@@ -145,7 +145,7 @@ def test_the_stage_trains_there_with_exposures_and_poses(gpu, up_to_teacher, tmp
     caplog.set_level(logging.INFO)
     folders = (("capture", "ingest"), ("points", "sfm"), ("features", "teacher"))
     inputs = {role: up_to_teacher / of for role, of in folders}
-    sections = {"train": WHOLE | {"exposure": "on", "poses": "refined"}, "describe": REGIONS}
+    sections = {"train": WHOLE | {"exposure": "learned", "poses": "refined"}, "describe": REGIONS}
     (tmp_path / "out").mkdir()
     job = Job(inputs, configs.build(sections, "toy"), tmp_path / "out", tmp_path / "scratch", "cuda")
     with gpu.active():

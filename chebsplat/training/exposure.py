@@ -5,16 +5,12 @@ The scene's own colours are those of the mean view: maps belong to photos, and n
 
 from __future__ import annotations
 
-from collections.abc import Iterable
 from typing import Any
 
-import numpy as np
 import torch
 from torch import Tensor
 
 from chebsplat.training.row_adam import RowAdam
-
-CELL, MOST_POINTS, LEAST_POINTS = 8, 4000, 30  # of `exposure_spread`: pixels; points that are looked at, and of a view
 
 
 class Exposure:
@@ -54,39 +50,3 @@ class Exposure:
     def load_state_dict(self, state: dict[str, Any]) -> None:
         self.maps = state["maps"]
         self.optimizer.load_state_dict(state["optimizer"])
-
-
-def exposure_spread(
-    images: Iterable[np.ndarray],
-    Ks: np.ndarray,
-    cam_from_world: np.ndarray,
-    points: np.ndarray,
-    seen: np.ndarray | None = None,
-) -> float:
-    """How much photos of the same points differ in colour: the standard deviation over views of its logarithm.
-
-    Args: images: u8 [H, W, 3] of V views; Ks [V, 3, 3] pixels; cam_from_world [V, 4, 4]; points [N, 3]; seen: bool
-      [N, V], or None: by all views that have the point within their frame.
-    Choices: of a view the median over points, each against its own median over views, so that walls in between and
-      highlights count little; colours are means over 8 × 8 pixels. 0 where no three views see enough of the same.
-    """
-    chosen = np.linspace(0, len(points) - 1, min(len(points), MOST_POINTS)).astype(int)
-    logs = np.full((len(chosen), len(Ks), 3), np.nan)
-    for view, image in enumerate(images):
-        height, width = image.shape[:2]
-        side = min(CELL, height, width)
-        camera = points[chosen] @ cam_from_world[view, :3, :3].T + cam_from_world[view, :3, 3]
-        front = camera[:, 2] > 1e-3
-        u, v = ((camera / np.where(front, camera[:, 2], 1)[:, None]) @ Ks[view].T)[:, :2].T
-        inside = front & (u >= 0) & (u < width // side * side) & (v >= 0) & (v < height // side * side)
-        if seen is not None:
-            inside &= seen[chosen, view]
-        cells = image[: height // side * side, : width // side * side].astype(np.float64)
-        cells = cells.reshape(height // side, side, width // side, side, 3).mean((1, 3))
-        logs[inside, view] = np.log(cells[(v[inside] / side).astype(int), (u[inside] / side).astype(int)] + 4)
-    logs = logs[np.isfinite(logs[..., 0]).sum(1) >= 3]
-    enough = np.isfinite(logs[..., 0]).sum(0) >= LEAST_POINTS
-    if enough.sum() < 3:
-        return 0.0
-    by_view = np.nanmedian(logs[:, enough] - np.nanmedian(logs, axis=1, keepdims=True), axis=0)
-    return float(by_view.std(0).mean())

@@ -12,6 +12,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from chebsplat.cameras import centers
+from chebsplat.photos.exposures import relit
 
 
 def recolored(images: np.ndarray, is_test: np.ndarray, stops: float, seed: int) -> np.ndarray:
@@ -22,15 +23,9 @@ def recolored(images: np.ndarray, is_test: np.ndarray, stops: float, seed: int) 
     """
     rng, rows = np.random.default_rng(seed), np.flatnonzero(~is_test)
     logs = rng.uniform(-stops, stops, (len(rows), 1)) + rng.uniform(-stops / 4, stops / 4, (len(rows), 3))
-    gains = 2.0 ** (logs - logs.mean(0))
-    values = np.arange(256) / 255
-    light = np.where(values <= 0.04045, values / 12.92, ((values + 0.055) / 1.055) ** 2.4)
     changed = images.copy()
-    for row, gain in zip(rows, gains, strict=True):
-        for channel in range(3):
-            lit = np.minimum(light * gain[channel], 1)
-            table = np.where(lit <= 0.0031308, 12.92 * lit, 1.055 * lit ** (1 / 2.4) - 0.055)
-            changed[row, ..., channel] = (255 * table).round().astype(np.uint8)[images[row, ..., channel]]
+    for row, own in zip(rows, logs - logs.mean(0), strict=True):
+        changed[row] = relit(images[row], own)
     return changed
 
 
