@@ -14,6 +14,7 @@ WINDOW, SMOOTH = 1, 1  # half widths in pixels: of the patches that are compared
 FLAT = 1e-4  # variance that patches are given: two without texture are alike
 BRIGHT = 0.3  # weight of a difference in brightness, as a logarithm, beside 1 - correlation
 OUTSIDE = 4.0  # cost of a pixel that the other view does not see
+AT_ONCE = 8  # depths: what they take stays in a processor's cache
 BEST = 2  # views that must agree, of the neighbours: others may be covered
 
 
@@ -53,24 +54,26 @@ def swept_depth(
     lowest = torch.full((BEST, len(depths), height, width), OUTSIDE)  # costs, ascending
     for other in neighbors:
         between = poses[other] @ torch.linalg.inv(poses[view])
-        at = Ks[other] @ between[:3, :3] @ rays(Ks[view], height, width) * depths[:, None, None]
-        x, y, z = (at + Ks[other] @ between[:3, 3:]).unbind(1)  # each [D, H W]
-        z = torch.where(z > 1e-6, z, torch.nan)
-        place = torch.stack([x / z / width * 2 - 1, y / z / height * 2 - 1], -1).nan_to_num(nan=-9.0)
-        seen = F.grid_sample(
-            torch.stack([grey[other], valid[other]])[None].expand(len(depths), -1, -1, -1),
-            place.reshape(len(depths), height, width, 2),
-            align_corners=False,
-        )
-        warped, counts = seen[:, 0], seen[:, 1] > 0.9
-        their_mean, their_spread = _moments(warped)
-        covariance = box_mean(warped * grey[view], WINDOW) - their_mean * mean
-        correlation = ((covariance + FLAT) / (their_spread * spread + FLAT)).clamp(-1, 1)
-        brighter = (their_mean.clamp_min(1e-3) / mean.clamp_min(1e-3)).log().abs().clamp_max(1)
-        cost = torch.where(counts, 1 - correlation + BRIGHT * brighter, OUTSIDE)
-        higher = box_mean(cost, SMOOTH)
-        for rank in lowest:
-            rank[:], higher = torch.minimum(rank, higher), torch.maximum(rank, higher)
+        ahead = Ks[other] @ between[:3, :3] @ rays(Ks[view], height, width)
+        pair = torch.stack([grey[other], valid[other]])[None]
+        for some, ranks in zip(depths.split(AT_ONCE), lowest.split(AT_ONCE, 1), strict=True):
+            x, y, z = (ahead * some[:, None, None] + Ks[other] @ between[:3, 3:]).unbind(1)  # each [D, H W]
+            z = torch.where(z > 1e-6, z, torch.nan)
+            place = torch.stack([x / z / width * 2 - 1, y / z / height * 2 - 1], -1).nan_to_num(nan=-9.0)
+            seen = F.grid_sample(
+                pair.expand(len(some), -1, -1, -1),
+                place.reshape(len(some), height, width, 2),
+                align_corners=False,
+            )
+            warped, counts = seen[:, 0], seen[:, 1] > 0.9
+            their_mean, their_spread = _moments(warped)
+            covariance = box_mean(warped * grey[view], WINDOW) - their_mean * mean
+            correlation = ((covariance + FLAT) / (their_spread * spread + FLAT)).clamp(-1, 1)
+            brighter = (their_mean.clamp_min(1e-3) / mean.clamp_min(1e-3)).log().abs().clamp_max(1)
+            cost = torch.where(counts, 1 - correlation + BRIGHT * brighter, OUTSIDE)
+            higher = box_mean(cost, SMOOTH)
+            for rank in ranks:
+                rank[:], higher = torch.minimum(rank, higher), torch.maximum(rank, higher)
     volume = lowest.mean(0)
     best = volume.min(0)
     middle = best.indices.clamp(1, len(depths) - 2)
