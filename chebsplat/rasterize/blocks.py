@@ -1,4 +1,6 @@
-"""Small dense products, transposes and prefetching for the tiles' kernels, emitted so that sums stay in registers."""
+"""What the tiles' kernels are made of: a queue, prefetching, small dense products and transposes, whose sums stay in
+registers.
+"""
 
 from __future__ import annotations
 
@@ -7,6 +9,20 @@ from numba.core import cgutils, types
 from numba.core.typing.templates import signature
 
 from chebsplat.kernels.simd import FLOAT, INT, WIDE, address, broadcast, intrinsic, multiply_add, shuffle
+
+LONG = ir.IntType(64)
+WORKERS = 256  # that take work from a queue: at most as many threads do so at once
+
+
+@intrinsic
+def claim(_typing, counter):
+    """The next number of a shared counter i64 [1], from what it holds on; each is given to one thread alone."""
+
+    def build(context, builder, sig, args):
+        place = address(context, builder, sig.args[0], args[0], context.get_constant(types.intp, 0), LONG)
+        return builder.atomic_rmw("add", place, LONG(1), "monotonic")
+
+    return signature(types.int64, counter), build
 
 
 @intrinsic

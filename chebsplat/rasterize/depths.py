@@ -11,9 +11,10 @@ import numpy as np
 from chebsplat.kernels.jit import kernel, prange, serial
 from chebsplat.rasterize import cells
 from chebsplat.rasterize.binning import TILE
+from chebsplat.rasterize.blocks import WORKERS, claim
 from chebsplat.rasterize.cells import LANES, SHAPE, ZERO
 from chebsplat.rasterize.lift import MAX_ALPHA, binned
-from chebsplat.rasterize.tiles import fill_shapes, spread
+from chebsplat.rasterize.tiles import fill_shapes
 
 COVERED = (0.7, 0.9)  # of the light, which part of it tells the depth
 
@@ -61,14 +62,15 @@ def _depths(splats, tile_starts, ranks, low, high, depth, covered):
     """Fill depth and covered [H, W]."""
     height, width = depth.shape
     columns, rows = (width + TILE - 1) // TILE, (height + TILE - 1) // TILE
-    n_tiles = columns * rows
-    for j in prange(16 * ((n_tiles + 15) // 16)):
-        if spread(j, n_tiles) < n_tiles:
-            tile = spread(j, n_tiles)
+    n_tiles, queue = columns * rows, np.zeros(1, np.int64)
+    for _ in prange(WORKERS):
+        tile = claim(queue)
+        while tile < n_tiles:
             _depth_tile(
                 splats, ranks, tile_starts[tile], tile_starts[tile + 1], (tile % columns) * TILE,
                 (tile // columns) * TILE, low, high, depth, covered,
             )  # fmt: skip
+            tile = claim(queue)
 
 
 def depths(

@@ -14,8 +14,9 @@ from chebsplat.kernels.jit import kernel, lanes, prange, serial
 from chebsplat.kernels.simd import load, splat, store, where
 from chebsplat.rasterize import binning, cell_adjoint, cells, ellipses, tiles
 from chebsplat.rasterize.binning import TILE, band_start
+from chebsplat.rasterize.blocks import WORKERS, claim
 from chebsplat.rasterize.cells import LANES, SHAPE, ZERO
-from chebsplat.rasterize.tiles import fill_shapes, spread
+from chebsplat.rasterize.tiles import fill_shapes
 
 MAX_ALPHA, NEAR, FAR, EPS2D = np.float32(0.99), 0.01, 1e10, 0.3  # as `reference.rasterize` has them
 
@@ -81,15 +82,17 @@ def _lift(splats, shown, tile_starts, ranks, pair, pair_starts, values, counts, 
     for band in range(bands):
         first_tile, base = band_start(band, rows) * columns, pair_starts[band, 0]
         n_tiles = band_start(band + 1, rows) * columns - first_tile
-        for j in prange(16 * ((n_tiles + 15) // 16)):
-            if spread(j, n_tiles) < n_tiles:
-                tile = first_tile + spread(j, n_tiles)
+        queue = np.full(1, first_tile, np.int64)
+        for _ in prange(WORKERS):
+            tile = claim(queue)
+            while tile < first_tile + n_tiles:
                 for k in range(tile_starts[tile], tile_starts[tile + 1]):
                     cell_adjoint.clear(records, pair[k] - base)
                 _lift_tile(
                     splats, ranks, pair, tile_starts[tile], tile_starts[tile + 1], (tile % columns) * TILE,
                     (tile // columns) * TILE, width, height, values, counts, gate, base, records,
                 )  # fmt: skip
+                tile = claim(queue)
         for m in prange(shown):
             for k in range(pair_starts[band, m] - base, pair_starts[band, m + 1] - base):
                 cell_adjoint.add_means(records, k, 0, sums, m)

@@ -18,18 +18,11 @@ import numpy as np
 from chebsplat.kernels.jit import inline, kernel, prange, serial
 from chebsplat.rasterize import cells
 from chebsplat.rasterize.binning import TILE
-from chebsplat.rasterize.blocks import from_lanes, prefetch
+from chebsplat.rasterize.blocks import WORKERS, claim, from_lanes, prefetch
 from chebsplat.rasterize.cells import LANES, ONE, SHAPE, SLACK
 
 AHEAD_OF_CACHE = 16  # rows between asking for one and using it
 CHUNK = 128  # Gaussians of a tile between two looks at whether it is done
-
-
-@inline
-def spread(j, n):
-    """The j-th of n tiles: neighbours go to different threads, for balance."""
-    stride = (n + 15) // 16
-    return j // stride + 16 * (j % stride)
 
 
 @inline
@@ -148,12 +141,14 @@ def forward(splats, tile_starts, ranks, channels, cell_channels, width, height, 
     means = np.empty(((height + 3) // 4, (width + 3) // 4, cell_channels), np.float32)
     transmittance = np.empty(height * width, np.float32)
     masks, used = np.empty(len(ranks) + LANES, np.uint16), np.zeros(n_tiles, np.int64)
-    for j in prange(16 * ((n_tiles + 15) // 16)):
-        tile = spread(j, n_tiles)
-        if tile < n_tiles:
+    queue = np.zeros(1, np.int64)
+    for _ in prange(WORKERS):
+        tile = claim(queue)
+        while tile < n_tiles:
             used[tile] = _forward_tile(
                 splats, ranks, tile_starts[tile], tile_starts[tile + 1], (tile % columns) * TILE,
                 (tile // columns) * TILE, width, height, channels, max_alpha, masks, render, means, transmittance,
             )  # fmt: skip
+            tile = claim(queue)
     shape = height, width
     return render.reshape((*shape, channels)), means, transmittance.reshape(shape), masks, used

@@ -11,9 +11,9 @@ import numpy as np
 from chebsplat.kernels.jit import kernel, prange, serial
 from chebsplat.rasterize import cell_adjoint, cells
 from chebsplat.rasterize.binning import TILE, band_start
-from chebsplat.rasterize.blocks import prefetch, to_lanes
+from chebsplat.rasterize.blocks import WORKERS, claim, prefetch, to_lanes
 from chebsplat.rasterize.cells import BLOCK, LANES, N_GEOMETRY, SHAPE, SLACK
-from chebsplat.rasterize.tiles import AHEAD_OF_CACHE, cell_column, fill_shapes, n_pixels_inside, spread
+from chebsplat.rasterize.tiles import AHEAD_OF_CACHE, cell_column, fill_shapes, n_pixels_inside
 
 
 @serial
@@ -116,9 +116,10 @@ def backward(
         first_tile = band_start(band, rows) * columns
         n_tiles = band_start(band + 1, rows) * columns - first_tile
         base, n_pairs = pair_starts[band, 0], pair_starts[band, shown] - pair_starts[band, 0]
-        for j in prange(16 * ((n_tiles + 15) // 16)):
-            if spread(j, n_tiles) < n_tiles:
-                tile = first_tile + spread(j, n_tiles)
+        queue = np.full(1, first_tile, np.int64)
+        for _ in prange(WORKERS):
+            tile = claim(queue)
+            while tile < first_tile + n_tiles:
                 for k in range(tile_starts[tile], tile_starts[tile + 1]):
                     cell_adjoint.clear(records, pair[k] - base)
                 finite[tile] = _backward_tile(
@@ -126,6 +127,7 @@ def backward(
                     (tile // columns) * TILE, width, height, channels, max_alpha, flat, grad_means, flat_alpha,
                     absolute, base, n_pairs + tile - first_tile, records,
                 )  # fmt: skip
+                tile = claim(queue)
         for m in prange(shown):
             following = np.int64(order[min(m + AHEAD_OF_CACHE, shown - 1)]) * channels
             prefetch(to_colors, following)
