@@ -17,6 +17,7 @@ if TYPE_CHECKING:
     from chebsplat.stages.settings import SfmSection
 
 log = logging.getLogger("chebsplat")
+PHOTOS, PAIRS = 8, 64  # a thread's share between two lines of progress; each such block of pairs indexes its views anew
 LARGEST = 128  # features of a view, by size, that say how alike two views are
 
 
@@ -52,7 +53,7 @@ def match(job: Job, capture: Capture, settings: SfmSection, pairs: np.ndarray | 
     extraction.sift.peak_threshold = settings.peak_threshold
     extraction.sift.max_num_features = settings.max_features
     extraction.use_gpu, extraction.num_threads = False, n_threads()
-    for some in _in_blocks(job, files, 2 * n_threads(), "features"):
+    for some in _in_blocks(job, files, PHOTOS * n_threads(), "features"):
         pycolmap.extract_features(database, folder, some, mode, reader, extraction)
     if pairs is None:
         pairs = _pairs(database, capture, settings)
@@ -62,7 +63,7 @@ def match(job: Job, capture: Capture, settings: SfmSection, pairs: np.ndarray | 
     verification.ransac.random_seed = settings.seed
     listed = pycolmap.ImportedPairingOptions()
     listed.match_list_path = job.scratch / "pairs.txt"
-    for some in _in_blocks(job, pairs.tolist(), 16 * n_threads(), "matching"):
+    for some in _in_blocks(job, pairs.tolist(), PAIRS * n_threads(), "matching"):
         lines = [f"{file_of(first)} {file_of(second)}\n" for first, second in some]
         listed.match_list_path.write_text("".join(lines))
         pycolmap.match_image_pairs(database, matching, listed, verification)
@@ -111,7 +112,7 @@ def _write_images(job: Job, capture: Capture, views: Iterable[int]) -> Path:
     folder.mkdir(exist_ok=True)
     masks.mkdir(exist_ok=True)
     for view in views:
-        Image.fromarray(capture.images[view]).save(folder / file_of(view), compress_level=1)
+        Image.fromarray(capture.images[view]).save(folder / file_of(view), compress_level=0)
         if capture.loss_mask is not None:
             mask = np.where(capture.loss_mask[view], 255, 0).astype(np.uint8)
             Image.fromarray(mask).save(masks / f"{file_of(view)}.png")
