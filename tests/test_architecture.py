@@ -21,7 +21,7 @@ PACKAGES = {
     "settings": set(),
     "synthetic": set(),
     "labels": set(),
-    "photos": {"kernels"},
+    "photos": {"cameras", "kernels"},
     "splats": {"kernels"},
     "views": set(),
     "rasterize": {"kernels", "splats"},
