@@ -78,15 +78,15 @@ def exposures_of(capture: Capture, points: Points) -> tuple[np.ndarray, np.ndarr
 
     row = {name: view for view, name in enumerate(capture.names)}
     used = [k for k, name in enumerate(points.names) if not capture.is_test[row[name]]]
-    means, seen = points.means, None
+    tracks = None
     if len(points.tracks):
-        seen = np.zeros((len(means), len(points.names)), bool)
-        seen[points.tracks[:, 0], points.tracks[:, 1]] = True
-        tracked = np.unique(points.tracks[:, 0])
-        means, seen = means[tracked], seen[tracked][:, used]
+        column = np.full(len(points.names), -1)
+        column[used] = np.arange(len(used))
+        tracks = np.stack([points.tracks[:, 0], column[points.tracks[:, 1]]], 1)
+        tracks = tracks[tracks[:, 1] >= 0]
     photos = (capture.images[row[points.names[k]]] for k in used)
     poses = points.cam_from_world[used]
-    return measured_exposures(photos, points.Ks[used], poses, means, seen), poses
+    return measured_exposures(photos, points.Ks[used], poses, points.means, tracks), poses
 
 
 def reached(models: CameraModels, views: Views, points: Points) -> np.ndarray:

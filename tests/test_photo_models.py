@@ -11,6 +11,7 @@ from chebsplat.errors import ConfigError
 from chebsplat.evaluation.metrics import color_fitted, psnr
 from chebsplat.formats.capture import Capture
 from chebsplat.formats.points import Points
+from chebsplat.photos import exposures
 from chebsplat.photos.exposures import measured_exposures, own_part, relit
 from chebsplat.rasterize import rasterize
 from chebsplat.render import SceneRenderer
@@ -145,10 +146,9 @@ def test_measured_exposures_are_those_the_photos_were_taken_with():
     Ks = np.tile(K.double().numpy(), (5, 1, 1))
     assert measured_exposures(images, Ks, poses, points) == pytest.approx(stops, abs=0.02)
     assert measured_exposures(images[[2] * 5], Ks, poses, points) == pytest.approx(0, abs=1e-9)
-    seen = np.zeros((2000, 5), bool)
-    assert np.isnan(measured_exposures(images, Ks, poses, points, seen)).all()
-    seen[:, :4] = True
-    some = measured_exposures(images, Ks, poses, points, seen)
+    assert np.isnan(measured_exposures(images, Ks, poses, points, np.zeros((0, 2), int))).all()
+    tracks = np.stack(np.meshgrid(np.arange(2000), np.arange(4)), -1).reshape(-1, 2)
+    some = measured_exposures(images, Ks, poses, points, tracks)
     assert np.isnan(some[4]).all() and some[:4] == pytest.approx(stops[:4] - stops[:4].mean(0), abs=0.02)
 
 
@@ -169,7 +169,7 @@ def ring(n):
     return poses
 
 
-def test_exposures_that_drift_along_the_path_are_shared_and_those_of_single_photos_their_own():
+def test_exposures_that_drift_along_the_path_are_shared_and_those_of_single_photos_their_own(monkeypatch):
     g, poses, angle = np.random.default_rng(0), ring(40), np.linspace(0, 2 * np.pi, 40, endpoint=False)[:, None]
     drift = 0.3 * np.sin(angle) * np.array([1, 0.9, 1.2])
     assert np.abs(own_part(drift, poses)).max() < 0.01
@@ -178,6 +178,10 @@ def test_exposures_that_drift_along_the_path_are_shared_and_those_of_single_phot
     assert (own - noise + noise.mean(0)).std() < 0.55 * noise.std()
     alone = np.full((40, 3), np.nan)
     assert not own_part(alone, poses).any() and not own_part(np.zeros((40, 3)), np.tile(np.eye(4), (40, 1, 1))).any()
+    twice = own_part(np.tile(drift + noise, (2, 1)), np.tile(poses, (2, 1, 1)))
+    monkeypatch.setattr(exposures, "MOST_VIEWS", 40)
+    halves = own_part(np.repeat(drift + noise, 2, 0), np.repeat(poses, 2, 0))
+    assert np.allclose(halves[::2], own) and np.allclose(halves[1::2], own) and not np.allclose(twice[:40], own)
     some = np.where(np.arange(40)[:, None] == 7, np.nan, drift + noise)
     assert not own_part(some, poses)[7].any() and own_part(some, poses)[8].any()
 

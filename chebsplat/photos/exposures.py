@@ -12,9 +12,11 @@ import numpy as np
 from chebsplat.cameras import centers
 
 CELL = 8  # pixels: colours of a point are means over squares of this side
-MOST_POINTS, LEAST_POINTS = 4000, 30  # points that are looked at, and of a view whose exposure is told
+MOST_POINTS, LEAST_POINTS = 4000, 30  # points without tracks, and of a view whose exposure is told
+MOST = 300_000  # sightings of points that are looked at, or about as many
 DARK, BRIGHT = 0.005, 0.85  # linear light beyond which a sensor's curve or its end tells instead of the exposure
-ROUNDS = 30  # of medians by point and by view, in turns
+ROUNDS, SETTLED = 30, 1e-4  # of medians by point and by view, in turns: more for what drifts along a path, which stays
+MOST_VIEWS = 1000  # of one process: every second view makes two of 2000
 REACHES = (0.1, 0.2, 0.4, 0.8, 1.6, 3.2)  # of `own_part`: how far apart views share, in median distances and radians
 RATIOS = 10.0 ** np.arange(-4, 4.1, 0.25)  # what is a photo's own over what is shared, as variances
 BRIGHTNESS_AND_HUES = np.array([[1, 1, 1], [1, 0, -1], [1, -2, 1]]) / np.sqrt([[3], [2], [6]])  # orthonormal
@@ -38,46 +40,76 @@ def measured_exposures(
     Ks: np.ndarray,
     cam_from_world: np.ndarray,
     points: np.ndarray,
-    seen: np.ndarray | None = None,
+    tracks: np.ndarray | None = None,
 ) -> np.ndarray:
     """Exposures [V, 3] of V photos of the same points; NaN of those that show too few of them.
 
-    Args: images: u8 [H, W, 3] of V views; Ks [V, 3, 3] pixels; cam_from_world [V, 4, 4]; points [N, 3]; seen: bool
-      [N, V], or None: by all views that have the point within their frame.
+    Args: images: u8 [H, W, 3] of V views; Ks [V, 3, 3] pixels; cam_from_world [V, 4, 4]; points [N, 3]; tracks: int
+      [T, 2] (point, view), or None: points are seen by all views that have them within their frame.
     Choices: light is that of a point times its view's exposure. Both are medians, by turns, so that walls in between
-      and highlights count little.
+      and highlights count little. Of many points, some: with tracks as many as are seen MOST times in all.
     """
-    chosen = np.linspace(0, len(points) - 1, min(len(points), MOST_POINTS)).astype(int)
-    logs = np.full((len(chosen), len(Ks), 3), np.nan)
-    light = light_of(np.arange(256) / 255)
-    for view, image in enumerate(images):
-        height, width = image.shape[:2]
-        half = min(CELL, height, width) // 2
-        camera = points[chosen] @ cam_from_world[view, :3, :3].T + cam_from_world[view, :3, 3]
-        front = camera[:, 2] > 1e-3
-        place = ((camera / np.where(front, camera[:, 2], 1)[:, None]) @ Ks[view].T)[:, :2]
-        inside = front & ((place >= half) & (place <= np.array([width, height]) - half)).all(1)
-        if seen is not None:
-            inside &= seen[chosen, view]
-        sums = np.pad(light[image].cumsum(0).cumsum(1), ((1, 0), (1, 0), (0, 0)))
-        x, y = place[inside].astype(int).T
-        right, left = (sums[y + half, end] - sums[y - half, end] for end in (x + half, x - half))
-        means = (right - left) / (2 * half) ** 2
-        logs[inside, view] = np.log2(np.where((means > DARK) & (means < BRIGHT), means, np.nan))
-    logs[np.isnan(logs).any(2)] = np.nan
-    logs = logs[np.isfinite(logs[..., 0]).sum(1) >= 2]
-    enough = np.isfinite(logs[..., 0]).sum(0) >= LEAST_POINTS
-    exposures = np.full((len(Ks), 3), np.nan)
+    n_views = len(Ks)
+    if tracks is None:
+        kept = np.linspace(0, len(points) - 1, min(len(points), MOST_POINTS, max(4 * MOST // n_views, 1))).astype(int)
+        seen = [kept] * n_views
+    else:
+        kept = np.linspace(0, len(points) - 1, min(len(points), max(len(points) * MOST // max(len(tracks), 1), 1)))
+        tracks = tracks[np.isin(tracks[:, 0], kept.astype(int))]
+        tracks = tracks[np.argsort(tracks[:, 1], kind="stable")]
+        seen = np.split(tracks[:, 0], np.searchsorted(tracks[:, 1], np.arange(1, n_views)))
+    found = [_light_at(*view) for view in zip(images, Ks, cam_from_world, (points[some] for some in seen), strict=True)]
+    light = np.concatenate([values for values, _ in found])
+    point = np.concatenate([some[there] for some, (_, there) in zip(seen, found, strict=True)])
+    view = np.repeat(np.arange(n_views), [len(values) for values, _ in found])
+    shared = np.bincount(point, minlength=len(points))[point] >= 2
+    light, point, view = light[shared], point[shared], view[shared]
+    exposures = np.full((n_views, 3), np.nan)
+    enough = np.bincount(view, minlength=n_views) >= LEAST_POINTS
     if enough.sum() < 2:
         return exposures
-    logs, found = logs[:, enough], np.zeros((enough.sum(), 3))
-    logs = logs[np.isfinite(logs[..., 0]).any(1)]
+    told = enough[view]
+    light, view, point = np.log2(light[told]), view[told], np.unique(point[told], return_inverse=True)[1]
+    found_so_far = np.zeros((n_views, 3))
     for _ in range(ROUNDS):
-        of_points = np.nanmedian(logs - found, axis=1, keepdims=True)
-        found = np.nanmedian(logs - of_points, axis=0)
-        found -= found.mean(0)
-    exposures[enough] = found
+        of_points = _medians(light - found_so_far[view], point)
+        now = _medians(light - of_points[point], view, n_views)
+        now -= now[enough].mean(0)
+        settled = np.abs(now - found_so_far)[enough].max() < SETTLED
+        found_so_far = now
+        if settled:
+            break
+    exposures[enough] = found_so_far[enough]
     return exposures
+
+
+def _light_at(image: np.ndarray, K: np.ndarray, pose: np.ndarray, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Mean linear light [M, 3] about points [P, 3] in an image, and which of them [P] it tells of."""
+    height, width = image.shape[:2]
+    half = min(CELL, height, width) // 2
+    camera = points @ pose[:3, :3].T + pose[:3, 3]
+    front = camera[:, 2] > 1e-3
+    place = ((camera / np.where(front, camera[:, 2], 1)[:, None]) @ K.T)[:, :2]
+    there = front & ((place >= half) & (place <= np.array([width, height]) - half)).all(1)
+    sums = np.pad(light_of(np.arange(256) / 255)[image].cumsum(0).cumsum(1), ((1, 0), (1, 0), (0, 0)))
+    x, y = place[there].astype(int).T
+    right, left = (sums[y + half, end] - sums[y - half, end] for end in (x + half, x - half))
+    means = (right - left) / (2 * half) ** 2
+    usable = ((means > DARK) & (means < BRIGHT)).all(1)
+    there[there] = usable
+    return means[usable], there
+
+
+def _medians(values: np.ndarray, group: np.ndarray, n_groups: int = 0) -> np.ndarray:
+    """Medians [G, 3] of values [M, 3] by group [M]; 0 of an empty one."""
+    counts = np.bincount(group, minlength=n_groups)
+    first, result = np.cumsum(counts) - counts, np.zeros((len(counts), values.shape[1]))
+    filled = counts > 0
+    low, high = (first + (counts - 1) // 2)[filled], (first + counts // 2)[filled]
+    for channel, column in enumerate(values.T):
+        ordered = column[np.lexsort((column, group))]
+        result[filled, channel] = (ordered[low] + ordered[high]) / 2
+    return result
 
 
 def own_part(exposures: np.ndarray, cam_from_world: np.ndarray) -> np.ndarray:
@@ -89,19 +121,24 @@ def own_part(exposures: np.ndarray, cam_from_world: np.ndarray) -> np.ndarray:
       those of the largest marginal likelihood, by brightness and by hue.
     """
     own = np.zeros_like(exposures)
-    known = np.isfinite(exposures).all(1)
-    if known.sum() < 3:
-        return own
-    eye, forward = centers(cam_from_world[known]), cam_from_world[known, 2, :3]
+    known = np.flatnonzero(np.isfinite(exposures).all(1))
+    every = -(-len(known) // MOST_VIEWS)
+    for some in (known[start::every] for start in range(every)):
+        if len(some) >= 3:
+            own[some] = _own_part(exposures[some], cam_from_world[some])
+    return own
+
+
+def _own_part(exposures: np.ndarray, cam_from_world: np.ndarray) -> np.ndarray:
+    """`own_part` of exposures that are all known, of not too many views."""
+    eye, forward = centers(cam_from_world), cam_from_world[:, 2, :3]
     apart = np.linalg.norm(eye[:, None] - eye, axis=-1)
     place = np.concatenate([eye / (np.median(apart[apart > 0]) if apart.any() else 1.0), forward], 1)
     distance = np.sqrt(3) * np.linalg.norm(place[:, None] - place, axis=-1)
     kernels = ((1 + distance / reach) * np.exp(-distance / reach) for reach in REACHES)
     spectra = [tuple(np.linalg.eigh(kernel)) for kernel in kernels]
-    axes = exposures[known] @ BRIGHTNESS_AND_HUES.T
-    parts = np.stack([_noise_of(values, spectra) for values in axes.T], 1)
-    own[known] = parts @ BRIGHTNESS_AND_HUES
-    return own
+    axes = exposures @ BRIGHTNESS_AND_HUES.T
+    return np.stack([_noise_of(values, spectra) for values in axes.T], 1) @ BRIGHTNESS_AND_HUES
 
 
 def _noise_of(values: np.ndarray, spectra: list[tuple[np.ndarray, ...]]) -> np.ndarray:
