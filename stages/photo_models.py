@@ -1,4 +1,4 @@
-"""What a training learns of each photo beside the scene, decided from the capture and points: exposures, and poses."""
+"""What is undone of each photo before a training, or learned beside the scene: exposures, and poses."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ LEAST_SPREAD = 0.05  # stops between the photos' own exposures, from which on th
 
 
 def camera_models(job: Job, capture: Capture, points: Points, views: Views) -> CameraModels:
-    """The models that `train.exposure` and `train.poses` ask for, each left out or on with its reason in the log."""
+    """The models that `train.exposure` and `train.poses` ask for, what is left out with its reason in the log."""
     import torch
 
     from chebsplat.training.camera_models import CameraModels
@@ -45,7 +45,7 @@ def exposures(job: Job, capture: Capture, points: Points) -> np.ndarray | None:
     """What each training photo's exposure [V, 3] differs from its neighbours', to be undone; None where they are left.
 
     Choices: generated views are alike by construction; elsewhere the photos are measured at the points, at the cost of
-      a second.
+      a second or two.
     """
     chosen = job.config.train.exposure
     if chosen == "learned":

@@ -50,12 +50,12 @@ def measured_exposures(
       and highlights count little. Of many points, some: with tracks as many as are seen MOST times in all.
     """
     n_views = len(Ks)
+    wanted = min(MOST_POINTS, 4 * MOST // n_views) if tracks is None else len(points) * MOST // max(len(tracks), 1)
+    kept = np.linspace(0, len(points) - 1, min(len(points), max(wanted, 1))).astype(int)
     if tracks is None:
-        kept = np.linspace(0, len(points) - 1, min(len(points), MOST_POINTS, max(4 * MOST // n_views, 1))).astype(int)
         seen = [kept] * n_views
     else:
-        kept = np.linspace(0, len(points) - 1, min(len(points), max(len(points) * MOST // max(len(tracks), 1), 1)))
-        tracks = tracks[np.isin(tracks[:, 0], kept.astype(int))]
+        tracks = tracks[np.isin(tracks[:, 0], kept)]
         tracks = tracks[np.argsort(tracks[:, 1], kind="stable")]
         seen = np.split(tracks[:, 0], np.searchsorted(tracks[:, 1], np.arange(1, n_views)))
     found = [_light_at(*view) for view in zip(images, Ks, cam_from_world, (points[some] for some in seen), strict=True)]
@@ -70,16 +70,14 @@ def measured_exposures(
         return exposures
     told = enough[view]
     light, view, point = np.log2(light[told]), view[told], np.unique(point[told], return_inverse=True)[1]
-    found_so_far = np.zeros((n_views, 3))
+    of_views = np.zeros((n_views, 3))
     for _ in range(ROUNDS):
-        of_points = _medians(light - found_so_far[view], point)
-        now = _medians(light - of_points[point], view, n_views)
-        now -= now[enough].mean(0)
-        settled = np.abs(now - found_so_far)[enough].max() < SETTLED
-        found_so_far = now
-        if settled:
+        before, of_points = of_views, _medians(light - of_views[view], point)
+        of_views = _medians(light - of_points[point], view, n_views)
+        of_views -= of_views[enough].mean(0)
+        if np.abs(of_views - before)[enough].max() < SETTLED:
             break
-    exposures[enough] = found_so_far[enough]
+    exposures[enough] = of_views[enough]
     return exposures
 
 
