@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 from chebsplat.stages.command import Job, n_threads
 
 if TYPE_CHECKING:
-    from collections.abc import Iterable, Iterator
+    from collections.abc import Iterable, Iterator, Sequence
 
     import numpy as np
 
@@ -18,6 +18,7 @@ if TYPE_CHECKING:
 
 log = logging.getLogger("chebsplat")
 PHOTOS, PAIRS = 8, 64  # a thread's share between two lines of progress; each such block of pairs indexes its views anew
+LEAST = 15  # matches of a pair that has any: pycolmap's own, of a free search
 LARGEST = 128  # features of a view, by size, that say how alike two views are
 
 
@@ -26,16 +27,22 @@ def file_of(view: int) -> str:
     return f"{view:06d}.png"
 
 
-def match(job: Job, capture: Capture, settings: SfmSection, pairs: np.ndarray | None = None) -> Path:
-    """Extract SIFT from the capture's own pixels and match pairs of views: those that are chosen, or given [P, 2].
+def match(job: Job, capture: Capture, settings: SfmSection, pairs: np.ndarray) -> Path:
+    """Extract SIFT from the capture's own pixels and match given pairs [P, 2] of its views.
 
-    Choices: of given pairs, which are few, views that occur in none have no features either.
+    Choices: views that occur in no pair have no features either.
     """
+    database = with_features(job, capture, settings, sorted(set(pairs.ravel().tolist())))
+    match_freely(job, database, pairs, settings)
+    return database
+
+
+def with_features(job: Job, capture: Capture, settings: SfmSection, views: Sequence[int]) -> Path:
+    """A database of views with SIFT from the capture's own pixels."""
     import pycolmap
 
     job.scratch.mkdir(parents=True, exist_ok=True)
     pycolmap.logging.minloglevel = pycolmap.logging.ERROR.value if hasattr(pycolmap.logging, "ERROR") else 2
-    views = range(len(capture.names)) if pairs is None else sorted(set(pairs.ravel().tolist()))
     folder, database = _write_images(job, capture, views), job.scratch / "database.db"
     database.unlink(missing_ok=True)
     pycolmap.Database.open(database).close()  # creates it
@@ -55,9 +62,13 @@ def match(job: Job, capture: Capture, settings: SfmSection, pairs: np.ndarray | 
     extraction.use_gpu, extraction.num_threads = False, n_threads()
     for some in _in_blocks(job, files, PHOTOS * n_threads(), "features"):
         pycolmap.extract_features(database, folder, some, mode, reader, extraction)
-    if pairs is None:
-        pairs = _pairs(database, capture, settings)
-        job.facts["n_pairs"] = len(pairs)
+    return database
+
+
+def match_freely(job: Job, database: Path, pairs: np.ndarray, settings: SfmSection) -> None:
+    """Match pairs of views [P, 2] as if nothing were known of their poses; what RANSAC verifies is kept."""
+    import pycolmap
+
     matching, verification = pycolmap.FeatureMatchingOptions(), pycolmap.TwoViewGeometryOptions()
     matching.use_gpu, matching.num_threads = False, n_threads()
     verification.ransac.random_seed = settings.seed
@@ -67,10 +78,41 @@ def match(job: Job, capture: Capture, settings: SfmSection, pairs: np.ndarray | 
         lines = [f"{file_of(first)} {file_of(second)}\n" for first, second in some]
         listed.match_list_path.write_text("".join(lines))
         pycolmap.match_image_pairs(database, matching, listed, verification)
-    return database
 
 
-def _pairs(database: Path, capture: Capture, settings: SfmSection) -> np.ndarray:
+def match_along_lines(job: Job, database: Path, pairs: np.ndarray, capture: Capture) -> None:
+    """Match pairs of views [P, 2] along the epipolar lines that their poses make, which fit the photos.
+
+    Choices: a pair of fewer than LEAST matches has none, as in a free search.
+    """
+    import numpy as np
+    import pycolmap
+
+    from chebsplat.photos.epipolar import fundamental
+    from chebsplat.photos.guided import along_lines
+
+    poses, Ks, n_matches = capture.cam_from_world, capture.Ks, 0
+    assert poses is not None
+    with pycolmap.Database.open(database) as opened:
+        image_ids = {int(image.name[:-4]): image.image_id for image in opened.read_all_images()}
+        views = [image_ids[view] for view in range(len(poses))]
+        pixels = [opened.read_keypoints(view)[:, :2] for view in views]
+        descriptors = [opened.read_descriptors(view).data for view in views]
+        opened.clear_two_view_geometries()  # those of the pairs that told whether the poses fit
+        for some in _in_blocks(job, pairs.tolist(), PAIRS * n_threads(), "matching"):
+            lines = np.stack([fundamental(Ks[a], poses[a], Ks[b], poses[b]) for a, b in some])
+            for (a, b), matches in zip(some, along_lines(pixels, descriptors, np.array(some), lines), strict=True):
+                if len(matches) < LEAST:
+                    continue
+                geometry = pycolmap.TwoViewGeometry()
+                geometry.config = pycolmap.TwoViewGeometryConfiguration.CALIBRATED
+                geometry.inlier_matches = matches.astype(np.uint32)
+                opened.write_two_view_geometry(views[a], views[b], geometry)
+                n_matches += len(matches)
+    job.facts["n_matches_along_lines"] = n_matches
+
+
+def chosen_pairs(job: Job, database: Path, capture: Capture, settings: SfmSection) -> np.ndarray:
     """Pairs of views to match, int [P, 2], as `sfm.matching` says."""
     from chebsplat.stages import view_pairs
 
@@ -85,6 +127,7 @@ def _pairs(database: Path, capture: Capture, settings: SfmSection) -> np.ndarray
     else:
         pairs, why = view_pairs.exhaustive(n), "all"
     log.info("%s: %d of %d pairs (%s; sfm.matching is %s)", mode, len(pairs), n * (n - 1) // 2, why, settings.matching)
+    job.facts["n_pairs"] = len(pairs)
     return pairs
 
 

@@ -7,9 +7,11 @@ from pathlib import Path
 from typing import TYPE_CHECKING, NamedTuple
 
 from chebsplat.stages.command import Job
-from chebsplat.stages.matching import file_of, match
+from chebsplat.stages.matching import file_of, match, match_freely
 
 if TYPE_CHECKING:
+    import numpy as np
+
     from chebsplat.formats.capture import Capture
     from chebsplat.stages.settings import SfmSection
 
@@ -30,9 +32,14 @@ class Fit(NamedTuple):
     n_pairs: int
 
     @property
+    def tells(self) -> bool:
+        """Whether so many pairs match that anything can be said."""
+        return self.n_pairs >= LEAST
+
+    @property
     def misses(self) -> bool:
         """Whether the poses do not fit."""
-        return self.n_pairs >= LEAST and self.given > max(MISFIT, OVER_FREE * self.free)
+        return self.tells and self.given > max(MISFIT, OVER_FREE * self.free)
 
 
 def wants_adjustment(job: Job, capture: Capture, settings: SfmSection, database: Path | None = None) -> bool:
@@ -44,34 +51,59 @@ def wants_adjustment(job: Job, capture: Capture, settings: SfmSection, database:
     """
     if settings.poses != "auto" or capture.cam_from_world is None:
         return settings.poses == "adjusted"
-    exact = capture.source.get("kind") == "generated" and "disturbed" not in capture.source
-    if exact or (capture.tracks is not None and len(capture.tracks)):
+    if _exact(capture) or (capture.tracks is not None and len(capture.tracks)):
         return False
-    database = probed(job, capture, settings) if database is None else database
+    return measured(job, capture, probed(job, capture, settings) if database is None else database).misses
+
+
+def show_lines(job: Job, capture: Capture, settings: SfmSection, database: Path, pairs: np.ndarray) -> bool:
+    """Whether the poses of a capture are known to fit its photos: matches then lie on the epipolar lines they make.
+
+    Args: database: with features of all views; some of the pairs [P, 2] are matched in it to find that out.
+    """
+    if capture.cam_from_world is None or settings.poses == "adjusted" or len(pairs) < LEAST:
+        return False
+    if _exact(capture):
+        return True
+    match_freely(job, database, _some_of(pairs), settings)
+    found = measured(job, capture, database)
+    return found.tells and found.given <= MISFIT
+
+
+def _exact(capture: Capture) -> bool:
+    return capture.source.get("kind") == "generated" and "disturbed" not in capture.source
+
+
+def _some_of(pairs: np.ndarray) -> np.ndarray:
+    """PROBED of the pairs [P, 2], evenly chosen."""
+    import numpy as np
+
+    return np.asarray(pairs[np.unique(np.linspace(0, len(pairs) - 1, PROBED).round().astype(int))])
+
+
+def measured(job: Job, capture: Capture, database: Path | None) -> Fit:
+    """How well the poses fit, by the matches of a database; in the facts and the log."""
     found = Fit(0.0, 0.0, 0) if database is None else fit(database, capture)
     job.facts |= {"epipolar_px": found.given, "epipolar_free_px": found.free}
     log.info(
         "given poses %s the photos: matches of %d pairs miss their epipolar lines by %.2f px, %.2f where each pair is "
         "free (medians)%s",
         "do not fit" if found.misses else "fit", found.n_pairs, found.given, found.free,
-        "" if found.n_pairs >= LEAST else f"; fewer than {LEAST} pairs match, too few to tell",
+        "" if found.tells else f"; fewer than {LEAST} pairs match, too few to tell",
     )  # fmt: skip
-    return found.misses
+    return found
 
 
 def probed(job: Job, capture: Capture, settings: SfmSection) -> Path | None:
     """A database of PROBED pairs of neighbouring views, evenly chosen, and large features; None without pairs."""
-    import numpy as np
-
     from chebsplat.stages.view_pairs import posed
 
     assert capture.cam_from_world is not None
     pairs = posed(capture.cam_from_world, settings.n_matched)
     if len(pairs) < LEAST:
         return None
-    chosen = np.unique(np.linspace(0, len(pairs) - 1, PROBED).round().astype(int))
     few = settings.model_copy(update={"max_features": min(FEATURES, settings.max_features)})
-    return match(job, capture, few, pairs[chosen])
+    return match(job, capture, few, _some_of(pairs))
 
 
 def fit(database: Path, capture: Capture) -> Fit:

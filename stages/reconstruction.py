@@ -7,9 +7,10 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from chebsplat.errors import ConfigError, DataFailure
+from chebsplat.stages import matching
 from chebsplat.stages.command import Job
-from chebsplat.stages.matching import file_of, match
-from chebsplat.stages.pose_check import wants_adjustment
+from chebsplat.stages.matching import file_of
+from chebsplat.stages.pose_check import show_lines, wants_adjustment
 
 if TYPE_CHECKING:
     import pycolmap
@@ -28,14 +29,20 @@ def reconstruct(job: Job, capture: Capture, settings: SfmSection, adjusted: bool
     Raises:  DataFailure if too few views register; ConfigError where pairs by pose are asked for without poses.
     Choices: images are imported in the order of their names before extraction, which makes extraction, matching and
       triangulation reproducible; mapping is reproducible at one thread only, which it gets. Test views take part in
-      posing, never in colouring.
+      posing, never in colouring. Where given poses fit the photos, matches are looked for along epipolar lines alone.
     """
     import numpy as np
 
     posed = capture.cam_from_world is not None
     if settings.matching == "posed" and not posed:
         raise ConfigError("sfm.matching is posed, but the source has no poses; use sfm.matching=auto")
-    database = match(job, capture, settings)
+    database = matching.with_features(job, capture, settings, range(len(capture.names)))
+    pairs = matching.chosen_pairs(job, database, capture, settings)
+    if not adjusted and show_lines(job, capture, settings, database, pairs):
+        matching.match_along_lines(job, database, pairs, capture)
+        adjusted = False
+    else:
+        matching.match_freely(job, database, pairs, settings)
     model = _triangulate(job, capture, database) if posed else _map(job, len(capture.names), database, settings)
     moved: dict[str, Any] = {}
     if wants_adjustment(job, capture, settings, database) if adjusted is None else adjusted:

@@ -11,12 +11,12 @@ from chebsplat.formats.points import read_points
 pytestmark = [pytest.mark.data, pytest.mark.xdist_group("sfm")]
 
 
-def points_of(tmp_path, kind, folder, views, **sfm):
+def points_of(tmp_path, kind, folder, views, ingest=(), **sfm):
     config = {
         "sfm": sfm,
         "scene": {"name": "fox"},
         "source": {"kind": kind, "path": str(folder)},
-        "ingest": {"max_side": 400, "max_views": views},
+        "ingest": {"max_side": 400, "max_views": views} | dict(ingest),
     }
     assert run_stage("ingest", tmp_path / kind, config=config) == 0
     assert run_stage("sfm", tmp_path / f"{kind}-points", {"capture": tmp_path / kind}, config) == 0
@@ -63,6 +63,19 @@ def test_mapping_finds_the_given_cameras_up_to_a_similarity(triangulated, tmp_pa
     scale = scales.sum() / (a**2).sum()
     error = np.linalg.norm(scale * a @ rotation - b, axis=1)
     assert np.median(error) < 0.05 * np.linalg.norm(b, axis=1).mean()
+
+
+def test_matches_follow_the_lines_of_poses_that_fit_and_of_no_others(tmp_path):
+    folder = data("fox")
+    fitting = points_of(tmp_path / "fitting", "transforms", folder, 12)
+    facts = artifact.read_manifest(tmp_path / "fitting/transforms-points").facts
+    assert facts["n_matches_along_lines"] > 1000
+    assert facts["epipolar_px"] < 0.5
+    turned = points_of(tmp_path / "turned", "transforms", folder, 12, {"disturb_degrees": 1.0}, poses="given")
+    facts = artifact.read_manifest(tmp_path / "turned/transforms-points").facts
+    assert "n_matches_along_lines" not in facts
+    assert facts["epipolar_px"] > 0.5
+    assert len(turned.means) < len(fitting.means)
 
 
 def test_too_few_registered_views_are_a_failure_that_counts_them(tmp_path):
