@@ -83,7 +83,8 @@ def match_freely(job: Job, database: Path, pairs: np.ndarray, settings: SfmSecti
 def match_along_lines(job: Job, database: Path, pairs: np.ndarray, capture: Capture) -> None:
     """Match pairs of views [P, 2] along the epipolar lines that their poses make, which fit the photos.
 
-    Choices: a pair of fewer than LEAST matches has none, as in a free search.
+    Choices: a pair of fewer than LEAST matches has none, as in a free search. Features of one block's views are in
+      memory at once.
     """
     import numpy as np
     import pycolmap
@@ -94,20 +95,21 @@ def match_along_lines(job: Job, database: Path, pairs: np.ndarray, capture: Capt
     poses, Ks, n_matches = capture.cam_from_world, capture.Ks, 0
     assert poses is not None
     with pycolmap.Database.open(database) as opened:
-        image_ids = {int(image.name[:-4]): image.image_id for image in opened.read_all_images()}
-        views = [image_ids[view] for view in range(len(poses))]
-        pixels = [opened.read_keypoints(view)[:, :2] for view in views]
-        descriptors = [opened.read_descriptors(view).data for view in views]
+        ids = {int(image.name[:-4]): image.image_id for image in opened.read_all_images()}
         opened.clear_two_view_geometries()  # those of the pairs that told whether the poses fit
         for some in _in_blocks(job, pairs.tolist(), PAIRS * n_threads(), "matching"):
+            views, rows = np.unique(some, return_inverse=True)
+            pixels = [opened.read_keypoints(ids[view])[:, :2] for view in views]
+            descriptors = [opened.read_descriptors(ids[view]).data for view in views]
             lines = np.stack([fundamental(Ks[a], poses[a], Ks[b], poses[b]) for a, b in some])
-            for (a, b), matches in zip(some, along_lines(pixels, descriptors, np.array(some), lines), strict=True):
+            found = along_lines(pixels, descriptors, rows.reshape(-1, 2), lines)
+            for (a, b), matches in zip(some, found, strict=True):
                 if len(matches) < LEAST:
                     continue
                 geometry = pycolmap.TwoViewGeometry()
                 geometry.config = pycolmap.TwoViewGeometryConfiguration.CALIBRATED
                 geometry.inlier_matches = matches.astype(np.uint32)
-                opened.write_two_view_geometry(views[a], views[b], geometry)
+                opened.write_two_view_geometry(ids[a], ids[b], geometry)
                 n_matches += len(matches)
     job.facts["n_matches_along_lines"] = n_matches
 

@@ -21,7 +21,7 @@ MISFIT = 0.5  # pixels that the median match may miss its epipolar line by
 OVER_FREE = 2.0  # times what it misses that of the pair's own fundamental matrix by: features may be coarse
 SHARED = 30  # verified matches of a pair that counts
 LEAST = 6  # such pairs, without which nothing is said
-PROBED, FEATURES = 16, 2048  # pairs, and features of a view, where nothing else needs matches
+PROBED, FEATURES = 16, 2048  # pairs that tell; features of a view, where nothing else needs matches
 
 
 class Fit(NamedTuple):
@@ -56,15 +56,15 @@ def wants_adjustment(job: Job, capture: Capture, settings: SfmSection, database:
     return measured(job, capture, probed(job, capture, settings) if database is None else database).misses
 
 
-def show_lines(job: Job, capture: Capture, settings: SfmSection, database: Path, pairs: np.ndarray) -> bool:
-    """Whether the poses of a capture are known to fit its photos: matches then lie on the epipolar lines they make.
+def wants_lines(job: Job, capture: Capture, settings: SfmSection, database: Path, pairs: np.ndarray) -> bool:
+    """Whether views are matched along the epipolar lines of their poses: where these are known to fit the photos.
 
-    Args: database: with features of all views; some of the pairs [P, 2] are matched in it to find that out.
+    Args:    database: with features of all views; PROBED of the pairs [P, 2] are matched in it to find that out.
+    Choices: stricter than what asks for adjustment, for it also says no where too few pairs match, and where features
+      are coarse. Generated rooms lost by it (docs/results.md, "At equal seconds"), and are matched by a free search.
     """
-    if capture.cam_from_world is None or settings.poses == "adjusted" or len(pairs) < LEAST:
+    if capture.cam_from_world is None or settings.poses == "adjusted" or _exact(capture) or len(pairs) < LEAST:
         return False
-    if _exact(capture):
-        return True
     match_freely(job, database, _some_of(pairs), settings)
     found = measured(job, capture, database)
     return found.tells and found.given <= MISFIT

@@ -10,7 +10,7 @@ from chebsplat.errors import ConfigError, DataFailure
 from chebsplat.stages import matching
 from chebsplat.stages.command import Job
 from chebsplat.stages.matching import file_of
-from chebsplat.stages.pose_check import show_lines, wants_adjustment
+from chebsplat.stages.pose_check import wants_adjustment, wants_lines
 
 if TYPE_CHECKING:
     import pycolmap
@@ -38,7 +38,7 @@ def reconstruct(job: Job, capture: Capture, settings: SfmSection, adjusted: bool
         raise ConfigError("sfm.matching is posed, but the source has no poses; use sfm.matching=auto")
     database = matching.with_features(job, capture, settings, range(len(capture.names)))
     pairs = matching.chosen_pairs(job, database, capture, settings)
-    if not adjusted and show_lines(job, capture, settings, database, pairs):
+    if not adjusted and wants_lines(job, capture, settings, database, pairs):
         matching.match_along_lines(job, database, pairs, capture)
         adjusted = False
     else:
