@@ -82,9 +82,9 @@ def test_jobs_end_with_a_run_that_is_killed(tmp_path):
 BUSY = """
 import hashlib, sys
 from pathlib import Path
-from chebsplat.stages.stopping import half_made, heeded
+from chebsplat.stages.stopping import deferred, half_made, heeded
 folder = Path(sys.argv[1])
-with heeded(), half_made(folder):
+with heeded(), half_made(folder), deferred():  # or else it could still listen on its way out of mkdir
     folder.mkdir()
     hashlib.pbkdf2_hmac("sha256", b"", b"", 10**9)
 """
