@@ -168,6 +168,7 @@ class TrainSection(Section):
     densify_from: float = number(0.1, "fraction after which Gaussians grow", 0, 1)
     densify_until: float = number(0.6, "fraction after which they no longer do", 0, 1)
     n_densify: int = number(12, "how often they grow between the two", 0, 1000)
+    opacity_resets: int = number(0, "how often opacities fall to 0.01 while Gaussians grow; 3DGS's schedule: 4", 0, 100)
     prune_from: float = number(0.4, "fraction after which Gaussians are pruned", 0, 1)
     remove_every: int = number(200, "steps from one pruning to the next, once growth is over", 1, 1_000_000)
     sh_freeze: float = number(0.8, "fraction after which SH bands stay as they are", 0, 1)

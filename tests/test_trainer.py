@@ -90,6 +90,20 @@ def test_gaussians_removed_after_the_freeze_take_their_bands_along(tiny_trainer)
         assert np.array_equal(after[name], before[name][kept]), name
 
 
+def test_opacities_fall_as_often_as_asked_while_gaussians_grow_and_rise_between(tiny_trainer):
+    made = tiny_trainer(steps=80, densify="off", prune=False, opacity_resets=3, densify_from=0.2, densify_until=0.6)
+    fallen, highest = [], 0.0
+    for _ in made.steps():
+        opacities = made.model.raw["logit_opacities"]
+        before, highest = highest, float(opacities.detach().sigmoid().max())
+        if made.population.n_reset > len(fallen):
+            fallen.append(made.step)
+            assert before > 0.0102 and highest == pytest.approx(0.01)
+            assert not made.optimizer.state[opacities]["exp_avg"].any()
+            assert not made.optimizer.state[opacities]["exp_avg_sq"].any()
+    assert fallen == [24, 32, 40] and highest > 0.012
+
+
 def test_growth_after_the_freeze_is_refused():
     with pytest.raises(ConfigError, match="densify_until"):
         config.build({"train": {"densify_until": 0.9}}, "test")
@@ -107,8 +121,9 @@ def bits(made):
 
 @pytest.mark.parametrize(
     "chosen",
-    [{"densify": name} for name in ("mixed", "region", "classic")] + [{"prune_gate": "printed", "sh_masks": "printed"}],
-    ids=lambda chosen: next(iter(chosen.values())),
+    [{"densify": name} for name in ("mixed", "region", "classic")]
+    + [{"prune_gate": "printed", "sh_masks": "printed"}, {"densify": "classic", "opacity_resets": 3}],
+    ids=lambda chosen: "-".join(map(str, chosen.values())),
 )
 def test_a_resumed_training_takes_the_same_steps_to_the_bit(tiny_trainer, tmp_path, chosen):
     """Saved after every step, through a file; over growth, removal, refreshes and the freeze."""

@@ -74,6 +74,12 @@ def apply_additions(optimizer: torch.optim.Optimizer, raw: dict[str, Tensor], ad
     extend_optimizer(optimizer, raw, additions.rows)
 
 
+def forget(optimizer: torch.optim.Optimizer, parameter: Tensor) -> None:
+    """Zero the moments of a parameter."""
+    for moment in _moments(optimizer, parameter).values():
+        moment.zero_()
+
+
 def _moments(optimizer: torch.optim.Optimizer, parameter: Tensor) -> dict[str, Tensor]:
     """What the optimizer holds per entry of a parameter; the step count is not."""
     state = optimizer.state.get(parameter, {})

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from typing import Any
 
 import torch
@@ -12,19 +13,20 @@ from chebsplat.training import densify, optimizer_rows, prune, sh_prune
 from chebsplat.training.model import Rendered, SceneModel
 
 FAINT = 0.005  # opacity below which a Gaussian is removed
-COUNTS = ("n_grown", "n_added", "n_removed", "n_broken")
+DIMMED = 0.01  # what a reset lowers opacities to
+COUNTS = ("n_grown", "n_reset", "n_added", "n_removed", "n_broken")
 
 
 class Population:
     """The Gaussians of a model under an optimizer whose groups are named for the raw parameters.
 
-    `n_grown` counts the times that some were added, the others Gaussians: `n_broken` those whose values a step made
-    non-finite. The caller refreshes the model's regions after any change.
+    `n_grown` and `n_reset` count the times that some were added and that all were dimmed, the others Gaussians:
+    `n_broken` those whose values a step made non-finite. The caller refreshes the model's regions after any change.
     """
 
     def __init__(self, model: SceneModel, settings: TrainSection, extent: float):
         self.model, self.settings, self.extent = model, settings, extent
-        self.n_grown = self.n_added = self.n_removed = self.n_broken = 0
+        self.n_grown = self.n_reset = self.n_added = self.n_removed = self.n_broken = 0
         self.clear_gradients()
 
     def state_dict(self) -> dict[str, Any]:
@@ -86,6 +88,14 @@ class Population:
             keep[strength.topk(min(self.settings.min_gaussians, len(strength))).indices] = True
         self.n_removed += int((~keep).sum())
         self._keep(optimizer, keep)
+
+    @torch.no_grad()
+    def dim(self, optimizer: torch.optim.Optimizer) -> None:
+        """3DGS's reset: no opacity above DIMMED. What the photos need comes back, what floats does not."""
+        opacities = self.model.raw["logit_opacities"]
+        opacities.clamp_(max=math.log(DIMMED / (1 - DIMMED)))
+        optimizer_rows.forget(optimizer, opacities)
+        self.n_reset += 1
 
     @torch.no_grad()
     def drop_broken(self, optimizer: torch.optim.Optimizer) -> bool:

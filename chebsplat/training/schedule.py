@@ -101,10 +101,13 @@ class Schedule:
     def __init__(self, settings: TrainSection):
         self.settings, self.steps = settings, settings.steps or MOST_STEPS
         self.seconds: float | None = settings.seconds
-        first, last, n = settings.densify_from, settings.densify_until, settings.n_densify
-        self.growth = [first + (last - first) * (k + 1) / (n + 1) for k in range(n)]
-        if settings.densify == "off":
-            self.growth = []
+        self.growth = [] if settings.densify == "off" else self._while_growing(settings.n_densify)
+        self.resets = self._while_growing(settings.opacity_resets)
+
+    def _while_growing(self, n: int) -> list[float]:
+        """Shares of n moments, evenly within growth."""
+        first, last = self.settings.densify_from, self.settings.densify_until
+        return [first + (last - first) * (k + 1) / (n + 1) for k in range(n)]
 
     def share(self, step: int, seconds: float) -> float:
         """Part of the budget, in [0, 1], that is spent once `step` is done."""
@@ -138,6 +141,10 @@ class Schedule:
     def grown(self, share: float) -> int:
         """How many times Gaussians were to be added until now."""
         return sum(share >= at for at in self.growth)
+
+    def reset(self, share: float) -> int:
+        """How many times opacities were to fall until now."""
+        return sum(share >= at for at in self.resets)
 
     def encodes(self, share: float) -> bool:
         """Are regions encoded?"""

@@ -118,6 +118,8 @@ class Trainer:
             self.population.grow(self.optimizer, self.members, self.generator)
         if removing:
             self.population.remove(self.optimizer, mask)
+        if self.schedule.reset(share) > self.population.n_reset:
+            self.population.dim(self.optimizer)
         if removing or due:
             self.refresh()
         if frozen and "sh_logits" in self.model.raw:
