@@ -142,6 +142,9 @@ class TrainSection(Section):
         "given", "of photos, as they are; refined: corrected while the scene is trained"
     )
     # sizes
+    scale_limit: float = number(
+        0.33, "largest scale of a Gaussian, of its distance to the nearest training camera; 1000: any", 1e-3, 1000
+    )
     sh_degree: int = number(3, "of colour, at most", 0, 3)
     max_gaussians: int = number(40_000, "growing stops here; more initial points are thinned", 16, 5_000_000)
     min_gaussians: int = number(64, "pruning stops here", 1, 5_000_000)

@@ -4,19 +4,37 @@ from __future__ import annotations
 
 import logging
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, NamedTuple
 
+import numpy as np
+
+from chebsplat.cameras import centers
 from chebsplat.stages.command import Job
 
 if TYPE_CHECKING:
-    import numpy as np
     import pycolmap
 
 log = logging.getLogger("chebsplat")
 
 ROUNDS = (48.0, 16.0, 4.0, 2.0)  # pixels that a point may miss its features by, each time it is triangulated
+FREE = 2  # of these, after which the photos alone have moved the poses about right
 SHARED = 30  # points that a view must see for its pose to be adjusted
 ENOUGH = 0.8  # part of the views that must see so many: poses that are adjusted and poses that are not do not mix
+ASTRAY = 4.0  # times the median, that a view has moved by, from which on it is not believed
+MEDIAN_OF_3 = 1.538  # of the length of a vector whose three coordinates have a spread of 1
+
+
+class Frame(NamedTuple):
+    """The world of the given poses as those found tell it: scale, rotation [3, 3] and shift [3] into it; led [V] bool:
+    views that see enough points and have not gone astray; spread: how far these have turned (radians) and moved (scene
+    units), each coordinate's standard deviation.
+    """
+
+    scale: float
+    rotation: np.ndarray
+    shift: np.ndarray
+    led: np.ndarray
+    spread: tuple[float, float]
 
 
 def adjust(
@@ -30,14 +48,17 @@ def adjust(
     Returns: the model with its points, and notes: how far poses moved, focal lengths and errors before and after.
     Choices: triangulation and bundle adjustment by turns (`ROUNDS`), under a soft L1 loss of a pixel; the principal
       point stays. The frame is that of the mean rotation, and of the centres under it, of the poses that were given,
-      their units with it. A view that shares few points keeps its pose; where many do, all keep theirs.
+      their units with it. After FREE rounds it is known how far given poses are off: from then on centres are held by
+      them with that spread, views that see few points or were moved much farther than the others begin anew from where
+      they were given, and those that are so at the end are found among the points of the others (`localized`). Where
+      too many views see few points, all keep their poses.
     """
-    import numpy as np
     import pycolmap
 
     focal, errors, as_given = _focals(model), [], model
     out = job.scratch / "adjusted"
     out.mkdir(exist_ok=True)
+    framed: Frame | None = None
     for allowed, status in job.progress.track(ROUNDS, len(ROUNDS), "adjusting"):
         options = pycolmap.IncrementalPipelineOptions()
         options.mapper.filter_max_reproj_error = allowed
@@ -51,34 +72,32 @@ def adjust(
         bundle = pycolmap.BundleAdjustmentOptions()
         bundle.print_summary = False
         bundle.ceres.loss_function_type = pycolmap.LossFunctionType.SOFT_L1
-        pycolmap.bundle_adjustment(model, bundle)
+        if framed is None or len(errors) <= FREE:
+            pycolmap.bundle_adjustment(model, bundle)
+        else:
+            _bundle_near(model, names, given, bundle, framed.spread[1])
+        seen = _seen(model, names)
+        if seen.mean() < ENOUGH:
+            log.warning("poses stay as given: %d of %d views share %d points or more", seen.sum(), len(seen), SHARED)
+            return as_given, {"poses_kept": len(names)}
+        framed = frame(_poses(model, names), given, seen)
+        model.transform(pycolmap.Sim3d(framed.scale, pycolmap.Rotation3d(framed.rotation), framed.shift))
+        for name, pose in zip(_where(names, ~framed.led), given[~framed.led], strict=True):
+            _put(model, name, pose[:3])
+    assert framed is not None
+    for name, pose in zip(_where(names, ~framed.led), given[~framed.led], strict=True):
+        _put(model, name, localized(model, database, name, pose, framed.spread, _where(names, framed.led)))
     model.update_point_3d_errors()
-    held = {image.name: image for image in model.images.values()}
-    found = np.tile(np.eye(4), (len(names), 1, 1))
-    found[:, :3] = [held[name].cam_from_world().matrix() for name in names]
-    seen = np.array([held[name].num_points3D >= SHARED for name in names])
-    if seen.mean() < ENOUGH:
-        log.warning("poses stay as given: %d of %d views share %d points or more", seen.sum(), len(seen), SHARED)
-        return as_given, {"poses_kept": len(names)}
-    scale, rotation, shift = alignment(found[seen], given[seen])
-    model.transform(pycolmap.Sim3d(scale, pycolmap.Rotation3d(rotation), shift))
-    moved, turned = [], []
-    for name, pose, used in zip(names, given, seen, strict=True):
-        if not used:
-            held[name].frame.set_cam_from_world(held[name].camera_id, pycolmap.Rigid3d(pose[:3]))
-            continue
-        new = held[name].cam_from_world().matrix()
-        moved.append(np.linalg.norm(new[:, :3].T @ new[:, 3] - pose[:3, :3].T @ pose[:3, 3]))
-        turned.append(np.degrees(np.arccos(np.clip((np.trace(new[:, :3] @ pose[:3, :3].T) - 1) / 2, -1, 1))))
+    moved, turned = (values[framed.led] for values in differences(_poses(model, names), given))
     notes = {
         "poses_moved": float(np.median(moved)),
-        "poses_turned_degrees": float(np.median(turned)),
-        "poses_kept": int((~seen).sum()),
+        "poses_turned_degrees": float(np.degrees(np.median(turned))),
+        "poses_kept": int((~framed.led).sum()),
         "focal_px": [focal, _focals(model)],
         "reprojection_error_given_px": errors[0],
     }
     log.info(
-        "poses adjusted to the photos: moved by %.3g scene units and %.2g° (medians), %d of %d kept; "
+        "poses adjusted to the photos: moved by %.3g scene units and %.2g° (medians), %d of %d held near the given; "
         "focal length %.1f -> %.1f px; reprojection error %.2f -> %.2f px",
         *(notes[name] for name in ("poses_moved", "poses_turned_degrees", "poses_kept")), len(names),
         focal, _focals(model), errors[0], model.compute_mean_reprojection_error(),
@@ -86,16 +105,90 @@ def adjust(
     return model, notes
 
 
+def frame(found: np.ndarray, given: np.ndarray, seen: np.ndarray) -> Frame:
+    """The world of the poses `given` [V, 4, 4] as those `found` [V, 4, 4] tell it, of views `seen` [V] bool.
+
+    Choices: `alignment` of all, then twice of those that have not gone astray.
+    """
+    led = seen
+    for _ in range(3):
+        scale, rotation, shift = alignment(found[led], given[led])
+        aligned = found.copy()
+        aligned[:, :3, :3] = found[:, :3, :3] @ rotation.T
+        places = scale * centers(found) @ rotation.T + shift
+        aligned[:, :3, 3] = -np.einsum("vij,vj->vi", aligned[:, :3, :3], places)
+        moved, turned = differences(aligned, given)
+        usual = max(np.median(moved[led]), 1e-12), max(np.median(turned[led]), 1e-12)
+        near = (moved <= ASTRAY * usual[0]) & (turned <= ASTRAY * usual[1]) & seen
+        led = near if near.sum() > len(seen) / 2 else led
+    return Frame(scale, rotation, shift, led, (float(usual[1]) / MEDIAN_OF_3, float(usual[0]) / MEDIAN_OF_3))
+
+
+def differences(poses: np.ndarray, given: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """How far apart poses [V, 4, 4] are: of their centres, scene units [V], and of their rotations, radians [V]."""
+    from scipy.spatial.transform import Rotation
+
+    turns = Rotation.from_matrix(np.einsum("vij,vkj->vik", poses[:, :3, :3], given[:, :3, :3]))
+    return np.linalg.norm(centers(poses) - centers(given), axis=1), turns.magnitude()
+
+
+def localized(
+    model: pycolmap.Reconstruction,
+    database: Path,
+    name: str,
+    given: np.ndarray,
+    spread: tuple[float, float],
+    others: list[str],
+) -> np.ndarray:
+    """The pose [3, 4] of an image by its matches with points of the `others`, near its given pose [4, 4].
+
+    Choices: the least sum of what its features miss these points by, pixels under a Cauchy loss, and of the pose's
+      change in units of `spread` (radians, scene units): where there are no matches, or they lead astray, the pose is
+      the given one.
+    """
+    import pycolmap
+    from scipy.optimize import least_squares
+    from scipy.spatial.transform import Rotation
+
+    held = {image.name: image for image in model.images.values()}
+    image, points, pixels = held[name], [], []
+    with pycolmap.Database.open(database) as opened:
+        for other in (held[other] for other in others):
+            if opened.exists_two_view_geometry(image.image_id, other.image_id):
+                pairs = opened.read_two_view_geometry(image.image_id, other.image_id).inlier_matches
+                both = [
+                    (mine, other.points2D[its].point3D_id) for mine, its in pairs if other.points2D[its].has_point3D()
+                ]
+                pixels += [image.points2D[mine].xy for mine, _ in both]
+                points += [model.points3D[point].xyz for _, point in both]
+    seen, features = np.reshape(points, (-1, 3)), np.reshape(pixels, (-1, 2))
+    K = model.cameras[image.camera_id].calibration_matrix()
+    turn, place = given[:3, :3], centers(given[None])[0]
+    unit = np.maximum(np.repeat(spread, 3), 1e-12)
+
+    def pose(change: np.ndarray) -> np.ndarray:
+        turned = Rotation.from_rotvec(change[:3]).as_matrix() @ turn
+        return np.column_stack([turned, -turned @ (place + change[3:])])
+
+    def residuals(change: np.ndarray) -> np.ndarray:
+        there = pose(change)
+        local = (seen @ there[:, :3].T + there[:, 3]) @ K.T
+        missed = (local[:, :2] / np.maximum(local[:, 2:], 1e-6) - features).ravel()
+        return np.concatenate([np.copysign(np.sqrt(np.log1p(missed**2)), missed), change / unit])
+
+    change = least_squares(residuals, np.zeros(6), x_scale=unit).x
+    far = np.linalg.norm((change / unit).reshape(2, 3), axis=1).max() > ASTRAY * MEDIAN_OF_3
+    return pose(np.zeros(6) if far else change)
+
+
 def alignment(found: np.ndarray, given: np.ndarray) -> tuple[float, np.ndarray, np.ndarray]:
     """Scale, rotation [3, 3] and shift [3] from the world of poses `found` to that of `given`, both [V, 4, 4].
 
     Choices: the rotation is the mean over views, not that of the centres, which tell none where they lie on a line.
     """
-    import numpy as np
-
     U, _, Vt = np.linalg.svd(np.einsum("vji,vjk->ik", given[:, :3, :3], found[:, :3, :3]))
     rotation = U @ np.diag([1, 1, np.linalg.det(U @ Vt)]) @ Vt
-    old, new = (-np.einsum("vji,vj->vi", poses[:, :3, :3], poses[:, :3, 3]) for poses in (given, found))
+    old, new = centers(given), centers(found)
     turned = new @ rotation.T
     spread = ((turned - turned.mean(0)) ** 2).sum()
     scale = float(((old - old.mean(0)) * (turned - turned.mean(0))).sum() / spread) if spread > 0 else 1.0
@@ -104,6 +197,53 @@ def alignment(found: np.ndarray, given: np.ndarray) -> tuple[float, np.ndarray, 
 
 def _focals(model: pycolmap.Reconstruction) -> float:
     """The mean focal length, pixels."""
-    import numpy as np
-
     return float(np.mean([camera.mean_focal_length() for camera in model.cameras.values()]))
+
+
+def _poses(model: pycolmap.Reconstruction, names: list[str]) -> np.ndarray:
+    """Of the model's images, f64 [V, 4, 4]."""
+    held = {image.name: image for image in model.images.values()}
+    poses = np.tile(np.eye(4), (len(names), 1, 1))
+    poses[:, :3] = [held[name].cam_from_world().matrix() for name in names]
+    return poses
+
+
+def _seen(model: pycolmap.Reconstruction, names: list[str]) -> np.ndarray:
+    """Which images see enough points, bool [V]."""
+    held = {image.name: image for image in model.images.values()}
+    return np.array([held[name].num_points3D >= SHARED for name in names])
+
+
+def _where(names: list[str], chosen: np.ndarray) -> list[str]:
+    return [name for name, used in zip(names, chosen, strict=True) if used]
+
+
+def _put(model: pycolmap.Reconstruction, name: str, pose: np.ndarray) -> None:
+    """Set the pose [3, 4] of an image."""
+    import pycolmap
+
+    image = next(image for image in model.images.values() if image.name == name)
+    image.frame.set_cam_from_world(image.camera_id, pycolmap.Rigid3d(pose))
+
+
+def _bundle_near(
+    model: pycolmap.Reconstruction,
+    names: list[str],
+    given: np.ndarray,
+    options: pycolmap.BundleAdjustmentOptions,
+    spread: float,
+) -> None:
+    """Bundle adjustment in which the given centres have a say: each coordinate's standard deviation is `spread`."""
+    import pycolmap
+
+    held = {image.name: image for image in model.images.values()}
+    config, priors = pycolmap.BundleAdjustmentConfig(), []
+    for name, place in zip(names, centers(given), strict=True):
+        config.add_image(held[name].image_id)
+        prior = pycolmap.PosePrior()
+        prior.corr_data_id, prior.position = held[name].data_id, place
+        prior.position_covariance = np.eye(3) * max(spread, 1e-9) ** 2
+        prior.coordinate_system = pycolmap.PosePriorCoordinateSystem.CARTESIAN
+        priors.append(prior)
+    kept = pycolmap.PosePriorBundleAdjustmentOptions()
+    pycolmap.create_pose_prior_bundle_adjuster(options, kept, config, priors, model).solve()

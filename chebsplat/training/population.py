@@ -13,7 +13,9 @@ from chebsplat.training import densify, optimizer_rows, prune, sh_prune
 from chebsplat.training.model import Rendered, SceneModel
 
 FAINT = 0.005  # opacity below which a Gaussian is removed
+TINY = 1e-30  # scene units: a bound for what lies in a camera
 DIMMED = 0.01  # what a reset lowers opacities to
+TENSORS = ("gradient_sum", "gradient_count", "log_bound")
 COUNTS = ("n_grown", "n_reset", "n_added", "n_removed", "n_broken")
 
 
@@ -30,9 +32,8 @@ class Population:
         self.clear_gradients()
 
     def state_dict(self) -> dict[str, Any]:
-        """Counts, and the gradients gathered since growth: tensors, not copied, and plain values."""
-        gradients = {"gradient_sum": self.gradient_sum, "gradient_count": self.gradient_count}
-        return {name: getattr(self, name) for name in COUNTS} | gradients
+        """Counts, bounds, and the gradients gathered since growth: tensors, not copied, and plain values."""
+        return {name: getattr(self, name) for name in (*COUNTS, *TENSORS)}
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
         """Go on as the population whose `state_dict()` this is."""
@@ -54,6 +55,26 @@ class Population:
         visible = rendered.meta["radii"][0] > 0
         self.gradient_sum.index_add_(0, rendered.index, torch.where(visible, length, 0))  # nothing waits for a count
         self.gradient_count.index_add_(0, rendered.index, visible.to(length))
+
+    def note_cameras(self, places: Tensor) -> None:
+        """How large each Gaussian may be before cameras at `places` [V, 3]: see `bound_scales`."""
+        from scipy.spatial import cKDTree
+
+        means = self.model.raw["means"].detach()
+        distance = cKDTree(places.cpu().numpy()).query(means.nan_to_num().cpu().numpy())[0]
+        bound = torch.from_numpy(distance * self.settings.scale_limit).clamp_min(TINY)
+        self.log_bound = bound.log().to(means)[:, None]
+
+    @torch.no_grad()
+    def bound_scales(self) -> None:
+        """Keep scales below `scale_limit` times the distance to the nearest camera, as the last `note_cameras` saw it.
+
+        Choices: EWA takes perspective for linear across a Gaussian, which holds for small ones. A needle that reaches
+          past cameras is another haze before each of them, and training fits it to those that it has. At a third, three
+          standard deviations end before the nearest camera.
+        """
+        scales = self.model.raw["log_scales"]
+        torch.minimum(scales, self.log_bound, out=scales)
 
     def grow(self, optimizer: torch.optim.Optimizer, members: Tensor, generator: torch.Generator) -> None:
         """Densify: by regions (Eqs 11-12), whose members are i64 [M, n], by classic clone and split, or by turns.

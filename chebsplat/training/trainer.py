@@ -73,6 +73,7 @@ class Trainer:
         self.seconds = 0.0  # of the steps but the first
         self.population = Population(model, settings, extent)
         self.laps = Laps()  # of the same steps; after a resume, from there on
+        self.places = -torch.einsum("vji,vj->vi", views.viewmats[:, :3, :3], views.viewmats[:, :3, 3])  # of the cameras
         self.refresh(regions, descriptors)
 
     @property
@@ -202,6 +203,7 @@ class Trainer:
         assert regions is not None
         self.members, self.guidance = torch.as_tensor(regions.members).to(self.model.device), None
         self.model.follow(regions)
+        self.population.note_cameras(self.places)
         self.laps.mark("refresh")
 
     def _guided(self, index: Tensor) -> Tensor | None:
@@ -254,6 +256,7 @@ class Trainer:
             (loss - losses["color"]).backward()
         self.laps.mark("backward")
         self.optimizer.step()
+        self.population.bound_scales()
         self.cameras.step(index, share)
         self.laps.mark("optimizer")
         figures = {"loss": loss.detach()} | {f"loss_{k}": v.detach() for k, v in losses.items()}
