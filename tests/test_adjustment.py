@@ -6,7 +6,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from chebsplat.cameras import centers
-from chebsplat.stages.adjustment import adjust, alignment
+from chebsplat.stages.adjustment import adjust, alignment, differences, frame, localized
 from chebsplat.stages.command import Job
 from chebsplat.stages.config import Config
 from chebsplat.stages.sfm import filled
@@ -119,6 +119,65 @@ def test_disturbed_poses_and_a_wrong_focal_length_are_found_again(synthetic):
     assert model.compute_mean_reprojection_error() < 1 < notes["reprojection_error_given_px"]
     assert notes["poses_kept"] == 0
     assert np.linalg.norm(centers(found) - centers(given), axis=1).mean() < 0.03 * size  # in the frame that was given
+
+
+def test_views_that_went_astray_do_not_turn_the_frame():
+    rng = np.random.default_rng(4)
+    places, rotations = rng.normal(size=(20, 3)), Rotation.random(20, rng=rng).as_matrix()
+    given = poses_of(rotations, places)
+    turns = Rotation.from_rotvec(np.radians(0.3) * rng.normal(size=(20, 3))).as_matrix()
+    turns[:2] = Rotation.from_rotvec(np.radians([[0, 0, 12.0], [0, 0, 9.0]])).as_matrix()
+    found = poses_of(turns @ rotations, places + 0.01 * rng.normal(size=(20, 3)))
+    found[5, :3, 3] += 0.5
+    framed = frame(found, given, np.arange(20) != 7)
+    assert np.flatnonzero(~framed.led).tolist() == [0, 1, 5, 7]
+    assert np.degrees(framed.spread[0]) == pytest.approx(0.3, rel=0.4)
+    assert framed.spread[1] == pytest.approx(0.01, rel=0.4)
+    assert np.degrees(np.arccos((np.trace(framed.rotation) - 1) / 2)) < 0.15
+    assert np.degrees(Rotation.from_matrix(alignment(found, given)[1]).magnitude()) > 0.3
+
+
+def test_a_view_is_found_among_the_points_of_others_or_stays_where_it_was_given(synthetic):
+    job, database, names, truth = synthetic
+    spread = np.radians(0.5), 0.02
+    options = {"clear_points": True, "refine_intrinsics": False}
+    model = model_of(database, names, truth, 900.0)
+    model = pycolmap.triangulate_points(model, database, job.scratch / "images", job.scratch, **options)
+    turn = Rotation.from_rotvec([0.008, -0.006, 0.004]).as_matrix()
+    given = poses_of((turn @ truth[3, :3, :3])[None], centers(truth)[3:4] + np.array([0.02, -0.02, 0.01]))[0]
+    others = [name for name in names if name != names[3]]
+    pose = np.eye(4)
+    pose[:3] = localized(model, database, names[3], given, spread, others)
+    before, after = (np.ravel(differences(p[None], truth[3:4])) for p in (given, pose))
+    assert (after < before / 5).all()
+    np.testing.assert_allclose(localized(model, database, names[3], given, spread, []), given[:3], atol=1e-9)
+    far = poses_of((Rotation.from_rotvec([0.3, 0, 0]).as_matrix() @ truth[3, :3, :3])[None], centers(truth)[3:4])[0]
+    np.testing.assert_allclose(localized(model, database, names[3], far, spread, others), far[:3], atol=1e-9)
+
+
+@pytest.mark.parametrize("weak", [1, 3])
+def test_views_with_few_matches_stay_near_where_they_were_given(synthetic, weak):
+    job, database, names, truth = synthetic
+    rng = np.random.default_rng(0)
+    turns = Rotation.from_rotvec(np.radians(0.5) * rng.normal(size=(len(truth), 3))).as_matrix()
+    size = np.linalg.norm(centers(truth) - centers(truth).mean(0), axis=1).mean()
+    given = poses_of(turns @ truth[:, :3, :3], centers(truth) + 0.01 * size * rng.normal(size=(len(truth), 3)))
+    with pycolmap.Database.open(database) as opened:
+        images = {image.name: image.image_id for image in opened.read_all_images()}
+        for name in names[:weak]:
+            for other in names:
+                if other != name and opened.exists_two_view_geometry(images[name], images[other]):
+                    geometry = opened.read_two_view_geometry(images[name], images[other])
+                    geometry.inlier_matches = geometry.inlier_matches[:2]
+                    opened.update_two_view_geometry(images[name], images[other], geometry)
+    model, notes = adjust(job, model_of(database, names, given, 900.0), database, names, given)
+    held = {image.name: image for image in model.images.values()}
+    found = given.copy()
+    found[:, :3] = [held[name].cam_from_world().matrix() for name in names]
+    assert notes["poses_kept"] == weak
+    moved, turned = differences(found[:weak], given[:weak])
+    assert (moved < 0.1 * size).all() and (np.degrees(turned) < 4).all()
+    assert (errors(found[weak:], truth[weak:]) < errors(given[weak:], truth[weak:]) / 5).all()
 
 
 def test_poses_stay_where_few_views_share_points(synthetic, monkeypatch):

@@ -104,6 +104,25 @@ def test_opacities_fall_as_often_as_asked_while_gaussians_grow_and_rise_between(
     assert fallen == [24, 32, 40] and highest > 0.012
 
 
+def test_no_gaussian_reaches_past_the_cameras(tiny_trainer):
+    made = tiny_trainer(steps=3, densify="off", prune=False)
+    eyes = torch.stack([-matrix[:3, :3].T @ matrix[:3, 3] for matrix in made.views.viewmats])
+    distance = (made.model.raw["means"].detach()[:, None] - eyes).norm(dim=-1).amin(1)
+    assert torch.allclose(made.population.log_bound[:, 0].exp(), 0.33 * distance, rtol=1e-4)
+    with torch.no_grad():
+        made.model.raw["log_scales"][7] = torch.tensor([3.0, -4.0, -4.0])
+        made.model.raw["log_scales"][8] = torch.nan
+    made.population.bound_scales()
+    scales = made.model.raw["log_scales"].detach()
+    assert scales[7, 0] == made.population.log_bound[7, 0]
+    assert torch.equal(scales[7, 1:], torch.tensor([-4.0, -4.0]))
+    assert scales[8].isnan().all()  # found and counted where all that breaks is
+    made.population.drop_broken(made.optimizer)
+    made.refresh()
+    for _ in made.steps():
+        assert (made.model.raw["log_scales"].detach() <= made.population.log_bound + 1e-6).all()
+
+
 def test_growth_after_the_freeze_is_refused():
     with pytest.raises(ConfigError, match="densify_until"):
         config.build({"train": {"densify_until": 0.9}}, "test")
