@@ -60,7 +60,7 @@ class Population:
         """How large each Gaussian may be before cameras at `places` [V, 3]: see `bound_scales`."""
         from scipy.spatial import cKDTree
 
-        means = self.model.raw["means"].detach()
+        means, places = self.model.raw["means"].detach(), places[finite_rows(places)]
         distance = cKDTree(places.cpu().numpy()).query(means.nan_to_num().cpu().numpy())[0]
         bound = torch.from_numpy(distance * self.settings.scale_limit).clamp_min(TINY)
         self.log_bound = bound.log().to(means)[:, None]
