@@ -75,20 +75,22 @@ def adjust(
         if framed is None or len(errors) <= FREE:
             pycolmap.bundle_adjustment(model, bundle)
         else:
-            _bundle_near(model, names, given, bundle, framed.spread[1])
-        seen = _seen(model, names)
-        if seen.mean() < ENOUGH:
-            log.warning("poses stay as given: %d of %d views share %d points or more", seen.sum(), len(seen), SHARED)
-            return as_given, {"poses_kept": len(names)}
-        framed = frame(_poses(model, names), given, seen)
-        model.transform(pycolmap.Sim3d(framed.scale, pycolmap.Rotation3d(framed.rotation), framed.shift))
-        for name, pose in zip(_where(names, ~framed.led), given[~framed.led], strict=True):
-            _put(model, name, pose[:3])
-    assert framed is not None
-    for name, pose in zip(_where(names, ~framed.led), given[~framed.led], strict=True):
-        _put(model, name, localized(model, database, name, pose, framed.spread, _where(names, framed.led)))
+            _bundle_near(model, _images(model, names), given, bundle, framed.spread[1])
+        images = _images(model, names)
+        seen = np.array([image.num_points3D >= SHARED for image in images])
+        framed = frame(_poses(images), given, seen) if seen.mean() >= ENOUGH else None
+        if framed is not None:
+            model.transform(pycolmap.Sim3d(framed.scale, pycolmap.Rotation3d(framed.rotation), framed.shift))
+            for row in np.flatnonzero(~framed.led):
+                _put(images[row], given[row, :3])
+    if framed is None:
+        log.warning("poses stay as given: %d of %d views share %d points or more", seen.sum(), len(seen), SHARED)
+        return as_given, {"poses_kept": len(names)}
+    others = [image for image, led in zip(images, framed.led, strict=True) if led]
+    for row in np.flatnonzero(~framed.led):
+        _put(images[row], localized(model, database, images[row], given[row], framed.spread, others))
     model.update_point_3d_errors()
-    moved, turned = (values[framed.led] for values in differences(_poses(model, names), given))
+    moved, turned = (values[framed.led] for values in differences(_poses(images), given))
     notes = {
         "poses_moved": float(np.median(moved)),
         "poses_turned_degrees": float(np.degrees(np.median(turned))),
@@ -135,25 +137,25 @@ def differences(poses: np.ndarray, given: np.ndarray) -> tuple[np.ndarray, np.nd
 def localized(
     model: pycolmap.Reconstruction,
     database: Path,
-    name: str,
+    image: pycolmap.Image,
     given: np.ndarray,
     spread: tuple[float, float],
-    others: list[str],
+    others: list[pycolmap.Image],
 ) -> np.ndarray:
     """The pose [3, 4] of an image by its matches with points of the `others`, near its given pose [4, 4].
 
+    Args: spread: each turn's (radians) and shift's (scene units) standard deviation about the given pose.
     Choices: the least sum of what its features miss these points by, pixels under a Cauchy loss, and of the pose's
-      change in units of `spread` (radians, scene units): where there are no matches, or they lead astray, the pose is
+      change in units of `spread`: where there are no matches, or they lead astray, the pose is
       the given one.
     """
     import pycolmap
     from scipy.optimize import least_squares
     from scipy.spatial.transform import Rotation
 
-    held = {image.name: image for image in model.images.values()}
-    image, points, pixels = held[name], [], []
+    points, pixels = [], []
     with pycolmap.Database.open(database) as opened:
-        for other in (held[other] for other in others):
+        for other in others:
             if opened.exists_two_view_geometry(image.image_id, other.image_id):
                 pairs = opened.read_two_view_geometry(image.image_id, other.image_id).inlier_matches
                 both = [
@@ -200,35 +202,30 @@ def _focals(model: pycolmap.Reconstruction) -> float:
     return float(np.mean([camera.mean_focal_length() for camera in model.cameras.values()]))
 
 
-def _poses(model: pycolmap.Reconstruction, names: list[str]) -> np.ndarray:
-    """Of the model's images, f64 [V, 4, 4]."""
+def _images(model: pycolmap.Reconstruction, names: list[str]) -> list[pycolmap.Image]:
+    """The model's images in the order of their names."""
     held = {image.name: image for image in model.images.values()}
-    poses = np.tile(np.eye(4), (len(names), 1, 1))
-    poses[:, :3] = [held[name].cam_from_world().matrix() for name in names]
+    return [held[name] for name in names]
+
+
+def _poses(images: list[pycolmap.Image]) -> np.ndarray:
+    """Of V images, f64 [V, 4, 4]."""
+    poses = np.tile(np.eye(4), (len(images), 1, 1))
+    poses[:, :3] = [image.cam_from_world().matrix() for image in images]
     return poses
 
 
-def _seen(model: pycolmap.Reconstruction, names: list[str]) -> np.ndarray:
-    """Which images see enough points, bool [V]."""
-    held = {image.name: image for image in model.images.values()}
-    return np.array([held[name].num_points3D >= SHARED for name in names])
-
-
-def _where(names: list[str], chosen: np.ndarray) -> list[str]:
-    return [name for name, used in zip(names, chosen, strict=True) if used]
-
-
-def _put(model: pycolmap.Reconstruction, name: str, pose: np.ndarray) -> None:
+def _put(image: pycolmap.Image, pose: np.ndarray) -> None:
     """Set the pose [3, 4] of an image."""
     import pycolmap
 
-    image = next(image for image in model.images.values() if image.name == name)
+    assert image.frame is not None  # every image of a reconstruction has one
     image.frame.set_cam_from_world(image.camera_id, pycolmap.Rigid3d(pose))
 
 
 def _bundle_near(
     model: pycolmap.Reconstruction,
-    names: list[str],
+    images: list[pycolmap.Image],
     given: np.ndarray,
     options: pycolmap.BundleAdjustmentOptions,
     spread: float,
@@ -236,12 +233,11 @@ def _bundle_near(
     """Bundle adjustment in which the given centres have a say: each coordinate's standard deviation is `spread`."""
     import pycolmap
 
-    held = {image.name: image for image in model.images.values()}
     config, priors = pycolmap.BundleAdjustmentConfig(), []
-    for name, place in zip(names, centers(given), strict=True):
-        config.add_image(held[name].image_id)
+    for image, place in zip(images, centers(given), strict=True):
+        config.add_image(image.image_id)
         prior = pycolmap.PosePrior()
-        prior.corr_data_id, prior.position = held[name].data_id, place
+        prior.corr_data_id, prior.position = image.data_id, place
         prior.position_covariance = np.eye(3) * max(spread, 1e-9) ** 2
         prior.coordinate_system = pycolmap.PosePriorCoordinateSystem.CARTESIAN
         priors.append(prior)

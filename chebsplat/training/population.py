@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from typing import Any
 
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -22,12 +23,16 @@ COUNTS = ("n_grown", "n_reset", "n_added", "n_removed", "n_broken")
 class Population:
     """The Gaussians of a model under an optimizer whose groups are named for the raw parameters.
 
+    places: of the training cameras, scene units [V, 3]; those that are not finite bound nothing.
     `n_grown` and `n_reset` count the times that some were added and that all were dimmed, the others Gaussians:
     `n_broken` those whose values a step made non-finite. The caller refreshes the model's regions after any change.
     """
 
-    def __init__(self, model: SceneModel, settings: TrainSection, extent: float):
+    def __init__(self, model: SceneModel, settings: TrainSection, extent: float, places: np.ndarray):
+        from scipy.spatial import cKDTree
+
         self.model, self.settings, self.extent = model, settings, extent
+        self.cameras = cKDTree(places[np.isfinite(places).all(1)])
         self.n_grown = self.n_reset = self.n_added = self.n_removed = self.n_broken = 0
         self.clear_gradients()
 
@@ -56,18 +61,16 @@ class Population:
         self.gradient_sum.index_add_(0, rendered.index, torch.where(visible, length, 0))  # nothing waits for a count
         self.gradient_count.index_add_(0, rendered.index, visible.to(length))
 
-    def note_cameras(self, places: Tensor) -> None:
-        """How large each Gaussian may be before cameras at `places` [V, 3]: see `bound_scales`."""
-        from scipy.spatial import cKDTree
-
-        means, places = self.model.raw["means"].detach(), places[finite_rows(places)]
-        distance = cKDTree(places.cpu().numpy()).query(means.nan_to_num().cpu().numpy())[0]
+    def note_distances(self) -> None:
+        """How large each Gaussian may be where it is now: see `bound_scales`."""
+        means = self.model.raw["means"].detach()
+        distance = self.cameras.query(means.nan_to_num().cpu().numpy())[0]
         bound = torch.from_numpy(distance * self.settings.scale_limit).clamp_min(TINY)
         self.log_bound = bound.log().to(means)[:, None]
 
     @torch.no_grad()
     def bound_scales(self) -> None:
-        """Keep scales below `scale_limit` times the distance to the nearest camera, as the last `note_cameras` saw it.
+        """Keep scales below `scale_limit` times the distance to the nearest camera, as `note_distances` saw it last.
 
         Choices: EWA takes perspective for linear across a Gaussian, which holds for small ones. A needle that reaches
           past cameras is another haze before each of them, and training fits it to those that it has. At a third, three

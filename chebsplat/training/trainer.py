@@ -11,6 +11,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from chebsplat.cameras import centers
 from chebsplat.errors import DataFailure
 from chebsplat.evaluation.metrics import psnr
 from chebsplat.settings import TrainSection
@@ -71,9 +72,8 @@ class Trainer:
         self.order: list[int] = []  # views still to be seen before any is seen again
         self.step = 0
         self.seconds = 0.0  # of the steps but the first
-        self.population = Population(model, settings, extent)
+        self.population = Population(model, settings, extent, centers(views.viewmats.cpu().numpy()))
         self.laps = Laps()  # of the same steps; after a resume, from there on
-        self.places = -torch.einsum("vji,vj->vi", views.viewmats[:, :3, :3], views.viewmats[:, :3, 3])  # of the cameras
         self.refresh(regions, descriptors)
 
     @property
@@ -203,7 +203,7 @@ class Trainer:
         assert regions is not None
         self.members, self.guidance = torch.as_tensor(regions.members).to(self.model.device), None
         self.model.follow(regions)
-        self.population.note_cameras(self.places)
+        self.population.note_distances()
         self.laps.mark("refresh")
 
     def _guided(self, index: Tensor) -> Tensor | None:
