@@ -18,9 +18,10 @@ from chebsplat.formats.evaluation import Evaluation, write_evaluation
 from chebsplat.formats.manifest import Manifest
 from chebsplat.pipelines.scenes import data_of, names
 from chebsplat.pipelines.sequences import scenes_of
+from chebsplat.pipelines.studies import figures
 from chebsplat.pipelines.studies.page import write
 from chebsplat.pipelines.studies.pictures import gallery
-from chebsplat.pipelines.studies.results import compare, row_of
+from chebsplat.pipelines.studies.results import compare, row_of, traces
 from chebsplat.pipelines.studies.study import Study, checked_study, execute, expand, outstanding, read_study
 from chebsplat.pipelines.studies.tables import Section, stability
 from chebsplat.stages.registry import STAGES
@@ -300,6 +301,24 @@ def test_a_figure_may_be_drawn_against_a_setting(tmp_path):
         finish(run)
     write(tmp_path, noise, runs, [row_of(run, {}) for run in runs], "c")
     assert (tmp_path / "error-against-time.png").stat().st_size > 10_000
+
+
+def test_a_figure_of_colour_alone_has_a_panel_for_each_scene(tmp_path, monkeypatch):
+    import matplotlib.figure
+
+    panels = []
+    monkeypatch.setattr(matplotlib.figure.Figure, "savefig", lambda figure, *args, **kw: panels.extend(figure.axes))
+    scenes = study(scenes=["toy", "office0"], seeds=[0])
+    runs = expand(scenes)
+    for run in runs:
+        finish(run)
+    rows = [row_of(run, {}) for run in runs]
+    figures.draw(tmp_path / "figure.png", rows, traces(runs, rows), None, "")
+    assert [panel.get_title()[:9] for panel in panels] == ["test PSNR", "test mIoU", "PSNR on w"]
+    panels.clear()
+    figures.draw(tmp_path / "figure.png", [row | {"miou": None} for row in rows], traces(runs, rows), None, "")
+    assert [panel.get_title() for panel in panels] == ["toy", "office0"]
+    assert all(len(panel.lines) >= 2 for panel in panels)  # test views, and the trace of views trained on
 
 
 @pytest.fixture

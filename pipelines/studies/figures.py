@@ -32,13 +32,21 @@ def draw(path: Path, rows: list[Row], traces: Traces, settings: dict[str, float]
     }
     conditions = [""] if settings is not None else list(dict.fromkeys(row["condition"] for row in rows))
     height = 3.4 * len(conditions) + 0.3 * -(-len(variants) // 5)
-    figure, axes = plt.subplots(len(conditions), 3, figsize=(12, height), layout="constrained", squeeze=False)
+    color_only = settings is None and bool(done) and all(row["miou"] is None for row in done)
+    scenes = list(dict.fromkeys(row["scene"] for row in done))
+    n, width = (len(scenes), max(3.2 * len(scenes), 5)) if color_only else (3, 12)
+    figure, axes = plt.subplots(len(conditions), n, figsize=(width, height), layout="constrained", squeeze=False)
     for line, condition in zip(axes, conditions, strict=True):
+        chosen = [row for row in done if row["condition"] == condition]
+        followed = [(row, trace) for row, trace in traces if row["condition"] == condition]
         if settings is not None:
             _over_setting(line, done, settings, style, label)
+        elif color_only:
+            for axis, scene in zip(line, scenes, strict=True):
+                _of_scene(axis, scene, chosen, followed, style)
+            line[0].set_ylabel(f"PSNR, dB {condition}".strip())
         else:
-            chosen = [row for row in done if row["condition"] == condition]
-            _over_time(line, chosen, [t for t in traces if t[0]["condition"] == condition], style)
+            _over_time(line, chosen, followed, style)
             line[0].set_ylabel(condition)
         for axis in line:
             axis.grid(alpha=0.3)
@@ -68,24 +76,44 @@ def _over_time(line: Any, rows: list[Row], traces: Traces, style: dict[str, dict
     """Test PSNR and mIoU over training seconds, a point a budget; held-in PSNR along the longest trainings."""
     titles = (("psnr", "test PSNR, dB", 1), ("miou", "test mIoU, %", 100))
     for axis, (key, title, scale) in zip(line, titles, strict=False):
-        for (variant,), members in groups([row for row in rows if row[key] is not None], "variant").items():
-            budgets = groups(members, "budget")
-            points = [
-                (name, [row["train_seconds"] for row in some], [scale * row[key] for row in some])
-                for name, some in budgets.items()
-            ]
-            _mean_line(axis, points, style[variant])
+        _over_budgets(axis, rows, key, scale, style)
         axis.set_title(title, fontsize=10)
         axis.set_xlabel("training seconds of whole runs")
+    _longest(line[2], traces, style)
+    line[2].set_title("PSNR on watched training views, dB; a line a run", fontsize=10)
+    line[2].set_xlabel("training seconds")
+
+
+def _of_scene(axis: Any, scene: str, rows: list[Row], traces: Traces, style: dict[str, dict[str, Any]]) -> None:
+    """Of a scene without semantics: test PSNR by budget, and as thin lines that of training views as they train."""
+    _over_budgets(axis, [row for row in rows if row["scene"] == scene], "psnr", 1, style)
+    _longest(axis, [(row, trace) for row, trace in traces if row["scene"] == scene], style)
+    axis.set_xscale("log")
+    axis.xaxis.set_major_formatter("{x:g}")
+    axis.set_title(scene, fontsize=10)
+    axis.set_xlabel("training seconds (thin: views trained on)", fontsize=9)
+
+
+def _over_budgets(axis: Any, rows: list[Row], key: str, scale: float, style: dict[str, dict[str, Any]]) -> None:
+    """A line a variant through the means of a figure, a point a budget."""
+    for (variant,), members in groups([row for row in rows if row[key] is not None], "variant").items():
+        budgets = groups(members, "budget")
+        points = [
+            (name, [row["train_seconds"] for row in some], [scale * row[key] for row in some])
+            for name, some in budgets.items()
+        ]
+        _mean_line(axis, points, style[variant])
+
+
+def _longest(axis: Any, traces: Traces, style: dict[str, dict[str, Any]]) -> None:
+    """PSNR of the watched training views along the longest training of each variant, or those as long."""
     longest: dict[str, int] = {}
     for row, _ in traces:
         longest[row["variant"]] = max(longest.get(row["variant"], 0), row["steps"])
     for row, trace in traces:
         if row["steps"] == longest[row["variant"]]:
             seconds, values = ([entry[name] for entry in trace] for name in ("seconds", "psnr"))
-            line[2].plot(seconds, values, color=style[row["variant"]]["color"], linewidth=0.7, alpha=0.7)
-    line[2].set_title("PSNR on watched training views, dB; a line a run", fontsize=10)
-    line[2].set_xlabel("training seconds")
+            axis.plot(seconds, values, color=style[row["variant"]]["color"], linewidth=0.7, alpha=0.7)
 
 
 def _over_setting(line: Any, rows: list[Row], settings: dict[str, float], style: dict[str, Any], label: str) -> None:
