@@ -11,7 +11,6 @@ import json
 import os
 import shutil
 import stat
-import sys
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import asdict
@@ -77,12 +76,6 @@ def publish(out: Path, manifest: Manifest, force: bool = False) -> Iterator[Path
                 _settle_tree(tmp)
                 _put(tmp, out, manifest, force)
                 sync(out.parent)
-    except BaseException:
-        if "zarr" in sys.modules:
-            from chebsplat.formats.arrays import settle
-
-            settle()
-        raise
     finally:
         shutil.rmtree(tmp, ignore_errors=True)
 
@@ -166,19 +159,6 @@ def read_manifest(path: Path, schema: str | None = None) -> Manifest:
         if state.st_size != entry["bytes"]:
             raise InputError(f"{member} has {state.st_size} bytes, expected {entry['bytes']}; {remedy_of(path)}")
     return manifest
-
-
-def stated(path: Path, manifest: Manifest, *names: str, kind: type | tuple[type, ...]) -> Any:
-    """What a manifest says under nested names, such as "config", "cks", "max_rank".
-
-    Raises: InputError if it does not, or says something of another kind.
-    """
-    value: Any = vars(manifest)
-    for name in names:
-        value = value.get(name) if isinstance(value, dict) else None
-    if not isinstance(value, kind):
-        raise InputError(f"{path / MANIFEST} is damaged: {'.'.join(names)} is {value!r:.60}; {remedy_of(path)}")
-    return value
 
 
 def verify(path: Path, schema: str | None = None) -> Manifest:

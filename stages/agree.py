@@ -26,7 +26,7 @@ def run(job: Job) -> None:
     import numpy as np
 
     from chebsplat.cameras import centers
-    from chebsplat.formats.agreement import OfLabel, ViewAgreement, write_agreement
+    from chebsplat.formats.agreement import ViewAgreement, write_agreement
     from chebsplat.formats.capture import read_capture
     from chebsplat.formats.features import read_features
     from chebsplat.formats.points import read_points
@@ -47,7 +47,7 @@ def run(job: Job) -> None:
     found = between(said[row, first], said[row, second], len(names))
     value = float(found.value) if len(row) else None
     labels = {
-        name: OfLabel(share=float(share), agreement=float(of_label))
+        name: {"share": float(share), "agreement": float(of_label)}
         for name, share, of_label in zip(names, found.share, found.by_label, strict=True)
         if share > 0
     }

@@ -30,7 +30,7 @@ def run(job: Job) -> None:
 
     from chebsplat.shape.cks import update
 
-    encoder = restored_encoder(job.inputs["gaussians"], checkpoint)
+    encoder = restored_encoder(checkpoint)
     if not encoder.blocks:
         raise DataFailure("the encoder has no attention weights (train.encoder = mlp); there is no knowledge to carry")
     maps = encoder.linear_maps()

@@ -50,23 +50,19 @@ def run(job: Job) -> None:
     import shlex
 
     from chebsplat.formats.artifact import read_manifest
-    from chebsplat.formats.documents import conform
     from chebsplat.formats.evaluation import read_evaluation
     from chebsplat.formats.gaussians import read_gaussians
-    from chebsplat.formats.manifest import remedy_of
     from chebsplat.stages.pages import parts
     from chebsplat.stages.pages import pictures as draw
     from chebsplat.stages.pages.template import REPORT, rendered
-    from chebsplat.stages.report_facts import Reported, facts_of
 
     evaluation = read_evaluation(job.inputs["evaluation"])
     gaussians = read_gaussians(job.inputs["gaussians"])
     if not gaussians.trace:
         raise DataFailure("the training left no trace of error against run time; train the scene again")
     manifests = {role: read_manifest(job.inputs[role]) for role in STAGE_OF if role in job.inputs}
-    facts = {role: facts_of(role, job.inputs[role], manifest) for role, manifest in manifests.items()}
-    evaluated = job.inputs["evaluation"]
-    figures = conform(evaluation.figures, Reported, evaluated / "figures.json", remedy_of(evaluated))
+    facts = {role: manifest.facts for role, manifest in manifests.items()}
+    figures = evaluation.figures
     left_out = absent_stages(job, gaussians) | figures["left_out"]
     for of_input in facts.values():
         left_out |= of_input.get("left_out", {})

@@ -90,7 +90,6 @@ def run(job: Job) -> None:
         f"{n}.{k}": v.detach().cpu().numpy() for n, m in model.modules.items() for k, v in m.state_dict().items()
     }
     cameras = Cameras(points.names, points.Ks, reached(models, views, points), *capture.size)
-    given_poses = None if models.poses is None else points.cam_from_world
     job.facts |= facts(models)
     notes: dict[str, Any] = {"left_out": job.facts.get("left_out", {}), "n_added": population.n_added}
     notes |= {"n_removed": population.n_removed, "n_broken": population.n_broken, "n_initial": n_initial}
@@ -117,8 +116,7 @@ def run(job: Job) -> None:
     if job.device == "cuda":
         job.facts["peak_device_bytes"] = torch.cuda.max_memory_allocated()
     job.facts["milliseconds"] = {part: 1e3 * seconds / timed for part, seconds in trainer.laps.seconds.items()}
-    moments = optimizer_state(trainer)
-    write_gaussians(job.out, Gaussians(parameters, cameras, modules, moments, trace, notes, given_poses))
+    write_gaussians(job.out, Gaussians(parameters, cameras, modules, trace, notes))
 
 
 def agreement(alone: np.ndarray, features: np.ndarray, embeddings: np.ndarray) -> dict[str, float]:
@@ -253,16 +251,6 @@ def state(
     """All that a resumed training goes on from."""
     resumed = job.facts.get("resumed_at", [])
     return {"trainer": trainer.state_dict(), "trace": trace, "since": since, "resumed_at": resumed}
-
-
-def optimizer_state(trainer: Trainer) -> dict[str, np.ndarray]:
-    """Adam's moments of the per-Gaussian parameters, and the step count."""
-    arrays: dict[str, np.ndarray] = {}
-    for group in trainer.optimizer.param_groups:
-        state = trainer.optimizer.state.get(group["params"][0], {})
-        if group["name"] not in ("modules", "gates") and "exp_avg" in state:
-            arrays |= {f"{group['name']}.{k}": state[k].cpu().numpy() for k in ("exp_avg", "exp_avg_sq")}
-    return arrays
 
 
 main = command("train", run)

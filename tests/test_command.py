@@ -32,14 +32,14 @@ def good(job):
 def test_artifact_is_published_and_its_path_printed(tmp_path):
     result = invoke(good, "--out", tmp_path / "x", "--key", KEY)
     assert (result.exit_code, result.stdout) == (0, f"{tmp_path / 'x'}\n")
-    manifest = artifact.verify(tmp_path / "x", "chebsplat.capture/1")
+    manifest = artifact.verify(tmp_path / "x", "chebsplat.capture/2")
     assert (manifest.key, manifest.facts) == (KEY, {"left_out": {"depth": "none given"}})
     assert set(manifest.config) == {"scene", "source", "ingest"}
 
 
 def test_called_from_python_a_stage_prints_nothing_and_raises_typed_errors(tmp_path, capsys):
     publish("ingest", good, tmp_path / "x", {}, key=KEY)
-    assert artifact.verify(tmp_path / "x", "chebsplat.capture/1").key == KEY
+    assert artifact.verify(tmp_path / "x", "chebsplat.capture/2").key == KEY
     with pytest.raises(DataFailure):
         publish("ingest", fail_data, tmp_path / "y", {})
     with pytest.raises(ConfigError, match="16 hexadecimal digits"):

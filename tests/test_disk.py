@@ -63,7 +63,7 @@ def test_a_home_folder_that_takes_nothing_stops_no_run(tmp_path, monkeypatch):
 
 
 def test_a_full_disk_is_recognised_behind_a_library_s_own_error(tmp_path):
-    manifest, said = Manifest("chebsplat.capture/1", "k", "ingest"), r"a\.bin cannot be .*more than 3 bytes are needed"
+    manifest, said = Manifest("chebsplat.capture/2", "k", "ingest"), r"a\.bin cannot be .*more than 3 bytes are needed"
     with pytest.raises(DiskFailure, match=said), artifact.publish(tmp_path / "x", manifest) as tmp:
         (tmp / "a.bin").write_bytes(b"abc")
         try:
@@ -85,7 +85,7 @@ def test_chunks_still_on_their_way_when_one_fails_leave_nothing_behind(tmp_path,
         await ordinary(self, key, value)
 
     monkeypatch.setattr(LocalStore, "set", slow)
-    manifest = Manifest("chebsplat.capture/1", "k", "ingest")
+    manifest = Manifest("chebsplat.capture/2", "k", "ingest")
     with pytest.raises(DiskFailure), artifact.publish(tmp_path / "x", manifest) as tmp:
         write_array(tmp / "a", np.ones((4, 2)), ("n", "c"))
     time.sleep(0.4)

@@ -162,8 +162,8 @@ def test_views_of_capture_and_teacher_in_another_order_change_no_figure(toy, tmp
             setattr(record, part, np.asarray(getattr(record, part)[:])[order])
         record.names = [record.names[k] for k in order]
     inputs = inputs_of(toy, "evaluate") | {
-        "capture": published(tmp_path / "c", "chebsplat.capture/1", write_capture, capture),
-        "features": published(tmp_path / "f", "chebsplat.features/1", write_features, features),
+        "capture": published(tmp_path / "c", "chebsplat.capture/2", write_capture, capture),
+        "features": published(tmp_path / "f", "chebsplat.features/2", write_features, features),
     }
     assert run_stage("evaluate", tmp_path / "out", inputs) == 0
     found, wanted = (read_evaluation(path).figures for path in (tmp_path / "out", toy["evaluate"]))
@@ -179,7 +179,7 @@ def test_points_are_measured_where_depth_and_poses_say_where_they_lie(toy, tmp_p
     record = read_capture(toy["ingest"])
     record.depth = None
     inputs = inputs_of(toy, "evaluate")
-    inputs["capture"] = published(tmp_path / "c", "chebsplat.capture/1", write_capture, record)
+    inputs["capture"] = published(tmp_path / "c", "chebsplat.capture/2", write_capture, record)
     assert run_stage("evaluate", tmp_path / "out", inputs) == 0
     figures = read_evaluation(tmp_path / "out").figures
     assert figures["segmentation"]["scene"]["point_miou"] is None
@@ -193,7 +193,7 @@ def test_a_teacher_of_other_labels_than_the_protocols_is_exit_4(toy, protocol, t
     record = read_capture(toy["ingest"])
     record.protocol = {"name": protocol}
     inputs = inputs_of(toy, "evaluate")
-    inputs["capture"] = published(tmp_path / "c", "chebsplat.capture/1", write_capture, record)
+    inputs["capture"] = published(tmp_path / "c", "chebsplat.capture/2", write_capture, record)
     assert run_stage("evaluate", tmp_path / "out", inputs) == 4
     assert "teacher" in capsys.readouterr().err
 

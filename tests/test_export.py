@@ -177,6 +177,6 @@ def test_files_of_others_come_back_unchanged(tmp_path, name):
 
 
 def test_what_was_left_out_is_listed(toy):
-    summary = json.loads((toy["export"] / "summary.json").read_text())
+    summary = read_scene(toy["export"]).summary
     assert summary["left_out"]["knowledge basis"].startswith("no sequence")
     assert set(summary["bytes"]) == {"unpruned_ply", "ply", "split", "ragged", "semantic"}

@@ -24,6 +24,7 @@ from chebsplat.formats import (
 )
 from chebsplat.formats.cameras import Cameras
 from chebsplat.formats.manifest import Manifest
+from chebsplat.formats.record import StoredArray
 
 DATA = Path(os.environ.get("CHEBSPLAT_TEST_DATA", Path(__file__).parents[1] / "../shared/data"))
 
@@ -191,7 +192,7 @@ def same(a, b):
 def touch_all(record):
     """Read what is lazy."""
     for value in [*vars(record).values(), *getattr(record, "pictures", {}).values()]:
-        if hasattr(value, "path"):
+        if isinstance(value, StoredArray):
             value[:]
 
 

@@ -334,7 +334,7 @@ def test_a_sources_own_points_become_the_scenes(scene, tmp_path, colored):
     colors = np.full((len(points), 3), 7, np.uint8) if colored else None
     fields = {key: scene[key] for key in ("names", "images", "Ks", "cam_from_world")}
     record = Capture(**fields, is_test=np.arange(16) % 8 == 0, points=points, point_colors=colors)
-    with artifact.publish(tmp_path / "c", Manifest("chebsplat.capture/1", KEY, "test")) as tmp:
+    with artifact.publish(tmp_path / "c", Manifest("chebsplat.capture/2", KEY, "test")) as tmp:
         write_capture(tmp, record)
     config = {"sfm": {"max_points": 100_000, "dense": "off"}}
     assert run_stage("sfm", tmp_path / "out", {"capture": tmp_path / "c"}, config) == 0

@@ -119,7 +119,7 @@ def one_photo(toy, tmp):
 def without_depth(toy, tmp):
     record = read_capture(toy["ingest"])
     record.depth = np.full(record.depth.shape, np.nan, np.float32)
-    return {"capture": published(tmp / "c", "chebsplat.capture/1", write_capture, record)}, TOY
+    return {"capture": published(tmp / "c", "chebsplat.capture/2", write_capture, record)}, TOY
 
 
 def teacher_of_nothing(toy, tmp):
@@ -139,7 +139,7 @@ def photos_apart(toy, tmp):
 def without_labels(toy, tmp):
     record = read_capture(toy["ingest"])
     record.labels = None
-    path = published(tmp / "c", "chebsplat.capture/1", write_capture, record)
+    path = published(tmp / "c", "chebsplat.capture/2", write_capture, record)
     return {"capture": path}, TOY
 
 
@@ -147,13 +147,13 @@ def without_points(toy, tmp):
     record = read_points(toy["sfm"])
     for name in ("means", "colors", "normals", "covariances"):
         setattr(record, name, getattr(record, name)[:0])
-    return {"points": published(tmp / "p", "chebsplat.points/1", write_points, record)}, TOY
+    return {"points": published(tmp / "p", "chebsplat.points/2", write_points, record)}, TOY
 
 
 def only_test_views(toy, tmp):
     record = read_capture(toy["ingest"])
     record.is_test[:] = True
-    path = published(tmp / "c", "chebsplat.capture/1", write_capture, record)
+    path = published(tmp / "c", "chebsplat.capture/2", write_capture, record)
     return inputs_of(toy, "train") | {"capture": path}, TOY
 
 
@@ -170,7 +170,7 @@ def only_test_views_to_agree(toy, tmp):
 def without_gaussians(toy, tmp):
     record = read_gaussians(toy["train"])
     record.parameters = {name: values[:0] for name, values in record.parameters.items()}
-    return {"gaussians": published(tmp / "g", "chebsplat.gaussians/1", write_gaussians, record)}, TOY
+    return {"gaussians": published(tmp / "g", "chebsplat.gaussians/2", write_gaussians, record)}, TOY
 
 
 def nothing_to_refine(toy, tmp):
@@ -192,14 +192,14 @@ def encoder_without_attention(toy, tmp):
 def no_test_view(toy, tmp):
     record = read_capture(toy["ingest"])
     record.is_test[:] = False
-    path = published(tmp / "c", "chebsplat.capture/1", write_capture, record)
+    path = published(tmp / "c", "chebsplat.capture/2", write_capture, record)
     return inputs_of(toy, "evaluate") | {"capture": path}, TOY
 
 
 def without_trace(toy, tmp):
     record = read_gaussians(toy["train"])
     record.trace = []
-    path = published(tmp / "g", "chebsplat.gaussians/1", write_gaussians, record)
+    path = published(tmp / "g", "chebsplat.gaussians/2", write_gaussians, record)
     return inputs_of(toy, "report") | {"gaussians": path}, TOY
 
 

@@ -51,7 +51,7 @@ def published_capture(path, images, labels=None, class_names=tuple(COLORS)):
         [f"view_{k:03d}" for k in range(n)], images, np.tile(np.eye(3), (n, 1, 1)), None, np.arange(n) % 4 == 0,
         labels=None if labels is None else labels.astype(np.int16), class_names=list(class_names) or None,
     )  # fmt: skip
-    with artifact.publish(path, Manifest("chebsplat.capture/1", KEY, "ingest")) as tmp:
+    with artifact.publish(path, Manifest("chebsplat.capture/2", KEY, "ingest")) as tmp:
         write_capture(tmp, record)
     return path
 
@@ -143,7 +143,7 @@ def test_channels_are_reduced_in_every_view_and_the_labels_are_the_teacher_s(tmp
     write_table(tmp_path / "tiny.npz", embeddings=np.array(list(COLORS.values())) @ wide.T)
     matrix = np.linalg.qr(np.concatenate([wide, rng.normal(size=(100, 5))], 1))[0].astype(np.float32)
     record = ChannelMap(matrix, matrix.T.copy(), np.ones(100, np.float32), "tiny", {})
-    with artifact.publish(tmp_path / "channels", Manifest("chebsplat.channels/1", KEY, "channels")) as tmp:
+    with artifact.publish(tmp_path / "channels", Manifest("chebsplat.channels/2", KEY, "channels")) as tmp:
         write_channels(tmp, record)
     code, found = encoded(tmp_path, capture, tmp_path / "tiny.onnx", {"channels": tmp_path / "channels"})
     assert code == 0

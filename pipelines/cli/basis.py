@@ -49,7 +49,7 @@ def log(name: str, out: Path | None) -> None:
             writer = csv.DictWriter(handle, list(rows[0]))
             writer.writeheader()
             writer.writerows(rows)
-        share = artifact.stated(path, artifact.read_manifest(path), "config", "cks", "max_rank", kind=(int, float))
+        share = artifact.read_manifest(path).config["cks"]["max_rank"]
         lineage.draw(out / "lineage.png", one, share)
         print(f"{out}: lineage.csv, lineage.png", file=sys.stderr)
 

@@ -4,14 +4,11 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Any
-
-from annotated_types import Len
+from typing import Any
 
 from chebsplat.evaluation import protocols
 from chebsplat.evaluation.statistics import Difference, Summary, paired_difference, summarize
 from chebsplat.formats import artifact
-from chebsplat.formats.documents import Count, TypedDict, read_document
 from chebsplat.formats.evaluation import read_figures
 from chebsplat.formats.gaussians import read_trace
 from chebsplat.pipelines.studies.study import Run
@@ -58,10 +55,6 @@ POOLED = ("miou", "miou_gain", "macc", "oa")  # what a protocol may work out ove
 COLUMNS = (*IDENTITY, *(figure.key for figure in FIGURES), *OTHERS)
 
 
-class ByDegree(TypedDict):
-    by_degree: Annotated[list[Count], Len(1, 4)]
-
-
 def row_of(run: Run, failed: dict[str, tuple[int, str, Path]]) -> Row:
     """One run's figures; None where a thing was not measured. `state` is `done`, or why there are none.
 
@@ -82,11 +75,10 @@ def row_of(run: Run, failed: dict[str, tuple[int, str, Path]]) -> Row:
         return row | {"state": f"{stage} failed with exit code {code}: {message}"}
     evaluation, train, scene = (artifact.read_manifest(targets[stage]) for stage in ("evaluate", "train", "export"))
     figures = read_figures(targets["evaluate"], evaluation)
-    summary = read_document(targets["export"], scene, "summary.json", ByDegree)
     trace = read_trace(targets["train"], train)
     segmentation = figures.get("segmentation") or {}
     row |= segmented(segmentation.get("scene", {}), segmentation.get("teacher", {}))
-    counts, guidance = summary["by_degree"], train.facts.get("guidance", {})
+    counts, guidance = scene.facts["by_degree"], train.facts.get("guidance", {})
     kept = sum(n * (degree + 1) ** 2 for degree, n in enumerate(counts))
     return row | {
         "state": "done",
