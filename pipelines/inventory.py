@@ -140,7 +140,8 @@ def _made_of(title: str, manifests: dict[str, Any]) -> set[str]:
 
 def others(folder: Path) -> list[str]:
     """What lies in a scene's folder and is none of ours; it is never removed."""
-    return sorted(e.name for e in os.scandir(folder) if not e.is_symlink() and e.name not in (QUERIES, PAGE))
+    own = QUERIES, PAGE
+    return sorted(e.name for e in os.scandir(folder) if not e.is_symlink() and e.name not in own)
 
 
 def unlink(folder: Path) -> None:

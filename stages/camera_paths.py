@@ -18,7 +18,7 @@ LEAST_SURE = 0.5  # of `cameras.common_up`, below which the orbit's plane is tha
 def path_of(scene: OpenedScene, path: str, n_frames: int | None) -> list[Camera]:
     """`capture`: the capture's cameras; `orbit`: an orbit among them; otherwise a .json file's.
 
-    Args:   n_frames: of the orbit (None: 120), or of a path through the cameras (None: these alone).
+    Args:   n_frames: of the orbit (None: 120), or of a path through the cameras (None: no path).
     Raises: ConfigError if it is none of these; InputError if the file's cameras cannot be used.
     """
     from chebsplat.stages.camera_files import read_cameras
@@ -75,7 +75,7 @@ def between(keys: list[Camera], n_frames: int) -> list[Camera]:
     if len(keys) < 2 or n_frames < 2:
         raise ConfigError("a path through cameras needs two of them, and --frames 2 at least")
     if len({(key.width, key.height) for key in keys}) > 1:
-        raise ConfigError("a path needs cameras of one size; leave out --frames to render them alone")
+        raise ConfigError("a path needs cameras of one size; without --frames each is rendered alone")
     poses, times = np.stack([camera.cam_from_world for camera in keys]), np.arange(len(keys))
     at = np.linspace(0, len(keys) - 1, n_frames)
     turns = Slerp(times, Rotation.from_matrix(poses[:, :3, :3]))(at).as_matrix()

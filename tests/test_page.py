@@ -195,7 +195,7 @@ def test_an_existing_file_stays(scene, tmp_path):
     assert (done.exit_code, out.read_text()) == (2, "mine")
 
 
-def test_viewing_writes_the_page_anew_into_the_scene_s_folder_and_opens_it(scene, tmp_path, monkeypatch):
+def test_viewing_writes_the_page_anew_beside_the_scene_and_opens_it(scene, tmp_path, monkeypatch):
     opened, ply = [], foreign_ply(tmp_path / "theirs.ply")
     monkeypatch.chdir(tmp_path)
     monkeypatch.setenv("BROWSER", "a browser")
@@ -241,8 +241,8 @@ def test_the_page_s_camera_path_is_a_file_that_render_flies_along(scene, page, t
         np.testing.assert_allclose(key.cam_from_world, view.cam_from_world, atol=1e-5)
         np.testing.assert_allclose(key.K, view.K)
         assert (key.width, key.height) == (view.width, view.height)
-    command = ["render", str(scene[0]), "--path", str(file), "--frames", "3", "--out", str(tmp_path / "frames")]
-    assert CliRunner().invoke(main, command).exit_code == 0
+    command = ["render", scene[0], "--path", file, "--frames", 3, "--out", tmp_path / "frames"]
+    assert CliRunner().invoke(main, list(map(str, command))).exit_code == 0
     names = sorted(frame.name for frame in (tmp_path / "frames/color").iterdir())
     assert names == ["path_0000.png", "path_0001.png", "path_0002.png"]
 
@@ -250,7 +250,8 @@ def test_the_page_s_camera_path_is_a_file_that_render_flies_along(scene, page, t
 @pytest.mark.skipif(shutil.which("node") is None, reason="node is not installed")
 def test_a_link_holds_the_camera_and_one_that_does_not_gives_none():
     about = {"views": ["a", "b"], "center": [4.0, -2.5, 100.0]}
-    at = {"view": 1, "pivot": 0.25, "eye": [1.0, -2.0, 0.5], "turn": [0.8, 0, 0.6, 0, 1, 0, -0.6, 0, 0.8]}
+    turn = [0.8, 0, 0.6, 0, 1, 0, -0.6, 0, 0.8]
+    at = {"view": 1, "pivot": 0.25, "eye": [1.0, -2.0, 0.5], "turn": turn}
     found = in_node("camera_of(link_of(given[0], given[1]), given[1])", [at, about])
     for name, value in at.items():
         np.testing.assert_allclose(found[name], value, atol=1e-5)

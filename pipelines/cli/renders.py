@@ -19,7 +19,7 @@ PATH = click.option(
 FRAMES = click.option(
     "--frames",
     type=click.IntRange(1, 100_000),
-    help="of an orbit (default: 120), or of a flight through the other cameras (default: these alone)",
+    help="of an orbit (default: 120), or of a flight through other cameras (default: none)",
 )
 SIZE = click.option("--size", help="WIDTHxHEIGHT in pixels, such as 1280x960; default: the cameras' own")
 SH = click.option(
@@ -157,8 +157,10 @@ def _write_page(scene: str, out: Path, sh: int, words: Path | None, against: str
     logging.basicConfig(stream=sys.stderr, format="page: %(message)s", level="WARNING", force=True)
     logging.getLogger("chebsplat").setLevel("INFO")
     theirs = scene.endswith(".ply")
-    opened = foreign(Path(scene).expanduser()) if theirs else read_scene(artifact_of(scene, "export"))
-    teacher = None if theirs else teacher_of(scene)
+    if theirs:
+        opened, teacher = foreign(Path(scene).expanduser()), None
+    else:
+        opened, teacher = read_scene(artifact_of(scene, "export")), teacher_of(scene)
     phrases = [word.strip() for word in against.split(",") if word.strip()]
     more = list(read_label_set(words)) if words else []
     counts = write_page(opened, _name(scene), teacher, out, sh, phrases, more)
