@@ -38,9 +38,8 @@ slurm: $(READY)
 	@$(PY) -c 'import snakemake_executor_plugin_slurm' 2>/dev/null || \
 	  $(PY) -m uv pip install --quiet --python $(PY) --editable '.[slurm]'
 
-view: $(READY)  ## make view scene=NAME|FOLDER|FILE.ply [port=8080]: look at a finished scene in a browser, live
-	@$(PY) -c 'import viser' 2>/dev/null || $(PY) -m uv pip install --quiet --python $(PY) --editable '.[view]'
-	@$(CHEBSPLAT) view '$(scene)' $(if $(port),--port '$(port)')
+view: $(READY)  ## make view scene=NAME|FOLDER|FILE.ply [args=]: write a finished scene as a page and open it in the browser
+	@$(CHEBSPLAT) view '$(scene)' $(args)
 
 plan: $(READY)  ## make plan scene=NAME (or study=NAME): what would run, what is fresh, what is left out, and why
 	@$(CHEBSPLAT) $(if $(study),study '$(study)' --plan,plan $(CHOICE)) $(if $(device),--device '$(device)')

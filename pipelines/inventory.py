@@ -16,7 +16,7 @@ from chebsplat.pipelines import folders, store, summary
 from chebsplat.pipelines.finished import is_artifact, links, scene_folder, titles
 from chebsplat.stages.registry import STAGES
 
-QUERIES = "query"  # answers of `chebsplat query`, in a scene's folder
+QUERIES, PAGE = "query", "view.html"  # of `chebsplat query` and `view`, in a scene's folder
 
 
 @dataclass(frozen=True)
@@ -140,13 +140,14 @@ def _made_of(title: str, manifests: dict[str, Any]) -> set[str]:
 
 def others(folder: Path) -> list[str]:
     """What lies in a scene's folder and is none of ours; it is never removed."""
-    return sorted(e.name for e in os.scandir(folder) if not e.is_symlink() and e.name != QUERIES)
+    own = QUERIES, PAGE
+    return sorted(e.name for e in os.scandir(folder) if not e.is_symlink() and e.name not in own)
 
 
 def unlink(folder: Path) -> None:
-    """Remove a scene's links and queries, and the folder if that leaves it empty."""
+    """Remove a scene's links, queries and page, and the folder if that leaves it empty."""
     for entry in list(os.scandir(folder)):
-        if entry.is_symlink():
+        if entry.is_symlink() or entry.name == PAGE:
             os.unlink(entry.path)
     if not (folder / QUERIES).is_symlink():
         shutil.rmtree(folder / QUERIES, ignore_errors=True)

@@ -1,4 +1,4 @@
-"""A generated scene for pages and viewers: the inside of a box with a sofa and a chair, and a teacher of ten words."""
+"""A generated scene for pages: the inside of a box with a sofa and a chair, and a teacher of ten words."""
 
 import numpy as np
 from shared import KEY
