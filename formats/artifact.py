@@ -12,6 +12,7 @@ import os
 import shutil
 import stat
 from collections.abc import Iterator, Mapping
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
 from dataclasses import asdict
 from pathlib import Path
@@ -197,13 +198,17 @@ def _file_table(root: Path) -> dict[str, dict[str, Any]]:
 def _settle_tree(root: Path) -> None:
     """Make files outlive a power cut, and as readable as the user's umask has made their folder: some writers give a
     file to its owner alone.
+
+    Choices: eight at a time, since a disk writes many files in little more time than one.
     """
     mode = root.stat().st_mode & 0o666
-    for path in root.rglob("*"):
-        if path.is_file():
-            with path.open("rb") as handle:
-                os.fchmod(handle.fileno(), mode)
-                os.fsync(handle.fileno())
+
+    def settle(path: Path) -> None:
+        path.chmod(mode)
+        sync(path)
+
+    with ThreadPoolExecutor(8) as threads:
+        list(threads.map(settle, _members(root).values()))
     sync(root)
 
 
