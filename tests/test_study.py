@@ -391,6 +391,30 @@ def test_a_wrong_study_is_an_error_that_names_what_is_wrong(changes, message):
         expand(study(**changes))
 
 
+def test_a_study_that_extends_another_has_its_values_but_for_its_own_and_names_what_it_takes():
+    base = read_study("parts")
+    own = {"extends": "parts", "title": "T", "seeds": [7], "variants": ["no-tle", "features-only"]}
+    found = checked_study(own, "mine")
+    assert (found.title, found.seeds) == ("T", [7])
+    assert (found.about, found.scenes, found.budgets) == (base.about, base.scenes, base.budgets)
+    assert found.variants == {name: base.variants[name] for name in ("no-tle", "features-only")}
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"extends": "prats"}, "no study is called prats; did you mean parts"),
+        ({"extends": "method-long"}, "mine: method-long itself extends parts; extend that"),
+        ({"variants": ["full", "half"]}, "mine: variants: 'half' is none of full, features-only"),
+        ({"conditions": ["noise"]}, "mine: conditions: 'noise' is none of"),
+        ({"variants": ["full"]}, "'features-only' is none of its variants"),
+    ],
+)
+def test_an_extension_of_what_is_not_there_is_an_error_that_names_it(changes, message):
+    with pytest.raises(ConfigError, match=message):
+        checked_study({"extends": "parts"} | changes, "mine")
+
+
 def test_a_study_may_be_a_file_of_the_user_s(tmp_path):
     (tmp_path / "mine.toml").write_text(
         'title = "M"\nabout = ""\nscenes = ["toy"]\nbaseline = "a"\n[variants.a]\n[variants.b.train]\nsteps = 5\n'
@@ -472,32 +496,3 @@ ablation = "features-only"
         assert all(seen["shown"])
         first = "photo | features-only"
         assert seen["layers"] == {first: 2, first.replace("photo", "true labels"): 4}
-
-
-def test_a_study_that_is_done_is_written_again_only_where_something_has_changed(tmp_path):
-    from click.testing import CliRunner
-
-    from chebsplat.pipelines.cli import main
-
-    file, out = tmp_path / "toys.toml", tmp_path / "out"
-    text = 'title = "T"\nabout = "A"\nscenes = ["toy"]\nseeds = [0]\nbaseline = "less"\n[variants]\nfull = {}\n'
-    file.write_text(text + 'less = { ablation = "features-only" }\n')
-    for run in expand(read_study(str(file)), running=True):
-        finish(run)
-
-    def written(*more):
-        done = CliRunner().invoke(main, ["study", str(file), "--out", str(out), "--cores", "2", *more])
-        assert done.exit_code == 0, done.stderr
-        assert done.stdout == f"{out / 'study.html'}\n"
-        return (out / "study.html").stat().st_mtime_ns
-
-    first = written()
-    assert written() == first
-    (out / "results.csv").unlink()
-    second = written()
-    assert second > first and (out / "results.csv").is_file()
-    third = written("--threads", "1")  # the page names its command
-    assert third > second
-    file.write_text(file.read_text().replace('"A"', '"B"'))
-    assert written("--threads", "1") > third
-    assert "B" in (out / "study.html").read_text()

@@ -16,12 +16,11 @@ BY_SCENE = ("miou", "miou_gain", "psnr", "n_gaussians", "train_seconds")
 
 @dataclass(frozen=True)
 class Section:
-    """A part of the page; `table` begins with its header, `picture` lies beside the page."""
+    """A part of the page; `table` begins with its header."""
 
     heading: str
     note: str
     table: list[list[str]]
-    picture: str = ""
 
 
 def number(value: float, figure: Figure) -> str:
