@@ -34,11 +34,13 @@ def files(folder):
 class Hub:
     """files: name -> bytes; sums: checksums that are told, where they differ from the true ones.
 
-    cut: bytes of the large file after which a connection ends; asked: (method, path, range) of every request.
+    cut: bytes of the large file after which a connection ends; asked: (method, path) of every request;
+    revisions: those that are there.
     """
 
     def __init__(self, served):
         self.files, self.sums, self.cut, self.asked = served, {}, None, []
+        self.revisions = ("main", COMMIT)
 
     def checksum(self, name):
         data = self.files[name]
@@ -65,12 +67,16 @@ def serving(hub):
                 self.wfile.write(body)
 
         def do_HEAD(self):
-            hub.asked.append((self.command, self.path, self.headers.get("Range")))
-            found = re.fullmatch(rf"/{REPOSITORY}/resolve/(main|{COMMIT})/(.+)", self.path)
+            hub.asked.append((self.command, self.path))
+            found = re.fullmatch(rf"/{REPOSITORY}/resolve/(\w+)/(.+)", self.path)
             if self.path.startswith("/large/"):
-                return self.large(hub.files[self.path.removeprefix("/large/")])
+                data = hub.files[self.path.removeprefix("/large/")]
+                self.close_connection = True
+                return self.answer(200, {"Content-Length": len(data)}, data[: hub.cut])
             if not self.path.startswith(f"/{REPOSITORY}/"):
                 return self.answer(401, {"X-Error-Code": "RepoNotFound"})
+            if found and found[1] not in hub.revisions:
+                return self.answer(404, {"X-Error-Code": "RevisionNotFound"})
             if not found or found[2] not in hub.files:
                 return self.answer(404, {"X-Error-Code": "EntryNotFound", "X-Repo-Commit": COMMIT})
             name, known = found[2], {"X-Repo-Commit": COMMIT}
@@ -80,14 +86,6 @@ def serving(hub):
             return self.answer(302, known | {"Location": f"{elsewhere}/large/{name}"})
 
         do_GET = do_HEAD
-
-        def large(self, data):
-            start = int(re.fullmatch(r"bytes=(\d+)-", self.headers.get("Range") or "bytes=0-")[1])
-            self.send_response(206 if start else 200)
-            self.send_header("Content-Length", str(len(data) - start))
-            self.end_headers()
-            self.wfile.write(data[start : hub.cut])
-            self.close_connection = True
 
     server = ThreadingHTTPServer(("127.0.0.1", 0), Handler)
     server.daemon_threads = True
