@@ -1,21 +1,88 @@
 """Teachers from a stand-in of the hub: whole, interrupted, damaged, out of reach. The hub itself is never asked."""
 
+import hashlib
+import json
 import os
+import re
 import subprocess
 import sys
+import threading
+from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
 
 import numpy as np
 import pytest
-import stand_in_hub
-from stand_in_hub import COMMIT, REPOSITORY, Hub, serving
+from onnx import helper
+from tiny_teachers import write_model
 
 from chebsplat.errors import ConfigError, InputError
 from chebsplat.formats.teacher_model import read_teacher
 from chebsplat.stages import teacher_check
 from chebsplat.stages.get_teacher import get_teacher, parsed
 
+REPOSITORY, COMMIT, CLASSES = "some/Segmenter-B0", "c" * 40, ["wall", "floor", "sofa: a seat", "wall"]
 NAME, SHORT = f"hf:{REPOSITORY}", "segmenter-b0"
+PREPARATION = {"size": {"height": 64, "width": 64}, "image_mean": [0.485, 0.456, 0.406], "image_std": [0.2, 0.2, 0.2]}
+
+
+def segmenter(path):
+    """Bytes of a segmenter whose logits are [1, C, h / 4, w / 4], and that is large enough to break off."""
+    rng = np.random.default_rng(0)
+    constants = {"kernel": rng.normal(size=(len(CLASSES), 3, 4, 4)), "padding": rng.normal(size=100_000)}
+    constants = {name: values.astype(np.float32) for name, values in constants.items()}
+    node = helper.make_node("Conv", ["image", "kernel"], ["logits"], strides=[4, 4])
+    shape = ("batch_size", "num_channels", "height", "width")
+    write_model(path, [node], ("logits",), shape, constants=constants)
+    return path.read_bytes()
+
+
+class Hub(ThreadingHTTPServer):
+    """Of one repository, whose checksums may be false (`sums`) and whose answers are `cut`; `asked`: its requests."""
+
+    daemon_threads = True
+
+    def __init__(self, folder):
+        super().__init__(("127.0.0.1", 0), Answer)
+        self.address = f"http://127.0.0.1:{self.server_port}"
+        self.sums, self.cut, self.asked, self.revisions = {}, None, [], ("main", COMMIT)
+        self.files = {
+            "config.json": json.dumps({"id2label": dict(enumerate(CLASSES))}).encode(),
+            "preprocessor_config.json": json.dumps(PREPARATION).encode(),
+            "onnx/model.onnx": segmenter(folder / "served.onnx"),
+        }
+
+    def checksum(self, name):
+        data = self.files[name]
+        true = hashlib.sha256(data) if name.endswith(".onnx") else hashlib.sha1(b"blob %d\0" % len(data) + data)
+        return self.sums.get(name, true.hexdigest())
+
+
+class Answer(BaseHTTPRequestHandler):
+    def log_message(self, *_):
+        pass
+
+    def do_HEAD(self):
+        hub = self.server
+        hub.asked.append((self.command, self.path))
+        found = re.fullmatch(rf"/{REPOSITORY}/resolve/(\w+)/(.+)", self.path)
+        code, headers, data = 200, {"X-Repo-Commit": COMMIT}, b""
+        if not found:
+            code, headers = 401, {"X-Error-Code": "RepoNotFound"}
+        elif found[1] not in hub.revisions:
+            code, headers = 404, {"X-Error-Code": "RevisionNotFound"}
+        elif found[2] not in hub.files:
+            code, headers = 404, {"X-Error-Code": "EntryNotFound"}
+        else:
+            data = hub.files[found[2]]
+            headers |= {"ETag": f'"{hub.checksum(found[2])}"'}
+        self.send_response(code)
+        for header in {"Content-Length": str(len(data)), **headers}.items():
+            self.send_header(*header)
+        self.end_headers()
+        if self.command == "GET":
+            self.wfile.write(data[: hub.cut])
+
+    do_GET = do_HEAD
 
 
 @pytest.fixture
@@ -29,11 +96,13 @@ def hub(constants, tmp_path, monkeypatch):
     photo = np.random.default_rng(0).integers(0, 255, (48, 64, 3), np.uint8)
     monkeypatch.setattr(teacher_check, "shown", lambda _: ("photo", photo))
     monkeypatch.setattr(constants, "HF_HUB_CACHE", str(tmp_path / "cache"))
+    monkeypatch.setattr("time.sleep", lambda _: None)  # where the client waits, and tries again
     monkeypatch.chdir(tmp_path)
-    found = Hub(stand_in_hub.files(tmp_path))
-    with serving(found) as address:
-        ask(constants, monkeypatch, address)
+    with Hub(tmp_path) as found:
+        threading.Thread(target=found.serve_forever, daemon=True).start()
+        ask(constants, monkeypatch, found.address)
         yield found
+        found.shutdown()
 
 
 def ask(constants, monkeypatch, address):
@@ -61,8 +130,7 @@ def test_a_repository_becomes_a_teacher_of_three_files(hub, tmp_path):
     assert hub.asked == []
 
 
-def test_a_download_that_broke_off_leaves_nothing_half(hub, tmp_path, monkeypatch):
-    monkeypatch.setattr("time.sleep", lambda _: None)  # the client waits, and tries again
+def test_a_download_that_broke_off_leaves_nothing_half(hub, tmp_path):
     hub.cut = 200_000
     with pytest.raises(InputError, match=r"onnx/model.onnx broke off \(.*\); run the same command again"):
         get_teacher(NAME)
@@ -71,7 +139,7 @@ def test_a_download_that_broke_off_leaves_nothing_half(hub, tmp_path, monkeypatc
     model, _ = get_teacher(NAME)
     assert model.read_bytes() == hub.files["onnx/model.onnx"]
     got = [path for method, path in hub.asked if method == "GET"]
-    assert got == ["/large/onnx/model.onnx"]  # and the small files not again
+    assert got == [f"/{REPOSITORY}/resolve/main/onnx/model.onnx"]  # and the small files not again
 
 
 @pytest.mark.parametrize("name", ["onnx/model.onnx", "config.json"])
@@ -148,9 +216,8 @@ def command(tmp_path, *arguments, **environment):
     return subprocess.run(call, cwd=tmp_path, env=environment, capture_output=True, text=True)
 
 
-def test_the_command_takes_the_hub_that_the_environment_names(constants, tmp_path):
-    with serving(Hub(stand_in_hub.files(tmp_path))) as address:
-        done = command(tmp_path, NAME, "--out", "mine", HF_ENDPOINT=address)
+def test_the_command_takes_the_hub_that_the_environment_names(hub, tmp_path):
+    done = command(tmp_path, NAME, "--out", "mine", HF_ENDPOINT=hub.address)
     assert (done.returncode, done.stdout) == (0, f"mine/{SHORT}.onnx\n"), done.stderr
     assert "teacher.model=mine/" in done.stderr and "sees" in done.stderr
 
@@ -160,7 +227,6 @@ def test_without_a_network_the_cache_serves_and_what_it_has_not_is_one_line_with
 ):
     get_teacher(NAME, tmp_path / "a")
     ask(constants, monkeypatch, "http://127.0.0.1:9")
-    monkeypatch.setattr("time.sleep", lambda _: None)  # the client waits, and tries again
     assert get_teacher(NAME, tmp_path / "b")[0].is_file()
     with pytest.raises(InputError, match=r"cache and http://127.0.0.1:9 is not reached; connect, or set HF_ENDPOINT"):
         get_teacher("segformer-b0-ade")
