@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import itertools
-import os
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -12,12 +11,11 @@ from typing import Annotated, Any
 from pydantic import AfterValidator, Field, model_validator
 
 from chebsplat.errors import ConfigError
-from chebsplat.formats.files import parse_toml
 from chebsplat.pipelines import store
 from chebsplat.pipelines.cluster import LOCAL
 from chebsplat.pipelines.plan import Plan, Planner, Step, merged, suffix
 from chebsplat.pipelines.run import Outcome, say, snakemake, wanted_steps
-from chebsplat.pipelines.scenes import read_toml, scene_values
+from chebsplat.pipelines.scenes import read_named, read_toml, scene_values
 from chebsplat.pipelines.sequences import scenes_of
 from chebsplat.pipelines.studies.progress import reported
 from chebsplat.stages.config import checked
@@ -117,11 +115,7 @@ def read_study(name: str) -> Study:
 
     Raises ConfigError naming the first bad key, or the nearest study's name.
     """
-    if not store.is_name(Path(name).stem):
-        raise ConfigError(f"no study can be called {name}: its links lie in the work folder")
-    if name.endswith(".toml"):
-        return checked_study(parse_toml(Path(os.path.expanduser(name)), "correct it", ConfigError), name)
-    return checked_study(read_toml("studies", name), f"study {name}")
+    return checked_study(read_named("studies", name), f"study {name}")
 
 
 def checked_study(values: dict[str, Any], origin: str) -> Study:
