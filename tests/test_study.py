@@ -446,53 +446,17 @@ evaluate = {{ lpips_weights = "{tmp_path}/vgg.safetensors" }}
 train = {{ sh_degree = 2 }}
 """)
     command = [sys.executable, "-m", "chebsplat.pipelines.cli", "study", str(tmp_path / "mine.toml")]
-    command += ["--cores", "2", "--threads", "1", "--out", str(tmp_path / "out")]
+    command += ["--cores", "1", "--threads", "2", "--out", str(tmp_path / "out")]
     for to_run in (
         "1 ingest, 1 sfm, 1 teacher, 1 agree, 1 describe, 2 train, 2 lift, 2 refine, 2 export, 2 evaluate",
         "1 evaluate",
     ):
         done = subprocess.run(command, capture_output=True, text=True, cwd=ROOT, env=os.environ)
         assert done.returncode == 3, done.stderr
-        assert f"toy, seed 0: to run: {to_run}; 2 at once, 1 threads each" in done.stderr
+        assert f"toy, seed 0: to run: {to_run}; 1 at once, 1 threads each" in done.stderr
         assert done.stdout.strip() == str(tmp_path / "out/study.html")
         with (tmp_path / "out/results.csv").open() as handle:
             states = {row["variant"]: row["state"] for row in csv.DictReader(handle)}
         assert states["whole"] == "done"
         assert states["breaks"].startswith("evaluate failed with exit code 3: ")
     assert len(list(work.glob("store/evaluate/*/artifact.json"))) == 1
-
-
-@pytest.mark.slow
-@pytest.mark.xdist_group("cli")
-def test_a_study_by_the_clock_spends_its_seconds_shares_the_machine_and_makes_a_page_for_a_browser(tmp_path, work):
-    (tmp_path / "clock.toml").write_text("""
-title = "By the clock"
-about = "One variant, two budgets."
-scenes = ["toy"]
-baseline = "features-only"
-budgets = { steps = [5], seconds = [8] }
-[settings]
-teacher = { kind = "labels" }
-sfm = { max_points = 200 }
-[variants.features-only]
-ablation = "features-only"
-""")
-    command = [sys.executable, "-m", "chebsplat.pipelines.cli", "study", str(tmp_path / "clock.toml")]
-    command += ["--cores", "1", "--threads", "2", "--out", str(tmp_path / "out")]
-    done = subprocess.run(command, capture_output=True, text=True, cwd=ROOT, env=os.environ)
-    assert done.returncode == 0, done.stderr
-    assert "1 at once, 1 threads each" in done.stderr  # no more threads than cores
-    with (tmp_path / "out/results.csv").open() as handle:
-        rows = {row["budget"]: row for row in csv.DictReader(handle)}
-    assert set(rows) == {"5 steps", "8 s"}
-    assert rows["5 steps"]["steps"] == "5"
-    assert rows["8 s"]["threads"] == "1"
-    assert 7 < float(rows["8 s"]["train_seconds"]) < 20  # the step in which they run out is finished
-    assert int(rows["8 s"]["steps"]) > 5
-    if BROWSER is not None:
-        seen, console, requests = browsed(tmp_path, (tmp_path / "out/study.html").read_text(), 390)
-        assert seen["problems"] == console == requests == []
-        assert seen["wide"] <= 390
-        assert all(seen["shown"])
-        first = "photo | features-only"
-        assert seen["layers"] == {first: 2, first.replace("photo", "true labels"): 4}

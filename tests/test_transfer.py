@@ -1,4 +1,4 @@
-"""What a study of sequences says of knowledge: gains, returns, and pairs."""
+"""What a study of sequences says of knowledge: gains, returns, pairs, and how soon a variant is as good."""
 
 import pytest
 from shared import ROOT
@@ -8,7 +8,7 @@ from chebsplat.errors import ConfigError
 from chebsplat.pipelines.studies import reaching, transfer
 from chebsplat.pipelines.studies.page import write
 from chebsplat.pipelines.studies.results import row_of
-from chebsplat.pipelines.studies.study import expand
+from chebsplat.pipelines.studies.study import Budgets, expand
 
 
 @pytest.fixture(autouse=True)
@@ -16,6 +16,22 @@ def work(tmp_path, monkeypatch):
     monkeypatch.setenv("CHEBSPLAT_WORK", str(tmp_path / "work"))
     monkeypatch.delenv("REPLICA_ROOT", raising=False)
     monkeypatch.chdir(ROOT)
+
+
+@pytest.mark.parametrize(
+    ("points", "x", "share"),
+    [
+        ([(10, 0.4), (20, 0.6)], 15, "60 %"),
+        ([(20, 0.6), (10, 0.4)], 15, "60 %"),  # whatever their order
+        ([(10, 0.5), (20, 0.6)], 10, "≤ 40 %"),
+        ([(10, 0.5)], 10, "40 %"),
+        ([(10, 0.1), (20, 0.4)], 20, "> 80 %"),
+        ([(10, 0.1), (20, 0.6), (30, 0.3)], 18, "72 %"),  # it got there, though it did not stay
+    ],
+)
+def test_a_curve_reaches_a_value_where_its_line_first_does(points, x, share):
+    found = reaching.reach(points, 0.5)
+    assert (found.x, found.share(25)) == (pytest.approx(x), share)
 
 
 BUDGETS = {"steps": [10, 20]}
@@ -69,6 +85,8 @@ def test_a_variant_that_has_not_finished_leaves_nothing_to_compare(finished, tmp
         if row["variant"] == "both":
             row["miou"] = None
     assert transfer.sections(asked, rows) == []
+    assert reaching.sections(asked, [row for row in rows if row["variant"] == "both"]) == []
+    assert reaching.sections(asked.model_copy(update={"budgets": Budgets(steps=[20])}), rows) == []
 
 
 def test_pairs_name_variants():
