@@ -23,7 +23,7 @@ from chebsplat.pipelines.studies.page import write
 from chebsplat.pipelines.studies.pictures import gallery
 from chebsplat.pipelines.studies.results import compare, row_of, traces
 from chebsplat.pipelines.studies.study import Study, checked_study, execute, expand, outstanding, read_study
-from chebsplat.pipelines.studies.tables import Section, stability
+from chebsplat.pipelines.studies.tables import Section
 from chebsplat.stages.registry import STAGES
 
 
@@ -284,13 +284,6 @@ def test_without_a_single_result_the_page_says_so(tmp_path):
     runs = expand(study(seeds=[0]))
     page = write(tmp_path, study(seeds=[0]), runs, [row_of(run, {}) for run in runs], "c")
     assert page.read_text().count("not run yet") == 2
-
-
-def test_the_page_sums_up_the_extreme_cases_by_part(tmp_path):
-    rows = ["module,case,error,tolerance,passed", "fusion,a,1e-7,1e-6,True", "fusion,b,0,0,True", "pruning,c,2,1,False"]
-    (tmp_path / "stability.csv").write_text("\n".join(rows))
-    assert stability(tmp_path / "stability.csv") == [("fusion", 2, 0, pytest.approx(0.1)), ("pruning", 1, 1, 2.0)]
-    assert stability(tmp_path / "none.csv") == []
 
 
 def test_a_figure_may_be_drawn_against_a_setting(tmp_path):

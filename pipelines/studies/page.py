@@ -21,7 +21,6 @@ from chebsplat.pipelines.studies.tables import (
     missing,
     scene_table,
     shown_figures,
-    stability,
     table_row,
     tables,
 )
@@ -29,7 +28,6 @@ from chebsplat.pipelines.studies.tables import (
 PAGE = Path(__file__).with_name("page.html")  # a jinja2 template; it fetches nothing from anywhere
 NAME = "study.html"
 PICTURE = "error-against-time.png"
-STABILITY = Path("build/bench/stability.csv")  # of `make stability`
 NARROW = 1100  # pixels of a screen; the comparison's tables take more
 
 
@@ -58,7 +56,6 @@ def write(
         "scenes": scene_table(rows),
         "missing": missing(rows),
         "note": note(study, rows),
-        "stability": stability(STABILITY),
         "more": more,
         "left_out": left_out(rows),
     }
@@ -156,9 +153,6 @@ def markdown(parts: dict[str, Any]) -> str:
         text += ["| " + " | ".join(row) + " |" for row in table[:1]]
         text += ["|" + "---|" * len(table[0])]
         text += ["| " + " | ".join(row) + " |" for row in table[1:]] + [""]
-    if parts["stability"]:
-        text += ["### Extreme cases (`make stability`)", "", "| part | cases | failed | largest error ÷ tolerance |"]
-        text += ["|---|---|---|---|", *(f"| {m} | {n} | {bad} | {e:.2g} |" for m, n, bad, e in parts["stability"]), ""]
     if parts["left_out"]:
         text += ["### Left out, and why", ""]
         text += [*(f"- {what}: {why} ({by})" for what, why, by in parts["left_out"]), ""]
