@@ -89,8 +89,7 @@ def artifact_of(scene: str, stage: str) -> Path:
 
     Raises: as `scene_folder`; ConfigError if the scene has no such artifact.
     """
-    path = Path(os.path.expanduser(scene))
-    if ("/" in scene or not links(store.work() / scene)) and is_artifact(path):
+    if path := _named(scene):
         return path
     folder = scene_folder(scene)
     if not is_artifact(folder / stage):
@@ -109,7 +108,12 @@ def teacher_of(scene: str) -> Path | None:
 
 def artifacts(scene: str) -> list[Path]:
     """All that a scene's links name, or the artifact alone that is named."""
+    path = _named(scene)
+    return [path] if path else list(links(scene_folder(scene)).values())
+
+
+def _named(scene: str) -> Path | None:
+    """The artifact that is named itself, if one is rather than a scene."""
     path = Path(os.path.expanduser(scene))
-    if ("/" in scene or not links(store.work() / scene)) and is_artifact(path):
-        return [path]
-    return list(links(scene_folder(scene)).values())
+    is_scene = "/" not in scene and links(store.work() / scene)
+    return path if is_artifact(path) and not is_scene else None

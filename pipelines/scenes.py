@@ -9,8 +9,10 @@ from pathlib import Path
 from typing import Any
 
 from chebsplat.errors import ConfigError, InputError
+from chebsplat.formats.files import parse_toml
 from chebsplat.formats.names import suggest
 from chebsplat.formats.videos import is_video
+from chebsplat.pipelines.store import is_name
 
 CONFIGS = Path(__file__).parent / "configs"
 ONE = {"scenes": "scene", "ablations": "ablation", "sequences": "sequence", "studies": "study"}
@@ -28,6 +30,18 @@ def read_toml(kind: str, name: str) -> dict[str, Any]:
         near = suggest(name, names(kind)) or names(kind)
         raise ConfigError(f"no {ONE[kind]} is called {shown(name)}; did you mean {', '.join(near)}?")
     return tomllib.loads((CONFIGS / kind / f"{name}.toml").read_text())
+
+
+def read_named(kind: str, name: str) -> dict[str, Any]:
+    """A config of ours by name, or a file of the user's that ends in .toml, after which links are called.
+
+    Raises ConfigError naming the file, or the nearest names.
+    """
+    if not is_name(Path(name).stem):
+        raise ConfigError(f"no {ONE[kind]} can be called {name}: its links lie in the work folder")
+    if name.endswith(".toml"):
+        return parse_toml(Path(os.path.expanduser(name)), "correct it", ConfigError)
+    return read_toml(kind, name)
 
 
 def shown(text: str) -> str:

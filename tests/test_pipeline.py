@@ -12,7 +12,7 @@ from shared import ROOT, finish, photo_folder, remember
 from chebsplat.errors import ConfigError, InputError
 from chebsplat.pipelines import store
 from chebsplat.pipelines.code import installed
-from chebsplat.pipelines.plan import Planner, overrides, suffix
+from chebsplat.pipelines.plan import Planner, suffix
 from chebsplat.pipelines.raw import content_hash, hashes
 from chebsplat.pipelines.run import failures, wanted_steps
 from chebsplat.pipelines.scenes import CONFIGS, names, read_toml
@@ -329,12 +329,6 @@ def test_every_config_of_ours_can_be_planned(kind, tmp_path, monkeypatch):
             assert Planner().plan(name).title == name
 
 
-def test_an_ablation_reuses_everything_before_training():
-    finish(Planner().plan("toy"))
-    assert stale(ablation="no-tle") == AFTER_TRAIN
-    assert Planner().plan("toy", "train.seed=3", "no-tle").title == "toy@no-tle+train.seed=3"
-
-
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
@@ -354,28 +348,6 @@ def test_a_wrong_name_is_an_error_that_suggests_the_nearest(arguments, message):
 def test_labels_cannot_be_asked_of_a_source_without_them(tmp_path):
     with pytest.raises(ConfigError, match=r"teacher\.model"):
         Planner().plan(photo_folder(tmp_path / "photos"), "teacher.kind=labels")
-
-
-def test_a_folder_that_is_not_there_is_an_input_error(tmp_path):
-    with pytest.raises(InputError, match="not a folder"):
-        Planner().plan(f"{tmp_path}/nowhere/")
-
-
-def test_set_takes_scalars_words_switches_and_lists():
-    found = overrides("train.albo=off,train.encoder=off,train.steps=5,teacher.scales=[0.75,1.0],source.kind=photos")
-    assert found["train"] == {"albo": False, "encoder": "off", "steps": 5}
-    assert found["teacher"] == {"scales": [0.75, 1.0]}
-    assert found["source"] == {"kind": "photos"}
-
-
-def test_a_sequence_carries_the_basis_from_scene_to_scene():
-    planner = Planner()
-    first = planner.plan("toy", keep_knowledge=True)
-    second = planner.plan("toy", basis=first.targets["cks"], keep_knowledge=True)
-    assert second.targets["ingest"] == first.targets["ingest"]
-    assert second.targets["train"] != first.targets["train"]
-    step = next(s for s in second.steps if s.stage == "cks")
-    assert step.inputs["basis"] == first.targets["cks"]
 
 
 def test_links_name_artifacts_and_clean_stale_finds_what_nothing_names(work):

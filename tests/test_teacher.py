@@ -1,18 +1,10 @@
 """Any ONNX teacher: windows, scales and flips, label sets, closed sets, and a clear error for what cannot be used."""
 
-import json
-import os
-import random
-import signal
-import subprocess
-import sys
-import time
-
 import numpy as np
 import onnx
 import pytest
 from onnx import TensorProto, helper
-from shared import KEY, ROOT, run_stage
+from shared import KEY, run_stage
 from tiny_teachers import COLORS, color_teacher, write_model, write_settings, write_table
 
 from chebsplat.errors import InputError
@@ -421,41 +413,9 @@ def test_another_teacher_starts_anew(tmp_path, capture, monkeypatch):
         before = set(marks.values())
 
 
-def command(capture, config, out):
-    return [sys.executable, "-m", "chebsplat.pipelines.cli", "teacher", "--in-capture", str(capture),
-            "--config", str(config), "--out", str(out)]  # fmt: skip
-
-
 def values_of(path):
     """Digests of all files but the log, which tells when things were done."""
     return {name: entry["sha256"] for name, entry in artifact.verify(path).files.items() if name != "log.jsonl"}
-
-
-@pytest.mark.slow
-def test_views_that_a_killed_run_finished_are_kept_and_the_bytes_are_the_same(tmp_path):
-    rng = np.random.default_rng(1)
-    images = np.stack([painted(rng, (240, 320))[0] for _ in range(16)])
-    views = published_capture(tmp_path / "capture", images)
-    slow = {"scales": [1.0 + k / 16 for k in range(8)], "flips": True}  # so that there is something to kill
-    model, config = color_teacher(tmp_path), tmp_path / "config.json"
-    config.write_text(json.dumps({"teacher": {"model": str(model)} | slow}))
-    whole, again = tmp_path / "whole", tmp_path / "again"
-    assert subprocess.run(command(views, config, whole), cwd=ROOT, capture_output=True).returncode == 0
-    done, kept, moment = tmp_path / ".part-again/features/done", 0, random.Random(os.getpid())
-    run = subprocess.Popen(command(views, config, again), cwd=ROOT, stderr=subprocess.DEVNULL, start_new_session=True)
-    wanted = moment.randrange(1, 12)
-    while run.poll() is None and len(list(done.glob("[0-9]*"))) < wanted:
-        time.sleep(0.002)
-    time.sleep(moment.uniform(0, 0.05))
-    os.killpg(run.pid, signal.SIGKILL)
-    run.wait()
-    kept = {mark.name: mark.stat().st_mtime_ns for mark in done.glob("[0-9]*")}
-    assert len(kept) >= wanted
-    assert not again.exists()
-    resumed = subprocess.run(command(views, config, again), cwd=ROOT, capture_output=True, text=True)
-    assert resumed.returncode == 0, resumed.stderr
-    assert f"{len(kept)} of 16 views are there" in resumed.stderr
-    assert values_of(again) == values_of(whole)
 
 
 def test_a_model_runs_on_the_gpu_where_onnxruntime_has_cuda_and_is_said_not_to_otherwise(

@@ -139,9 +139,9 @@ def study(
     name: str, cores: int | None, threads: int, out: Path | None, only_plan: bool, no_run: bool, device: str, on: str
 ) -> int:
     """Run a study (of pipelines/configs/studies, or a .toml): its table, figure and page; goes on where it stopped."""
-    from chebsplat.pipelines import cluster, store
+    from chebsplat.pipelines import cluster
     from chebsplat.pipelines.run import Outcome, device_of, say
-    from chebsplat.pipelines.studies import kept, page, reaching, results, transfer
+    from chebsplat.pipelines.studies import page, reaching, results, transfer
     from chebsplat.pipelines.studies import study as studies
 
     where, asked = cluster.checked(on), studies.read_study(name)
@@ -158,19 +158,13 @@ def study(
 
     def write(failed: dict[str, tuple[int, str, Path]]) -> Path:
         rows = [results.row_of(run, failed) for run in runs]
-        more = transfer.sections(folder, asked, rows) if asked.sequences else reaching.sections(asked, rows)
+        more = reaching.sections(asked, rows) + (transfer.sections(asked, rows) if asked.sequences else [])
         return page.write(folder, asked, runs, rows, command, more).absolute()
 
     outcome = Outcome()
     if not no_run:
         outcome = studies.execute(Path(name).stem, runs, cores, used, computing, where, lambda: write({}))
-    whole = not outcome.failed and all(store.is_fresh(run.plan.targets[studies.LAST]) for run in runs)
-    now = kept.identity(asked, runs, command) if whole else ""
-    if not (whole and kept.is_current(folder, now)):
-        write(outcome.failed)
-        if whole:
-            kept.keep(folder, now)
-    print((folder / page.NAME).absolute())
+    print(write(outcome.failed))
     return outcome.code
 
 

@@ -129,12 +129,12 @@ def over_scenes(rows: list[Row]) -> list[Row]:
 
 def traces(runs: list[Run], rows: list[Row]) -> list[tuple[Row, list[dict[str, float]]]]:
     """The trace of every finished run, with its row."""
-    pairs = []
+    found = []
     for run, row in zip(runs, rows, strict=True):
         if row["state"] == "done":
             path = run.plan.targets["train"]
-            pairs.append((row, read_trace(path, artifact.read_manifest(path))))
-    return pairs
+            found.append((row, read_trace(path, artifact.read_manifest(path))))
+    return found
 
 
 @dataclass(frozen=True)
@@ -184,16 +184,16 @@ def compare(rows: list[Row], baseline: str) -> list[Line]:
             values = [row[figure.key] for row in mine if row[figure.key] is not None]
             if values:
                 summaries[figure.key] = summarize(values)
-            pairs = _pairs(mine, theirs, figure.key) if variant != baseline else []
-            if pairs:
-                scenes, own, other = zip(*pairs, strict=True)
+            found = pairs(mine, theirs, figure.key) if variant != baseline else []
+            if found:
+                scenes, own, other = zip(*found, strict=True)
                 difference = paired_difference(own, other, list(scenes), figure.ratio)
                 differences[figure.key] = difference
         lines.append(Line(condition, budget, variant, len(done), len(members), summaries, differences))
     return lines
 
 
-def _pairs(done: list[Row], against: list[Row], key: str) -> list[tuple[str, float, float]]:
+def pairs(done: list[Row], against: list[Row], key: str) -> list[tuple[str, float, float]]:
     """(scene, value, the baseline's) of the same scene, seed and place in a sequence.
 
     Choices: a scene in several sequences is one unit: its baseline is the same run in all of them.
