@@ -12,7 +12,7 @@ from chebsplat.formats.names import check_names, suggest
 from chebsplat.formats.ply import read_ply
 from chebsplat.formats.scene import SCHEMA, Scene, read_scene, write_scene
 from chebsplat.stages.extract import extract
-from chebsplat.stages.query import file_names
+from chebsplat.stages.frames import file_names
 
 LABELS = ["café", "Tür", "沙发", "two\nlines", "🛋️", "back\\slash"]
 

@@ -2,18 +2,22 @@
 
 from __future__ import annotations
 
-from typing import Any
+from typing import Any, NoReturn
 
 import click
 
 from chebsplat.pipelines.cli import about, renders, runs, upkeep, uses
 from chebsplat.pipelines.cli.basis import basis
-from chebsplat.pipelines.cli.group import Guarded
+from chebsplat.pipelines.cli.group import Guarded, logged
 from chebsplat.stages.registry import STAGES
 
 
 class Commands(Guarded):
     """Stages are listed from their table and imported only when called, so that --help stays instant."""
+
+    def invoke(self, context: click.Context) -> NoReturn:
+        with logged(context):
+            super().invoke(context)
 
     def list_commands(self, context: click.Context) -> list[str]:
         return [*(name for name in super().list_commands(context) if name not in STAGES), *STAGES]

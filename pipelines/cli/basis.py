@@ -3,15 +3,14 @@
 from __future__ import annotations
 
 import csv
-import os
 import sys
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 import click
 
-from chebsplat.errors import ConfigError
 from chebsplat.pipelines.cli.group import Guarded
+from chebsplat.pipelines.cli.options import NewPath
 from chebsplat.pipelines.tables import show_rows
 
 if TYPE_CHECKING:
@@ -96,14 +95,12 @@ def verify(name: str) -> None:
 
 @basis.command()
 @click.argument("name")
-@click.option("--out", type=click.Path(path_type=Path), required=True, help="folder to make; later: basis=FOLDER/")
+@click.option("--out", type=NewPath(), required=True, help="folder to make; later: basis=FOLDER/")
 def export(name: str, out: Path) -> None:
     """Copy a revision, to start scenes from it elsewhere (basis=FOLDER/)."""
     from chebsplat.formats import artifact
 
     path, _ = newest(name)
-    if os.path.lexists(out):
-        raise ConfigError(f"{out} exists; choose another --out")
     artifact.copy(path, out, artifact.verify(path))
     print(out.absolute())
 

@@ -11,6 +11,7 @@ from pathlib import Path
 import click
 
 from chebsplat.errors import ConfigError, InputError
+from chebsplat.pipelines.cli.options import AGAINST
 
 PATH = click.option(
     "--path", default="capture", show_default=True, help="orbit, capture, or a cameras.json or transforms.json"
@@ -25,7 +26,7 @@ SIZE = click.option("--size", help="WIDTHxHEIGHT in pixels, such as 1280x960; de
 @FRAMES
 @click.option("--what", default="color", show_default=True, help="of color,labels,depth,relevancy; with commas")
 @click.option("--query", help="words that relevancy is of")
-@click.option("--against", default="", help="phrases the query is weighed against, with commas")
+@AGAINST
 @SIZE
 @click.option("--fps", type=click.IntRange(1, 240), default=24, show_default=True, help="of a video")
 @click.option("--out", type=click.Path(path_type=Path), required=True, help="a folder of frames, or a .mp4")
@@ -35,7 +36,7 @@ def render(
     frames: int,
     what: str,
     query: str | None,
-    against: str,
+    against: list[str],
     size: str | None,
     fps: int,
     out: Path,
@@ -49,14 +50,11 @@ def render(
     from chebsplat.stages.progress import Progress
     from chebsplat.stages.video import library, render_video
 
-    logging.basicConfig(stream=sys.stderr, format="render: %(message)s", level="WARNING", force=True)
-    logging.getLogger("chebsplat").setLevel("INFO")
     opened, wanted = load(scene), size_of(size)
     kinds = kinds_of(what, opened, query is not None)
     if out.suffix == ".mp4":
         library()
-    phrases = [word.strip() for word in against.split(",") if word.strip()]
-    asked = None if query is None else opened.understood(query, phrases)
+    asked = None if query is None else opened.understood(query, against)
     shot = Shot(kinds, read_manifest(artifact_of(scene, "export")).key, asked)
     cameras = [fitted(camera, wanted) for camera in path_of(opened, path, frames)]
     if out.suffix == ".mp4":
