@@ -40,7 +40,7 @@ def extract(
     """
     import numpy as np
 
-    if out.name.endswith(".compressed.ply"):
+    if out.suffix != ".ply" or out.name.endswith(".compressed.ply"):
         raise ConfigError(f"{out}: only a plain .ply is written; convert that, for instance: {CONVERT}")
     filters = passing(scene.exported, scene.source, labels, min_opacity, box)
     if query is not None:

@@ -18,7 +18,6 @@ TOY = {
     "teacher": {"kind": "labels"},
     "describe": {"n_regions": 24, "region_size": 8},
     "knowledge": {"n_rooms": 1, "n_held_out": 1, "n_views": 6, "n_points": 200, "steps": 3},
-    "mesh": {"raw": True},  # needs no extra
     "train": {
         "encoder": "transformer",
         "steps": 24,
@@ -47,7 +46,6 @@ INPUTS = {
         "points": "sfm",
         "knowledge": "teach",
     },
-    "mesh": {"scene": "export"},
     "onnx": {"gaussians": "train"},
     "cks": {"gaussians": "train"},
     "evaluate": {"capture": "ingest", "scene": "export", "features": "teacher"},

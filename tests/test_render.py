@@ -26,9 +26,6 @@ TOLERANCE = 1e-12  # of text with all of a double's digits, through an inverse
 
 
 @pytest.fixture(autouse=True)
-def _release_logging():
-    yield
-    logging.getLogger().handlers.clear()
 
 
 @pytest.fixture(scope="module")

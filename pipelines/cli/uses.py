@@ -67,7 +67,7 @@ def get_teacher(name: str, out: Path | None, graph: str) -> None:
 
 @click.command()
 @click.argument("scene")
-@click.option("--out", type=NewPath(".ply"), required=True, help="the .ply to write")
+@click.option("--out", type=NewPath(), required=True, help="the .ply to write")
 @click.option("--keep-label", "labels", multiple=True, help="a name of labels.json; may be given again")
 @click.option("--min-opacity", type=click.FloatRange(0, 1), default=0.0, help="activated")
 @click.option("--box", help="x0,y0,z0,x1,y1,z1 that centres lie in, scene units")
