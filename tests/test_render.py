@@ -1,7 +1,6 @@
 """`chebsplat render` and `chebsplat cameras`: frames are those that are evaluated, kept, and of the asked cameras."""
 
 import json
-import logging
 import os
 import signal
 import subprocess
@@ -23,9 +22,6 @@ from chebsplat.stages.opened import Camera
 from chebsplat.stages.sources.colmap_model import read_model
 
 TOLERANCE = 1e-12  # of text with all of a double's digits, through an inverse
-
-
-@pytest.fixture(autouse=True)
 
 
 @pytest.fixture(scope="module")
