@@ -8,7 +8,7 @@ from functools import partial
 from typing import TYPE_CHECKING, Any
 
 from chebsplat.errors import DataFailure
-from chebsplat.stages.command import Job, command, n_threads
+from chebsplat.stages.command import Job, n_threads
 from chebsplat.stages.measured_depth import with_depth_loss
 from chebsplat.stages.photo_models import camera_models, exposures, facts, reached
 from chebsplat.stages.resume import Saves
@@ -263,6 +263,3 @@ def optimizer_state(trainer: Trainer) -> dict[str, np.ndarray]:
         if group["name"] not in ("modules", "gates") and "exp_avg" in state:
             arrays |= {f"{group['name']}.{k}": state[k].cpu().numpy() for k in ("exp_avg", "exp_avg_sq")}
     return arrays
-
-
-main = command("train", run)

@@ -98,6 +98,8 @@ def run_stage(stage, out, inputs=None, config=None):
     """Run a stage's own command; returns its exit code."""
     from importlib import import_module
 
+    from chebsplat.stages.command import command
+
     out.parent.mkdir(parents=True, exist_ok=True)
     file = out.parent / f"{out.name}.json"
     file.write_text(json.dumps(TOY if config is None else config))
@@ -105,7 +107,7 @@ def run_stage(stage, out, inputs=None, config=None):
     for role, path in (inputs or {}).items():
         arguments += [f"--in-{role}", str(path)]
     with pytest.raises(SystemExit) as stop:
-        import_module(f"chebsplat.stages.{stage}").main(arguments, prog_name=stage)
+        command(stage, import_module(f"chebsplat.stages.{stage}").run)(arguments, prog_name=stage)
     return stop.value.code
 
 

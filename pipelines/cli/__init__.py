@@ -32,7 +32,9 @@ class Commands(Guarded):
         if args[0] in STAGES and not (of_a_file and args[0] in self.commands):  # `lift` is of a file, too
             from importlib import import_module
 
-            return args[0], import_module(f"chebsplat.stages.{args[0]}").main, args[1:]
+            from chebsplat.stages.command import command
+
+            return args[0], command(args[0], import_module(f"chebsplat.stages.{args[0]}").run), args[1:]
         return super().resolve_command(context, args)
 
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import csv
 import sys
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -33,24 +32,11 @@ def newest(name: str) -> tuple[Path, Basis]:
 
 @basis.command()
 @click.argument("name")
-@click.option("--out", type=click.Path(path_type=Path), help="folder for lineage.csv and lineage.png")
-def log(name: str, out: Path | None) -> None:
+def log(name: str) -> None:
     """Revisions: the scene, ranks, ρ before and after, σ_f and ρ′, energy; means over linear maps."""
-    from chebsplat.formats import artifact
     from chebsplat.pipelines import lineage
 
-    path, one = newest(name)
-    show_rows(lineage.log_table(one))
-    if out is not None:
-        out.mkdir(parents=True, exist_ok=True)
-        rows = lineage.records(one)
-        with (out / "lineage.csv").open("w", newline="") as handle:
-            writer = csv.DictWriter(handle, list(rows[0]))
-            writer.writeheader()
-            writer.writerows(rows)
-        share = artifact.stated(path, artifact.read_manifest(path), "config", "cks", "max_rank", kind=(int, float))
-        lineage.draw(out / "lineage.png", one, share)
-        print(f"{out}: lineage.csv, lineage.png", file=sys.stderr)
+    show_rows(lineage.log_table(newest(name)[1]))
 
 
 @basis.command()
