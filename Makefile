@@ -26,8 +26,6 @@ CLUSTER := $(if $(filter-out local,$(on)),slurm)
 .PHONY: help run study slurm cluster-test view plan verify status clean-stale setup test test-all gpu malformed soak stability bench text-model nouns knowledge calibration teacher teacher-quality lint lock
 
 run: $(READY) $(CLUSTER)  ## make scene=NAME|FOLDER [stage=] [set=a.b=c,...] [ablation=] [basis=NAME@REVISION|none] [cores=] [device=] [on=slurm]; or sequence=NAME
-	@[ '$(stage)' != mesh ] || $(PY) -c 'import pymeshlab' 2>/dev/null || \
-	  $(PY) -m uv pip install --quiet --python $(PY) --editable '.[mesh]'
 	@$(CHEBSPLAT) run $(CHOICE) $(if $(stage),--stage '$(stage)') $(if $(cores),--cores '$(cores)') $(if $(device),--device '$(device)') $(if $(on),--on '$(on)')
 
 study: $(READY) $(CLUSTER)  ## make study=NAME [cores=] [threads=] [on=slurm] [args=--no-run]: its runs, then table, figure, page in build/studies

@@ -20,6 +20,7 @@ from chebsplat.cameras import unproject
 from chebsplat.formats.capture import Capture, read_capture
 from chebsplat.formats.meshes import Mesh, cleaned, fused
 from chebsplat.pipelines.api import load
+from chebsplat.splats.cubes import first_of_each
 from chebsplat.stages.mesh import LEAST_PART, LONGEST_HOLE, frames, labels_at
 from chebsplat.stages.progress import Progress
 
@@ -38,8 +39,7 @@ def truth(capture: Capture) -> tuple[np.ndarray, np.ndarray]:
         points.append(unproject(depth, capture.Ks[view], pose, pixels))
         labels.append(capture.labels[view][pixels[:, 0], pixels[:, 1]])
     every = np.concatenate(points)
-    cells = np.floor((every - every.min(0)) / SPACING).astype(np.int64)
-    _, kept = np.unique(cells @ [1, 1 << 21, 1 << 42], return_index=True)
+    kept = first_of_each(every, SPACING)
     return every[kept], np.concatenate(labels)[kept]
 
 
@@ -82,7 +82,7 @@ def main(arguments: Sequence[str]) -> int:
         scene, capture = load(work), read_capture(work / "ingest")
         points, labels = truth(capture)
         began = time.perf_counter()
-        seen = list(frames(scene.renderer, scene.exported.cameras, Progress()))
+        seen = list(frames(scene, Progress()))
         rendering = time.perf_counter() - began
         names = [list(capture.class_names or []).index(name) for name in scene.label_names or []]
         for voxel in options.voxels:
@@ -93,7 +93,7 @@ def main(arguments: Sequence[str]) -> int:
             cleaning = time.process_time() - cleaning
             named = None
             if scene.label_embeddings is not None:
-                named = np.array([*names, -1])[labels_at(scene.renderer, scene.label_embeddings, mesh.vertices)]
+                named = np.array([*names, -1])[labels_at(scene, mesh.vertices)]
             row = {"scene": work.name, "voxel_cm": 100 * voxel, "fused": len(raw.triangles)}
             row |= {"triangles": len(mesh.triangles), "render_s": rendering, "fuse_s": fusing, "clean_cpu_s": cleaning}
             rows.append(row | measured(mesh, points, labels, named) | {"spent_s": time.process_time() - spent})

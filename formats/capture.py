@@ -76,9 +76,10 @@ def _check(capture: Capture) -> None:
     if (capture.labels is not None or capture.pseudo_labels is not None) and not capture.class_names:
         raise InputError(f"{where}: labels without class names; name them in scene.json or labels.json")
     check_cameras(capture.names, capture.Ks, capture.cam_from_world, where, remedy)
-    if points is not None and tracks is not None and len(tracks):
-        if tracks.min() < 0 or (tracks.max(0) >= (len(points), n_views)).any():
-            raise InputError(f"{where}: tracks of points or views that are not there; {remedy}")
+    if points is None or tracks is None or not len(tracks):
+        return
+    if tracks.min() < 0 or (tracks.max(0) >= (len(points), n_views)).any():
+        raise InputError(f"{where}: tracks of points or views that are not there; {remedy}")
 
 
 SCHEMA = Capture.SCHEMA

@@ -52,7 +52,6 @@ NEEDS = {  # measured in 18 scenes on two EPYC cores: seconds (median, most); mo
     "lift": Need(5, 2000),  # 5, 12; 571 MB
     "refine": Need(5, 4000),  # 9, 22; 1083 MB
     "export": Need(5, 2000),  # 1, 2; 138 MB
-    "mesh": Need(10, 4000),
     "onnx": Need(5, 2000),
     "cks": Need(5, 2000),
     "evaluate": Need(5, 2000),  # 5, 27; 646 MB

@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 import os
-import shutil
 import time
 from collections import Counter
 from dataclasses import dataclass
+from itertools import chain
 from pathlib import Path
 
 from chebsplat.errors import ConfigError, InputError
@@ -16,39 +16,47 @@ from chebsplat.pipelines import folders, store, summary
 from chebsplat.pipelines.finished import is_artifact, links, scene_folder, titles
 from chebsplat.stages.registry import STAGES
 
-QUERIES, PAGE = "query", "view.html"  # of `chebsplat query` and `view`, in a scene's folder
+PAGE = "view.html"  # of `chebsplat view`, in a scene's folder
 
 
 @dataclass(frozen=True)
 class Scene:
-    """One folder of links. size: bytes of the artifacts that it names; when: the newest of them, seconds since 1970."""
+    """One folder of links, of a scene or a study. size: bytes of what it names and of all that this was made of; alone:
+    of these, what nothing else was made of; when: the newest of what it names, seconds since 1970.
+    """
 
     title: str
     source: str
-    stages: list[str]
+    done: str
     size: int
+    alone: int
     when: float
     psnr: str
     miou: str
 
     def row(self) -> tuple[str, ...]:
-        done = "all" if "report" in self.stages else " ".join(self.stages)
         day = time.strftime("%Y-%m-%d %H:%M", time.localtime(self.when))
-        return self.title, self.source, done, f"{self.size / 1e6:.1f}", day, self.psnr, self.miou
+        sizes = (f"{size / 1e6:.1f}" for size in (self.size, self.alone))
+        return self.title, self.source, self.done, *sizes, day, self.psnr, self.miou
 
 
 def scenes() -> list[Scene]:
     """Those in work, each as far as it can be read; what is damaged counts nothing."""
+    store_paths = store.work().glob("store/*/*")
+    held = {path.name: _manifest(path) for path in store_paths if not path.name.startswith(".")}
+    reached = {title: _made_of(title, held) for title in titles()}
+    sizes, times = {key: _size(manifest) for key, manifest in held.items()}, Counter(chain(*reached.values()))
     rows = []
-    for title in titles():
-        artifacts = {stage: path for stage, path in links(store.work() / title).items() if stage in STAGES}
-        if not artifacts:
-            continue
-        manifests = {stage: _manifest(path) for stage, path in artifacts.items()}
-        size = sum(_size(manifest) for manifest in manifests.values())
-        when = max((path / "artifact.json").stat().st_mtime for path in artifacts.values())
-        psnr, miou, _ = summary.quality(summary.figures(artifacts["evaluate"]) if "evaluate" in artifacts else None)
-        rows.append(Scene(title, _source(title, manifests.get("ingest")), list(artifacts), size, when, psnr, miou))
+    for title, keys in reached.items():
+        named = links(store.work() / title)
+        when = max((path / "artifact.json").stat().st_mtime for path in named.values())
+        stages = [stage for stage in named if stage in STAGES]
+        done = " ".join(stages) or f"{len(named)} artifacts"
+        source = _source(title, _manifest(named["ingest"]) if "ingest" in named else None) if stages else ""
+        psnr, miou, _ = summary.quality(summary.figures(named["evaluate"]) if "evaluate" in named else None)
+        size = sum(sizes[key] for key in keys)
+        alone = sum(sizes[key] for key in keys if times[key] == 1)
+        rows.append(Scene(title, source, "all" if "report" in named else done, size, alone, when, psnr, miou))
     return rows
 
 
@@ -99,27 +107,6 @@ def untouched(age: float) -> list[Path]:
     return [store.work() / title for title, paths in ours.items() if min(map(store.age, paths.values())) >= age]
 
 
-def usage() -> tuple[list[tuple[str, int, int]], list[tuple[str, int, int]]]:
-    """What artifacts take: (stage, how many, bytes), and (folder of links, bytes, of it alone), the largest first.
-
-    What a folder takes is what its links name, and all that this was made of.
-    """
-    paths = [path for path in store.work().glob("store/*/*") if not path.name.startswith(".")]
-    manifests = {path.name: _manifest(path) for path in paths}
-    sizes = {key: _size(manifest) for key, manifest in manifests.items()}
-    stages: dict[str, list[int]] = {}
-    for path in paths:
-        stages.setdefault(path.parent.name, []).append(sizes[path.name])
-    reached = {title: _made_of(title, manifests) for title in titles()}
-    times = Counter(key for keys in reached.values() for key in keys)
-    scenes = [
-        (title, sum(sizes[key] for key in keys), sum(sizes[key] for key in keys if times[key] == 1))
-        for title, keys in reached.items()
-    ]
-    by_size = sorted(((stage, len(found), sum(found)) for stage, found in stages.items()), key=lambda row: -row[2])
-    return by_size, sorted(scenes, key=lambda row: -row[1])
-
-
 def _made_of(title: str, manifests: dict[str, Manifest | None]) -> set[str]:
     """Keys of the artifacts in the store that a folder's links lead to, directly and as inputs."""
     found: set[str] = set()
@@ -136,16 +123,14 @@ def _made_of(title: str, manifests: dict[str, Manifest | None]) -> set[str]:
 
 def others(folder: Path) -> list[str]:
     """What lies in a scene's folder and is none of ours; it is never removed."""
-    own = QUERIES, PAGE
-    return sorted(e.name for e in os.scandir(folder) if not e.is_symlink() and e.name not in own)
+    return sorted(e.name for e in os.scandir(folder) if not e.is_symlink() and e.name != PAGE)
 
 
 def unlink(folder: Path) -> None:
-    """Remove a scene's links, queries and page, and the folder if that leaves it empty."""
+    """Remove a scene's links and page, its name among folders, and the folder if that leaves it empty."""
     for entry in list(os.scandir(folder)):
         if entry.is_symlink() or entry.name == PAGE:
             os.unlink(entry.path)
-    if not (folder / QUERIES).is_symlink():
-        shutil.rmtree(folder / QUERIES, ignore_errors=True)
     if not others(folder):
         folder.rmdir()
+    folders.release(folder.name.partition("@")[0])

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
@@ -25,15 +24,6 @@ def ancestors(path: Path) -> list[Path | None]:
         earlier = store.artifact_path("cks", key) if key else None
         found.insert(0, earlier if earlier is not None and store.is_fresh(earlier) else None)
     return found
-
-
-def records(basis: Basis) -> list[dict[str, Any]]:
-    """A row a revision and linear map, for the CSV file."""
-    return [
-        {"revision": number, "map": name} | {key: entry[key] for key in ("scene", "gaussians", "spread")} | report
-        for number, entry in enumerate(basis.lineage, start=1)
-        for name, report in entry["maps"].items()
-    ]
 
 
 def log_table(basis: Basis) -> Table:
@@ -136,37 +126,3 @@ def verify(path: Path | None, earlier: Path | None) -> str:
         if not np.array_equal(basis.bases[name][:, : columns.shape[1]], columns):
             raise InputError(f"{path}: {name} does not begin with the columns of {earlier}; {remedy_of(path)}")
     return checks + f", continues revision {before.revision}"
-
-
-def draw(path: Path, basis: Basis, max_rank: float) -> None:
-    """Rank and residual over revisions, as PNG: a thin line a linear map, the mean bold; max_rank: as a share of q."""
-    import matplotlib
-
-    matplotlib.use("Agg")
-    import matplotlib.pyplot as plt
-
-    x = np.arange(1, basis.revision + 1)
-
-    def values(key: str) -> np.ndarray:
-        return np.array([[e["maps"].get(name, {}).get(key, np.nan) for name in basis.bases] for e in basis.lineage])
-
-    figure, (left, right) = plt.subplots(1, 2, figsize=(11, 4), layout="constrained")
-    rank, widths = values("rank_after"), sorted({len(columns) for columns in basis.bases.values()})
-    left.plot(x, rank, color="C0", linewidth=0.6, alpha=0.5)
-    left.plot(x, np.nanmean(rank, 1), color="C0", linewidth=2, marker="o", label="rank r: mean, and each map")
-    left.bar(x, np.nanmean(values("added"), 1), color="C1", alpha=0.6, label="columns added, mean")
-    for width in widths:
-        left.axhline(int(max_rank * width), color="C0", linestyle="--", linewidth=0.8, label=f"ceiling, of q = {width}")
-    left.set_title("rank", fontsize=10)
-    for key, color, label in (("rho", "C3", "before the update"), ("rho_after", "C2", "after it")):
-        right.plot(x, values(key), color=color, linewidth=0.6, alpha=0.4)
-        right.plot(x, np.nanmean(values(key), 1), color=color, linewidth=2, marker="o", label=label)
-    right.set_ylim(0, 1.02)
-    right.set_title("ρ: the share of W's norm outside the basis", fontsize=10)
-    for axis in (left, right):
-        names = [f"{number} {entry['scene']}" for number, entry in zip(x, basis.lineage, strict=True)]
-        axis.set_xticks(x, names, rotation=40, ha="right", fontsize=8)
-        axis.grid(alpha=0.3)
-        axis.legend(fontsize=8)
-    figure.savefig(path, dpi=130)
-    plt.close(figure)

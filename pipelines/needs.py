@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import os
 from collections.abc import Iterable
-from importlib.util import find_spec
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -141,15 +140,6 @@ def media_packages(files: Iterable[Path]) -> tuple[str, ...]:
     if "pillow_heif" in used:
         require_heic(used["pillow_heif"])
     return tuple(sorted(used))
-
-
-def require_meshlab() -> None:
-    """Raises ConfigError, with the command that installs it, where what cleans meshes is missing."""
-    if find_spec("pymeshlab") is None:
-        raise ConfigError(
-            "cleaning a mesh needs the extra `mesh`: .venv/bin/pip install -e '.[mesh]' (`make scene=NAME stage=mesh` "
-            "does); or set=mesh.raw=true takes it as it is fused"
-        )
 
 
 def source_sentence(name: str, asked: Any, source: Any) -> str:

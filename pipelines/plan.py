@@ -21,7 +21,6 @@ from chebsplat.pipelines.needs import (
     left_out_knowledge,
     left_out_stages,
     media_packages,
-    require_meshlab,
     source_sentence,
     teacher_kind,
     text_packages,
@@ -144,13 +143,11 @@ class Planner:
         basis: Path | None = None,
         keep_knowledge: bool = False,
         values: dict[str, Any] | None = None,
-        also: str | None = None,
     ) -> Plan:
         """The steps of one scene.
 
         Args: settings: `set=`; basis: an earlier scene's basis to train on; keep_knowledge: end with a cks step;
-              values: config sections that replace the scene's own, before ablation and settings (a study's);
-              also: a stage that runs where it is asked for alone.
+              values: config sections that replace the scene's own, before ablation and settings (a study's).
         Raises: ConfigError, InputError.
         Choices: a scene of a sequence, or on a basis, trains the encoder of regions, which a basis is of.
         """
@@ -202,10 +199,6 @@ class Planner:
             keys = {role: path.name for role, path in inputs.items()}
             steps[stage.name] = self.step(stage, config, inputs, keys, used.get(stage.name, ()))
             steps[stage.name].after = [steps[earlier].path for earlier in stage.after if earlier in steps]
-            if stage.on_demand and also != stage.name and not steps[stage.name].fresh:
-                del steps[stage.name]
-        if also == "mesh" and not config.mesh.raw and not steps[also].fresh:
-            require_meshlab()
         title = self._named(scene) + title
         return Plan(title, source_sentence(name, asked, source), list(steps.values()), left_out)
 

@@ -6,7 +6,7 @@ import logging
 from typing import TYPE_CHECKING
 
 from chebsplat.errors import DataFailure, InputError
-from chebsplat.stages.command import Job, command
+from chebsplat.stages.command import Job
 
 if TYPE_CHECKING:
     import numpy as np
@@ -120,6 +120,3 @@ def labels_of(
             of_points[~capture.loss_mask[row][rows, columns]] = UNSEEN
         said[seen, number] = of_points
     return said
-
-
-main = command("agree", run)

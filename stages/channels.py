@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any
 
 from chebsplat.errors import ConfigError, DataFailure, InputError
 from chebsplat.formats.images import SUFFIXES, read_rgb
-from chebsplat.stages.command import Job, command, n_threads
+from chebsplat.stages.command import Job, n_threads
 
 if TYPE_CHECKING:
     import numpy as np
@@ -162,6 +162,3 @@ def generated(seeds: range) -> Iterator[tuple[str, np.ndarray]]:
         with ThreadPoolExecutor(VIEWS) as pool:
             for view, (image, _, _) in enumerate(pool.map(shoot, walk(room.size, VIEWS, seed))):
                 yield f"room {seed}, view {view}", image
-
-
-main = command("channels", run)

@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import TYPE_CHECKING, Any
 
 from chebsplat.errors import DataFailure
-from chebsplat.stages.command import Job, command
+from chebsplat.stages.command import Job
 
 if TYPE_CHECKING:
     from chebsplat.formats.gaussians import Gaussians
@@ -86,6 +86,3 @@ def descriptor_spread(job: Job, gaussians: Gaussians) -> float:
     regions = regions_of(means.double().numpy(), describe)
     members = torch.from_numpy(regions.members)
     return spread(Descriptors(describe).update(means, quats, log_scales, members, regions.radius), members >= 0)
-
-
-main = command("cks", run)

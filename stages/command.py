@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import logging
 import os
 import sys
@@ -15,9 +14,9 @@ from typing import Any
 
 import click
 
-from chebsplat.errors import ChebsplatError, ConfigError, Stopped
+from chebsplat.errors import ChebsplatError, Stopped
 from chebsplat.formats import artifact, disk
-from chebsplat.formats.manifest import Manifest, is_key
+from chebsplat.formats.manifest import Manifest
 from chebsplat.stages import config as configs
 from chebsplat.stages.device import DEVICES, resolve
 from chebsplat.stages.progress import Progress
@@ -53,10 +52,10 @@ def command(name: str, run: Callable[[Job], None]) -> click.Command:
     """The click command of stage `name`: explicit inputs, one config, one output, whose path it prints."""
     stage = STAGES[name]
 
-    def invoke(out: Path, code: str | None, **options: Any) -> None:
+    def invoke(out: Path, **options: Any) -> None:
         def action() -> None:
             inputs = {role: path for role in stage.roles if (path := options.pop(f"in_{role}"))}
-            publish(name, run, out, inputs, code=json.loads(code or "{}"), **options)
+            publish(name, run, out, inputs, **options)
             print(out.absolute())
 
         sys.exit(exit_code(action))
@@ -73,11 +72,8 @@ def command(name: str, run: Callable[[Job], None]) -> click.Command:
     params += [
         click.Option(["--config"], type=click.Path(path_type=Path), help="TOML or JSON; defaults otherwise"),
         click.Option(["--out"], type=click.Path(path_type=Path), required=True, help="the artifact's directory"),
-        click.Option(["--key"], help="identity given by the planner; the content's digest otherwise"),
-        click.Option(["--code"], hidden=True, help="code identity given by the planner (JSON)"),
         click.Option(["--device"], type=click.Choice(DEVICES), default="auto", show_default=True),
         click.Option(["--force"], is_flag=True, help="run even if the artifact exists, and replace it; nothing else"),
-        click.Option(["--progress/--no-progress"], default=None, help="default: when stderr is a terminal"),
         click.Option(["--log-level"], default="info",
                      type=click.Choice(["debug", "info", "warning", "error"])),
     ]  # fmt: skip
@@ -111,15 +107,14 @@ def publish(
     code: dict[str, Any] | None = None,
     device: str = "auto",
     force: bool = False,
-    progress: bool | None = None,
     log_level: str = "info",
     within: AbstractContextManager[Any] | None = None,
 ) -> None:
     """Run one stage in this process and publish its artifact; nothing if it is there, unless by `force`.
 
     Args: inputs: artifacts by role; config: TOML or JSON, otherwise defaults; key, code: identities given by the
-          planner; progress: None: where stderr is a terminal; within: what the stage reads and computes within; what it
-          raises at its end keeps the artifact from being published.
+          planner; within: what the stage reads and computes within; what it raises at its end keeps the artifact from
+          being published.
     Raises: ChebsplatError, Stopped.
     """
     line = f"%(asctime)s {name}: %(message)s"
@@ -129,15 +124,13 @@ def publish(
     if not force and artifact.is_whole(out, stage.schema):
         log.info("already there")
         return
-    inputs, shown = {role: path.absolute() for role, path in inputs.items()}, Progress(progress)
+    inputs, shown = {role: path.absolute() for role, path in inputs.items()}, Progress()
     with heeded(), disk.explained(out.parent):
         chosen = configs.load(config) if config else configs.Config()
         schemas = {role: STAGES[of].schema for role, of in stage.roles.items()}
         manifests = {role: artifact.read_manifest(path, schemas[role]) for role, path in inputs.items()}
         settings = chosen.sections(stage.sections)
         sources = {role: {"key": m.key, "schema": m.schema} for role, m in manifests.items()}
-        if key is not None and not is_key(key):
-            raise ConfigError(f"--key {key}: a key is 16 hexadecimal digits; leave it away, or correct it")
         device, why = resolve(device)
         device = stage.device(device, settings)
         computed = {} if device == "cpu" else {"device": device}

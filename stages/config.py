@@ -46,7 +46,6 @@ class Config(Section):
     onnx: parts.OnnxSection = parts.OnnxSection()
     cks: parts.CksSection = parts.CksSection()
     evaluate: parts.EvaluateSection = parts.EvaluateSection()
-    mesh: parts.MeshSection = parts.MeshSection()
     report: parts.ReportSection = parts.ReportSection()
 
     def sections(self, names: tuple[str, ...]) -> dict[str, Any]:

@@ -154,16 +154,14 @@ def fused(means: np.ndarray, colors: np.ndarray, seen_from: np.ndarray) -> dict[
     """
     import numpy as np
 
-    from chebsplat.stages.thinning import cubes
+    from chebsplat.splats.cubes import cubes_of, means_of_each
+    from chebsplat.stages.thinning import edge_of
 
     if len(means) == 0:
         return {"means": means, "colors": colors, "seen_from": seen_from}
-    first, cube, count = cubes(means, 2 * MOST)
-    kept = count >= max(3, LEAST * np.median(count[cube]))
-    sums = np.zeros((2, len(count), 3))
-    np.add.at(sums[0], cube, means)
-    np.add.at(sums[1], cube, colors)
-    middle, color = sums[:, kept] / count[kept, None]
+    numbers = cubes_of(means, edge_of(means, 2 * MOST))
+    _, first, cube = np.unique(numbers, return_index=True, return_inverse=True)
+    kept, middle, color = means_of_each(cube, LEAST, means, colors)
     return {"means": middle, "colors": color.round().astype(np.uint8), "seen_from": seen_from[first[kept]]}
 
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import logging
 
 from chebsplat.errors import DataFailure
-from chebsplat.stages.command import Job, command
+from chebsplat.stages.command import Job
 
 log = logging.getLogger("chebsplat")
 
@@ -50,6 +50,3 @@ def run(job: Job) -> None:
     facts = settings.model_dump(mode="json") | {"radius": regions.radius, "share": regions.share}
     record = Descriptors(regions.centers, regions.members, values, facts)
     write_descriptors(job.out, record)
-
-
-main = command("describe", run)

@@ -39,10 +39,6 @@ def encode(scene: Path, encoder: Path, features: Path | None, out: Path, device:
     from chebsplat.settings import DescribeSection
     from chebsplat.stages.config import checked
 
-    if out.suffix != ".npz":
-        raise ConfigError(f"{out}: the result is a .npz; name it so")
-    if out.exists():
-        raise ConfigError(f"{out} exists; remove it, or choose another --out")
     if device == "cuda" and CUDA not in providers(device):
         raise ConfigError(f"onnxruntime here has no CUDA: {GPU_REMEDY}, or encode with --device cpu")
     name = FLOAT if encoder.is_dir() else encoder.name

@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from chebsplat.errors import ConfigError, DataFailure, InputError
-from chebsplat.stages.command import Job, command
+from chebsplat.stages.command import Job
 
 if TYPE_CHECKING:
     import numpy as np
@@ -192,6 +192,3 @@ def evaluated_views(
                 view.surface = placed(depths[name], cameras[name])
             shown.setdefault("labels", []).append(view.truth)
         yield view
-
-
-main = command("evaluate", run)

@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import TYPE_CHECKING, Any
 
 from chebsplat.errors import DataFailure, InputError
-from chebsplat.stages.command import Job, command
+from chebsplat.stages.command import Job
 
 if TYPE_CHECKING:
     import numpy as np
@@ -80,6 +80,3 @@ def later_features(job: Job, n: int) -> np.ndarray | None:
     if len(features) != n:
         raise InputError(f"{job.inputs[role]} is of {len(features)} Gaussians, not these {n}; make it again")
     return features
-
-
-main = command("export", run)

@@ -6,7 +6,6 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from chebsplat.errors import ConfigError, DataFailure
-from chebsplat.formats.files import atomic_path
 from chebsplat.formats.names import suggest
 
 if TYPE_CHECKING:
@@ -15,13 +14,14 @@ if TYPE_CHECKING:
     import numpy as np
 
     from chebsplat.formats.scene import Scene
+    from chebsplat.stages.opened import OpenedScene
     from chebsplat.stages.query import Query
 
 CONVERT = "npx @playcanvas/splat-transform@2.7.1 scene.ply scene.compressed.ply"  # or scene.spz --spz-version 3
 
 
 def extract(
-    path: Path,
+    scene: OpenedScene,
     out: Path,
     labels: tuple[str, ...],
     min_opacity: float,
@@ -31,7 +31,6 @@ def extract(
     """Write the Gaussians that pass every filter, trimmed to the highest SH degree among them.
 
     Args:
-      path:        a `scene` artifact.
       out:         the PLY to write; never overwritten.
       labels:      names to keep; all where there are none.
       min_opacity: activated, in [0, 1]; box: x0, y0, z0, x1, y1, z1 of centres, scene units.
@@ -41,27 +40,18 @@ def extract(
     """
     import numpy as np
 
-    from chebsplat.formats.ply import write_ply
-    from chebsplat.formats.scene import read_scene
-
     if out.suffix != ".ply" or out.name.endswith(".compressed.ply"):
         raise ConfigError(f"{out}: only a plain .ply is written; convert that, for instance: {CONVERT}")
-    if out.exists():
-        raise ConfigError(f"{out} exists; remove it, or choose another --out")
-    scene = read_scene(path)
-    filters = passing(scene, path, labels, min_opacity, box)
+    filters = passing(scene.exported, scene.source, labels, min_opacity, box)
     if query is not None:
-        filters["query"] = asked_for(scene, query)
-    n = len(scene.parameters["means"])
+        filters["query"] = asked_for(scene.exported, query)
+    n = len(scene)
     left_out = {name: int(n - keep.sum()) for name, keep in filters.items()}
     kept = np.logical_and.reduce([np.ones(n, bool), *filters.values()])
     if not kept.any():
         why = ", ".join(f"{name} {number}" for name, number in left_out.items())
         raise DataFailure(f"no Gaussian of {n} is left ({why}); choose wider filters")
-    part = {name: values[kept] for name, values in scene.parameters.items()}
-    held = None if scene.labels is None else scene.labels[kept]
-    with atomic_path(out) as temporary:
-        write_ply(temporary, part, int(part["degrees"].max()), held, scene.label_names)
+    scene.select(kept).to_ply(out)
     return {"kept": int(kept.sum()), "of": n} | {f"left out by {name}": number for name, number in left_out.items()}
 
 

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import itertools
 import json
 import logging
+import re
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -67,8 +69,6 @@ def render_frames(
       Depth is float32 .npy, scene units along the camera's axis, nan where nothing is: units are the source's own, and
       16 bits of thousandths would cut or coarsen what is no metre. Relevancy is the render under its heat.
     """
-    from chebsplat.stages.query import file_names
-
     names = file_names([f"{camera.name}.png" for camera in cameras])
     claim(out, cameras, shot, scene)
     files = {kind: [out / kind / f"{name}{ending(kind)}" for name in names] for kind in shot.kinds}
@@ -84,6 +84,19 @@ def render_frames(
             with atomic_path(files[kind][k]) as temporary:
                 save(kind, values, temporary, len(scene.label_names or []))
     return files
+
+
+def file_names(views: list[str]) -> list[str]:
+    """A file's name for each view: its path with every separator replaced, and a number where two would be alike."""
+    names: list[str] = []
+    for view in views:
+        name = re.sub(r"[^\w.-]+", "-", view.removesuffix(Path(view).suffix)).strip(".-") or "view"
+        name = name.encode()[:200].decode(errors="ignore")
+        taken = {held.lower() for held in names}  # some file systems fold case
+        names.append(
+            next(new for k in itertools.count(1) if (new := name if k == 1 else f"{name}-{k}").lower() not in taken)
+        )
+    return names
 
 
 def ending(kind: str) -> str:

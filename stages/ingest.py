@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from chebsplat.errors import ConfigError, DataFailure, InputError
-from chebsplat.stages.command import Job, command
+from chebsplat.stages.command import Job
 from chebsplat.stages.progress import Progress
 from chebsplat.stages.settings import IngestSection, SourceSection
 
@@ -191,6 +191,3 @@ def run(job: Job) -> None:
         job.left_out("views", f"{n_views - len(capture.names)} that ingest.max_train_views spares the training")
     job.facts |= {"source": capture.source, "n_views": len(capture.names), "n_test": int(np.sum(capture.is_test))}
     write_capture(job.out, capture)
-
-
-main = command("ingest", run)

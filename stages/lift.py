@@ -6,7 +6,7 @@ from collections.abc import Iterator
 from typing import TYPE_CHECKING, Any
 
 from chebsplat.errors import DataFailure, InputError
-from chebsplat.stages.command import Job, command
+from chebsplat.stages.command import Job
 
 if TYPE_CHECKING:
     import numpy as np
@@ -132,6 +132,3 @@ def counts_of(features: Features, view: int, values: np.ndarray) -> np.ndarray:
     if features.convention.get("kind") == "given" and features.confidence is not None:
         return labelled * features.confidence[view].astype(np.float32)  # type: ignore[no-any-return]
     return labelled
-
-
-main = command("lift", run)

@@ -6,11 +6,13 @@ import json
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from chebsplat.errors import ConfigError, InputError
+from chebsplat.errors import InputError
 from chebsplat.formats import artifact
 from chebsplat.stages.command import publish
 
 if TYPE_CHECKING:
+    import numpy as np
+
     from chebsplat.formats.cameras import Cameras
 
 
@@ -26,12 +28,13 @@ def lift_ply(
       model:    .onnx of the teacher to run; None: the embedded one.
       out:      becomes a folder of artifacts by name, as a scene's: gaussians, lift, export, and what the teacher made.
     Returns: counts.
-    Raises:  ConfigError if `out` exists, InputError on what cannot be read, DataFailure if no view sees a Gaussian.
+    Raises:  InputError on what cannot be read, DataFailure if no view sees a Gaussian.
     """
     from chebsplat.formats.features import read_features
     from chebsplat.stages import export, lift
+    from chebsplat.stages.page import foreign
 
-    taken_over(ply, cameras_of(capture, points), out)
+    taken_over(ply, foreign(ply).parameters, cameras_of(capture, points), out)
     config = out / "settings.json"
     config.write_text(json.dumps({"train": {"features": "lifted"}}))
     if features is None:
@@ -51,33 +54,22 @@ def lift_ply(
 def import_ply(ply: Path, out: Path) -> dict[str, Any]:
     """A PLY as a scene without semantics, of `gaussians` and `export` below `out`; one camera sees its middle half.
 
-    Returns: counts. Raises: ConfigError if `out` exists, InputError on what cannot be read.
+    Returns: counts. Raises: InputError on what cannot be read.
     """
     from chebsplat.stages import export
     from chebsplat.stages.page import foreign
 
-    taken_over(ply, foreign(ply).cameras, out)
-    config = out / "settings.json"
-    config.write_text("{}")
-    publish("export", export.run, out / "export", {"gaussians": out / "gaussians"}, config)
+    scene = foreign(ply)
+    taken_over(ply, scene.parameters, scene.cameras, out)
+    publish("export", export.run, out / "export", {"gaussians": out / "gaussians"})
     return {"gaussians": artifact.read_manifest(out / "export").facts["n_gaussians"]}
 
 
-def taken_over(ply: Path, cameras: Cameras, out: Path) -> None:
-    """Make the folder `out`, and in it `gaussians` of a PLY. Raises ConfigError if `out` exists, InputError."""
+def taken_over(ply: Path, parameters: dict[str, np.ndarray], cameras: Cameras, out: Path) -> None:
+    """Make the folder `out`, and in it `gaussians` of what a PLY holds."""
     from chebsplat.formats.gaussians import SCHEMA, Gaussians, write_gaussians
     from chebsplat.formats.manifest import Manifest
-    from chebsplat.formats.ply import read_ply
 
-    if out.exists():
-        raise ConfigError(f"{out} exists; remove it, or choose another --out")
-    parameters, degree, _ = read_ply(ply)
-    if not len(parameters["means"]):
-        raise InputError(f"{ply} holds no Gaussians; choose another")
-    if "degrees" not in parameters:
-        import numpy as np
-
-        parameters["degrees"] = np.full(len(parameters["means"]), degree, np.uint8)
     out.mkdir(parents=True)
     given = {"path": ply.name, "sha256": artifact.sha256_file(ply)}
     manifest = Manifest(SCHEMA, artifact.digest(given), "train", facts={"source": given})

@@ -6,7 +6,7 @@ from pathlib import Path
 from typing import Any
 
 from chebsplat.errors import DataFailure
-from chebsplat.stages.command import Job, command
+from chebsplat.stages.command import Job
 from chebsplat.stages.contract import contract
 
 SIZES = (
@@ -147,6 +147,3 @@ def compare(module: Any, path: Path, given: dict[str, Any]) -> float:
         wanted = module(*given.values())
     pairs = zip(outputs, wanted if isinstance(wanted, tuple) else (wanted,), strict=True)
     return max(float((torch.from_numpy(a) - b).abs().max()) for a, b in pairs)
-
-
-main = command("onnx", run)

@@ -147,8 +147,10 @@ class OpenedScene:
         if self.features is None:
             raise ConfigError(f"{self.source} has no semantics; train the scene with a teacher")
         if self._teacher is None:
-            raise ConfigError(f"{self.source} is an artifact alone, without its teacher's; open the scene's folder")
-        return understood(self._teacher, text, list(against))
+            raise ConfigError(f"{self.source} has no teacher's artifact beside it; open the scene's folder")
+        if not text.strip():
+            raise ConfigError("the query is empty; say what to look for")
+        return understood(self._teacher, text.strip(), list(against))
 
     def select(
         self,

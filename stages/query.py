@@ -1,28 +1,24 @@
-"""query: where in a finished scene is what some words mean? Relevancy by Gaussian, and heat maps of the test views."""
+"""query: where in a finished scene is what some words mean? Relevancy by Gaussian and by label."""
 
 from __future__ import annotations
 
-import itertools
 import logging
-import re
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
-from chebsplat.errors import ConfigError, DataFailure, InputError
+from chebsplat.errors import ConfigError, InputError
 
 if TYPE_CHECKING:
     import numpy as np
 
     from chebsplat.formats.features import Features
-    from chebsplat.formats.scene import Scene
     from chebsplat.formats.teacher_model import TeacherModel
     from chebsplat.labels.calibration import Calibration
 
 log = logging.getLogger("chebsplat")
 
 CANONICAL = ("object", "things", "stuff", "texture")  # LERF's: phrases that fit anything
-N_SHEET = 6  # views on the contact sheet
 
 
 @dataclass
@@ -100,34 +96,6 @@ class Relevancy:
         if self.presence is None:
             return f"{text}; uncalibrated: there may be none in the scene"
         return text if self.present else f"{text}; {self.text!r} is probably not here ({self.presence:.0%})"
-
-
-def run(folder: Path, text: str, phrases: list[str], out: Path, n_rows: int) -> None:
-    """Answer a query about the scene whose artifacts lie in `folder`; fill `out`, tell the labels that fit best.
-
-    Args: phrases: what to weigh the query against; empty: LERF's, or all other labels where a scene knows only these.
-    Raises: InputError naming what is missing or damaged; ConfigError on words that the scene cannot know.
-    """
-    import numpy as np
-
-    from chebsplat.formats.scene import read_scene
-
-    for name in ("ingest", "export", "teacher"):
-        if not (folder / name).is_dir():
-            raise InputError(f"{folder / name} is missing: no finished scene with semantics; run the scene first")
-    scene = read_scene(folder / "export")
-    if scene.labels is None or scene.label_names is None:
-        raise InputError(f"{folder / 'export'} has no semantics; train the scene with a teacher")
-    query = understood(folder / "teacher", text, phrases)
-    answer = query.answer(scene.parameters["features"])
-    out.mkdir(parents=True, exist_ok=True)
-    held: dict[str, Any] = {"query": text, "against": query.phrases, "calibrated": answer.calibrated}
-    held |= {"relevancy": answer.scores, "selected": answer.selected}
-    held["presence"] = np.nan if answer.presence is None else answer.presence
-    np.savez_compressed(out / "relevancy.npz", **held)
-    for line in [str(answer), *table(answer, scene.labels, scene.label_names, n_rows)]:
-        log.info("%s", line)
-    draw(scene, test_views(folder / "ingest", scene), query, out)
 
 
 def taught(path: Path) -> tuple[Features, str | None]:
@@ -241,52 +209,3 @@ def table(answer: Relevancy, labels: np.ndarray, names: list[str], n_rows: int) 
         count = int(answer.selected[mine].sum())
         lines.append(f"{names[k]:{width}s}  {score:{len(mean)}.3f}  {mine.sum():9d}  {count:9d}")
     return lines
-
-
-def test_views(path: Path, scene: Scene) -> list[int]:
-    """Places of the capture's test views among the scene's cameras."""
-    from chebsplat.formats.capture import read_capture
-
-    capture = read_capture(path)
-    tests = {name for name, is_test in zip(capture.names, capture.is_test, strict=True) if is_test}
-    rows = [k for k, name in enumerate(scene.cameras.names) if name in tests]
-    if not rows:
-        raise DataFailure("no test view has a camera; lower ingest.test_every")
-    return rows
-
-
-def draw(scene: Scene, views: list[int], query: Query, out: Path) -> None:
-    """`heat/<view>.png` of every view, and `sheet.png` of renders beside heat maps."""
-    import numpy as np
-
-    from chebsplat.render import SceneRenderer
-    from chebsplat.stages.evaluate import camera
-    from chebsplat.stages.pages.pictures import heat, heat_scale, png
-
-    renderer, rows = SceneRenderer(scene.parameters), []
-    shown = {views[round(k)] for k in np.linspace(0, len(views) - 1, min(N_SHEET, len(views)))}
-    (out / "heat").mkdir(exist_ok=True)
-    files = dict(zip(views, file_names([scene.cameras.names[k] for k in views]), strict=True))
-    for k in views:
-        image, features = renderer.render(camera(scene, k), with_features=True)
-        assert features is not None
-        warm = heat(image, query.scores(features))
-        png(warm, out / "heat" / f"{files[k]}.png")
-        if k in shown:
-            rows.append(np.concatenate([image, warm], 1))
-    against = "probability" if query.calibration else f"against {', '.join(query.phrases)}"
-    title = heat_scale(f"{query.text}  ({against})", rows[0].shape[1])
-    png(np.concatenate([title, *rows]), out / "sheet.png")
-
-
-def file_names(views: list[str]) -> list[str]:
-    """A file's name for each view: its path with every separator replaced, and a number where two would be alike."""
-    names: list[str] = []
-    for view in views:
-        name = re.sub(r"[^\w.-]+", "-", view.removesuffix(Path(view).suffix)).strip(".-") or "view"
-        name = name.encode()[:200].decode(errors="ignore")
-        taken = {held.lower() for held in names}  # some file systems fold case
-        names.append(
-            next(new for k in itertools.count(1) if (new := name if k == 1 else f"{name}-{k}").lower() not in taken)
-        )
-    return names

@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import TYPE_CHECKING, Any
 
 from chebsplat.errors import ConfigError, DataFailure, InputError
-from chebsplat.stages.command import Job, command
+from chebsplat.stages.command import Job
 
 if TYPE_CHECKING:
     import numpy as np
@@ -162,6 +162,3 @@ def shares(job: Job, made: list[np.ndarray]) -> dict[str, Any]:
     labels = [decode_labels(features, embeddings) for features in made]
     names = ("changed_by_smoothing", "changed_by_knowledge")
     return {name: float((a != b).mean()) for name, a, b in zip(names, labels, labels[1:], strict=False)}
-
-
-main = command("refine", run)

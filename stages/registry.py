@@ -22,7 +22,6 @@ class Stage:
 
     of_scene: bool = True  # false: never a part of a scene's run, only what such a run is given
     after: tuple[str, ...] = ()  # stages of the scene that come first, although nothing of theirs is read
-    on_demand: bool = False  # part of a run only where `--stage` names it, or where it is there already
     on_device: bool = False  # computes on a GPU where one is used, to other bytes than the CPU's: the key says so then
     device_packages: tuple[str, ...] = ()  # what it computes with there
 
@@ -68,8 +67,6 @@ STAGES: dict[str, Stage] = {
         Stage("export", "chebsplat.scene/3", ("export",), (("gaussians", "train"),),
               (("features", "teacher"), ("lifted", "lift"), ("refined", "refine")),
               help="Write PLY files, ragged zarr, the label dictionary and the summary."),
-        Stage("mesh", "chebsplat.mesh/1", ("mesh",), (("scene", "export"),), on_demand=True,
-              help="The surface of the exported scene as triangles with colours and labels: PLY and GLB."),
         Stage("onnx", "chebsplat.encoder/2", ("onnx",), (("gaussians", "train"),),
               help="Export the local encoder to ONNX and check it against torch."),
         Stage("cks", "chebsplat.basis/3", ("scene", "cks"), (("gaussians", "train"),), (("basis", "cks"),),

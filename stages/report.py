@@ -6,7 +6,7 @@ import csv
 from typing import TYPE_CHECKING, Any
 
 from chebsplat.errors import DataFailure
-from chebsplat.stages.command import Job, command
+from chebsplat.stages.command import Job
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -223,6 +223,3 @@ def write_table(path: Path, rows: list[list[Any]]) -> None:
     """Write rows as CSV."""
     with path.open("w", newline="") as handle:
         csv.writer(handle).writerows(rows)
-
-
-main = command("report", run)

@@ -226,11 +226,5 @@ class EvaluateSection(Section):
     )
 
 
-class MeshSection(Section):
-    voxel: float | None = number(None, "edge, scene units; default: the 250th part of the room", 1e-9, 1e9)
-    n_triangles: int = number(200_000, "at most", 4, 100_000_000)
-    raw: bool = setting(False, "as it was fused: nothing removed, closed or decimated")
-
-
 class ReportSection(Section):
     n_pictures: int = number(4, "test views in the report", 1, 100)

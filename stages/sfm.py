@@ -6,7 +6,7 @@ import logging
 from typing import TYPE_CHECKING, Any
 
 from chebsplat.errors import DataFailure
-from chebsplat.stages.command import Job, command
+from chebsplat.stages.command import Job
 from chebsplat.stages.dense import MOST, swept, wants_more
 from chebsplat.stages.pose_check import wants_adjustment
 from chebsplat.stages.thinning import by_color, edge_of, thin
@@ -223,6 +223,3 @@ def tracks_of(capture: Capture, kept: np.ndarray) -> np.ndarray:
     place[kept] = np.arange(len(kept))
     tracks = np.stack([place[capture.tracks[:, 0]], capture.tracks[:, 1]], 1)
     return tracks[tracks[:, 0] >= 0].astype(np.int32)
-
-
-main = command("sfm", run)

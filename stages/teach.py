@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from chebsplat.errors import ConfigError, DataFailure, InputError
-from chebsplat.stages.command import Job, command, n_threads
+from chebsplat.stages.command import Job, n_threads
 
 if TYPE_CHECKING:
     import numpy as np
@@ -175,6 +175,3 @@ def measured(encoder: PointEncoder, rooms: Sequence[Room], embeddings: np.ndarra
         for name, features in (("teacher", room.features), ("shape", shape), ("both", room.features + shape)):
             right[name].append(float((decode_labels(features, embeddings) == room.labels)[known].mean()))
     return {name: float(np.mean(values)) for name, values in right.items()}
-
-
-main = command("teach", run)

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 
 from chebsplat.errors import ConfigError, DataFailure
 from chebsplat.formats.artifact import read_manifest, sha256_file
-from chebsplat.stages.command import Job, command
+from chebsplat.stages.command import Job
 
 if TYPE_CHECKING:
     from chebsplat.formats.capture import Capture
@@ -157,6 +157,3 @@ def from_pseudo_labels(job: Job, capture: Capture, settings: TeacherSection) -> 
     convention = {"kind": "given", "normalized": True, "n_scales": 1, "flips": False, "downscale": settings.downscale}
     half = features.astype(np.float16), labels, confidence.astype(np.float16)
     return Features(capture.names, half[0], capture.class_names, codes, *half[1:], convention)
-
-
-main = command("teacher", run)

@@ -4,9 +4,11 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-if TYPE_CHECKING:
-    import numpy as np
+import numpy as np
 
+from chebsplat.splats.cubes import cubes_of, first_of_each
+
+if TYPE_CHECKING:
     from chebsplat.formats.points import Points
 
 LEVELS = 4  # sizes of cubes that colours choose among, each half of the one before
@@ -15,58 +17,27 @@ NOISE = 1e-3  # what colours of one surface differ by: squared, of channels in [
 
 def thin(points: np.ndarray, count: int) -> np.ndarray:
     """Indices of at most `count` points, the first in each cube of the smallest edge that allows it."""
-    import numpy as np
-
     if len(points) <= count:
         return np.arange(len(points))
-    return np.sort(cubes(points, count)[0])
+    return first_of_each(points, edge_of(points, count))
 
 
 def even(points: Points) -> np.ndarray:
     """Indices of points that lie as far apart wherever they are: of those that are closer where colours change, the
     first in each of the largest cubes; all others.
     """
-    import numpy as np
-
     if "largest" not in points.notes:
         return np.arange(len(points.means))
-    flat = cells(points.means, points.notes["largest"], points.notes["from"])
-    return np.sort(np.unique(flat, return_index=True)[1])
-
-
-def cubes(points: np.ndarray, count: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """At most `count` cubes that hold points [N, 3], of the smallest edge that allows it: the first point of each, the
-    cube of every point [N], and how many points each holds.
-    """
-    import numpy as np
-
-    flat = cells(points, edge_of(points, count))
-    _, first, cube, held = np.unique(flat, return_index=True, return_inverse=True, return_counts=True)
-    return first, cube, held
-
-
-def cells(points: np.ndarray, edge: float, origin: np.ndarray | list[float] | None = None) -> np.ndarray:
-    """A number [N] for each cube of an edge that holds points [N, 3]. Cubes of half the edge lie within these.
-
-    Args: origin [3]: a corner of cubes, not beyond any point; None: the least coordinates.
-    """
-    import numpy as np
-
-    place = np.floor((points - (points.min(0) if origin is None else np.array(origin))) / edge).astype(np.int64)
-    sides = place.max(0) + 1
-    numbers: np.ndarray = (place[:, 0] * sides[1] + place[:, 1]) * sides[2] + place[:, 2]
-    return numbers
+    return first_of_each(points.means, points.notes["largest"], points.notes["from"])
 
 
 def edge_of(points: np.ndarray, count: int) -> float:
     """The smallest edge of cubes, `count` at most, that hold all points [N, 3]."""
-    import numpy as np
-
     size = float(np.ptp(points, axis=0).max()) or 1.0
     low, high = size / 4096, size
     for _ in range(24):
         middle = (low * high) ** 0.5
-        low, high = (middle, high) if len(np.unique(cells(points, middle))) > count else (low, middle)
+        low, high = (middle, high) if len(np.unique(cubes_of(points, middle))) > count else (low, middle)
     return high
 
 
@@ -80,14 +51,12 @@ def by_color(points: np.ndarray, colors: np.ndarray, count: int, edge: float) ->
       each point, sum to more than a bound, the least that keeps to `count`. Where pixels have given the points, that
       sum is the error of pictures in which each cube has one colour.
     """
-    import numpy as np
-
     values = colors / 255.0
     cube_of: list[np.ndarray] = []
     errors, parents, firsts = [], [], []
     for level in range(LEVELS):
         _, first, cube, held = np.unique(
-            cells(points, edge / 2**level), return_index=True, return_inverse=True, return_counts=True
+            cubes_of(points, edge / 2**level), return_index=True, return_inverse=True, return_counts=True
         )
         sums = np.stack([np.bincount(cube, values[:, k]) for k in range(3)])
         squares = np.bincount(cube, (values**2).sum(1))

@@ -8,7 +8,7 @@ from functools import partial
 from typing import TYPE_CHECKING, Any
 
 from chebsplat.errors import DataFailure
-from chebsplat.stages.command import Job, command, n_threads
+from chebsplat.stages.command import Job, n_threads
 from chebsplat.stages.measured_depth import with_depth_loss
 from chebsplat.stages.photo_models import camera_models, exposures, facts, reached
 from chebsplat.stages.resume import Saves
@@ -253,4 +253,3 @@ def state(
     return {"trainer": trainer.state_dict(), "trace": trace, "since": since, "resumed_at": resumed}
 
 
-main = command("train", run)

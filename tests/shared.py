@@ -18,7 +18,6 @@ TOY = {
     "teacher": {"kind": "labels"},
     "describe": {"n_regions": 24, "region_size": 8},
     "knowledge": {"n_rooms": 1, "n_held_out": 1, "n_views": 6, "n_points": 200, "steps": 3},
-    "mesh": {"raw": True},  # needs no extra
     "train": {
         "encoder": "transformer",
         "steps": 24,
@@ -47,7 +46,6 @@ INPUTS = {
         "points": "sfm",
         "knowledge": "teach",
     },
-    "mesh": {"scene": "export"},
     "onnx": {"gaussians": "train"},
     "cks": {"gaussians": "train"},
     "evaluate": {"capture": "ingest", "scene": "export", "features": "teacher"},
@@ -100,6 +98,8 @@ def run_stage(stage, out, inputs=None, config=None):
     """Run a stage's own command; returns its exit code."""
     from importlib import import_module
 
+    from chebsplat.stages.command import command
+
     out.parent.mkdir(parents=True, exist_ok=True)
     file = out.parent / f"{out.name}.json"
     file.write_text(json.dumps(TOY if config is None else config))
@@ -107,7 +107,7 @@ def run_stage(stage, out, inputs=None, config=None):
     for role, path in (inputs or {}).items():
         arguments += [f"--in-{role}", str(path)]
     with pytest.raises(SystemExit) as stop:
-        import_module(f"chebsplat.stages.{stage}").main(arguments, prog_name=stage)
+        command(stage, import_module(f"chebsplat.stages.{stage}").run)(arguments, prog_name=stage)
     return stop.value.code
 
 

@@ -27,8 +27,8 @@ PACKAGES = {
     "rasterize": {"kernels", "splats"},
     "render": {"rasterize", "splats", "views"},
     "shape": {"cameras", "kernels", "settings", "splats"},
-    "lifting": {"cameras", "kernels", "labels", "rasterize", "render", "views"},
-    "evaluation": {"labels", "rasterize", "render", "views"},
+    "lifting": {"cameras", "kernels", "labels", "rasterize", "render", "splats", "views"},
+    "evaluation": {"labels", "rasterize", "render", "splats", "views"},
     "training": {"cameras", "evaluation", "kernels", "rasterize", "settings", "shape", "splats", "views"},
 }
 SOURCES = [p for layer in LAYERS for p in sorted((ROOT / layer).rglob("*.py"))]

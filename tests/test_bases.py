@@ -1,6 +1,5 @@
 """`chebsplat basis`: what revisions say of themselves, and what is found out about a damaged one."""
 
-import csv
 import shutil
 
 import numpy as np
@@ -62,18 +61,12 @@ def call(*arguments):
     return result.exit_code, result.stdout, result.stderr
 
 
-def test_log_says_which_scene_added_how_much_and_draws_it(chain, tmp_path):
-    code, out, _ = call("log", "shared", "--out", tmp_path / "log")
+def test_log_says_which_scene_added_how_much(chain):
+    code, out, _ = call("log", "shared")
     assert code == 0
     lines = out.splitlines()
     assert [line.split()[:2] for line in lines[1:]] == [[str(k), scene] for k, scene in enumerate(SCENES, start=1)]
-    with (tmp_path / "log/lineage.csv").open() as handle:
-        rows = list(csv.DictReader(handle))
-    assert [(row["scene"], row["map"], row["rank_after"]) for row in rows[::2]] == [
-        ("office0", NAMES[0], "2"), ("room0", NAMES[0], "4"), ("office1", NAMES[0], "6")
-    ]  # fmt: skip
-    assert all(float(row["rho_after"]) < 0.02 < float(row["rho"]) for row in rows)
-    assert (tmp_path / "log/lineage.png").stat().st_size > 10_000
+    assert [line.split()[2] for line in lines[1:]] == ["2.0", "4.0", "6.0"]
 
 
 def test_show_names_the_columns_of_every_scene(chain):

@@ -101,7 +101,6 @@ def test_ls_tells_of_each_scene_even_of_a_damaged_one(tmp_path, work):
 
 def test_rm_removes_a_scene_and_what_only_it_names(work):
     one, other = run("toy"), run("toy", "train.steps=9")
-    (work / "toy/query/sofa").mkdir(parents=True)
     (work / "toy/view.html").write_text("a page")
     listed = CliRunner().invoke(main, ["rm", "toy"])
     assert (listed.exit_code, str(one.targets["train"]) in listed.stdout) == (0, True)

@@ -93,7 +93,7 @@ def test_an_imported_splat_stays_where_it_was(moved, tmp_path):
     import chebsplat
 
     checkpoint, export = moved
-    done = CliRunner().invoke(main, ["import", str(export / "scene.ply"), "--out", str(tmp_path / "theirs")])
+    done = CliRunner().invoke(main, ["lift", str(export / "scene.ply"), "--out", str(tmp_path / "theirs")])
     assert done.exit_code == 0, done.output
     scene = chebsplat.load(tmp_path / "theirs")
     close(scene.parameters["means"], checkpoint.parameters["means"], 0)
@@ -102,12 +102,12 @@ def test_an_imported_splat_stays_where_it_was(moved, tmp_path):
     assert (shown.alpha > 0.5).mean() > 0.05
     for arguments in (["verify", tmp_path / "theirs"], ["extract", tmp_path / "theirs", "--min-opacity", "0.1",
                       "--out", tmp_path / "part.ply"], ["page", tmp_path / "theirs", "--out", tmp_path / "page.html"],
-                      ["import", export / "scene.ply", "--out", tmp_path / "again"]):  # fmt: skip
+                      ["lift", export / "scene.ply", "--out", tmp_path / "again"]):  # fmt: skip
         done = CliRunner().invoke(main, list(map(str, arguments)))
         assert done.exit_code == 0, done.output
     for arguments, said in ((["--out", tmp_path / "theirs"], "exists"),
                             (["--teacher", "x.onnx", "--out", tmp_path / "x"], "add --capture")):  # fmt: skip
-        done = CliRunner().invoke(main, ["import", str(export / "scene.ply"), *map(str, arguments)])
+        done = CliRunner().invoke(main, ["lift", str(export / "scene.ply"), *map(str, arguments)])
         assert (done.exit_code, said in done.output) == (2, True)
 
 
@@ -124,6 +124,10 @@ def test_a_mesh_lies_there_too(mixed, moved, tmp_path):
         assert done.exit_code == 0, done.output
         vertex = PlyData.read(out)["vertex"]
         found.append(np.stack([vertex[axis] for axis in "xyz"], 1).astype(np.float64))
+    for arguments, code, said in (([tmp_path / "a.glb", "--voxel", 1e6, "--raw"], 4, "shows no surface"),
+                                  ([tmp_path / "a.obj"], 2, ".ply or .glb"), ([out], 2, "exists")):  # fmt: skip
+        done = CliRunner().invoke(main, ["mesh", str(mixed[1]), "--out", *map(str, arguments)])
+        assert (done.exit_code, said in done.output) == (code, True)
     back = (found[1] - SHIFT) @ TURN / SCALE
     for a, b in ((found[0], back), (back, found[0])):
         assert len(a) > 500

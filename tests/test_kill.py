@@ -20,7 +20,7 @@ def test_kills_and_stops_leave_nothing_half_or_behind_and_a_rerun_gives_the_same
     assert len(blows) == 12 and finished
 
 
-TRAIN = "import chebsplat.stages.resume as r; r.SECONDS = 0.0; from chebsplat.stages.train import main; main()"
+TRAIN = "import chebsplat.stages.resume as r; r.SECONDS = 0.0; from chebsplat.pipelines.cli import main; main()"
 
 
 @pytest.mark.slow
@@ -28,7 +28,7 @@ TRAIN = "import chebsplat.stages.resume as r; r.SECONDS = 0.0; from chebsplat.st
 def test_a_training_killed_at_any_moment_ends_in_the_same_bytes(toy, tmp_path):
     config = TOY | {"train": TOY["train"] | {"steps": 150, "n_densify": 4}}
     (tmp_path / "config.json").write_text(json.dumps(config))
-    command = [sys.executable, "-c", TRAIN, "--config", tmp_path / "config.json", "--no-progress"]
+    command = [sys.executable, "-c", TRAIN, "train", "--config", tmp_path / "config.json"]
     command += [part for role, of in INPUTS["train"].items() for part in (f"--in-{role}", toy[of])]
 
     def train(out, kill_after=None):

@@ -12,7 +12,8 @@ from chebsplat.formats.names import check_names, suggest
 from chebsplat.formats.ply import read_ply
 from chebsplat.formats.scene import SCHEMA, Scene, read_scene, write_scene
 from chebsplat.stages.extract import extract
-from chebsplat.stages.query import file_names
+from chebsplat.stages.frames import file_names
+from chebsplat.stages.opened import OpenedScene
 
 LABELS = ["café", "Tür", "沙发", "two\nlines", "🛋️", "back\\slash"]
 
@@ -43,7 +44,7 @@ def test_labels_in_any_language_survive_export(scene):
 
 @pytest.mark.parametrize("label", LABELS)
 def test_a_label_in_any_language_can_be_extracted(scene, tmp_path, label):
-    extract(scene, tmp_path / "part.ply", (label,), 0.0, None)
+    extract(OpenedScene(read_scene(scene), scene), tmp_path / "part.ply", (label,), 0.0, None)
     parameters, _, labels = read_ply(tmp_path / "part.ply")
     assert labels.tolist() == [LABELS.index(label)] and len(parameters["means"]) == 1
 

@@ -18,7 +18,7 @@ from chebsplat.pipelines.run import failures, wanted_steps
 from chebsplat.pipelines.scenes import CONFIGS, names, read_toml
 from chebsplat.stages.registry import STAGES
 
-PLANNED = {name for name, stage in STAGES.items() if stage.of_scene and not stage.on_demand}
+PLANNED = {name for name, stage in STAGES.items() if stage.of_scene}
 ALL = [name for name in STAGES if name in PLANNED - {"channels", "cks"}]
 AFTER_TRAIN = ["train", "lift", "refine", "export", "onnx", "evaluate", "report"]
 
@@ -374,20 +374,6 @@ def test_relinking_drops_stages_that_are_left_out_and_keeps_those_still_to_run(w
     assert not (work / "toy/teacher").is_symlink()
     assert (work / "toy/ingest").resolve() == less.targets["ingest"]
     assert (work / "toy/train").resolve() == whole.targets["train"]
-
-
-def test_a_mesh_is_made_where_it_is_asked_for_and_stays_as_long_as_it_is_the_scene_s(monkeypatch):
-    asked = Planner().plan("toy", "mesh.raw=true", also="mesh")
-    plain = Planner().plan("toy", "mesh.raw=true")
-    assert set(asked.targets) - set(plain.targets) == {"mesh"}
-    assert [step.key for step in asked.steps if step.stage != "mesh"] == [step.key for step in plain.steps]
-    finish(asked)
-    assert "mesh" in Planner().plan("toy", "mesh.raw=true").targets
-    assert "mesh" not in Planner().plan("toy", "mesh.raw=true,train.steps=9").targets
-    monkeypatch.setattr("chebsplat.pipelines.needs.find_spec", lambda name: None)
-    assert "mesh" in Planner().plan("toy", "mesh.raw=true", also="mesh").targets
-    with pytest.raises(ConfigError, match="stage=mesh"):
-        Planner().plan("toy", also="mesh")
 
 
 def running_plan(work, plan, pid):

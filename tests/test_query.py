@@ -1,6 +1,5 @@
 """`chebsplat query` finds what words mean in a finished scene, or says why it cannot."""
 
-import logging
 import shutil
 
 import numpy as np
@@ -18,6 +17,7 @@ from chebsplat.formats.features import Features, write_features
 from chebsplat.formats.manifest import Manifest
 from chebsplat.formats.scene import Scene, write_scene
 from chebsplat.labels.relevancy import relevancy
+from chebsplat.pipelines.api import load
 from chebsplat.pipelines.cli import main
 
 EMBEDDINGS = {
@@ -29,12 +29,6 @@ LABELS = ["chair", "sofa", "wall"]
 CANONICAL = ["object", "things", "stuff", "texture"]
 N = 12  # Gaussians of a label
 SIZE = (32, 48)
-
-
-@pytest.fixture(autouse=True)
-def _release_logging():
-    yield
-    logging.getLogger().handlers.clear()
 
 
 def vectors(names):
@@ -102,62 +96,52 @@ def folder(made, tmp_path, monkeypatch):
     return tmp_path / "work"
 
 
-def held_in(out):
-    with np.load(out / "relevancy.npz") as arrays:
-        return dict(arrays)
-
-
 def asked(*arguments):
     return CliRunner().invoke(main, ["query", *map(str, arguments)])
 
 
-def test_a_word_is_found_in_the_scene_and_in_its_test_views(folder):
-    done = asked("words", "seat")
-    out = folder / "words/query/seat"
-    assert (done.exit_code, done.stdout) == (0, f"{out}\n")
-    held = held_in(out)
-    assert held["relevancy"].dtype == np.float32
-    assert held["relevancy"].shape == (3 * N,)
-    assert (str(held["query"]), held["against"].tolist()) == ("seat", CANONICAL)
-    assert not held["calibrated"] and np.isnan(held["presence"])
-    assert held["relevancy"][: 2 * N].min() > 0.9
-    assert held["relevancy"][2 * N :].max() < 0.1
-    assert [path.name for path in (out / "heat").iterdir()] == ["b.png"]  # a.png is of training
-    heat = np.asarray(Image.open(out / "heat/b.png")).astype(int)
+def test_a_word_is_found_in_the_scene_and_drawn_by_render(folder, tmp_path):
+    answer = load(folder / "words").ask("seat")
+    assert (answer.scores.dtype, answer.scores.shape) == (np.float32, (3 * N,))
+    assert not answer.calibrated and answer.presence is None
+    assert answer.scores[: 2 * N].min() > 0.9
+    assert answer.scores[2 * N :].max() < 0.1
+    command = ["render", "words", "--what", "relevancy", "--query", "seat", "--out", str(tmp_path / "seats")]
+    assert CliRunner().invoke(main, command).exit_code == 0
+    heat = np.asarray(Image.open(tmp_path / "seats/relevancy/b.png.png")).astype(int)
     colored = np.ptp(heat, axis=-1) > 40
     middle = SIZE[0] // 2
     assert heat.shape == (*SIZE, 3)
     assert colored[middle, 12] and colored[middle, 24]
     assert not colored[:, 34:].any()
-    assert np.asarray(Image.open(out / "sheet.png")).shape == (28 + SIZE[0], 2 * SIZE[1], 3)
 
 
-def test_the_table_tells_the_labels_that_fit_best(folder):
-    lines = asked("words", "seat", "--top", 2).stderr.splitlines()
-    assert f"{2 * N} of {3 * N} Gaussians" in "".join(lines)
-    rows = [line.split()[1] for line in lines[-2:]]
-    assert rows == ["sofa", "chair"]
+def test_the_answer_tells_the_labels_that_fit_best_and_writes_nothing(folder):
+    before = sorted(folder.rglob("*"))
+    done = asked("words", "seat", "--top", 2)
+    lines = done.stdout.splitlines()
+    assert (done.exit_code, len(lines)) == (0, 4)
+    assert f"{2 * N} of {3 * N} Gaussians" in lines[0]
+    assert [line.split()[0] for line in lines[-2:]] == ["sofa", "chair"]
+    assert sorted(folder.rglob("*")) == before
 
 
 def test_a_channel_map_that_holds_the_features_leaves_relevancy_as_it_is(folder):
-    asked("words", "seat")
     own = relevancy(vectors(LABELS).repeat(N, 0), vectors(["seat"])[0], vectors(CANONICAL))
-    assert np.allclose(held_in(folder / "words/query/seat")["relevancy"], own, atol=2e-3)
+    assert np.allclose(load(folder / "words").ask("seat").scores, own, atol=2e-3)
 
 
-def test_what_it_is_weighed_against_and_where_it_goes_can_be_chosen(folder, tmp_path):
-    done = asked(folder / "words", "seat", "--against", "sofa, wall", "--out", tmp_path / "elsewhere")
-    assert done.stdout == f"{tmp_path / 'elsewhere'}\n"
-    held = held_in(tmp_path / "elsewhere")
-    assert held["against"].tolist() == ["sofa", "wall"]
-    assert held["relevancy"][N : 2 * N].max() < 0.5 < held["relevancy"][:N].min()
+def test_what_it_is_weighed_against_can_be_chosen(folder):
+    scores = load(folder / "words").ask("seat", ["sofa", "wall"]).scores
+    assert scores[N : 2 * N].max() < 0.5 < scores[:N].min()
+    chosen = asked(folder / "words", "seat", "--against", "sofa, wall").stdout.splitlines()
+    assert chosen[0].startswith(f"{N} of {3 * N} Gaussians")
 
 
 def test_a_scene_of_labels_is_asked_for_a_label_against_the_others(folder):
     assert asked("labels", "Sofa").exit_code == 0
-    held = held_in(folder / "labels/query/Sofa")
-    assert held["against"].tolist() == ["chair", "wall"]
-    assert np.all((held["relevancy"] > 0.5) == (np.arange(3 * N) // N == 1))
+    scores = load(folder / "labels").ask("Sofa").scores
+    assert np.all((scores > 0.5) == (np.arange(3 * N) // N == 1))
 
 
 def remove_teacher(folder):
@@ -185,7 +169,7 @@ def nothing(folder):
         (nothing, ["word", "seat"], 2, "there is words"),
         (nothing, ["store", "seat"], 2, "no finished scene"),
         (nothing, ["words", " "], 2, "empty"),
-        (remove_teacher, ["words", "seat"], 3, "teacher is missing"),
+        (remove_teacher, ["words", "seat"], 2, "no teacher's artifact"),
         (other_model, ["words", "seat"], 3, "toy.onnx is not the model"),
         (small_table, ["words", "sofa"], 3, "choose with --against"),
     ],
@@ -196,4 +180,3 @@ def test_what_cannot_be_answered_is_told_with_the_remedy(folder, damage, argumen
     assert done.exit_code == code
     assert said in done.stderr
     assert not done.stdout
-    assert not list(folder.glob("*/query"))

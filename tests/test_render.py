@@ -1,7 +1,6 @@
 """`chebsplat render` and `chebsplat cameras`: frames are those that are evaluated, kept, and of the asked cameras."""
 
 import json
-import logging
 import os
 import signal
 import subprocess
@@ -24,12 +23,6 @@ from chebsplat.stages.opened import Camera
 from chebsplat.stages.sources.colmap_model import read_model
 
 TOLERANCE = 1e-12  # of text with all of a double's digits, through an inverse
-
-
-@pytest.fixture(autouse=True)
-def _release_logging():
-    yield
-    logging.getLogger().handlers.clear()
 
 
 @pytest.fixture(scope="module")

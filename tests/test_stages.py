@@ -193,10 +193,6 @@ def without_trace(toy, tmp):
     return inputs_of(toy, "report") | {"gaussians": path}, TOY
 
 
-def voxels_beyond_the_room(toy, tmp):
-    return {"scene": toy["export"]}, {"mesh": {"voxel": 1e6, "raw": True}}
-
-
 FAILURES = {
     "ingest": one_photo,
     "sfm": without_depth,
@@ -209,7 +205,6 @@ FAILURES = {
     "lift": only_test_views_to_lift,
     "refine": nothing_to_refine,
     "export": without_gaussians,
-    "mesh": voxels_beyond_the_room,
     "onnx": strict_tolerance,
     "cks": encoder_without_attention,
     "evaluate": no_test_view,

@@ -91,7 +91,7 @@ def test_scenes_that_nothing_was_added_to_for_long_are_given_up_with_what_they_a
     assert not any(path.exists() for path in only) and all(path.exists() for path in plans[1].targets.values())
 
 
-def test_du_counts_what_scenes_share_in_each_and_apart_what_is_one_s_alone():
+def test_ls_counts_what_scenes_share_in_each_and_apart_what_is_one_s_alone():
     for settings in ("", "train.steps=5"):
         plan = Planner(running=True).plan("toy", settings)
         finish(plan)
@@ -101,14 +101,10 @@ def test_du_counts_what_scenes_share_in_each_and_apart_what_is_one_s_alone():
                 manifest["files"]["weight"] = {"bytes": 10**6, "sha256": "0" * 64}
                 (step.path / "artifact.json").write_text(json.dumps(manifest))
         store.link(plan.title, {"report": plan.targets["report"]})
-    rows = [line.split() for line in told("du").splitlines()]
-    assert ["train", "2", "2.0"] in rows and ["ingest", "1", "1.0"] in rows
-    scenes = {row[0]: [float(cell) for cell in row[1:]] for row in rows if row and row[0].startswith("toy")}
-    n_steps = {name: whole for name, (whole, _) in scenes.items()}
-    assert set(n_steps) == {"toy", "toy@train.steps=5"}
-    assert scenes["toy"] == scenes["toy@train.steps=5"]
-    whole, alone = scenes["toy"]
-    assert 0 < alone < whole <= len(plan.steps)
+    heading, *rows = [line.split() for line in told("ls").splitlines()]
+    assert {row[0] for row in rows} == {"toy", "toy@train.steps=5"}
+    ((whole, alone),) = {(float(row[3]), float(row[4])) for row in rows}
+    assert heading[3:5] == ["MB", "alone"] and 0 < alone < whole <= len(plan.steps)
 
 
 def test_a_run_under_way_on_another_machine_keeps_what_it_makes_from_clean_stale(monkeypatch):

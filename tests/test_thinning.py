@@ -4,9 +4,10 @@ import numpy as np
 import pytest
 
 from chebsplat.formats.points import Points
+from chebsplat.splats.cubes import cubes_of, first_of_each, means_of_each
 from chebsplat.stages.config import Config
 from chebsplat.stages.sfm import reduced
-from chebsplat.stages.thinning import LEVELS, by_color, cells, cubes, edge_of, even, thin
+from chebsplat.stages.thinning import LEVELS, by_color, edge_of, even, thin
 from chebsplat.stages.train_inputs import model_of
 
 
@@ -23,12 +24,30 @@ def error(colors, cube):
     return float(((colors - (sums / np.bincount(cube)[:, None])[cube]) ** 2).sum())
 
 
+def test_the_first_of_each_cube_is_kept_in_order_wherever_the_grid_begins():
+    points = np.random.default_rng(2).normal(size=(2000, 3)) * [3, 1, 0.2]
+    for origin in (None, [0.1, -0.2, 0.3]):  # points on both sides of it
+        seen: set = set()
+        place = np.floor((points - (points.min(0) if origin is None else origin)) / 0.25).astype(int).tolist()
+        wanted = [k for k, row in enumerate(place) if tuple(row) not in seen and not seen.add(tuple(row))]
+        assert first_of_each(points, 0.25, origin).tolist() == wanted
+
+
+def test_means_are_of_the_points_of_a_cube_that_holds_enough_of_them():
+    points = np.array([[0.1, 0, 0], [0.3, 0, 0], [0.2, 0.3, 0], [5, 0, 0], [0, 5, 0], [0, 5.5, 0], [0.5, 5, 0.5]])
+    cube = np.unique(cubes_of(points, 1.0), return_inverse=True)[1]
+    kept, middles = means_of_each(cube, 0.5, points)
+    assert kept.tolist() == [True, True, False]  # the last one has a single point
+    np.testing.assert_allclose(middles, [[0.2, 0.1, 0], [0.5 / 3, 15.5 / 3, 0.5 / 3]])
+
+
 def test_cubes_are_smaller_where_colours_change_and_say_more_of_the_picture():
     places, colors = wall()
     kept, cube = by_color(places, colors, 4000, edge_of(places, 2000))
     assert 3500 < len(kept) <= 4000
     assert (places[kept, 0] > 2).mean() > 0.75
-    assert error(colors, cube) < 0.7 * error(colors, cubes(places, 4000)[1])
+    alike = np.unique(cubes_of(places, edge_of(places, 4000)), return_inverse=True)[1]
+    assert error(colors, cube) < 0.7 * error(colors, alike)
 
 
 def test_each_point_kept_is_the_first_of_its_cube_and_cubes_lie_within_the_largest():
@@ -37,7 +56,7 @@ def test_each_point_kept_is_the_first_of_its_cube_and_cubes_lie_within_the_large
     kept, cube = by_color(places, colors, 900, edge)
     assert (np.diff(kept) > 0).all() and (cube[kept] == np.arange(len(kept))).all()
     assert (kept[cube] <= np.arange(len(places))).all()
-    largest, smallest = cells(places, edge), cells(places, edge / 2 ** (LEVELS - 1))
+    largest, smallest = cubes_of(places, edge), cubes_of(places, edge / 2 ** (LEVELS - 1))
     assert all(len(np.unique(largest[cube == k])) == 1 for k in range(0, len(kept), 7))
     of = np.full(smallest.max() + 1, -1)
     of[smallest] = cube

@@ -66,7 +66,7 @@ def stage_rows() -> list[dict[str, Any]]:
                 config.write_text(text)
                 seconds = []
                 for k in range(2):
-                    call = [sys.executable, "-c", "from chebsplat.stages.describe import main; main()"]
+                    call = [sys.executable, "-P", "-m", "chebsplat.pipelines.cli", "describe"]
                     call += ["--in-points", str(path), "--config", str(config), "--log-level", "error"]
                     call += ["--out", f"{folder}/out-{n}-{len(text)}-{k}", "--device", "cpu"]
                     began = time.perf_counter()

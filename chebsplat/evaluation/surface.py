@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
+from chebsplat.splats.cubes import first_of_each
+
 REACH = 3.0  # standard deviations
 CELLS = 128  # along the longest side of what is measured
 CHUNK = 2048  # Gaussians at a time, so that their pairs with points stay in memory
@@ -62,6 +64,4 @@ def thinned(points: np.ndarray) -> np.ndarray:
         return np.zeros(0, np.int64)
     low, high = np.quantile(points, [0.01, 0.99], axis=0)
     side = float((high - low).max()) / CELLS or 1.0
-    cells = np.floor((points - low) / side).clip(-(2.0**20), 2.0**20 - 1).astype(np.int64) + 2**20
-    _, first = np.unique(cells @ np.array([2**42, 2**21, 1]), return_index=True)
-    return np.sort(first)
+    return first_of_each(points, side, low)

@@ -2,5 +2,5 @@
 
 What is made of them afterwards: smoothing, a blend with what is known beforehand, and how both are chosen.
 
-N Gaussians, V training views, C channels; weights are α T summed over pixels. May import kernels, rasterize.
+N Gaussians, V training views, C channels; weights are α T summed over pixels. May import kernels, rasterize, splats.
 """

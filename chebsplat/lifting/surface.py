@@ -14,6 +14,7 @@ import torch
 
 from chebsplat.cameras import centers, unproject, upright
 from chebsplat.render import SceneRenderer
+from chebsplat.splats.cubes import cubes_of, means_of_each
 from chebsplat.views import View
 
 OPAQUE = 0.9  # least coverage of a pixel whose depth counts
@@ -102,10 +103,6 @@ def fused(points: np.ndarray, eyes: np.ndarray, edge: float, least: float = LEAS
     """The mean of the points in each cube of this edge, and of their eyes, where it holds enough of them (`least`)."""
     if len(points) == 0:
         return Surface(points, eyes)
-    cells = np.floor((points - points.min(0)) / edge).astype(np.int64)
-    _, cell, count = np.unique(cells, axis=0, return_inverse=True, return_counts=True)
-    sums = np.zeros((2, len(count), 3))
-    np.add.at(sums[0], cell.ravel(), points)
-    np.add.at(sums[1], cell.ravel(), eyes)
-    kept = count >= max(3, least * np.median(count[cell]))
-    return Surface(*(total[kept] / count[kept, None] for total in sums))
+    cube = np.unique(cubes_of(points, edge), return_inverse=True)[1]
+    _, middles, means = means_of_each(cube, least, points, eyes)
+    return Surface(middles, means)

@@ -9,6 +9,7 @@ import numpy as np
 from chebsplat.cameras import upright
 from chebsplat.settings import DescribeSection
 from chebsplat.shape.descriptor import describe_members
+from chebsplat.splats.cubes import first_of_each
 
 RADII = (0.12, 0.3, 0.7, 1.6)  # metres
 N_OWN = 6
@@ -85,14 +86,6 @@ def point_inputs(
     )
 
 
-def spread_out(means: np.ndarray, edge: float) -> np.ndarray:
-    """Indices of the first point in each cube of this edge."""
-    cells = np.floor((means - means.min(0)) / edge).astype(np.int64)
-    sides = cells.max(0) + 1
-    flat = (cells[:, 0] * sides[1] + cells[:, 1]) * sides[2] + cells[:, 2]
-    return np.sort(np.unique(flat, return_index=True)[1])
-
-
 def _scale(
     means: np.ndarray,
     radius: float,
@@ -108,7 +101,7 @@ def _scale(
     near = np.full((n, MEMBERS), -1, np.int64)
     distance = np.full((n, MEMBERS), np.inf)
     if n:
-        kept = spread_out(means, SPACING * radius)
+        kept = first_of_each(means, SPACING * radius)
         count = min(MEMBERS, len(kept))
         found, index = cKDTree(means[kept]).query(means, count, workers=-1)
         near[:, :count] = kept[index.reshape(n, count)]

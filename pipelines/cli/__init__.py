@@ -2,18 +2,22 @@
 
 from __future__ import annotations
 
-from typing import Any
+from typing import Any, NoReturn
 
 import click
 
 from chebsplat.pipelines.cli import about, renders, runs, upkeep, uses
 from chebsplat.pipelines.cli.basis import basis
-from chebsplat.pipelines.cli.group import Guarded
+from chebsplat.pipelines.cli.group import Guarded, logged
 from chebsplat.stages.registry import STAGES
 
 
 class Commands(Guarded):
     """Stages are listed from their table and imported only when called, so that --help stays instant."""
+
+    def invoke(self, context: click.Context) -> NoReturn:
+        with logged(context):
+            super().invoke(context)
 
     def list_commands(self, context: click.Context) -> list[str]:
         return [*(name for name in super().list_commands(context) if name not in STAGES), *STAGES]
@@ -28,7 +32,9 @@ class Commands(Guarded):
         if args[0] in STAGES and not (of_a_file and args[0] in self.commands):  # `lift` is of a file, too
             from importlib import import_module
 
-            return args[0], import_module(f"chebsplat.stages.{args[0]}").main, args[1:]
+            from chebsplat.stages.command import command
+
+            return args[0], command(args[0], import_module(f"chebsplat.stages.{args[0]}").run), args[1:]
         return super().resolve_command(context, args)
 
 

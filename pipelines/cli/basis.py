@@ -2,16 +2,14 @@
 
 from __future__ import annotations
 
-import csv
-import os
 import sys
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 import click
 
-from chebsplat.errors import ConfigError
 from chebsplat.pipelines.cli.group import Guarded
+from chebsplat.pipelines.cli.options import NewPath
 from chebsplat.pipelines.tables import show_rows
 
 if TYPE_CHECKING:
@@ -34,24 +32,11 @@ def newest(name: str) -> tuple[Path, Basis]:
 
 @basis.command()
 @click.argument("name")
-@click.option("--out", type=click.Path(path_type=Path), help="folder for lineage.csv and lineage.png")
-def log(name: str, out: Path | None) -> None:
+def log(name: str) -> None:
     """Revisions: the scene, ranks, ρ before and after, σ_f and ρ′, energy; means over linear maps."""
-    from chebsplat.formats import artifact
     from chebsplat.pipelines import lineage
 
-    path, one = newest(name)
-    show_rows(lineage.log_table(one))
-    if out is not None:
-        out.mkdir(parents=True, exist_ok=True)
-        rows = lineage.records(one)
-        with (out / "lineage.csv").open("w", newline="") as handle:
-            writer = csv.DictWriter(handle, list(rows[0]))
-            writer.writeheader()
-            writer.writerows(rows)
-        share = artifact.read_manifest(path).config["cks"]["max_rank"]
-        lineage.draw(out / "lineage.png", one, share)
-        print(f"{out}: lineage.csv, lineage.png", file=sys.stderr)
+    show_rows(lineage.log_table(newest(name)[1]))
 
 
 @basis.command()
@@ -96,14 +81,12 @@ def verify(name: str) -> None:
 
 @basis.command()
 @click.argument("name")
-@click.option("--out", type=click.Path(path_type=Path), required=True, help="folder to make; later: basis=FOLDER/")
+@click.option("--out", type=NewPath(), required=True, help="folder to make; later: basis=FOLDER/")
 def export(name: str, out: Path) -> None:
     """Copy a revision, to start scenes from it elsewhere (basis=FOLDER/)."""
     from chebsplat.formats import artifact
 
     path, _ = newest(name)
-    if os.path.lexists(out):
-        raise ConfigError(f"{out} exists; choose another --out")
     artifact.copy(path, out, artifact.verify(path))
     print(out.absolute())
 

@@ -1,9 +1,13 @@
-"""How a command leaves: its return is the exit code; a typed error or a stop becomes a line on stderr and a code."""
+"""How a command speaks and leaves: its log goes to stderr; its return is the exit code; a typed error or a stop becomes
+a line on stderr and a code.
+"""
 
 from __future__ import annotations
 
+import logging
 import sys
-from contextlib import suppress
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
 from typing import NoReturn
 
 import click
@@ -22,6 +26,30 @@ def say(text: str) -> None:
     """Print a line of ours to stderr, where that is possible."""
     with suppress(OSError):  # the terminal may be gone, and the disk of a log full
         print(f"chebsplat: {text}", file=sys.stderr)
+
+
+class _Lines(logging.Formatter):
+    """Each line begins with the command's name."""
+
+    def __init__(self, context: click.Context):
+        super().__init__()
+        self.context = context
+
+    def format(self, record: logging.LogRecord) -> str:
+        return f"{self.context.invoked_subcommand}: {super().format(record)}"
+
+
+@contextmanager
+def logged(context: click.Context) -> Iterator[None]:
+    """The log goes to stderr within; a stage that is run there says it in its own way from then on."""
+    shown = logging.StreamHandler(sys.stderr)
+    shown.setFormatter(_Lines(context))
+    logging.getLogger("chebsplat").setLevel("INFO")
+    logging.getLogger().addHandler(shown)
+    try:
+        yield
+    finally:
+        logging.getLogger().removeHandler(shown)
 
 
 class Guarded(click.Group):

@@ -12,6 +12,7 @@ from pathlib import Path
 import click
 
 from chebsplat.errors import ConfigError, InputError
+from chebsplat.pipelines.cli.options import AGAINST, NewPath
 
 PATH = click.option(
     "--path", default="capture", show_default=True, help="orbit, capture, or a cameras.json or transforms.json"
@@ -34,11 +35,6 @@ WORDS = click.option(
     type=click.Path(path_type=Path),
     help="text file of more words to ask for, one a line",
 )
-AGAINST = click.option(
-    "--against",
-    default="",
-    help="phrases that words are weighed against, as of query",
-)
 
 
 @click.command()
@@ -47,7 +43,7 @@ AGAINST = click.option(
 @FRAMES
 @click.option("--what", default="color", show_default=True, help="of color,labels,depth,relevancy; with commas")
 @click.option("--query", help="words that relevancy is of")
-@click.option("--against", default="", help="phrases the query is weighed against, with commas")
+@AGAINST
 @SIZE
 @click.option("--fps", type=click.IntRange(1, 240), default=24, show_default=True, help="of a video")
 @click.option("--out", type=click.Path(path_type=Path), required=True, help="a folder of frames, or a .mp4")
@@ -57,7 +53,7 @@ def render(
     frames: int | None,
     what: str,
     query: str | None,
-    against: str,
+    against: list[str],
     size: str | None,
     fps: int,
     out: Path,
@@ -71,14 +67,11 @@ def render(
     from chebsplat.stages.progress import Progress
     from chebsplat.stages.video import library, render_video
 
-    logging.basicConfig(stream=sys.stderr, format="render: %(message)s", level="WARNING", force=True)
-    logging.getLogger("chebsplat").setLevel("INFO")
     opened, wanted = load(scene), size_of(size)
     kinds = kinds_of(what, opened, query is not None)
     if out.suffix == ".mp4":
         library()
-    phrases = [word.strip() for word in against.split(",") if word.strip()]
-    asked = None if query is None else opened.understood(query, phrases)
+    asked = None if query is None else opened.understood(query, against)
     shot = Shot(kinds, read_manifest(artifact_of(scene, "export")).key, asked)
     cameras = [fitted(camera, wanted) for camera in path_of(opened, path, frames)]
     if out.suffix == ".mp4":
@@ -107,14 +100,12 @@ def cameras(scene: str, path: str, frames: int | None, size: str | None, out: Pa
 
 @click.command()
 @click.argument("scene")
-@click.option("--out", type=click.Path(path_type=Path), required=True, help="the .html to write")
+@click.option("--out", type=NewPath(), required=True, help="the .html to write")
 @SH
 @WORDS
 @AGAINST
-def page(scene: str, out: Path, sh: int, words: Path | None, against: str) -> None:
+def page(scene: str, out: Path, sh: int, words: Path | None, against: list[str]) -> None:
     """Write a finished SCENE (or a .ply) as one HTML page to fly through and ask in words: no server, no network."""
-    if out.exists():
-        raise ConfigError(f"{out} exists; remove it, or choose another --out")
     _write_page(scene, out, sh, words, against)
 
 
@@ -123,7 +114,7 @@ def page(scene: str, out: Path, sh: int, words: Path | None, against: str) -> No
 @SH
 @WORDS
 @AGAINST
-def view(scene: str, sh: int, words: Path | None, against: str) -> None:
+def view(scene: str, sh: int, words: Path | None, against: list[str]) -> None:
     """Look at a finished SCENE (or a .ply): write it as `page` does, and open that in a browser.
 
     The page lies in the scene's folder, that of a .ply where you stand; each call writes it anew.
@@ -147,7 +138,7 @@ def _name(scene: str) -> str:
     return path.stem if path.suffix == ".ply" else path.name
 
 
-def _write_page(scene: str, out: Path, sh: int, words: Path | None, against: str) -> None:
+def _write_page(scene: str, out: Path, sh: int, words: Path | None, against: list[str]) -> None:
     """Write the page and say where it is."""
     from chebsplat.formats.scene import read_scene
     from chebsplat.formats.teacher_model import read_label_set
@@ -161,9 +152,8 @@ def _write_page(scene: str, out: Path, sh: int, words: Path | None, against: str
         opened, teacher = foreign(Path(scene).expanduser()), None
     else:
         opened, teacher = read_scene(artifact_of(scene, "export")), teacher_of(scene)
-    phrases = [word.strip() for word in against.split(",") if word.strip()]
     more = list(read_label_set(words)) if words else []
-    counts = write_page(opened, _name(scene), teacher, out, sh, phrases, more)
+    counts = write_page(opened, _name(scene), teacher, out, sh, against, more)
     print(", ".join(f"{name} {number:,}" for name, number in counts.items()), file=sys.stderr)
     print(out, flush=True)
 

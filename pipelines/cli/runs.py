@@ -22,7 +22,6 @@ def plans(
     basis: str,
     running: bool = False,
     device: str = "cpu",
-    also: str | None = None,
 ) -> list[Any]:
     """The plan of a scene, after those of the scenes that its basis comes from, or the plans of a sequence."""
     from chebsplat.pipelines import bases, sequences
@@ -39,9 +38,9 @@ def plans(
         if basis == "none":
             settings = ",".join(part for part in (settings, "refine.knowledge=none") if part)
         if basis in ("", "none"):
-            return [planner.plan(str(scene), settings, ablation, also=also)]
+            return [planner.plan(str(scene), settings, ablation)]
         earlier, path, name = bases.before(planner, basis, settings, ablation)
-        plan = planner.plan(str(scene), settings, ablation, path, also=also)
+        plan = planner.plan(str(scene), settings, ablation, path)
         plan.title += ("+" if ablation or settings else "@") + f"basis={name}"
         for one in earlier:
             one.asked = False
@@ -103,7 +102,7 @@ def run(stage: str | None, cores: int | None, device: str, on: str, **choice: An
     where = cluster.checked(on)
     used = device_of(device, where)
     cores = cores or (os.cpu_count() or 1 if where == cluster.LOCAL else 4)
-    chosen = plans(**choice, running=True, device=used, also=stage)
+    chosen = plans(**choice, running=True, device=used)
     return execute(chosen, checked_stage(stage or None, chosen), cores, used, where)
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import re
 import sys
+from pathlib import Path
 from typing import Any
 
 import click
@@ -28,7 +29,7 @@ class Age(click.ParamType):
 
 @click.command("ls")
 def list_scenes() -> None:
-    """List the scenes in work: source, stages done, size, when, and what was measured."""
+    """List the scenes and studies in work: source, stages done, what they take, when, and what was measured."""
     from chebsplat.pipelines import inventory, store
     from chebsplat.pipelines.tables import show_rows
 
@@ -36,17 +37,17 @@ def list_scenes() -> None:
     if not scenes:
         print(f"no scene in {store.work()}", file=sys.stderr)
         return
-    heading = ("scene", "source", "done", "MB", "when", "PSNR", "mIoU")
+    heading = ("scene", "source", "done", "MB", "alone", "when", "PSNR", "mIoU")
     show_rows([heading, *(scene.row() for scene in scenes)])
-    print(f"{store.work()}: artifacts that several scenes share count in each", file=sys.stderr)
+    print(f"{store.work()}: what several share counts in each, and in none alone", file=sys.stderr)
 
 
 @click.command()
 @click.argument("scenes", nargs=-1, required=True)
 @click.option("--yes", is_flag=True, help="remove what is listed")
 def rm(scenes: tuple[str, ...], yes: bool) -> None:
-    """Remove SCENES: their links, queries and pages, and the artifacts that nothing else names."""
-    from chebsplat.pipelines import folders, inventory, store
+    """Remove SCENES: their links and pages, and the artifacts that nothing else names."""
+    from chebsplat.pipelines import inventory
 
     chosen = list(dict.fromkeys(inventory.in_work(scene) for scene in scenes))
     artifacts = inventory.only_of(chosen)
@@ -54,11 +55,16 @@ def rm(scenes: tuple[str, ...], yes: bool) -> None:
         kept = inventory.others(folder)
         print(f"           {folder}" + (f" (stays, for what is not ours: {', '.join(kept)})" if kept else ""))
     show_sizes(artifacts, yes, "--yes removes them")
-    if not yes:
-        return
+    if yes:
+        remove(chosen, artifacts)
+
+
+def remove(chosen: list[Path], artifacts: list[tuple[Path, int]]) -> None:
+    """Remove the links of these folders, and these artifacts and leftovers."""
+    from chebsplat.pipelines import inventory, store
+
     for folder in chosen:
         inventory.unlink(folder)
-        folders.release(folder.name.partition("@")[0])
     for path, _ in artifacts:
         store.remove(path)
 
@@ -95,7 +101,7 @@ def verify(scenes: tuple[str, ...]) -> int:
 @click.option("--older-than", type=Age(), help="give up scenes and studies, too, that nothing was added to for so long")
 def clean_stale(yes: bool, keep_newer: float, older_than: float | None) -> None:
     """List the artifacts that no scene names any more, and leftovers of killed runs."""
-    from chebsplat.pipelines import folders, inventory, store
+    from chebsplat.pipelines import inventory, store
 
     old = [] if older_than is None else inventory.untouched(older_than)
     leftovers = store.unnamed(set(old))
@@ -104,11 +110,7 @@ def clean_stale(yes: bool, keep_newer: float, older_than: float | None) -> None:
         print(f"           {folder}")
     show_sizes(leftovers, yes or not (leftovers or old), "yes=1 (--yes) removes them")
     if yes:
-        for folder in old:
-            inventory.unlink(folder)
-            folders.release(folder.name.partition("@")[0])
-        for path, _ in leftovers:
-            store.remove(path)
+        remove(old, leftovers)
         store.sweep()
 
 
@@ -126,17 +128,4 @@ def status() -> None:
         print(f"nothing runs in {store.work()}, and nothing has failed", file=sys.stderr)
 
 
-@click.command()
-def du() -> None:
-    """Say what the artifacts take, by stage and by scene or study."""
-    from chebsplat.pipelines import inventory
-    from chebsplat.pipelines.tables import show_rows
-
-    stages, scenes = inventory.usage()
-    show_rows([("stage", "artifacts", "MB"), *((name, str(n), f"{size / 1e6:.1f}") for name, n, size in stages)])
-    print()
-    rows = [(name, f"{size / 1e6:.1f}", f"{alone / 1e6:.1f}") for name, size, alone in scenes]
-    show_rows([("scene or study", "MB", "of it alone"), *rows])
-
-
-COMMANDS = (list_scenes, rm, verify, status, du, clean_stale)
+COMMANDS = (list_scenes, rm, verify, status, clean_stale)

@@ -1,4 +1,4 @@
-"""Pictures of pages and queries, as self-contained data URIs and inline SVG."""
+"""Pictures of pages, as self-contained data URIs and inline SVG."""
 
 from __future__ import annotations
 
@@ -35,21 +35,6 @@ def heat(image: np.ndarray, relevancy: np.ndarray) -> np.ndarray:
     warmth = (2 * relevancy - 1).clip(0, 1)[..., None]
     opacity = np.where(warmth > 0, 0.5 + 0.4 * warmth, 0)
     return np.round((1 - opacity) * 0.8 * grey + opacity * (0.7 + 0.3 * grey / 255) * warm(warmth)).astype(np.uint8)
-
-
-def heat_scale(title: str, width: int) -> np.ndarray:
-    """A strip u8 [28, width, 3]: the title, and the colours of `heat` from 0.5 to 1."""
-    from PIL import Image, ImageDraw
-
-    strip = np.full((28, width, 3), 255, np.uint8)
-    left, right = round(0.82 * width), round(0.97 * width)
-    strip[9:19, left:right] = warm(np.linspace(0, 1, right - left)[None, :, None]).round()
-    picture = Image.fromarray(strip)
-    draw, room = ImageDraw.Draw(picture), max(left - 40, 0) // 6  # letters of the built-in font
-    draw.text((8, 8), title if len(title) <= room else f"{title[: max(room - 3, 0)]}...", fill="black")
-    draw.text((left - 22, 8), "0.5", fill="black")
-    draw.text((right + 6, 8), "1", fill="black")
-    return np.asarray(picture)
 
 
 def warm(warmth: np.ndarray) -> np.ndarray:

@@ -9,7 +9,6 @@ from pathlib import Path
 from malformed.case import Asked, Case, stage
 from malformed.manifests import DAMAGES, KEY, fake
 
-KEYS = ["", "abc", "../../x", "/tmp/x", KEY.upper(), KEY + "0", KEY[:-1] + "\n", "0" * 15 + "²"]
 NAMES = {  # option: names that lead elsewhere, or nowhere
     "--ablation": ["../../x", "/etc/passwd", "../scenes/toy", "..", "no-tle/../no-tle", "x" * 5000, "a\nb"],
     "--set": ["train.steps", "=", "a=1", "../x.y=1", "train.steps=", ".=1"],
@@ -25,10 +24,6 @@ def _ingest(folder: Path, *more: str | Path, named: str, out: Path | None = None
     if out is not None:
         arguments[arguments.index("--out") + 1] = out
     return Asked(arguments, named)
-
-
-def _key(key: str) -> Callable[[Path], Asked]:
-    return lambda folder: _ingest(folder, "--key", key, named="--key")
 
 
 def _option(option: str, value: str) -> Callable[[Path], Asked]:
@@ -177,8 +172,6 @@ def _without_a_rank(folder: Path) -> Asked:
 
 def cases() -> Iterator[Case]:
     yield Case("argument", "basis verify FOLDER/, settings gone", _without_a_rank, (3,))
-    for key in KEYS:
-        yield Case("argument", f"--key {key!r}", _key(key), (2,))
     for option, values in NAMES.items():
         for value in values:
             yield Case("argument", f"{option} {value[:40]!r}", _option(option, value), (2,))

@@ -179,7 +179,7 @@ WORK: list[tuple[str, Callable[[Path], list[str]], str, int]] = [
         "export",
         2,
     ),
-    ("query of an unfinished scene", lambda folder: _unfinished(folder, "query", "toy", "sofa"), "ingest", 3),
+    ("query of an unfinished scene", lambda folder: _unfinished(folder, "query", "toy", "sofa"), "export", 2),
     ("work is a file", _occupied, "lair", 2),
     (
         "photos not run yet",
