@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import logging
 import os
 import sys
 import webbrowser
@@ -11,7 +10,7 @@ from pathlib import Path
 
 import click
 
-from chebsplat.errors import ConfigError, InputError
+from chebsplat.errors import InputError
 from chebsplat.pipelines.cli.options import AGAINST, NewPath
 
 PATH = click.option(
@@ -145,8 +144,6 @@ def _write_page(scene: str, out: Path, sh: int, words: Path | None, against: lis
     from chebsplat.pipelines.finished import artifact_of, teacher_of
     from chebsplat.stages.page import foreign, write_page
 
-    logging.basicConfig(stream=sys.stderr, format="page: %(message)s", level="WARNING", force=True)
-    logging.getLogger("chebsplat").setLevel("INFO")
     theirs = scene.endswith(".ply")
     if theirs:
         opened, teacher = foreign(Path(scene).expanduser()), None
