@@ -75,7 +75,6 @@ def test_a_quarter_of_each_degree_costs_at_most_what_the_bar_allows(mixed):
 
 @pytest.mark.slow
 def test_a_pruned_scene_takes_two_fifths_of_the_bytes_and_renders_as_its_checkpoint(toy, tmp_path):
-    """The bar of the issue, on what training really pruned; `make bench-layouts` shows it for office0."""
     config = TOY | {
         "train": TOY["train"] | {"steps": 1500, "weight_sh": 3.3e-4, "max_gaussians": 1500, "refresh_every": 300}
     }
