@@ -80,7 +80,7 @@ malformed: $(READY)  ## every malformed input of the corpus: exit code, seconds,
 soak: $(READY)  ## runs killed, stopped, on full disks, by the hundred; build/soak-*.csv (args="kills=200 stops=50 disk=20 runs=60")
 	@PYTHONPATH=tests $(PY) -m soak $(args)
 
-stability: bench-stability  ## every extreme case, naive and ours; build/bench/stability.csv; fails if one does (args=--only X)
+stability: bench-stability  ## every extreme case of the maths; build/bench/stability.csv; fails if one does (args=--only X)
 
 bench: $(READY)  ## list the benchmarks; make bench=NAME [args=] runs one after the stages that it needs, into build/bench
 	@$(PY) -m benchmarks $(args)

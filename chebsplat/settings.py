@@ -38,7 +38,7 @@ class Section(BaseModel):
 class DescribeSection(Section):
     """docs/method.md, section 2; shared by the describe stage and the refresh inside training."""
 
-    # with 10 for a, 8 angles are better than 4 and 30 at ghosts and noisy frames (make bench-shapes)
+    # with 10 for a, 8 angles are better than 4 and 30 at ghosts and noisy frames
     n_angles: int = number(8, "rotations of the anisotropic metric (J)", 1, 64)
     max_degree: int = number(8, "degree of the Chebyshev descriptor (D)", 2, 64)
     anisotropy: float = number(10.0, "of the metric (a); 0: isotropic", 0, 1e4)

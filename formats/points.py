@@ -33,9 +33,9 @@ class Points(Record):
     covariances: Annotated[np.ndarray, Array("float32", ("point", 3, 3), "scene units squared")]
     tracks: Annotated[np.ndarray, Array("int32", ("observation", 2), "index of a point, of a view")]
     notes: dict[str, Any] = field(default_factory=dict)
-    depths: Annotated[
-        np.ndarray | None, Array("float32", ("view", "row", "column"), "scene units, z; 0 unknown")
-    ] = None
+    depths: Annotated[np.ndarray | None, Array("float32", ("view", "row", "column"), "scene units, z; 0 unknown")] = (
+        None
+    )
 
 
 def thinned(points: Points, most: int, seed: int) -> Points:

@@ -56,9 +56,7 @@ class RaggedScene(Record):
     quats: Annotated[np.ndarray, Array("float32", ("gaussian", 4), "wxyz")]
     logit_opacities: Annotated[np.ndarray, Array("float32", ("gaussian",))]
     sh0: Annotated[np.ndarray, Array("float32", ("gaussian", 3))]
-    degrees: Annotated[
-        np.ndarray, Array("uint8", ("gaussian",), "highest SH band, in the checkpoint's order")
-    ]
+    degrees: Annotated[np.ndarray, Array("uint8", ("gaussian",), "highest SH band, in the checkpoint's order")]
     cameras: Cameras
     steps: dict[str, float]
     summary: dict[str, Any]
@@ -98,9 +96,7 @@ def write_scene(out: Path, scene: Scene, split_by_degree: bool = True) -> dict[s
     for band in range(1, top + 1):
         rows = p["shN"][degrees >= band, REST[band - 1] : REST[band]]
         bands[f"sh{band}"] = rows.reshape(len(rows), -1)
-    steps = {
-        name: float(np.abs(p[name]).max(initial=0)) / 32767 or 1.0 for name in SEMANTIC if name in p
-    }
+    steps = {name: float(np.abs(p[name]).max(initial=0)) / 32767 or 1.0 for name in SEMANTIC if name in p}
     fixed = {name: np.round(p[name] / step).astype(np.int16) for name, step in steps.items()}
     stored = RaggedScene(
         **{name: p[name] for name in ("means", "log_scales", "quats", "logit_opacities")},
@@ -145,9 +141,7 @@ def read_scene(path: Path) -> Scene:
     for name, step in stored.steps.items():
         parameters[name] = getattr(stored, name) * np.float32(step)
     names = read_label_names(path, artifact.read_manifest(path)) if stored.labels is not None else None
-    return Scene(
-        parameters, stored.cameras, order, stored.labels, names, stored.label_embeddings, stored.summary
-    )
+    return Scene(parameters, stored.cameras, order, stored.labels, names, stored.label_embeddings, stored.summary)
 
 
 def read_label_names(path: Path, manifest: Manifest) -> list[str]:

@@ -120,7 +120,7 @@ class ChannelsSection(Section):
     """What a teacher's channels are reduced to, for all scenes alike.
 
     Choices: at most 32 channels. The embedded teacher's features span fewer (the artifact's facts say how many) and
-      lose nothing. Of 512 channels stood in for LSeg's (make bench-store) 32 keep 99.8 % of the decisions between 150
+      lose nothing. Of 512 channels stood in for LSeg's 32 keep 99.8 % of the decisions between 150
       words where the spectrum falls as k^-3 and 95 % where it falls as k^-1; 13 keep 98 and 77 %. 48 are needed for
       1 % relative error in the first case; in the second no 57 channels, the most that 20 MB a view hold, come below
       18 %.

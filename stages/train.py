@@ -251,5 +251,3 @@ def state(
     """All that a resumed training goes on from."""
     resumed = job.facts.get("resumed_at", [])
     return {"trainer": trainer.state_dict(), "trace": trace, "since": since, "resumed_at": resumed}
-
-

@@ -8,7 +8,7 @@ from chebsplat.labels.class_codes import VOCABULARY, class_codes
 from chebsplat.labels.decode import decode, decode_labels
 from chebsplat.labels.noisy_teacher import confusable, confuse_segments, noisy_features, reduced
 from chebsplat.shape.encoder import RegionEncoder, Standardize
-from chebsplat.shape.fusion import Gate, propagate, propagation_weights
+from chebsplat.shape.fusion import Gate
 from chebsplat.shape.regions import build_regions
 from chebsplat.splats.gaussians import activated, covariances, initial_gaussians, local_shape
 from chebsplat.stages.config import Config
@@ -58,28 +58,6 @@ def test_no_region_encodes_to_nothing_and_has_a_gradient(n_layers):
 def test_heads_must_divide_the_width():
     with pytest.raises(ValueError, match="multiple"):
         RegionEncoder(3, 4, width=30, n_heads=4)
-
-
-def propagation(means, centers, scale=0.1, cover=None, radius=1.0):
-    n, m = len(means), len(centers)
-    cover = torch.arange(m).expand(n, m) if cover is None else cover
-    return propagation_weights(means, cover, centers, torch.eye(3).expand(m, 3, 3), torch.full((m, 3), scale), radius)
-
-
-def test_propagation_weights_sum_to_one_even_for_needles():
-    means, centers = torch.rand(20, 3), torch.rand(4, 3)
-    for scale in (0.0, 1e-12, 1.0, 1e12):
-        weights = propagation(means, centers, scale)
-        assert torch.allclose(weights.sum(1), torch.ones(20))
-
-
-def test_the_nearer_region_weighs_more_and_an_uncovered_point_gets_nothing():
-    centers = torch.tensor([[0.0, 0, 0], [1.0, 0, 0]])
-    weights = propagation(torch.tensor([[0.1, 0, 0]]), centers)
-    assert weights[0, 0] > weights[0, 1]
-    bare = propagation(torch.zeros(1, 3), centers, cover=torch.tensor([[-1, -1]]))
-    assert (bare == 0).all()
-    assert (propagate(torch.ones(2, 5), torch.tensor([[-1, -1]]), bare) == 0).all()
 
 
 def test_the_gate_mixes_within_bounds_and_keeps_uncovered_features():
@@ -143,22 +121,6 @@ def test_noise_free_features_decode_to_their_labels():
     found, confidence = decode(features, codes)
     assert np.array_equal(found, labels)
     assert (confidence > 0.9).all()
-
-
-@pytest.mark.parametrize("unit", [1e-22, 1.0, 1e22])
-@pytest.mark.parametrize("temperature", [1e-9, 1.0])
-def test_propagation_weights_do_not_depend_on_units_and_stay_finite(unit, temperature):
-    g = torch.Generator().manual_seed(0)
-    means = (torch.rand(20, 3, generator=g) * unit).requires_grad_(True)
-    cover = torch.tensor([[0, 1, -1], [2, -1, -1], [-1, -1, -1], [0, 2, 1]]).repeat(5, 1)
-    rotmats, scales = torch.eye(3).expand(3, 3, 3), torch.full((3, 3), 0.1 * unit)
-    weights = propagation_weights(
-        means, cover, means.detach()[:3], rotmats, scales, 0.5 * unit, temperature=temperature
-    )
-    covered = (cover >= 0).any(1)
-    torch.testing.assert_close(weights.sum(1), covered.float())
-    (weights * torch.rand(weights.shape, generator=g)).sum().backward()
-    assert torch.isfinite(means.grad).all()
 
 
 def test_labels_are_told_in_parts_as_they_are_in_one():

@@ -1,6 +1,5 @@
 """What is exported renders as the checkpoint does, and a part of a scene is chosen as asked."""
 
-
 import numpy as np
 import pytest
 from click.testing import CliRunner

@@ -78,12 +78,6 @@ def test_means2d_keep_their_gradient_for_densification():
     assert meta["means2d"].grad.abs().sum() > 0
 
 
-def test_order_of_gaussians_does_not_matter():
-    given = scene(8)
-    shuffled = {k: v[torch.randperm(8, generator=torch.Generator().manual_seed(1))] for k, v in given.items()}
-    torch.testing.assert_close(rasterize(**given, **camera())[0], rasterize(**shuffled, **camera())[0])
-
-
 @pytest.mark.parametrize("length", [1e-10, 1.0, 1e20])
 def test_length_of_a_quaternion_does_not_matter(length):
     quats = scene()["quats"]

@@ -12,9 +12,9 @@ import pytest
 import stand_in_gsplat
 import torch
 from raster import camera, gradients, scene
-from shared import ROOT
 from simulated_gpu import GPU, SimulatedGpu
 
+from benchmarks.cost import trainer_from
 from chebsplat.rasterize import rasterize
 from chebsplat.render import SceneRenderer
 from chebsplat.stages import config as configs
@@ -44,10 +44,8 @@ def gpu(monkeypatch):
 
 
 @pytest.fixture
-def trainer_on(up_to_teacher, monkeypatch):
+def trainer_on(up_to_teacher):
     """Makes a trainer of the toy scene before its first step, by device and settings."""
-    monkeypatch.syspath_prepend(str(ROOT))
-    from benchmarks.scene import trainer_from
 
     def make(device, **settings):
         chosen = configs.build({"train": WHOLE | settings, "describe": REGIONS}, "toy")
