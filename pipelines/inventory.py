@@ -69,11 +69,11 @@ def _size(manifest: Any) -> int:
 def _source(title: str, ingest: Any) -> str:
     """Where a scene comes from: the folder that its name stands for, or what its capture was made of."""
     try:
-        if folders.record(name := title.partition("@")[0]).exists():
-            return folders.owner(name) or ""
+        if folder := folders.owner(title.partition("@")[0]):
+            return folder
         source = ingest["config"]["source"]
         return source["path"] or f"generated {source['preset']}, seed {source['seed']}"
-    except (InputError, TypeError, KeyError):
+    except (TypeError, KeyError):
         return "damaged"
 
 
