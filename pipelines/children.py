@@ -16,9 +16,10 @@ from types import FrameType
 
 from chebsplat.stages.stopping import PATIENCE
 
-# Snakemake's own words go to a file; its jobs inherit the real stderr, which may be a terminal. Its standard input is a
-# pipe that ends with the run, however that ends: its session is then stopped, and killed if it does not listen. Its
-# cache lies beside its other files, not in the home folder, which may be full or read-only.
+# Snakemake's own words go to a file; its jobs inherit the real stderr, which may be a terminal. Its
+# standard input is a pipe that ends with the run, however that ends: its session is then stopped, and
+# killed if it does not listen. Its cache lies beside its other files, not in the home folder, which may
+# be full or read-only.
 SNAKEMAKE = """
 import atexit, json, os, signal, subprocess, sys, threading, time
 patience, words, beside, cache = float(sys.argv.pop(1)), *(sys.argv.pop(1) for _ in range(3))
@@ -49,16 +50,18 @@ def snakemake(
       command of ours that runs meanwhile.
     """
     reader, writer = os.pipe()
+    # -P and PYTHONSAFEPATH: a module where the user stands, or in the work folder, is never run
+    command = [sys.executable, "-P", "-c", SNAKEMAKE, str(PATIENCE), str(words), json.dumps(beside)]
+    environment = os.environ | {"PYTHONSAFEPATH": "1", **environment}
     with open(reader, "rb") as standard_input, open(writer, "wb"):
-        # -P and PYTHONSAFEPATH: a module where the user stands, or in the work folder, is never run. A session of its
-        # own: a terminal's Ctrl-C reaches the run alone, which ends its jobs in good order.
-        command = [sys.executable, "-P", "-c", SNAKEMAKE, str(PATIENCE), str(words), json.dumps(beside), str(cache)]
-        process = subprocess.Popen([*command, *arguments], stdin=standard_input, stdout=subprocess.DEVNULL,
-                                   start_new_session=True,
-                                   env=os.environ | {"PYTHONSAFEPATH": "1", **environment})  # fmt: skip
+        # a session of its own: a terminal's Ctrl-C reaches the run alone, which ends its jobs
+        process = subprocess.Popen(
+            [*command, str(cache), *arguments],
+            stdin=standard_input, stdout=subprocess.DEVNULL, env=environment, start_new_session=True,
+        )  # fmt: skip
         try:
             with paused_together(process):
-                while process.poll() is None:  # a signal that another thread has taken wakes no `wait`
+                while process.poll() is None:  # a signal that another thread takes wakes no `wait`
                     time.sleep(0.02)
             return process.returncode
         finally:

@@ -90,7 +90,7 @@ def prepared(step: dict[str, Any], hashes: dict[str, Any]) -> Iterator[None]:
 
 @contextmanager
 def logged(path: Path) -> Iterator[None]:
-    """What is logged within goes to a file as well. A full disk costs the log, not the stage, which meets it itself."""
+    """What is logged within goes to a file as well; a full disk costs the log, not the stage."""
     try:
         log: logging.Handler = _Log(path)
     except OSError:

@@ -1,11 +1,12 @@
 """Leases: who is at work on what, told by a file that any shared file system keeps right.
 
-A lease is filelock's: a file that only one process can make, which says who that is and is touched every few seconds. It
-goes when its holder is done. Whether a process of this machine lives is asked of the system; one elsewhere is dead when
-its file has not moved for long by the clock of who looks. No lock of the file system is needed.
+A lease is filelock's: a file that only one process can make, which says who that is, is touched
+every few seconds, and goes when its holder is done. Whether a process of this machine lives is
+asked of the system; one elsewhere is dead when its file has not moved for long by the clock of who
+looks. No lock of the file system is needed.
 
-Choices: whoever is silent for EXPIRES seconds and was alive all the same works on beside its successor. Both publish
-  the same artifact, whole; one is kept.
+Choices: whoever is silent for EXPIRES seconds and was alive all the same works on beside its
+  successor. Both publish the same artifact, whole; one is kept.
 """
 
 from __future__ import annotations
@@ -18,12 +19,11 @@ from filelock import SoftFileLease, Timeout
 
 EVERY = 5.0  # seconds between signs of life
 EXPIRES = 60.0  # seconds of silence after which a holder elsewhere counts as dead
-LOOK = 0.1  # seconds between looks at a lease that is waited for
 
 
 @contextmanager
 def held(path: Path, wait: Callable[[str], object] = lambda _machine: None) -> Iterator[None]:
-    """Hold the lease `path` within the block, after whoever holds it; `wait` is told on which machine that is."""
+    """Hold the lease `path` within, after whoever holds it; `wait` is told on which machine."""
     lease, seconds = _lease(path), 0.0
     while True:
         try:
@@ -40,7 +40,7 @@ def held(path: Path, wait: Callable[[str], object] = lambda _machine: None) -> I
 
 
 def holder(path: Path) -> str | None:
-    """The machine of who seems to hold a lease; None: nobody, or a process of this machine that is dead."""
+    """The machine of who seems to hold a lease; None: nobody, or a dead process of this machine."""
     lease = _lease(path)
     if machine := _machine(lease):
         try:
@@ -51,9 +51,9 @@ def holder(path: Path) -> str | None:
 
 
 def _lease(path: Path) -> SoftFileLease:
-    return SoftFileLease(path, lease_duration=EXPIRES, heartbeat_interval=EVERY, poll_interval=LOOK)
+    return SoftFileLease(path, lease_duration=EXPIRES, heartbeat_interval=EVERY)
 
 
 def _machine(lease: SoftFileLease) -> str | None:
     owner = lease.owner
-    return owner.hostname.partition("?")[0] if owner else None  # containers have a number behind it
+    return owner.hostname.partition("?")[0] if owner else None  # a container's number follows

@@ -106,7 +106,7 @@ def content_hash(entries: Hashes, root: Path | None) -> str:
 
 @contextmanager
 def unchanged(stage: str, sections: dict[str, Any], planned: Hashes) -> Iterator[None]:
-    """A stage reads its raw files within: before and afterwards they are what the plan, and so the key, says.
+    """A stage reads its raw files within, before and after which they are what the key says.
 
     Raises: InputError naming the file that is another now, is new or gone.
     """

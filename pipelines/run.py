@@ -223,9 +223,7 @@ def rehearsal_command(entries: list[dict[str, Any]]) -> list[str]:
 
 
 def job_command(plan: Path, of_job: dict[str, Any]) -> str:
-    """The shell line that the Snakefile runs for a job, its steps one after the other: Snakemake waits for them, where
-    a signal would end the shell alone.
-    """
+    """The shell line of a job, its steps one after the other; a signal meets no shell before it."""
     command = [sys.executable, "-P", "-m", "chebsplat.pipelines.cli", "job", *["--elsewhere"] * of_job["elsewhere"]]
     return "exec " + shlex.join([*command, str(plan), *of_job["keys"]])
 

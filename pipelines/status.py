@@ -68,7 +68,8 @@ def runs() -> Iterator[tuple[str, list[State]]]:
             yield f"{plan} is damaged; remove {plan.parent} if no run is under way", []
             continue
         machine = leases.holder(store.run_lease(plan.parent))
-        yield f"run {plan.parent.name}" + (f" on {machine}, {seconds(plan)} s" if machine else ", over"), states
+        since = f" on {machine}, {seconds(plan)} s" if machine else ", over"
+        yield f"run {plan.parent.name}{since}", states
 
 
 def lines() -> Iterator[str]:

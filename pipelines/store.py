@@ -141,18 +141,19 @@ def unnamed(without: Container[Path] = ()) -> list[tuple[Path, int]]:
 def age(path: Path) -> float:
     """Seconds since an artifact was finished, or a leftover was last changed, by the clock of the file system."""
     done = path / "artifact.json"
+    changed = (done if done.is_file() else path).lstat().st_mtime
     with tempfile.TemporaryFile(dir=work()) as clock:
-        return os.fstat(clock.fileno()).st_mtime - (done if done.is_file() else path).lstat().st_mtime
+        return os.fstat(clock.fileno()).st_mtime - changed
 
 
 def sweep() -> None:
-    """Remove leases of dead processes; what Snakemake remembers of earlier runs, too, where none is under way."""
+    """Remove leases of the dead, and where no run is under way what Snakemake remembers."""
     for path in work().glob(".held/*"):
         with suppress(FileNotFoundError):
             if age(path) > leases.EXPIRES:
                 path.unlink()
     if not any(map(is_under_way, work().glob(".plans/*"))):
-        for name in (".snakemake", ".leases", ".names", ".locks", ".done"):  # but for the first, of earlier versions
+        for name in (".snakemake", ".leases", ".names"):  # earlier versions had the last two
             shutil.rmtree(work() / name, ignore_errors=True)
 
 
@@ -182,10 +183,10 @@ def is_under_way(plans: Path) -> bool:
     return _owner_lives(plans) or is_held(run_lease(plans))
 
 
-def is_held(lease: Path) -> bool:
+def is_held(path: Path) -> bool:
     """Whether someone holds a lease and gives signs of life, by the clock of the file system."""
     with suppress(FileNotFoundError):  # it has just been let go
-        return leases.holder(lease) is not None and age(lease) < leases.EXPIRES
+        return leases.holder(path) is not None and age(path) < leases.EXPIRES
     return False
 
 
@@ -208,7 +209,7 @@ def remove_half(path: Path) -> None:
 
 
 def remove_halves(paths: Iterable[Path]) -> None:
-    """Remove what a run's killed jobs have left of artifacts, but for those that another run makes."""
+    """Remove what killed jobs have left of artifacts, but for those that another run makes."""
     for path in paths:
         if leases.holder(lease(path.parents[2], f"{path.parent.name}-{path.name}")) is None:
             remove_half(path)

@@ -1,7 +1,8 @@
 """How our processes end: well, with a typed error, a crash, or by SIGINT, SIGTERM or SIGHUP.
 
-A signal raises `Stopped` in the main thread, so that nothing half made is left; a loop that can reach a better place
-within a moment defers it. Whoever cannot listen for long (a kernel is being compiled) is killed by its run.
+A signal raises `Stopped` in the main thread, so that nothing half made is left; a loop that can reach
+a better place within a moment defers it. Whoever cannot listen (a kernel is being compiled) is killed
+by its run.
 """
 
 from __future__ import annotations
@@ -30,9 +31,9 @@ KEPT = "what was finished is kept, and the same command goes on from there"
 
 
 def exit_code(action: Callable[[], int | None], folder: Path, tell: Callable[[str], object] = log.error) -> int:
-    """The one door that commands leave by: the action's exit code (None: 0), or that of what ends it early.
+    """The door that all commands leave by: the action's code (None: 0), or that of what ends it.
 
-    Args: folder: what a disk's error is about, where it names no file; tell: says a typed error or a stop in a line.
+    Args: folder: of a disk's error that names no file; tell: says a typed error or a stop.
     """
     try:
         with heeded(), disk.explained(folder):
@@ -66,10 +67,10 @@ _asked: Asked | None = None
 
 @contextmanager
 def heeded() -> Iterator[None]:
-    """Signals raise `Stopped` within; one that is ignored (nohup) stays so. Of nested ones the outermost rules.
+    """Signals raise `Stopped` within; one that is ignored (nohup) stays so. The outermost rules.
 
-    What breaks because a stop has come, an import that it fell into, is the stop and no crash; in a destructor, where
-    Python can raise nothing, it is passed over in silence.
+    What breaks because a stop has come, an import that it fell into, is the stop and no crash; a
+    destructor, where nothing can be raised, says nothing of it.
     """
     global _asked
     outermost = _asked is None and threading.current_thread() is threading.main_thread()

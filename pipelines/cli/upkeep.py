@@ -46,7 +46,7 @@ def list_scenes() -> None:
 @click.option("--yes", is_flag=True, help="remove what is listed")
 def rm(scenes: tuple[str, ...], yes: bool) -> None:
     """Remove SCENES: their links, their queries, and the artifacts that nothing else names."""
-    from chebsplat.pipelines import folders, inventory, store
+    from chebsplat.pipelines import inventory, store
 
     chosen = list(dict.fromkeys(inventory.in_work(scene) for scene in scenes))
     artifacts = inventory.only_of(chosen)
@@ -58,7 +58,6 @@ def rm(scenes: tuple[str, ...], yes: bool) -> None:
         return
     for folder in chosen:
         inventory.unlink(folder)
-        folders.release(folder.name.partition("@")[0])
     for path, _ in artifacts:
         store.remove(path)
 
@@ -95,7 +94,7 @@ def verify(scenes: tuple[str, ...]) -> int:
 @click.option("--older-than", type=Age(), help="give up scenes and studies, too, that nothing was added to for so long")
 def clean_stale(yes: bool, keep_newer: float, older_than: float | None) -> None:
     """List the artifacts that no scene names any more, and leftovers of killed runs."""
-    from chebsplat.pipelines import folders, inventory, store
+    from chebsplat.pipelines import inventory, store
 
     old = [] if older_than is None else inventory.untouched(older_than)
     leftovers = store.unnamed(set(old))
@@ -106,7 +105,6 @@ def clean_stale(yes: bool, keep_newer: float, older_than: float | None) -> None:
     if yes:
         for folder in old:
             inventory.unlink(folder)
-            folders.release(folder.name.partition("@")[0])
         for path, _ in leftovers:
             store.remove(path)
         store.sweep()
