@@ -26,7 +26,7 @@ from chebsplat.formats import disk
 
 log = logging.getLogger("chebsplat")
 SIGNALS = signal.SIGINT, signal.SIGTERM, signal.SIGHUP
-PATIENCE = 3.0  # seconds from being asked to being killed
+PATIENCE = 2.5  # seconds from being asked to being killed
 KEPT = "what was finished is kept, and the same command goes on from there"
 
 
