@@ -50,13 +50,13 @@ def scene_folder(scene: str) -> Path:
         raise InputError(f"{path} belongs to no scene in {store.work()}; name the scene")
     if links(path):
         return path
-    name = folders.known(Path(os.path.realpath(path))) if is_source(os.path.expanduser(scene)) else scene
+    name = folders.name_of(Path(os.path.realpath(path))) if is_source(path) else scene
     runs = [title for title in titles() if title.partition("@")[0] == name]
     if len(runs) == 1 or name in runs:
         return store.work() / (name if name in runs else runs[0])
     if runs:
         raise ConfigError(f"{shown(scene)} was run with different settings: name one of {', '.join(runs)}")
-    raise unknown(scene, name)
+    raise unknown(scene)
 
 
 def holder(artifact: Path) -> Path | None:
@@ -70,7 +70,7 @@ def holder(artifact: Path) -> Path | None:
     return None
 
 
-def unknown(scene: str, name: str | None) -> ConfigError | InputError:
+def unknown(scene: str) -> ConfigError | InputError:
     """The error for a scene that is not there, with the nearest names."""
     where = f"no finished scene in {store.work()}"
     if is_source(os.path.expanduser(scene)):

@@ -74,11 +74,11 @@ def _size(manifest: Manifest | None) -> int:
 def _source(title: str, ingest: Manifest | None) -> str:
     """Where a scene comes from: the folder that its name stands for, or what its capture was made of."""
     try:
-        if folders.record(name := title.partition("@")[0]).exists():
-            return folders.owner(name) or ""
+        if folder := folders.owner(title.partition("@")[0]):
+            return folder
         source = ingest.config["source"] if ingest else {}
         return source["path"] or f"generated {source['preset']}, seed {source['seed']}"
-    except (InputError, TypeError, KeyError):
+    except (TypeError, KeyError):
         return "damaged"
 
 
@@ -127,10 +127,9 @@ def others(folder: Path) -> list[str]:
 
 
 def unlink(folder: Path) -> None:
-    """Remove a scene's links and page, its name among folders, and the folder if that leaves it empty."""
+    """Remove a scene's links and page, and the folder if that leaves it empty."""
     for entry in list(os.scandir(folder)):
         if entry.is_symlink() or entry.name == PAGE:
             os.unlink(entry.path)
     if not others(folder):
         folder.rmdir()
-    folders.release(folder.name.partition("@")[0])

@@ -87,12 +87,11 @@ def scene_values(scene: str) -> tuple[str, dict[str, Any]]:
     return scene, values
 
 
-def folder_name(folder: Path, more: int = 0) -> str:
-    """A source's name as that of links: its last part, those above it up to one with a letter, and `more` parts."""
+def folder_name(folder: Path) -> str:
+    """A source's name: the last part of its path, and those above it up to one with a letter."""
     parts = (folder.with_suffix("") if is_video(folder.name) else folder).parts[1:]
     words = next((k for k in range(1, len(parts)) if re.search(r"[a-zA-Z]", parts[-k])), 1)  # "dense/0" is no "0"
-    name = re.sub(r"[^\w.-]+", "-", "-".join(parts[-words - more :])).lstrip(".") or "scene"
-    return name + ("-scene" if name == "store" else "")  # links lie beside the store
+    return re.sub(r"[^\w.-]+", "-", "-".join(parts[-words:])).lstrip(".") or "scene"
 
 
 def data_of(scene: str) -> tuple[str, Path] | None:

@@ -41,21 +41,17 @@ for number in range(int(sys.argv[3])):
 
     heads.extend(root / "basis-shared", build)
 """
-# As COUNTING, where the file system knows no locks, on four machines, and with a lease of what follows a revision.
-LOCKLESS = """
-import fcntl, sys
-from chebsplat.pipelines import leases
+# As COUNTING, where the file system knows no locks.
+LOCKLESS = (
+    """
+import fcntl
 
 def refused(*_):
     raise OSError("no locks here")
 
 fcntl.flock = fcntl.lockf = refused
-leases.EVERY, leases.EXPIRES = 0.1, 3.0
-leases.here = lambda: f"machine-{int(sys.argv[2]) % 4}"
-""" + COUNTING.replace(
-    "        with artifact",
-    """\
-        with leases.held(root / f".leases/{len(lineage)}"), artifact""",
+"""
+    + COUNTING
 )
 
 

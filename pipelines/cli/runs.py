@@ -176,15 +176,12 @@ def job(plan: Path, keys: tuple[str, ...], elsewhere: bool) -> int:
     from chebsplat.pipelines import job as jobs
     from chebsplat.pipelines.children import in_turn
     from chebsplat.pipelines.cluster import watch_run
-    from chebsplat.stages.stopping import watch_lifeline
 
     jobs.use_threads()
     if len(keys) > 1:
         return in_turn(_main, [["job", *["--elsewhere"] * elsewhere, str(plan), key] for key in keys])
     if elsewhere:
         watch_run(plan)
-    else:
-        watch_lifeline()
     return jobs.run(plan, keys[0], again=elsewhere)
 
 
@@ -195,9 +192,7 @@ def rehearse(semantic: bool) -> int:
     import os
 
     from chebsplat.pipelines.rehearsal import rehearsed
-    from chebsplat.stages.stopping import watch_lifeline
 
-    watch_lifeline()
     os.nice(5)
     with rehearsed(2, semantic):
         return 0

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Callable, Iterator
 from pathlib import Path
 
@@ -101,22 +100,6 @@ def linked(work: Path, title: str, stage: str, manifest: str) -> None:
     (work / title / stage).symlink_to(artifact)
 
 
-def _register(folder: Path, text: str) -> list[str]:
-    file = folder / "lair/.names/images.json"
-    file.parent.mkdir(parents=True)
-    file.write_text(text)
-    return ["plan", "--scene", f"{photos(folder / 'images')}/"]
-
-
-def _taken(folder: Path) -> list[str]:
-    from chebsplat.pipelines.folders import candidates
-
-    arguments = _register(folder, "{}")
-    for name in candidates(folder / "images"):
-        (folder / f"lair/.names/{name}.json").write_text(json.dumps({"source": "/elsewhere"}))
-    return arguments
-
-
 def _damaged(folder: Path, *arguments: str) -> list[str]:
     linked(folder / "lair", "toy", "train", "{")
     return list(arguments)
@@ -160,11 +143,6 @@ def _elsewhere(folder: Path) -> list[str]:
 
 # what is in work (here: `lair`), and what is asked: (what it is, its builder, what must be named, the exit code)
 WORK: list[tuple[str, Callable[[Path], list[str]], str, int]] = [
-    ("register cut short", lambda folder: _register(folder, "{"), "images.json", 3),
-    ("register of another kind", lambda folder: _register(folder, "[1]"), "images.json", 3),
-    ("register nested too deeply", lambda folder: _register(folder, "[" * 100_000), "images.json", 3),
-    ("register without a path", lambda folder: _register(folder, '{"source": 3}'), "images.json", 3),
-    ("every name is taken", _taken, "stand for other folders", 2),
     ("verify of a damaged manifest", lambda folder: _damaged(folder, "verify", "toy"), "artifact.json", 3),
     ("rm of a damaged manifest", lambda folder: _damaged(folder, "rm", "toy"), "artifact.json", 3),
     ("clean-stale of a damaged manifest", lambda folder: _damaged(folder, "clean-stale"), "artifact.json", 3),
