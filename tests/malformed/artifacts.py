@@ -35,8 +35,8 @@ def artifacts() -> Path:
     """A folder with an artifact of each schema, by the name of its stage; made once a process."""
     root = Path(tempfile.mkdtemp(prefix="malformed-artifacts-"))
     atexit.register(shutil.rmtree, root, ignore_errors=True)
-    for stage, (schema, write) in WRITERS.items():
-        _publish(root / stage, schema, stage, write)
+    for name, (schema, write) in WRITERS.items():
+        _publish(root / name, schema, name, write)
     return root
 
 
@@ -143,12 +143,13 @@ FEATURES: list[tuple[str, bytes, str]] = [
     ("nan", npy(np.full((N, C), np.nan, np.float32)), "finite"),
     ("words", npy(np.full((N, C), "a")), "one row a Gaussian"),
 ]
-HEADER = b"ply\nformat binary_little_endian 1.0\nelement vertex 2\n"
+HEADER = b"ply\nformat binary_little_endian 1.0\nelement vertex 2\nproperty float x\n"
+AXES = b"property float y\nproperty float z\nend_header\n"
 SPLATS: list[tuple[str, bytes, str]] = [
     ("nothing", b"", "scene.ply"),
     ("text", b"a splat\n", "scene.ply"),
-    ("a cloud", HEADER + b"property float x\nproperty float y\nproperty float z\nend_header\n" + bytes(24), "scene.ply"),
-    ("10^12 Gaussians", HEADER.replace(b"2\n", b"1000000000000\n") + b"property float x\nend_header\n", "scene.ply"),
+    ("a cloud", HEADER + AXES + bytes(24), "scene.ply"),
+    ("10^12 Gaussians", HEADER.replace(b"2", b"1000000000000") + AXES, "scene.ply"),
 ]
 
 

@@ -94,8 +94,8 @@ STUDIES: list[tuple[str, str, str]] = [  # what is wrong, the text, what stderr 
     ("an unknown ablation", STUDY + '[variants.a]\nablation = "no-tel"\n', "no-tel"),
     ("an unknown scene", STUDY.replace("toy", "tyo") + "[variants.a]\n", "tyo"),
 ]
-SEQUENCES = ["[scenes", "", "scenes = []\n", 'scenes = "toy"\n', "scenes = [1, 2]\n", 'scenes = ["toy", ""]\n',
-             'scenes = ["to\\ny"]\n', 'scenes = ["toy"]\nsteps = 5\n', "scenes = [" + '"toy",' * 2000 + "]\n"]  # fmt: skip
+SEQUENCES = ["[scenes", "", "scenes = []", 'scenes = "toy"', "scenes = [1, 2]", 'scenes = ["toy", ""]',
+             'scenes = ["to\\ny"]', 'scenes = ["toy"]\nsteps = 5', "scenes = [" + '"toy",' * 2000 + "]"]  # fmt: skip
 NAMES: list[tuple[str, str, int]] = [  # a command's words, what it must name, its exit code
     ("run", "scene=", 2),
     ("run --scene ofice0", "office0", 2),
@@ -172,8 +172,6 @@ def settings() -> Iterator[Row]:
         yield Row("setting", f"{setting} = {value!r:.30}", build, (word,), 2)
     for text, word in SET.items():
         yield words("set=", ["plan", "--scene", "toy", "--set", text], word)
-    nowhere = {"source": {"kind": "photos", "path": "nowhere"}}
-    yield Row("setting", "source.path = 'nowhere'", lambda folder: stage("ingest", folder, nowhere), ("source.path",))
     for name, kind in STAGES.items():
 
         def misspelt(folder: Path, name: str = name) -> Arguments:
@@ -259,9 +257,13 @@ PLACES: dict[str, tuple[Callable[[Path], object], str, int]] = {  # what stands 
 
 
 def places() -> Iterator[Row]:
-    toy = {"source": {"kind": "generated", "preset": "toy", "seed": 1}}
-    for key in ("", "abc", "../../x", "/tmp/x", KEY.upper(), KEY + "0", KEY[:-1] + "\n", "0" * 15 + "²"):
-        yield Row("--key", f"{key!r}", lambda folder, key=key: [*stage("ingest", folder, toy), "--key", key], ("--key",), 2)
+    def ingest(folder: Path) -> list[str | Path]:
+        """Of a folder that is not there: what is refused later names that."""
+        return stage("ingest", folder, {"source": {"kind": "photos", "path": "nowhere"}})
+
+    yield Row("setting", "source.path = 'nowhere'", ingest, ("nowhere", "source.path"))
+    for key in ("", "abc", "../../x", KEY.upper(), KEY + "0", KEY[:-1] + "\n", "0" * 15 + "²"):
+        yield Row("--key", f"{key!r}", lambda folder, key=key: [*ingest(folder), "--key", key], ("--key",), 2)
     for what, (stands, place, code) in PLACES.items():
         for force in (False, True) if place == "mine" else (False,):
             if what == "a link to an artifact" and not force:
@@ -269,15 +271,17 @@ def places() -> Iterator[Row]:
 
             def build(folder: Path, stands=stands, place: str = place, force: bool = force) -> Arguments:  # type: ignore[no-untyped-def]
                 stands(folder / place)
-                arguments = stage("ingest", folder, toy)
+                arguments = ingest(folder)
                 arguments[arguments.index("--out") + 1] = folder / place
                 return [*arguments, *["--force"] * force]
 
-            yield Row("--out", f"{what}{', --force' * force}", build, ("mine" if "mine" in place else place[-60:],), code)
+            word = "mine" if "mine" in place else place[-60:]
+            remedy = "choose another --out" if code == 2 else "nothing was replaced"
+            yield Row("--out", f"{what}{', --force' * force}", build, (word, remedy), code)
 
     def noted(folder: Path) -> Arguments:
         with_a_note(folder / "out")
-        return [*stage("ingest", folder, toy), "--force"]
+        return [*ingest(folder), "--force"]
 
     yield Row("--out", "an artifact with a note in it, --force", noted, ("thesis.tex", "no part of the artifact"))
 

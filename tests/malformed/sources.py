@@ -142,9 +142,14 @@ def companions() -> Iterator[Row]:
             (path, "turned", picture(path, (6, 8), mode), "is 6x8, its photo 8x6"),
             (path, "a looping link", no_file(path, "looping link"), "symbolic links"),
         ]
-    cases += [(f"{place}/b.png", "missing", remove(f"{place}/b.png"), "is missing") for place in ("depth", "semantic")]
-    cases += [("depth/b.png", f"mode {mode}", picture("depth/b.png", mode=mode), "16-bit depth") for mode in ("L", "RGB")]
-    cases.append(("semantic/b.png", "coloured", picture("semantic/b.png"), "ids in one channel"))
+    depth, labels = "depth/b.png", "semantic/b.png"
+    cases += [
+        (depth, "missing", remove(depth), "is missing"),
+        (labels, "missing", remove(labels), "is missing"),
+        (depth, "8 bits", picture(depth, mode="L"), "16-bit depth"),
+        (depth, "coloured", picture(depth), "16-bit depth"),
+        (labels, "coloured", picture(labels), "ids in one channel"),
+    ]
     yield from met(write_companions, cases)
     heavy: list[Case] = [(f"{place}/b.png", "10,000 million pixels", declared_png(100_000, 100_000, 0), "too large")
                          for place in MODES]  # fmt: skip
@@ -352,8 +357,8 @@ def transforms() -> Iterator[Row]:
     yield from met(write_transforms, few, 4)
     heavy: list[Case] = [(FILE, f"a {kind}", no_file(FILE, kind), "a device") for kind in ("pipe", "device")]
     yield from met(write_transforms, [*heavy, (FILE, "a terabyte", swollen(FILE), "are read")], alone=True)
-    planned: list[Case] = [(FILE, "nested lists", DEEP, "nested"), (FILE, "a path climbs", frame(file_path="../x"), ELSEWHERE)]
-    yield from met(write_transforms, planned, plan=True)
+    climbs = (FILE, "a path climbs", frame(file_path="../x"), ELSEWHERE)
+    yield from met(write_transforms, [(FILE, "nested lists", DEEP, "nested"), climbs], plan=True)
 
 
 # Replica
@@ -400,7 +405,8 @@ def replica() -> Iterator[Row]:
             change = changed(CAMERA, lambda d, key=key, value=value: d["camera"].update({key: value}))
             cases.append((CAMERA, f"{key} = {value!r}", change, word))
     yield from met(write_slam, cases)
-    yield from met(write_slam, [("ingest.min_views", "poses of nan", put(TRAJECTORY, POSE.format("nan") * 3), "finite")], 4)
+    nowhere = put(TRAJECTORY, POSE.format("nan") * 3)
+    yield from met(write_slam, [("ingest.min_views", "poses of nan", nowhere, "not finite")], 4)
     yield from met(write_slam, [(TRAJECTORY, "a terabyte", swollen(TRAJECTORY), "are read")], alone=True)
     cases = [(CLASSES, text, text, "lacks classes with id and name")
              for text in ("{}", '{"classes": 3}', '{"classes": ["a"]}', '{"classes": [{"name": "a"}]}')]  # fmt: skip
@@ -492,14 +498,15 @@ def scannet() -> Iterator[Row]:
     yield from met(write_sg, cases)
     bombs = {"10^12 points": header(10**12) + coordinates(), "10^12 points as text": header(10**12, "ascii 1.0"),
              "a long header": header(more="comment a\n" * 200_000) + coordinates(),
-             "10^5 points of 2,000 values": header(10**5, more="property double p\n" * 2000) + bytes(1 << 18)}  # fmt: skip
+             "2,000 values a point": header(10**5, more="property double p\n" * 2000) + bytes(1 << 18)}  # fmt: skip
     heavy: list[Case] = [(POINTS, what, content, NO_PLY) for what, content in bombs.items()]
     heavy += [(POINTS, "a pipe", no_file(POINTS, "pipe"), "a pipe"), (TABLE, "a terabyte", swollen(TABLE), "are read")]
     yield from met(write_sg, heavy, alone=True)
 
     cases = [(SPLIT, f"test = {value!r}", keys(SPLIT, test=value), LISTS) for value in (None, "30", {"30": 1}, [30])]
     cases.append((SPLIT, "a view in both lists", keys(SPLIT, train=["10"], test=["10"]), "10 is both"))
-    cases += [(CONFIDENCE, "missing", remove(CONFIDENCE), "is missing"), (CONFIDENCE, "cut short", cut(CONFIDENCE, 40), COPY)]
+    cases.append((CONFIDENCE, "missing", remove(CONFIDENCE), "is missing"))
+    cases.append((CONFIDENCE, "cut short", cut(CONFIDENCE, 40), COPY))
     for what, content in {
         "no zip": b"confidence", "another name": npz(probability=npy(SURE)), "one row": npz(confidence=npy(SURE[0])),
         "words": npz(confidence=npy(np.full((6, 8), "a"))), "nan": npz(confidence=npy(SURE * NAN)),

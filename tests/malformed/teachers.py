@@ -8,10 +8,11 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from tiny_teachers import COLORS, color_teacher, write_model
+from tiny_teachers import COLORS, color_teacher, write_model, write_table
 
+from malformed.artifacts import artifacts
 from malformed.edits import DEEP, Edit, all_of, no_file, npy, npz, picture, put, remove
-from malformed.row import Arguments, Row
+from malformed.row import Arguments, Row, stage
 
 MODEL, TOML, TABLE = "tiny.onnx", "tiny.toml", "tiny.npz"
 VALUES: list[tuple[str, str, str]] = [  # a key of tiny.toml, its value as TOML, a word of the message
@@ -179,9 +180,12 @@ def models() -> Iterator[tuple[str, str, Edit, str]]:
     yield MODEL, "an output of integers", model(node("Shape")), MODEL
     yield MODEL, "one feature a view", model(node("GlobalAveragePool")), "one feature every"
     yield MODEL, "weights outside", changed(outside), MODEL
-    yield MODEL, "another size than its graph", all_of(
-        lambda folder: color_teacher(folder, shape=(1, 3, 32, 32)), set_to("size", "[64, 64]")
-    ), "says size = [64, 64]"
+    yield (
+        MODEL,
+        "another size than its graph",
+        all_of(lambda folder: color_teacher(folder, shape=(1, 3, 32, 32)), set_to("size", "[64, 64]")),
+        "says size = [64, 64]",
+    )
     yield MODEL, "multiple not met", halves(), "correct `size` or `multiple`"
     yield MODEL, "missing", remove(MODEL), "is missing"
     yield TOML, "missing", remove(TOML), "is missing"
@@ -189,7 +193,8 @@ def models() -> Iterator[tuple[str, str, Edit, str]]:
     yield TOML, "cut short", put(TOML, "mean = [0.5"), "does not parse"
     yield TOML, "nested", put(TOML, f"a = {DEEP}"), "nested too deeply"
     yield TOML, "no labels", set_to("labels", ""), "neither `labels` nor `text`"
-    yield TOML, "no names of channels", all_of(set_to("labels", ""), set_to("output", '"logits"')), "names of the channels"
+    logits = all_of(set_to("labels", ""), set_to("output", '"logits"'))
+    yield TOML, "no names of channels", logits, "names of the channels"
     yield "classes.txt", "too few classes", segmenter("red\ngreen\n"), "names 2 classes"
     yield "classes.txt", "a class twice", segmenter("red\ngreen\nred\n"), "line 3: a name is given twice"
 
@@ -207,6 +212,12 @@ def met(named: str, what: str, edit: Edit, word: str, code: int = 3, alone: bool
     return Row("teacher", f"{named}: {what}", build, (named, word), code, alone)
 
 
+def many_channels(folder: Path) -> Arguments:
+    color_teacher(folder, channels=65)
+    write_table(folder / TABLE, embeddings=np.eye(3, 65))
+    return stage("teacher", folder, {"teacher": {"model": str(folder / MODEL)}}, capture=artifacts() / "ingest")
+
+
 def rows() -> Iterator[Row]:
     for key, value, word in VALUES:
         yield met("tiny.", f"{key} = {value}", set_to(key, value), word)
@@ -216,6 +227,7 @@ def rows() -> Iterator[Row]:
         yield met(TABLE, what, put(TABLE, content), word)
     for what, content, word in LABELS:
         yield met("labels.txt", what, put("labels.txt", content), word)
+    yield Row("teacher", f"{MODEL}: 65 channels", many_channels, (MODEL, "at most 64 can be rendered"), 2)
     yield met(MODEL, "nan", model(node("Log")), "non-finite values", 4)
     yield met(MODEL, "an output of 120 GB", huge(), MODEL, 3, True)
     yield met(MODEL, "a loop of 2^62 steps", endless(), MODEL, 3, True)
