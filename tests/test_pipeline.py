@@ -335,30 +335,9 @@ def test_an_ablation_reuses_everything_before_training():
     assert Planner().plan("toy", "train.seed=3", "no-tle").title == "toy@no-tle+train.seed=3"
 
 
-@pytest.mark.parametrize(
-    ("arguments", "message"),
-    [
-        (("ofice0",), "office0"),
-        (("toy", "train.stps=3"), "train.steps"),
-        (("toy", "tran.steps=3"), "train"),
-        (("toy", "train.steps"), "section.key=value"),
-        (("toy", "train.steps=many"), "train.steps"),
-        (("toy", "", "no-tel"), "no-tle"),
-    ],
-)
-def test_a_wrong_name_is_an_error_that_suggests_the_nearest(arguments, message):
-    with pytest.raises(ConfigError, match=message):
-        Planner().plan(*arguments)
-
-
 def test_labels_cannot_be_asked_of_a_source_without_them(tmp_path):
     with pytest.raises(ConfigError, match=r"teacher\.model"):
         Planner().plan(photo_folder(tmp_path / "photos"), "teacher.kind=labels")
-
-
-def test_a_folder_that_is_not_there_is_an_input_error(tmp_path):
-    with pytest.raises(InputError, match="not a folder"):
-        Planner().plan(f"{tmp_path}/nowhere/")
 
 
 def test_set_takes_scalars_words_switches_and_lists():
