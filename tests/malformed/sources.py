@@ -33,7 +33,6 @@ from malformed.edits import (
 from malformed.row import Arguments, Row, stage
 
 NAN, INF = float("nan"), float("inf")
-BINARY = bytes(range(256))
 # the file or setting that is named, what is wrong with it, the edit or the file's content, a word of the message
 Case = tuple[str, str, Edit | str | bytes, str]
 
@@ -96,20 +95,15 @@ def photos() -> Iterator[Row]:
         ("b.jpg", "a web page", "<!doctype html><title>404</title>", NO_IMAGE),
         ("b.jpg", "an EPS", EPS, NO_IMAGE),
         ("b.jpg", "a pickle", b"cos\nsystem\n(S'exit 1'\ntR.", NO_IMAGE),
-        ("b.jpg", "a PNG without rows", declared_png(8, 0), NO_IMAGE),
         ("b.jpg", "a GIF", picture("b.jpg", form="GIF"), NO_IMAGE),
-        ("b.jpg", "a TIFF", picture("b.jpg", form="TIFF"), NO_IMAGE),
         ("b.jpg", "a JPEG's first bytes", b"\xff\xd8\xff\xe0\0\x10JFIF", BROKEN),
         ("b.jpg", "a JPEG cut short", cut("b.jpg", 300), BROKEN),
         ("b.jpg", "a folder", no_file("b.jpg", "folder"), "is a folder"),
-        ("b.jpg", "a dangling link", no_file("b.jpg", "dangling link"), "is missing"),
         ("b.jpg", "a looping link", no_file("b.jpg", "looping link"), "symbolic links"),
         ("b.jpg", "two suffixes of one name", picture("b.png"), "are both view b"),
         ("c.png", "16 bits", picture("c.png", mode="I;16"), "convert it to 8 bits"),
         ("c.png", "70,000 columns", picture("c.png", (70_000, 1)), "65535 pixels a side"),
         ("c.png", "65 million pixels", picture("c.png", (65_000, 1001), mode="1"), "64 megapixels"),
-        ("photo", "a newline in a name", called_by(b"photo\n.jpg"), r"'photo\n.jpg'"),
-        ("photo", "an escape in a name", called_by(b"photo\x1b[2J.png"), "cannot be printed"),
         ("photo", "a name that is no UTF-8", called_by(b"photo\xff\xfe.jpg"), "cannot be printed"),
     ])  # fmt: skip
     one = all_of(remove("a.jpg"), remove("b.jpg"))
@@ -216,28 +210,23 @@ def colmap() -> Iterator[Row]:
             (place, "a byte too long", content + b"\0", NO_MODEL),
             (place, "2^64 - 1 records", struct.pack("<Q", 2**64 - 1), NO_MODEL),
         ]
-    cases += [(images, "missing", remove(images), "is missing"), (cloud, "missing", remove(cloud), "is missing")]
     for what, values, word in (
         ("no known model", (99,), "no known model"),
         ("a fisheye", (FISHEYE, (8, 6), (10, 10, 4, 3, 0, 0, 0, 0)), "OPENCV_FISHEYE is not supported"),
-        ("no column", (PINHOLE, (0, 6)), NO_CAMERA),
         ("2^63 rows", (PINHOLE, (8, 2**63)), NO_CAMERA),
-        ("f = 0", (PINHOLE, (8, 6), (0, 10, 4, 3)), "focal length"),
         ("f = 1e300", (PINHOLE, (8, 6), (1e300, 10, 4, 3)), "focal length"),
         ("f = nan", (PINHOLE, (8, 6), (NAN, 10, 4, 3)), "no numbers"),
-        ("cx = 1e30", (PINHOLE, (8, 6), (10, 10, 1e30, 3)), "principal point"),
         ("k1 = 1e300", (OPENCV, (8, 6), (10, 10, 4, 3, 1e300, 0, 0, 0)), "distortion"),
     ):
         cases.append((cameras, what, camera(*values), word))  # type: ignore[arg-type]
     cases += [
         (images, "a camera that is not there", views(of=7), "'c.png' is of camera 7"),
-        (images, "a quaternion of 0", views(quaternion=(0, 0, 0, 0)), NO_POSE),
         (images, "a quaternion of nan", views(quaternion=(NAN, 0, 0, 0)), NO_POSE),
         (images, "a quaternion of length 2", views(quaternion=(1, 1, 1, 1)), NO_POSE),
         (images, "1e30 away", views(place=(1e30, 0, 0)), "c.png lies 1e+30 units"),
-        (images, "inf away", views(place=(0, INF, 0)), NO_POSE),
         (images, "2^40 keypoints", views(n_keypoints=2**40), NO_MODEL),
         (images, "a name without an end", views()[:72] + b"a" * 10**6, NO_MODEL),
+        (cloud, "missing", remove(cloud), "is missing"),
         (cloud, "a track of 2^40", points(2**40), NO_MODEL),
         ("images/a.png", "another size", put(cameras, camera(size=(80, 60), params=(100, 100, 40, 30))), "80x60"),
     ]
@@ -253,22 +242,21 @@ def colmap() -> Iterator[Row]:
     yield from met(write_model, [gone], plan=True)
 
     as_text: list[Case] = [("images", "missing", remove("images"), "is missing")]
-    for row, word in (("nonsense", NO_MODEL), ("1 PINHOLE 8 6 10", NO_CAMERA), ("1 PINHOLE 8 6 ten 10 4 3", NO_MODEL),
-                      ("1 MAGIC 8 6 10 10 4 3", "MAGIC is not supported"), ("1 PINHOLE 8 6 nan 10 4 3", "no numbers"),
+    for row, word in (("nonsense", NO_MODEL), ("1 PINHOLE 8 6 10", NO_CAMERA),
+                      ("1 MAGIC 8 6 10 10 4 3", "MAGIC is not supported"),
                       (f"1 PINHOLE {'9' * 5000} 6 10 10 4 3", NO_MODEL)):  # fmt: skip
         as_text.append((f"{MODEL}/cameras.txt", row[:24], f"{row}\n", word))
     kept = "1 1 0 0 0 0 0 0 1 a.png\n\n2 1 0 0 0 1 0 0 1 b.png\n\n"
-    for row, word in (("3 nan 0 0 0 2 0 0 1 c.png", NO_POSE), ("3 1 0 0 0 2 0 0 1", NO_MODEL), ("3 1 0", NO_MODEL),
-                      ("3 1 0 0 0 2 0 0 9 c.png", "of camera 9")):  # fmt: skip
+    for row, word in (("3 nan 0 0 0 2 0 0 1 c.png", NO_POSE), ("3 1 0 0 0 2 0 0 1", NO_MODEL)):
         as_text.append((f"{MODEL}/images.txt", row, f"{kept}{row}\n", word))
     as_text += [("scene.json", f"test_every = {value!r}", keys("scene.json", test_every=value), "test_every")
-                for value in (True, 0, "8", [8])]  # fmt: skip
+                for value in (True, 0, "8")]  # fmt: skip
     as_text += [("scene.json", f"frames = {value!r}", keys("scene.json", test_every=8, frames=value), "frames")
-                for value in (3, [3], [{"file": 3}])]  # fmt: skip
+                for value in (3, [{"file": 3}])]  # fmt: skip
     as_text += [("scene.json", f"labels = {value!r}", keys("scene.json", labels=value), "label")
-                for value in ([], {"7": None}, {"7": " "}, {"7": ["sofa"]})]  # fmt: skip
+                for value in ([], {"7": " "}, {"7": ["sofa"]})]  # fmt: skip
     as_text += [("labels.json", f"an id of {key[:9]!r}", f'{{"{key}": "sofa"}}', "a label's id is not usable")
-                for key in ("-1", "65536", "a", "9" * 5000)]  # fmt: skip
+                for key in ("-1", "65536", "9" * 5000)]  # fmt: skip
     yield from met(write_colmap, as_text)
 
 
@@ -309,7 +297,6 @@ def transforms() -> Iterator[Row]:
     cases: list[Case] = [
         (FILE, "half an object", '{"frames": [', "does not parse"),
         (FILE, "a list", "[]", "holds a list"),
-        (FILE, "binary", BINARY, "UTF-8"),
         (FILE, "nested lists", DEEP, "nested too deeply"),
     ]
     cases += [(FILE, f"frames = {value}", keys(FILE, frames=value), "no frames") for value in (None, [], "a")]
@@ -319,24 +306,20 @@ def transforms() -> Iterator[Row]:
         ("3 rows", np.eye(4)[:3].tolist(), "is (3, 4)"),
         ("ragged", [[1], [1, 2]], "no usable transform_matrix"),
         ("words", [["1", "0", "0", "0"]] * 4, "does not hold numbers"),
-        ("truths", (np.eye(4) > 0).tolist(), "does not hold numbers"),
-        ("400 digits", [[10**400] * 4] * 4, "does not hold numbers"),
-        ("zeros", np.zeros((4, 4)).tolist(), RIGID),
         ("twice the size", (2 * np.eye(4)).tolist(), RIGID),
         ("mirrored", np.diag([1.0, 1, -1, 1]).tolist(), RIGID),
         ("another last row", np.diag([1.0, 1, 1, 2]).tolist(), RIGID),
-        ("1e300 everywhere", [[1e300] * 4] * 4, RIGID),
         ("1e7 away", moved(1e7), FAR),
     ):
         cases.append((FILE, f"a matrix: {what}", frame(transform_matrix=matrix), word))
     numbers: dict[str, dict[str, tuple[Any, ...]]] = {
-        NO_NUMBERS: {"fl_x": (NAN, "10", True, None, 10**400), "cx": (None,), "w": ("8",), "h": ([6],), "k1": ("0.1",)},
-        NO_CAMERA: {"fl_x": (0, -1, 1e300), "cx": (1e30,), "w": (0, 1e9), "h": (2**63,), "k1": (1e30,)},
+        NO_NUMBERS: {"fl_x": (NAN, "10", True, 10**400), "w": (None,), "k1": ("0.1",)},
+        NO_CAMERA: {"fl_x": (0, 1e300), "cx": (1e30,), "w": (0,), "h": (2**63,), "k1": (1e30,)},
         "is not supported": {"k3": (0.1,), "camera_model": ("OPENCV_FISHEYE", {})},
     }
     cases += [(FILE, f"{key} = {json.dumps(value)[:20]}", keys(FILE, **{key: value}), word)
               for word, given in numbers.items() for key, values in given.items() for value in values]  # fmt: skip
-    cases += [(FILE, f"camera_angle_x = {text}", by_angle(text), NO_NUMBERS) for text in ("0", "NaN", "3.2", '"1"')]
+    cases += [(FILE, f"camera_angle_x = {text}", by_angle(text), NO_NUMBERS) for text in ("0", "1e400", "3.2")]
     paths = {"climbs": "../../etc/hostname", "is absolute": "/etc/x.png", "climbs late": "images/../../x.png",
              "climbs by backslashes": "..\\..\\x.png"}  # fmt: skip
     cases += [(FILE, f"a path that {what}", frame(file_path=path), ELSEWHERE) for what, path in paths.items()]
@@ -378,8 +361,6 @@ def write_nerf(source: Path) -> None:
 def replica() -> Iterator[Row]:
     two, lost = POSE.format(0) * 2, remove("results/frame000001.png")
     cases: list[Case] = [
-        (TRAJECTORY, "nothing", "", "0 poses for 3 images"),
-        (TRAJECTORY, "binary", BINARY, "UTF-8"),
         (TRAJECTORY, "a row too few", two, "2 poses for 3 images"),
         (TRAJECTORY, "words", "a\nb\nc\n", "row 1 does not hold 16 numbers"),
         (TRAJECTORY, "15 numbers", two + POSE[:-3].format(0) + "\n", "row 3 does not hold 16 numbers"),
@@ -391,14 +372,13 @@ def replica() -> Iterator[Row]:
         ("results/depth000001.png", "missing", remove("results/depth000001.png"), "is missing"),
         ("scene", "no results", remove("results"), "neither results/"),
         (CAMERA, "missing", remove(CAMERA), "is missing"),
-        (CAMERA, "a list", "[]", "holds a list"),
         (CAMERA, "no camera", '{"camera": []}', "lacks a camera's"),
     ]
     values: dict[str, dict[str, tuple[Any, ...]]] = {
-        NO_NUMBERS: {"w": ("8", None), "h": ([6],), "fx": (NAN,)},
-        NO_CAMERA: {"w": (0,), "fx": (-1, 1e300), "cx": (1e30,)},
-        "lacks a camera's": {"cx": ("4",), "scale": (True, None, NAN)},
-        "depth scale": {"scale": (0, 1e300, 1e7)},
+        NO_NUMBERS: {"w": ("8",), "fx": (NAN,)},
+        NO_CAMERA: {"w": (0,), "fx": (-1,)},
+        "lacks a camera's": {"cx": ("4",), "scale": (True, NAN)},
+        "depth scale": {"scale": (0, 1e7)},
     }
     for word, given in values.items():
         for key, value in ((key, value) for key, each in given.items() for value in each):
@@ -409,7 +389,7 @@ def replica() -> Iterator[Row]:
     yield from met(write_slam, [("ingest.min_views", "poses of nan", nowhere, "not finite")], 4)
     yield from met(write_slam, [(TRAJECTORY, "a terabyte", swollen(TRAJECTORY), "are read")], alone=True)
     cases = [(CLASSES, text, text, "lacks classes with id and name")
-             for text in ("{}", '{"classes": 3}', '{"classes": ["a"]}', '{"classes": [{"name": "a"}]}')]  # fmt: skip
+             for text in ("{}", '{"classes": 3}', '{"classes": ["a"]}')]  # fmt: skip
     for value in (-1, True, 70_000):
         entry = {"id": value, "name": "a"}
         cases.append((CLASSES, f"an id of {value}", keys(CLASSES, classes=[entry]), "a label's id is not usable"))
@@ -462,25 +442,19 @@ def scannet() -> Iterator[Row]:
     clouds: list[tuple[str, bytes, str]] = [
         ("empty", b"", NO_PLY),
         ("a header without an end", header()[:-11], NO_PLY),
-        ("another format", header(form="binary_middle_endian 1.0") + coordinates(), NO_PLY),
         ("cut in a row", header() + coordinates()[:-5], NO_PLY),
-        ("-1 points", header(-1) + coordinates(), NO_PLY),
-        ("5000 digits of points", header("9" * 5000) + coordinates(), NO_PLY),
         ("two x", header(axes="xxyz") + coordinates() * 2, NO_PLY),
         ("lists for x", lists + b"\xff" * 400, NO_PLY),
         ("words", header(2, "ascii 1.0") + b"a b c\nd e f\n", NO_PLY),
         ("too few rows of text", header(9, "ascii 1.0") + b"0 0 0\n" * 5, NO_PLY),
         ("a face of 2^32 corners", header(more=faces) + coordinates() + struct.pack("<I", 2**32 - 1), NO_PLY),
-        ("a header that is no ASCII", header(more="comment \xff\n") + coordinates(), NO_PLY),
         ("no z", header(axes="xy") + coordinates(), "has no x, y, z"),
         ("0 points", header(0), "holds 0 points"),
         ("nan", header() + coordinates(NAN), "not finite"),
-        ("1e38 away", header() + coordinates(1e38), "farther than 1e+06"),
     ]
-    tables = [("nothing", "", IDS), ("no header", "1\twall\t1\n", IDS), ("a negative id", f"{HEAD}-1\twall\t1\n", IDS),
+    tables = [("nothing", "", IDS), ("a negative id", f"{HEAD}-1\twall\t1\n", IDS),
               ("class 21", f"{HEAD}1\twall\t21\n", IDS), ("short rows", f"{HEAD}1\n", "no usable columns"),
               ("another column", "id\tnyu40id\n1\t1\n", "cocomapid"),
-              ("a word for an id", f"{HEAD}one\twall\t1\n", "no usable columns"),
               ("an endless id", f"{HEAD}{'9' * 5000}\twall\t1\n", "no usable columns"),
               ("an open quote", f'{HEAD}1\t"{"a" * 200_000}', "is no table")]  # fmt: skip
     cases: list[Case] = [
@@ -530,10 +504,8 @@ def seven_scenes() -> Iterator[Row]:
         (pose, "half a matrix", "1 0 0 0\n0 1 0 0\n", "3x3 or 4x4 matrix"),
         (pose, "a mirror", EYE.replace("0 0 1 0", "0 0 -1 0"), RIGID),
         (pose, "missing", remove(pose), "is missing"),
-        (intrinsics, "binary", BINARY, "UTF-8"),
         (intrinsics, "f = -10", "-10 0 4\n0 10 3\n0 0 1\n", "focal length"),
         (intrinsics, "f = nan", "nan 0 4\n0 10 3\n0 0 1\n", "no numbers"),
-        (intrinsics, "cx = 1e30", "10 0 1e30\n0 10 3\n0 0 1\n", "principal point"),
         (color, "cut short", cut(color, 30), BROKEN),
         (color, "another size", picture(color, (16, 12)), "its camera 8x6"),
         (depth, "missing", remove(depth), "is missing"),
