@@ -490,7 +490,7 @@ def scannet() -> Iterator[Row]:
         cases.append((CONFIDENCE, what, content, COPY))
     yield from met(write_pl, cases)
     heavy = [(CONFIDENCE, "terabytes", npz(confidence=npy(SURE, shape=(10**6, 10**6))), COPY),
-             (CONFIDENCE, "32 million zeros", npz(confidence=npy(np.zeros((4000, 8000)))), COPY),
+             (CONFIDENCE, "18 MB of zeros", npz(confidence=npy(np.zeros((1500, 1500)))), COPY),
              (CONFIDENCE, "a pipe", no_file(CONFIDENCE, "pipe"), "a pipe")]  # fmt: skip
     yield from met(write_pl, heavy, alone=True)
     strangers = keys(SPLIT, train=["x"], test=["y"])
