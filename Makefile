@@ -23,7 +23,7 @@ CLUSTER := $(if $(filter-out local,$(on)),slurm)
 
 # `make scene=office0` needs no target: naming a scene, a sequence, a study or a benchmark means running it.
 .DEFAULT_GOAL := $(if $(study),study,$(if $(bench),bench-$(bench),$(if $(scene)$(sequence),run,help)))
-.PHONY: help run study slurm cluster-test view plan verify status clean-stale setup test test-all gpu malformed soak stability bench text-model nouns knowledge calibration teacher teacher-quality lint lock
+.PHONY: help run study slurm cluster-test view plan verify status clean-stale setup test test-all gpu soak stability bench text-model nouns knowledge calibration teacher teacher-quality lint lock
 
 run: $(READY) $(CLUSTER)  ## make scene=NAME|FOLDER [stage=] [set=a.b=c,...] [ablation=] [basis=NAME@REVISION|none] [cores=] [device=] [on=slurm]; or sequence=NAME
 	@$(CHEBSPLAT) run $(CHOICE) $(if $(stage),--stage '$(stage)') $(if $(cores),--cores '$(cores)') $(if $(device),--device '$(device)') $(if $(on),--on '$(on)')
@@ -73,9 +73,6 @@ cluster-test: slurm  ## study=toys on a Slurm of its own on 127.0.0.1 (apt-get i
 gpu: $(READY)  ## tests that need an NVIDIA GPU, then office0 on it beside the CPU: build/bench/gpu.csv (under 10 minutes)
 	@$(PY) -m pytest -q -m gpu $(args)
 	@$(PY) -m benchmarks gpu
-
-malformed: $(READY)  ## every malformed input of the corpus: exit code, seconds, memory; build/malformed.csv (args="WORD ...")
-	@PYTHONPATH=tests $(PY) -m malformed $(args)
 
 soak: $(READY)  ## runs killed, stopped, on full disks, by the hundred; build/soak-*.csv (args="kills=200 stops=50 disk=20 runs=60")
 	@PYTHONPATH=tests $(PY) -m soak $(args)

@@ -9,31 +9,6 @@ from chebsplat.stages import config
 from chebsplat.stages.registry import STAGES
 
 
-@pytest.mark.parametrize(
-    ("values", "hint"),
-    [
-        ({"train": {"stpes": 5}}, "train.stpes: no such key; did you mean train.steps?"),
-        ({"trian": {}}, "trian: no such key; did you mean train?"),
-        ({"projection": {"n_channels": 9}}, "projection: no such key; did you mean channels.n_channels?"),
-        ({"train": {"n_angles": 5}}, "did you mean describe.n_angles?"),
-        ({"train": {"steps": 0}}, "train.steps"),
-        ({"train": {"encoder": "trnsformer"}}, "train.encoder"),
-    ],
-)
-def test_bad_key_or_value_is_named(values, hint):
-    with pytest.raises(ConfigError) as error:
-        config.build(values, "x.toml")
-    assert hint in str(error.value)
-
-
-def test_missing_and_malformed_files_are_config_errors(tmp_path):
-    with pytest.raises(ConfigError, match=r"none\.toml"):
-        config.load(tmp_path / "none.toml")
-    (tmp_path / "bad.toml").write_text("[train\n")
-    with pytest.raises(ConfigError, match=r"bad\.toml"):
-        config.load(tmp_path / "bad.toml")
-
-
 def test_json_and_toml_give_the_same_config(tmp_path):
     (tmp_path / "a.toml").write_text("[train]\nsteps = 7\n")
     (tmp_path / "a.json").write_text(json.dumps({"train": {"steps": 7}}))

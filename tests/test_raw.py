@@ -139,12 +139,6 @@ def test_a_damaged_memory_of_hashes_costs_time_only(photos, own_work, damage):
     assert again.key == step.key
 
 
-def test_a_pipe_among_the_photos_is_named(photos):
-    os.mkfifo(photos / "9.jpg")
-    with pytest.raises(InputError, match=r"9\.jpg is a pipe"):
-        Planner().plan(str(photos))
-
-
 def test_names_that_are_not_utf8_are_hashed(tmp_path):
     path = tmp_path / os.fsdecode(b"\xff.png")
     path.write_bytes(b"x")
