@@ -72,7 +72,7 @@ class RaggedScene(Record):
 SCHEMA = RaggedScene.SCHEMA
 
 
-def write_scene(out: Path, scene: Scene, split_by_degree: bool = True) -> dict[str, int]:
+def write_scene(out: Path, scene: Scene) -> dict[str, int]:
     """Fill the directory that `artifact.publish` yields; returns bytes by part.
 
     Choices: `scene.ply` is trimmed to the highest degree in use; `scene_d<k>.ply` hold each degree apart, each valid
@@ -86,7 +86,7 @@ def write_scene(out: Path, scene: Scene, split_by_degree: bool = True) -> dict[s
         raise ValueError("Gaussians are not sorted by degree, stably")
     top = int(degrees.max(initial=0))
     write_ply(out / "scene.ply", p, top, scene.labels, scene.label_names)
-    if split_by_degree and len(np.unique(degrees)) > 1:
+    if len(np.unique(degrees)) > 1:
         for degree in np.unique(degrees):
             chosen = degrees == degree
             part = {name: values[chosen] for name, values in p.items()}

@@ -16,6 +16,7 @@ if TYPE_CHECKING:
     from chebsplat.formats.points import Points
 
 log = logging.getLogger("chebsplat")
+SEED = 0  # of the choice among points
 
 
 def run(job: Job) -> None:
@@ -37,9 +38,8 @@ def run(job: Job) -> None:
     points, features = read_points(job.inputs["points"]), read_features(job.inputs["features"])
     views = training_views(capture, points, features)
     rows = even(points)
-    chosen = np.sort(
-        np.random.default_rng(settings.seed).choice(rows, min(settings.n_points, len(rows)), replace=False)
-    )
+    rng = np.random.default_rng(SEED)
+    chosen = np.sort(rng.choice(rows, min(settings.n_points, len(rows)), replace=False))
     said = labels_of(job, capture, points, features, views, chosen)
     eyes = centers(points.cam_from_world)[[place for _, place, _ in views]]
     row, first, second = far_pairs(points.means[chosen], eyes, said >= 0).T

@@ -176,7 +176,7 @@ def run(job: Job) -> None:
 
         if fields.get("cam_from_world") is None and any(strengths[1:]):
             raise ConfigError("ingest.disturb_degrees and disturb_shift change poses, and this source has none")
-        fields |= disturbed(fields, *strengths, settings.disturb_seed)
+        fields |= disturbed(fields, *strengths)
     if settings.classes is not None:
         fields |= renamed(fields, settings.classes)
     without = {what: f"the {source.kind} source has none" for what in ("depth", "labels") if fields.get(what) is None}

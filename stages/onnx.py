@@ -39,9 +39,8 @@ def run(job: Job) -> None:
     config = trained_with(path)
     fusion = restored_fusion(gaussians, encoder.n_channels, config["train"])
     agreed = contract(encoder, config)
-    opset = job.config.onnx.opset
-    onnx.save(encoder_model(encoder, opset), job.out / FLOAT)
-    onnx.save(fusion_model(fusion, opset), job.out / FUSED)
+    onnx.save(encoder_model(encoder), job.out / FLOAT)
+    onnx.save(fusion_model(fusion), job.out / FUSED)
     quantize(job.out / FLOAT, job.out / DYNAMIC)
     for name in (FLOAT, FUSED, DYNAMIC):
         annotate(job.out / name, agreed)

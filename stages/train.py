@@ -9,8 +9,8 @@ from typing import TYPE_CHECKING, Any
 
 from chebsplat.errors import DataFailure
 from chebsplat.stages.command import Job, n_threads
+from chebsplat.stages.exposures import exposures
 from chebsplat.stages.measured_depth import with_depth_loss
-from chebsplat.stages.photo_models import camera_models, exposures, facts, reached
 from chebsplat.stages.resume import Saves
 from chebsplat.stages.stopping import deferred
 from chebsplat.stages.train_inputs import (
@@ -68,7 +68,6 @@ def run(job: Job) -> None:
     views = training_views(capture, points, features, bool(train.weight_depth), undone).to(job.device)
     if features is not None:
         begin_features(job, model, capture, points, features, len(views.names))
-    models = camera_models(job, capture, points, views)
     trainer = Trainer(
         model,
         views,
@@ -77,7 +76,6 @@ def run(job: Job) -> None:
         basis=knowledge(job, model, train),
         regions=regions,
         descriptors=described_values,
-        cameras=models,
     )
     trace = follow(job, trainer, train)
     parameters, population = trainer.finish(), trainer.population
@@ -89,8 +87,7 @@ def run(job: Job) -> None:
     modules = {
         f"{n}.{k}": v.detach().cpu().numpy() for n, m in model.modules.items() for k, v in m.state_dict().items()
     }
-    cameras = Cameras(points.names, points.Ks, reached(models, views, points), *capture.size)
-    job.facts |= facts(models)
+    cameras = Cameras(points.names, points.Ks, points.cam_from_world, *capture.size)
     notes: dict[str, Any] = {"left_out": job.facts.get("left_out", {}), "n_added": population.n_added}
     notes |= {"n_removed": population.n_removed, "n_broken": population.n_broken, "n_initial": n_initial}
     if features is not None:

@@ -128,10 +128,8 @@ SETTING_CHANGES = [
     ("sfm.max_points=700", ["sfm", "agree", "describe", *AFTER_TRAIN]),
     ("lift.gate=0.3", ["lift", "refine", "export", "evaluate", "report"]),
     ("refine.smooth=on", ["refine", "export", "evaluate", "report"]),
-    ("export.split_by_degree=false", ["export", "evaluate", "report"]),
     ("onnx.tolerance=1e-4", ["onnx", "report"]),
     ("evaluate.boundary=3", ["evaluate", "report"]),
-    ("report.n_pictures=2", ["report"]),
     ("source.seed=7", ALL),
     ("train.steps=60", []),
 ]
@@ -423,8 +421,8 @@ def test_a_run_makes_the_report_and_a_second_run_does_nothing(work):
     assert second.stdout.strip() == page
     assert "to run" not in second.stderr
     assert times == {p: p.stat().st_mtime_ns for p in work.glob("store/*/*/artifact.json")}
-    only = chebsplat("run", "--scene", "toy", "--set", FAST + ",report.n_pictures=1")
-    assert f"to run: report   fresh: {len(ALL) - 1}" in only.stderr
+    only = chebsplat("run", "--scene", "toy", "--set", FAST + ",evaluate.boundary=3")
+    assert f"to run: evaluate report   fresh: {len(ALL) - 2}" in only.stderr
     assert "report: done" in only.stderr
     assert "already there" not in only.stderr
     assert "profile" not in first.stderr + only.stderr

@@ -159,7 +159,7 @@ def test_the_exported_fusion_has_the_trained_inflation_and_temperature(tmp_path)
     differences = []
     for inflation, temperature in ((0.25, 1.0), (0.0, 1.0), (0.1, 7.0)):
         fusion = Fusion(Gate(4, 0.0), inflation, temperature).eval()
-        onnx.save(fusion_model(fusion, 18), tmp_path / "a.onnx")
+        onnx.save(fusion_model(fusion), tmp_path / "a.onnx")
         given = fusion_example(4, 16, 64)
         assert compare(fusion, tmp_path / "a.onnx", given) < 1e-5
         differences.append(compare(Fusion(Gate(4, 0.0)), tmp_path / "a.onnx", given))
@@ -194,8 +194,8 @@ def test_the_printed_count_depends_on_the_unit_and_ours_does_not():
 
 
 def test_growth_bounds_out_of_order_are_refused():
-    with pytest.raises(ValueError, match="grow_farthest"):
-        TrainSection(grow_nearest=2.0)
+    with pytest.raises(ValueError, match=r"nearest 2\.0 < farthest 1\.5"):
+        densify(*growing(), torch.ones(2), 1.0, 10, torch.Generator(), nearest=2.0)
 
 
 def test_canonical_regions_know_their_unit():

@@ -148,7 +148,7 @@ def test_penalties_reach_gate_and_histogram_weights_only_where_guidance_is_on(sc
 
 def test_masks_are_nested_binary_and_pass_the_gradient_of_what_they_threshold():
     delta = torch.tensor([[0.9, 0.05, 0.9, 0.9], [0.05, 0.9, 0.9, 0.05], [0.5, 0.4, 0.3, 0.9]], requires_grad=True)
-    masks = nested(delta, 0.1)
+    masks = nested(delta)
     assert masks.detach().tolist() == [[1, 0, 0, 0], [0, 1, 1, 0], [1, 1, 1, 1]]
     masks.sum().backward()
     assert (delta.grad > 0).all()
