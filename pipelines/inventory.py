@@ -2,16 +2,16 @@
 
 from __future__ import annotations
 
+import json
 import os
 import shutil
 import time
 from collections import Counter
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 from chebsplat.errors import ConfigError, InputError
-from chebsplat.formats import artifact
-from chebsplat.formats.manifest import Manifest
 from chebsplat.pipelines import folders, store, summary
 from chebsplat.pipelines.finished import is_artifact, links, scene_folder, titles
 from chebsplat.stages.registry import STAGES
@@ -52,23 +52,26 @@ def scenes() -> list[Scene]:
     return rows
 
 
-def _manifest(path: Path) -> Manifest | None:
+def _manifest(path: Path) -> Any:
     try:
-        return artifact.read_manifest(path)
-    except InputError:
+        return json.loads((path / "artifact.json").read_text())
+    except (OSError, ValueError, RecursionError):
         return None
 
 
-def _size(manifest: Manifest | None) -> int:
-    return sum(entry["bytes"] for entry in manifest.files.values()) if manifest else 0
+def _size(manifest: Any) -> int:
+    try:
+        return sum(int(entry["bytes"]) for entry in manifest["files"].values())
+    except (TypeError, KeyError, AttributeError, ValueError):
+        return 0
 
 
-def _source(title: str, ingest: Manifest | None) -> str:
+def _source(title: str, ingest: Any) -> str:
     """Where a scene comes from: the folder that its name stands for, or what its capture was made of."""
     try:
         if folders.record(name := title.partition("@")[0]).exists():
             return folders.owner(name) or ""
-        source = ingest.config["source"] if ingest else {}
+        source = ingest["config"]["source"]
         return source["path"] or f"generated {source['preset']}, seed {source['seed']}"
     except (InputError, TypeError, KeyError):
         return "damaged"
@@ -120,7 +123,7 @@ def usage() -> tuple[list[tuple[str, int, int]], list[tuple[str, int, int]]]:
     return by_size, sorted(scenes, key=lambda row: -row[1])
 
 
-def _made_of(title: str, manifests: dict[str, Manifest | None]) -> set[str]:
+def _made_of(title: str, manifests: dict[str, Any]) -> set[str]:
     """Keys of the artifacts in the store that a folder's links lead to, directly and as inputs."""
     found: set[str] = set()
     waiting = [Path(os.path.realpath(link)).name for link in links(store.work() / title).values()]
@@ -129,8 +132,9 @@ def _made_of(title: str, manifests: dict[str, Manifest | None]) -> set[str]:
         if key in found or key not in manifests:
             continue
         found.add(key)
-        manifest = manifests[key]
-        waiting += [entry["key"] for entry in manifest.inputs.values()] if manifest else []
+        inputs = manifests[key].get("inputs") if isinstance(manifests[key], dict) else None
+        entries = inputs.values() if isinstance(inputs, dict) else ()
+        waiting += [str(entry["key"]) for entry in entries if isinstance(entry, dict) and "key" in entry]
     return found
 
 

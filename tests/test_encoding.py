@@ -1,4 +1,4 @@
-"""The encoder ignores padding and order, and fusion keeps what nothing covers."""
+"""Regions cover their points, the encoder ignores padding and order, and fusion keeps what nothing covers."""
 
 import numpy as np
 import pytest
@@ -9,7 +9,7 @@ from chebsplat.labels.decode import decode, decode_labels
 from chebsplat.labels.noisy_teacher import confusable, confuse_segments, noisy_features, reduced
 from chebsplat.shape.encoder import RegionEncoder, Standardize
 from chebsplat.shape.fusion import Gate, propagate, propagation_weights
-from chebsplat.shape.regions import build_regions
+from chebsplat.shape.regions import build_regions, covering
 from chebsplat.splats.gaussians import activated, covariances, initial_gaussians, local_shape
 from chebsplat.stages.config import Config
 from chebsplat.stages.train import agreement
@@ -18,6 +18,30 @@ from chebsplat.training.model import SceneModel
 
 def cloud(n=600, seed=0):
     return np.random.default_rng(seed).normal(size=(n, 3))
+
+
+def test_regions_cover_every_point_and_hold_their_centre():
+    points = cloud()
+    regions = build_regions(points, 40, 16)
+    assert (covering(points, points[regions.centers], regions.radius, 3)[:, 0] >= 0).all()
+    assert np.array_equal(regions.members[:, 0], regions.centers)
+    for row in regions.members:
+        kept = row[row >= 0]
+        assert len(set(kept)) == len(kept)
+        assert (np.linalg.norm(points[kept] - points[row[0]], axis=1) <= regions.radius * 1.001).all()
+
+
+@pytest.mark.parametrize("n", [0, 1, 2, 5])
+def test_few_points_make_few_regions(n):
+    regions = build_regions(cloud(n), 40, 16)
+    assert len(regions.centers) == n
+    assert (regions.members < max(n, 1)).all()
+
+
+def test_coincident_points_make_a_region():
+    regions = build_regions(np.zeros((30, 3)), 4, 8)
+    assert regions.radius > 0
+    assert len(regions.centers) >= 1
 
 
 def test_non_finite_points_are_refused():
