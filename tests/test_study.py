@@ -355,6 +355,30 @@ def test_every_budget_starts_from_what_the_last_one_taught(there_and_back):
     assert len(cks) == 3
 
 
+def test_a_study_that_extends_another_has_its_values_but_for_its_own_and_names_what_it_takes():
+    base = read_study("parts")
+    own = {"extends": "parts", "title": "T", "seeds": [7], "variants": ["no-tle", "features-only"]}
+    found = checked_study(own, "mine")
+    assert (found.title, found.seeds) == ("T", [7])
+    assert (found.about, found.scenes, found.budgets) == (base.about, base.scenes, base.budgets)
+    assert found.variants == {name: base.variants[name] for name in ("no-tle", "features-only")}
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"extends": "prats"}, "no study is called prats; did you mean parts"),
+        ({"extends": "method-long"}, "mine: method-long itself extends parts; extend that"),
+        ({"variants": ["full", "half"]}, "mine: variants: 'half' is none of full, features-only"),
+        ({"conditions": ["noise"]}, "mine: conditions: 'noise' is none of"),
+        ({"variants": ["full"]}, "'features-only' is none of its variants"),
+    ],
+)
+def test_an_extension_of_what_is_not_there_is_an_error_that_names_it(changes, message):
+    with pytest.raises(ConfigError, match=message):
+        checked_study({"extends": "parts"} | changes, "mine")
+
+
 @pytest.mark.parametrize("name", names("studies"))
 def test_every_study_of_ours_can_be_planned(name):
     found = read_study(name)
@@ -382,30 +406,6 @@ def test_every_study_of_ours_can_be_planned(name):
 def test_a_wrong_study_is_an_error_that_names_what_is_wrong(changes, message):
     with pytest.raises(ConfigError, match=message):
         expand(study(**changes))
-
-
-def test_a_study_that_extends_another_has_its_values_but_for_its_own_and_names_what_it_takes():
-    base = read_study("parts")
-    own = {"extends": "parts", "title": "T", "seeds": [7], "variants": ["no-tle", "features-only"]}
-    found = checked_study(own, "mine")
-    assert (found.title, found.seeds) == ("T", [7])
-    assert (found.about, found.scenes, found.budgets) == (base.about, base.scenes, base.budgets)
-    assert found.variants == {name: base.variants[name] for name in ("no-tle", "features-only")}
-
-
-@pytest.mark.parametrize(
-    ("changes", "message"),
-    [
-        ({"extends": "prats"}, "no study is called prats; did you mean parts"),
-        ({"extends": "method-long"}, "mine: method-long itself extends parts; extend that"),
-        ({"variants": ["full", "half"]}, "mine: variants: 'half' is none of full, features-only"),
-        ({"conditions": ["noise"]}, "mine: conditions: 'noise' is none of"),
-        ({"variants": ["full"]}, "'features-only' is none of its variants"),
-    ],
-)
-def test_an_extension_of_what_is_not_there_is_an_error_that_names_it(changes, message):
-    with pytest.raises(ConfigError, match=message):
-        checked_study({"extends": "parts"} | changes, "mine")
 
 
 def test_a_study_may_be_a_file_of_the_user_s(tmp_path):
