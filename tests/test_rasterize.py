@@ -1,4 +1,4 @@
-"""The rasterizer reproduces gsplat's image, and no input, however broken, spreads beyond itself."""
+"""The rasterizer reproduces gsplat's image, and its gradients those of finite differences."""
 
 import math
 import os
@@ -67,15 +67,6 @@ def test_gradients_match_finite_differences():
         tuple(given.values()),
         atol=1e-6,
     )
-
-
-def test_means2d_keep_their_gradient_for_densification():
-    given = scene()
-    given["means"].requires_grad_()
-    image, _, meta = rasterize(**given, **camera())
-    image.sum().backward()
-    assert meta["means2d"].grad.shape == (1, 6, 2)
-    assert meta["means2d"].grad.abs().sum() > 0
 
 
 @pytest.mark.parametrize("length", [1e-10, 1.0, 1e20])
