@@ -23,7 +23,7 @@ CLUSTER := $(if $(filter-out local,$(on)),slurm)
 
 # `make scene=office0` needs no target: naming a scene, a sequence, a study or a benchmark means running it.
 .DEFAULT_GOAL := $(if $(study),study,$(if $(bench),bench-$(bench),$(if $(scene)$(sequence),run,help)))
-.PHONY: help run study slurm cluster-test view plan verify status clean-stale setup test test-all gpu malformed soak stability bench text-model nouns knowledge calibration teacher teacher-quality lint lock
+.PHONY: help run study slurm cluster-test view plan verify status clean-stale setup test test-all gpu soak stability bench text-model nouns knowledge calibration teacher teacher-quality lint lock
 
 run: $(READY) $(CLUSTER)  ## make scene=NAME|FOLDER [stage=] [set=a.b=c,...] [ablation=] [basis=NAME@REVISION|none] [cores=] [device=] [on=slurm]; or sequence=NAME
 	@$(CHEBSPLAT) run $(CHOICE) $(if $(stage),--stage '$(stage)') $(if $(cores),--cores '$(cores)') $(if $(device),--device '$(device)') $(if $(on),--on '$(on)')
@@ -36,9 +36,8 @@ slurm: $(READY)
 	@$(PY) -c 'import snakemake_executor_plugin_slurm' 2>/dev/null || \
 	  $(PY) -m uv pip install --quiet --python $(PY) --editable '.[slurm]'
 
-view: $(READY)  ## make view scene=NAME|FOLDER|FILE.ply [port=8080]: look at a finished scene in a browser, live
-	@$(PY) -c 'import viser' 2>/dev/null || $(PY) -m uv pip install --quiet --python $(PY) --editable '.[view]'
-	@$(CHEBSPLAT) view '$(scene)' $(if $(port),--port '$(port)')
+view: $(READY)  ## make view scene=NAME|FOLDER|FILE.ply [args=]: write a finished scene as a page and open it in the browser
+	@$(CHEBSPLAT) view '$(scene)' $(args)
 
 plan: $(READY)  ## make plan scene=NAME (or study=NAME): what would run, what is fresh, what is left out, and why
 	@$(CHEBSPLAT) $(if $(study),study '$(study)' --plan,plan $(CHOICE)) $(if $(device),--device '$(device)')
@@ -75,13 +74,10 @@ gpu: $(READY)  ## tests that need an NVIDIA GPU, then office0 on it beside the C
 	@$(PY) -m pytest -q -m gpu $(args)
 	@$(PY) -m benchmarks gpu
 
-malformed: $(READY)  ## every malformed input of the corpus: exit code, seconds, memory; build/malformed.csv (args="WORD ...")
-	@PYTHONPATH=tests $(PY) -m malformed $(args)
-
 soak: $(READY)  ## runs killed, stopped, on full disks, by the hundred; build/soak-*.csv (args="kills=200 stops=50 disk=20 runs=60")
 	@PYTHONPATH=tests $(PY) -m soak $(args)
 
-stability: bench-stability  ## every extreme case, naive and ours; build/bench/stability.csv; fails if one does (args=--only X)
+stability: bench-stability  ## every extreme case of the maths; build/bench/stability.csv; fails if one does (args=--only X)
 
 bench: $(READY)  ## list the benchmarks; make bench=NAME [args=] runs one after the stages that it needs, into build/bench
 	@$(PY) -m benchmarks $(args)

@@ -26,28 +26,14 @@ class Benchmark:
     settings: str = ""
 
 
-LABELS = "teacher.kind=labels"
 BENCHMARKS = {
-    "raster": Benchmark("rasterizer.main", "the rasterizer against its bars: milliseconds, errors, memory"),
-    "train": Benchmark(
-        "backends", "a training without the shape branch: seconds, PSNR by backend", ("sfm", "teacher"), LABELS
+    "raster": Benchmark("raster", "the rasterizer against its bars: milliseconds, ratios"),
+    "cost": Benchmark(
+        "cost", "whole trainings beside plain 3DGS; --growth: by Gaussians, pixels, views", ("sfm", "teacher")
     ),
-    "cost": Benchmark("cost", "whole trainings beside plain 3DGS: what each part costs", ("sfm", "teacher")),
-    "scale": Benchmark("scale", "how a training grows: seconds, memory, disk by Gaussians, pixels, views", ("sfm",)),
-    "knowledge": Benchmark(
-        "knowledge", "what the knowledge space costs a training: regulariser and update", ("sfm", "teacher"), LABELS
-    ),
-    "refresh": Benchmark("refresh", "what refreshing descriptors costs, and how stale they get", ("sfm", "teacher")),
-    "descriptor": Benchmark("descriptor.main", "routes to the descriptor: error against run time, growth of sampling"),
-    "shapes": Benchmark("shapes.main", "which shapes a classifier tells apart, ours beside FPFH and others"),
-    "encoder": Benchmark(
-        "encoder",
-        "the region encoder: error against run time of torch and onnxruntime",
-        ("export", "onnx"),
-        "train.encoder=transformer",
-    ),
+    "descriptor": Benchmark("descriptor", "the descriptor: regions a second, error, growth of sampling"),
     "lift": Benchmark(
-        "lift", "features lifted to a finished scene: seconds, error", ("train", "teacher"), "train.features=lifted"
+        "lift", "features lifted to a finished scene: seconds", ("train", "teacher"), "train.features=lifted"
     ),
     "refine": Benchmark(
         "refine", "what follows a training: error against run time of lift, smoothing, encoders by size", ("lift",)
@@ -57,10 +43,8 @@ BENCHMARKS = {
     "label": Benchmark("label", "which Gaussians of a PLY are named right by shape alone; trains its scenes"),
     "teaching": Benchmark("teaching", "what the encoder of points owes to rooms, radii, descriptor, size"),
     "query": Benchmark("query", "asking at the suggested cut: precision, recall, absent words refused; trains 5 rooms"),
-    "layouts": Benchmark("layouts", "the exported layouts: bytes, and images beside the checkpoint's", ("export",)),
-    "store": Benchmark("store", "the feature store: bytes, error, label decisions, bandwidth, memory"),
     "gpu": Benchmark("gpu", "office0 on a GPU beside the CPU: seconds, PSNR, mIoU, frames/s, memory; needs a GPU"),
-    "stability": Benchmark("stability.main", "every extreme case of the maths, naive and ours; fails if one does"),
+    "stability": Benchmark("stability.main", "every extreme case of the maths; fails if one does"),
 }
 
 

@@ -1,27 +1,75 @@
-"""What the joint method costs: seconds of whole trainings, as a multiple of plain 3DGS.
+"""What a training costs beside plain 3DGS; with --growth, how it grows with Gaussians, pixels and views.
 
 The trainings take turns of fifty steps, so that other load on the machine meets all alike; a short training of each
 goes before, so that no kernel is left to compile.
+
+Of growth, each case is a process of its own: some steps of the default training, colour and depth loss, on views of the
+scene that are enlarged and repeated, from as many points of its depth as Gaussians are wanted. Exponents are slopes of
+logarithms between the first and the last case of a row.
 """
 
 from __future__ import annotations
 
-import os
+import json
+import math
+import subprocess
+import sys
+import tempfile
+import time
+from argparse import SUPPRESS
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
-import torch
+import numpy as np
+from torch import Tensor
 
-import chebsplat
 from benchmarks import shared
-from benchmarks.scene import trainer_from
+from chebsplat.cameras import extent, unproject
+from chebsplat.formats import artifact
+from chebsplat.formats.capture import SCHEMA, read_capture, write_capture
+from chebsplat.formats.features import read_features
+from chebsplat.formats.manifest import Manifest
+from chebsplat.formats.points import Points, read_points
 from chebsplat.pipelines.plan import merged
 from chebsplat.pipelines.scenes import read_toml
 from chebsplat.settings import MOST_STEPS
+from chebsplat.splats.gaussians import local_shape
 from chebsplat.stages.config import Config
+from chebsplat.stages.measured_depth import with_depth_loss
+from chebsplat.stages.train_inputs import model_of, training_views
 from chebsplat.training.trainer import Trainer
 
 BAR, TURN, REHEARSAL = 1.25, 50, 100
+BASE = (20_000, (320, 240), 60)  # Gaussians, pixels, views
+GROWTH = {
+    "Gaussians": [(n, BASE[1], BASE[2]) for n in (20_000, 100_000, 400_000, 1_000_000)],
+    "pixels": [(BASE[0], size, BASE[2]) for size in ((320, 240), (640, 480), (1280, 960), (1920, 1080))],
+    "views": [(*BASE[:2], n) for n in (60, 300, 1000)],
+    "all": [(400_000, (1920, 1080), 1000)],
+}
+WARM, TIMED, BOUND = 10, 30, 6.0  # steps of a case before those that are timed, and these; gigabytes
+
+
+def trainer_from(
+    work: Path,
+    config: Config,
+    backend: str = "auto",
+    basis: dict[str, Tensor] | None = None,
+    device: str = "cpu",
+) -> Trainer:
+    """A trainer before its first step, of a scene that has been run up to its teacher.
+
+    Args: work: folder of the links `ingest`, `sfm` and, if semantics are trained, `teacher`; backend: of the
+          rasterizer; basis: earlier knowledge, as `Trainer` takes it; device: `cpu` or `cuda`.
+    """
+    capture, points = read_capture(work / "ingest"), read_points(work / "sfm")
+    features = read_features(work / "teacher") if config.train.semantics else None
+    train, _ = with_depth_loss(config.train, capture, points)
+    model = model_of(points, features, train, config.describe, device, backend)
+    views = training_views(capture, points, features, bool(train.weight_depth)).to(device)
+    return Trainer(model, views, train, extent(points.cam_from_world), basis=basis)
 
 
 def begun(work: Path, ablation: str, steps: int) -> Trainer:
@@ -29,26 +77,123 @@ def begun(work: Path, ablation: str, steps: int) -> Trainer:
     return trainer_from(work, Config.model_validate(merged(values, {"train": {"steps": steps}})))
 
 
-def main(arguments: Sequence[str]) -> None:
+def by_turns(work: Path, variants: Sequence[str], n_steps: int) -> None:
+    """Milliseconds a step of whole trainings, as a multiple of the first variant's."""
+    for name in variants:
+        for _ in begun(work, name, REHEARSAL).steps():
+            pass
+    trainers = {name: begun(work, name, n_steps) for name in variants}
+    rounds = {name: trainer.steps() for name, trainer in trainers.items()}
+    for done in range(0, n_steps, TURN):
+        for steps in rounds.values():
+            for _ in range(min(TURN, n_steps - done)):
+                next(steps)
+        if (done + TURN) % 500 == 0 or done + TURN >= n_steps:
+            print(f"after {min(done + TURN, n_steps)} steps")
+            for name, trainer in trainers.items():
+                ratio = trainer.seconds / trainers[variants[0]].seconds
+                parts = "  ".join(f"{part} {1e3 * s / trainer.step:.1f}" for part, s in trainer.laps.seconds.items())
+                print(f"  {name:12s} {1e3 * trainer.seconds / trainer.step:6.1f} ms a step  ×{ratio:.2f}  {parts}")
+
+
+def enlarged(work: Path, size: tuple[int, int], n_views: int, out: Path) -> Path:
+    """A capture of a scene's training views, repeated and enlarged to pixels (width, height)."""
+    given = read_capture(work / "ingest")
+    assert given.cam_from_world is not None and given.depth is not None
+    used = np.resize(np.flatnonzero(~given.is_test), n_views)
+    rows = np.arange(size[1]) * given.size[1] // size[1]
+    columns = np.arange(size[0]) * given.size[0] // size[0]
+    images = np.empty((n_views, size[1], size[0], 3), np.uint8)
+    depth = np.empty((n_views, size[1], size[0]), np.float32)
+    for k, view in enumerate(used):
+        images[k] = given.images[view][rows[:, None], columns]
+        depth[k] = given.depth[view][rows[:, None], columns]
+    Ks = given.Ks[used] * np.array([[size[0] / given.size[0]], [size[1] / given.size[1]], [1.0]])
+    nothing: dict[str, Any] = {"labels": None, "loss_mask": None, "pseudo_labels": None, "confidence": None}
+    capture = replace(
+        given, names=[f"view{k:04d}" for k in range(n_views)], images=images, depth=depth, Ks=Ks,
+        cam_from_world=given.cam_from_world[used], is_test=np.zeros(n_views, bool), **nothing,
+    )  # fmt: skip
+    folder = out / "capture"
+    with artifact.publish(folder, Manifest(SCHEMA, artifact.digest({"case": str(out)}), "ingest")) as tmp:
+        write_capture(tmp, capture)
+    return folder
+
+
+def measured(capture: Path, n_gaussians: int) -> dict[str, float]:
+    """What a training of this process takes; nothing else is to be in its memory."""
+    held, rng = read_capture(capture), np.random.default_rng(0)
+    assert held.cam_from_world is not None and held.depth is not None
+    views = np.linspace(0, len(held.names) - 1, 60).astype(int)
+    means, colors = [], []
+    for view in views:
+        pixels = np.stack([rng.integers(0, side, n_gaussians // len(views) + 1) for side in held.size[::-1]], 1)
+        means.append(unproject(held.depth[view], held.Ks[view], held.cam_from_world[view], pixels))
+        colors.append(held.images[view][pixels[:, 0], pixels[:, 1]])
+    places = np.concatenate(means)[:n_gaussians] + rng.normal(0, 1e-4, (n_gaussians, 3))
+    shapes, normals = local_shape(places, 16)
+    points = Points(
+        held.names, held.Ks, held.cam_from_world, places, np.concatenate(colors)[:n_gaussians], normals, shapes,
+        np.zeros((0, 2), np.int32), {"how": "depth"},
+    )  # fmt: skip
+    settings = {"steps": 3000, "semantics": False, "max_gaussians": 2 * n_gaussians, "weight_depth": 0.8}
+    config = Config.model_validate({"train": settings})
+    trainer = Trainer(
+        model_of(points, None, config.train, config.describe),
+        training_views(held, points, None, True), config.train, extent(points.cam_from_world),
+    )  # fmt: skip
+    trainer.step = int(config.train.steps * 0.1)  # at full resolution, before growth
+    steps = trainer.steps()
+    for _ in range(WARM):
+        next(steps)
+    began = time.perf_counter()
+    for _ in range(TIMED):
+        next(steps)
+    seconds = (time.perf_counter() - began) / TIMED
+    return {"step_ms": 1e3 * seconds, "peak_gb": shared.peak_memory() / 2**30}
+
+
+def growth(work: Path, names: Sequence[str], out: Path) -> int:
+    """A row for each case, and the exponents; 1 if a thousand views take more than BOUND."""
+    print(f"bar: 1000 views of 1920×1080 within {BOUND:g} GB")
+    rows: list[dict[str, Any]] = []
+    for name in names:
+        for n_gaussians, size, n_views in GROWTH[name]:
+            with tempfile.TemporaryDirectory(prefix="growth-") as folder:
+                capture = enlarged(work, size, n_views, Path(folder))
+                stored = sum(file.stat().st_size for file in capture.rglob("*") if file.is_file())
+                command = [sys.executable, "-m", "benchmarks", "cost", "--work", str(work)]
+                command += ["--case", str(capture), str(n_gaussians)]
+                done = subprocess.run(command, stdout=subprocess.PIPE, text=True, check=True)
+            row = {"row": name, "gaussians": n_gaussians, "width": size[0], "height": size[1], "views": n_views}
+            rows.append(row | json.loads(done.stdout) | {"disk_gb": stored / 2**30})
+            print("{gaussians:>9,} Gaussians  {width:>4}×{height:<4}  {views:>4} views  {step_ms:7.1f} ms a step  "
+                  "{peak_gb:5.2f} GB  {disk_gb:6.3f} GB on disk".format(**rows[-1]), flush=True)  # fmt: skip
+        first, last = ([row for row in rows if row["row"] == name][k] for k in (0, -1))
+        if first is not last:
+            grown = {"Gaussians": last["gaussians"] / first["gaussians"], "views": last["views"] / first["views"],
+                     "pixels": last["width"] * last["height"] / (first["width"] * first["height"])}[name]  # fmt: skip
+            slopes = (math.log(last[key] / first[key]) / math.log(grown) for key in ("step_ms", "peak_gb", "disk_gb"))
+            print("with {}: step ^{:.2f}, memory ^{:.2f}, disk ^{:.2f}".format(name, *slopes))
+    shared.write_csv(out / "growth.csv", rows)
+    return int(any(row["peak_gb"] > BOUND for row in rows if row["views"] == 1000))
+
+
+def main(arguments: Sequence[str]) -> int:
     parser = shared.parser("cost", __doc__, work=True)
     parser.add_argument("--steps", type=int, default=MOST_STEPS)
     parser.add_argument("--ablations", nargs="*", default=[])
+    parser.add_argument("--growth", choices=list(GROWTH), nargs="+", help="instead: by size")
+    parser.add_argument(
+        "--case", nargs=2, help=SUPPRESS
+    )  # a capture and a number of Gaussians: in a process of its own
     options = parser.parse_args(arguments)
-    print(f"chebsplat {chebsplat.__version__}, torch {torch.__version__} on {torch.get_num_threads()} threads; "
-          f"{os.cpu_count()} cores, load {os.getloadavg()[0]:.1f}; bar {BAR}")  # fmt: skip
-    variants = ("plain", "full", *options.ablations)
-    for name in variants:
-        for _ in begun(options.work, name, REHEARSAL).steps():
-            pass
-    trainers = {name: begun(options.work, name, options.steps) for name in variants}
-    rounds = {name: trainer.steps() for name, trainer in trainers.items()}
-    for done in range(0, options.steps, TURN):
-        for steps in rounds.values():
-            for _ in range(min(TURN, options.steps - done)):
-                next(steps)
-        if (done + TURN) % 500 == 0 or done + TURN >= options.steps:
-            print(f"after {min(done + TURN, options.steps)} steps")
-            for name, trainer in trainers.items():
-                ratio = trainer.seconds / trainers["plain"].seconds
-                parts = "  ".join(f"{part} {1e3 * s / trainer.step:.1f}" for part, s in trainer.laps.seconds.items())
-                print(f"  {name:12s} {1e3 * trainer.seconds / trainer.step:6.1f} ms a step  ×{ratio:.2f}  {parts}")
+    if options.case:
+        print(json.dumps(measured(Path(options.case[0]), int(options.case[1]))))
+        return 0
+    print(shared.machine())
+    if options.growth:
+        return growth(options.work, options.growth, options.out)
+    print(f"bar {BAR}")
+    by_turns(options.work, ("plain", "full", *options.ablations), options.steps)
+    return 0

@@ -24,7 +24,6 @@ from chebsplat.formats.gaussians import Gaussians, read_gaussians
 from chebsplat.formats.knowledge import SHIPPED
 from chebsplat.formats.ply import write_ply
 from chebsplat.lifting.cell_maps import to_cells
-from chebsplat.pipelines.plan import Planner
 from chebsplat.rasterize.lift import lift
 from chebsplat.splats.gaussians import activated
 from chebsplat.stages.known_shapes import up_of
@@ -80,18 +79,14 @@ def main(arguments: Sequence[str]) -> int:
     parser.add_argument("--steps", type=int, default=1000, help="of the trainings")
     parser.add_argument("--seeds", nargs="+", type=int, default=[0], help="of the trainings")
     options = parser.parse_args(arguments)
-    planner, plans = Planner(running=True), {}
-    for scene, seed in product(shared.there(options.scenes), options.seeds):
-        settings = f"train.steps={options.steps}" + (f",train.seed={seed}" if seed else "")
-        plans[scene, seed] = planner.plan(scene, settings)
-    planner.save()
-    if code := shared.ran(list(plans.values()), "train"):
-        return code
+    pairs = list(product(shared.there(options.scenes), options.seeds))
+    steps = f"train.steps={options.steps}"
+    wanted = [(scene, steps + (f",train.seed={seed}" if seed else "")) for scene, seed in pairs]
     rows = []
-    for (scene, seed), plan in plans.items():
+    for (scene, seed), plan in zip(pairs, shared.finished(wanted, "train"), strict=True):
         rows.append({"scene": scene, "seed": seed, **named(plan.targets), "bar": SCENES.get(scene, 0.0)})
         print("{scene:<10} seed {seed}: {gaussians} Gaussians, {oa:.1%} named right (bar {bar:.0%}), of the surer half "
               "{oa_surer_half:.1%}, mIoU {miou:.1%}".format(**rows[-1]), flush=True)  # fmt: skip
     shared.write_csv(options.out / "label.csv", rows)
-    means = {scene: np.mean([row["oa"] for row in rows if row["scene"] == scene]) for scene, _ in plans}
+    means = {scene: np.mean([row["oa"] for row in rows if row["scene"] == scene]) for scene, _ in pairs}
     return int(any(mean < SCENES.get(scene, 0.0) for scene, mean in means.items()))

@@ -7,9 +7,6 @@ anything. Words that no room has are `measured` of teachers/words.toml.
 
 from __future__ import annotations
 
-import os
-import subprocess
-import sys
 import tomllib
 from collections.abc import Sequence
 from pathlib import Path
@@ -24,7 +21,7 @@ from chebsplat.formats.capture import read_capture
 from chebsplat.formats.scene import Scene, read_scene
 from chebsplat.formats.teacher_model import EMBEDDED
 from chebsplat.labels.relevancy import relevancy
-from chebsplat.pipelines.plan import suffix
+from chebsplat.pipelines import store
 from chebsplat.stages.query import CANONICAL, understood
 from chebsplat.synthetic import CLASS_NAMES
 
@@ -33,14 +30,6 @@ SETTINGS = "train.steps=1000,evaluate.timing_repeats=0"
 BARS = {"precision": 0.75, "recall": 0.6, "refused": 0.85}
 NEAR = 0.1  # metres
 LEAST = 20  # Gaussians of a class, of which a room has it
-
-
-def linked(scene: str, settings: str) -> Path:
-    """The folder of a scene's links, run to its export. Raises CalledProcessError if that fails."""
-    command = [sys.executable, "-P", "-m", "chebsplat.pipelines.cli", "run", "--scene", scene, "--stage", "export"]
-    subprocess.run([*command, "--set", settings], check=True, stdout=subprocess.DEVNULL)
-    work = Path(os.environ.get("CHEBSPLAT_WORK") or "work")
-    return work / f"{scene}@{suffix(settings)}"
 
 
 def classes_of(scene: Scene, capture: Path) -> np.ndarray:
@@ -77,7 +66,10 @@ def main(arguments: Sequence[str]) -> int:
     parser.add_argument("--settings", default=SETTINGS, help="as set= takes them")
     parser.add_argument("--folders", type=Path, nargs="*", help="of links of finished scenes, instead")
     options = parser.parse_args(arguments)
-    folders = options.folders or [linked(scene, options.settings) for scene in options.scenes.split(",")]
+    folders = options.folders
+    if not folders:
+        wanted = [(scene, options.settings) for scene in options.scenes.split(",")]
+        folders = [store.work() / plan.title for plan in shared.finished(wanted, "export")]
     absent = tomllib.loads(EMBEDDED.with_name("words.toml").read_text())["absent"]["measured"]
     table: list[dict[str, Any]] = []
     pooled: dict[str, list[tuple[int, int, int]]] = {"calibrated": [], "relevancy above 0.5": []}

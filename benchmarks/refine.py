@@ -94,7 +94,7 @@ def main(arguments: Sequence[str]) -> None:
     encoders = {name: taught(rooms, variant, options.steps, words, 0)[0] for name, variant in SIZES.items()}
     encoders["as shipped"] = PointEncoder.restored(shipped.encoder, shipped.weights)
     told = scene.capture, scene.gaussians.cameras, scene.gaussians.parameters, scene.taught
-    lifted, to_lift = timed(lambda: lifted_from(*told, LiftSection(), Progress(False)))
+    lifted, to_lift = timed(lambda: lifted_from(*told, LiftSection().gate, Progress(False)))
     near, to_compare = timed(lambda: affinities(scene.means, *scene.surface))
     smoothed, to_smooth = timed(lambda: smooth(scene.features, lifted.n_views, near))
     rows: list[dict[str, Any]] = []

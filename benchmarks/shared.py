@@ -6,14 +6,19 @@ import csv
 import os
 import platform
 from argparse import ArgumentParser, RawDescriptionHelpFormatter
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from contextlib import redirect_stdout
 from io import StringIO
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
-if TYPE_CHECKING:
-    from chebsplat.pipelines.plan import Plan
+import numba
+import torch
+
+import chebsplat
+from chebsplat.pipelines.plan import Plan, Planner
+from chebsplat.pipelines.run import execute
+from chebsplat.pipelines.scenes import data_of
 
 
 def parser(name: str, description: str | None, work: bool = False) -> ArgumentParser:
@@ -37,8 +42,6 @@ def write_csv(path: Path, rows: Sequence[dict[str, Any]]) -> None:
 
 def there(scenes: Sequence[str]) -> list[str]:
     """The scenes whose data is there; a line for each of the others."""
-    from chebsplat.pipelines.scenes import data_of
-
     kept = []
     for scene in scenes:
         if (needed := data_of(scene)) and not needed[1].is_dir():
@@ -48,12 +51,28 @@ def there(scenes: Sequence[str]) -> list[str]:
     return kept
 
 
-def ran(plans: Sequence[Plan], stage: str) -> int:
-    """The exit code of running plans up to a stage, without a path for each on stdout."""
-    from chebsplat.pipelines.run import execute
+def finished(wanted: Iterable[tuple[str, str]], stage: str) -> list[Plan]:
+    """Plans of (scene, settings as `set=` takes them), run up to a stage, without a path for each on stdout.
 
+    Raises SystemExit with the run's exit code if a step fails.
+    """
+    planner = Planner(running=True)
+    plans = [planner.plan(scene, settings) for scene, settings in wanted]
+    planner.save()
     with redirect_stdout(StringIO()):
-        return execute(list(plans), stage, os.cpu_count() or 1)
+        code = execute(plans, stage, os.cpu_count() or 1)
+    if code:
+        raise SystemExit(code)
+    return plans
+
+
+def machine() -> str:
+    """What figures are measured with: versions, threads, processor, load."""
+    return (
+        f"chebsplat {chebsplat.__version__}, torch {torch.__version__} on {torch.get_num_threads()} threads, "
+        f"numba {numba.__version__} on {numba.get_num_threads()}; {processor()}, {os.cpu_count()} cores, "
+        f"load {os.getloadavg()[0]:.1f}"
+    )
 
 
 def processor() -> str:

@@ -9,6 +9,7 @@ The houses need the test data (CHEBSPLAT_TEST_DATA), and are left out with a lin
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from itertools import product
 from pathlib import Path
 
 import numpy as np
@@ -20,7 +21,6 @@ from chebsplat.evaluation.protocols.task import predicted, resized
 from chebsplat.formats.agreement import read_agreement
 from chebsplat.formats.capture import read_capture
 from chebsplat.formats.features import read_features
-from chebsplat.pipelines.plan import Planner
 from chebsplat.stages.settings import AgreeSection
 
 SCENES = ("office0", "room0", "shuffled0", "kitchen", "living")
@@ -47,14 +47,10 @@ def main(arguments: Sequence[str]) -> int:
     parser = shared.parser("trust", __doc__)
     parser.add_argument("--scenes", nargs="+", default=list(SCENES))
     options = parser.parse_args(arguments)
-    planner, pairs = Planner(running=True), {}
-    for scene in shared.there(options.scenes):
-        pairs |= {(scene, name): planner.plan(scene, settings) for name, settings in TEACHERS.items()}
-    planner.save()
-    if code := shared.ran(list(pairs.values()), "agree"):
-        return code
+    pairs = list(product(shared.there(options.scenes), TEACHERS))
+    plans = shared.finished([(scene, TEACHERS[teacher]) for scene, teacher in pairs], "agree")
     rows = []
-    for (scene, teacher), plan in pairs.items():
+    for (scene, teacher), plan in zip(pairs, plans, strict=True):
         found, miou = read_agreement(plan.targets["agree"]), true_miou(plan.targets)
         value = found.agreement or 0.0
         rows.append({"scene": scene, "teacher": teacher, "agreement": value, "miou": miou, "points": found.n_points})

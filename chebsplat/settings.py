@@ -38,7 +38,7 @@ class Section(BaseModel):
 class DescribeSection(Section):
     """docs/method.md, section 2; shared by the describe stage and the refresh inside training."""
 
-    # with 10 for a, 8 angles are better than 4 and 30 at ghosts and noisy frames (make bench-shapes)
+    # with 10 for a, 8 angles are better than 4 and 30 at ghosts and noisy frames
     n_angles: int = number(8, "rotations of the anisotropic metric (J)", 1, 64)
     max_degree: int = number(8, "degree of the Chebyshev descriptor (D)", 2, 64)
     anisotropy: float = number(10.0, "of the metric (a); 0: isotropic", 0, 1e4)
@@ -121,25 +121,12 @@ class TrainSection(Section):
         "logits", "of a Gaussian's SH bands, guided by colour; printed: the paper's network, guided by semantics too"
     )
     sh_guided: bool = setting(True, "false: nothing but a Gaussian's own logits closes its SH bands")
-    sh_bins: int = number(8, "of the histogram of a region's colours", 1, 64)
-    mask_threshold: float = number(0.1, "soft mask below which a Gaussian or an SH band is closed", 1e-3, 0.5)
     grow_rule: Literal["spacing", "printed"] = setting(
         "spacing", "candidates by a region's volume in local spacings; printed: in scene units"
     )
-    grow_density: float = number(0.05, "candidates per unit of that volume (α of Eq 12)", 1e-9, 1e9)
-    grow_candidates: int = number(32, "of a region, at most", 1, 10_000)
-    grow_nearest: float = number(
-        0.5, "least distance of a new Gaussian to the nearest one, in local spacings", 1e-6, 1e3
-    )
-    grow_farthest: float = number(1.5, "largest one", 1e-6, 1e6)
     # photos
-    exposure: Literal["auto", "measured", "learned", "off"] = setting(
-        "auto",
-        "of photos; measured: what one has alone is undone; learned: a map of colours for each; auto: measured, where "
-        "they differ",
-    )
-    poses: Literal["given", "refined"] = setting(
-        "given", "of photos, as they are; refined: corrected while the scene is trained"
+    exposure: Literal["auto", "measured", "off"] = setting(
+        "auto", "of photos; measured: what one has alone is undone; auto: where they differ"
     )
     # sizes
     scale_limit: float = number(
@@ -176,38 +163,28 @@ class TrainSection(Section):
     remove_every: int = number(200, "steps from one pruning to the next, once growth is over", 1, 1_000_000)
     sh_freeze: float = number(0.8, "fraction after which SH bands stay as they are", 0, 1)
     refresh_every: int = number(200, "steps between refreshes of regions and descriptors", 1, 1_000_000)
-    refresh_tolerance: float = number(0.0, "change, in radii, that leaves a region's descriptors as they are", 0, 1e3)
     report_every: int = number(100, "steps between rows of the trace", 1, 1_000_000)
     # rates
     # 3DGS's are of 30,000 steps; a training of fewer goes further in each, of fewer than 1000 as far as one of 1000
     lr_means: float | None = number(None, "of centres, in scene sizes; default: 1.6e-4 (30,000 / steps)^0.61", 0, 10)
     lr_scales: float | None = number(None, "of log scales; default: 5e-3 (30,000 / steps)^0.52", 0, 10)
     lr_quats: float | None = number(None, "of rotations; default: 1e-3 (30,000 / steps)^0.52", 0, 10)
-    lr_opacities: float = number(5e-2, "learning rate of opacities before the sigmoid", 0, 10)
     lr_sh0: float | None = number(None, "of SH band 0; default: 2.5e-3 (30,000 / steps)^0.41", 0, 10)
     lr_sh: float | None = number(None, "of SH bands 1 to 3; default: 1.25e-4 (30,000 / steps)^0.41", 0, 10)
     lr_features: float | None = number(
         None, "of features; default: 10 / steps that teach them, at most 5e-2; more fits each view's errors", 0, 10
     )
-    lr_encoder: float = number(3e-3, "learning rate of the encoder", 0, 10)
-    lr_gates: float = number(1e-2, "learning rate of the printed gates' weights", 0, 10)
     lr_masks: float = number(5e-2, "learning rate of pruning masks, in up to 3000 steps; lower in more", 0, 10)
-    lr_exposure: float = number(5e-3, "learning rate of a photo's colours, from 0 to 1", 0, 10)
-    lr_poses: float = number(1.0, "of a photo's pose, in pixels that it moves the picture by", 0, 100)
     lr_sh_masks: float = number(0.4, "learning rate of SH masks; fast, under a weak penalty: docs/results.md", 0, 10)
     # weights
-    weight_ssim: float = number(0.2, "share of SSIM in the colour loss", 0, 1)
-    weight_features: float = number(1.0, "of the feature loss", 0, 1e4)
     feature_loss: Literal["length", "l1", "cross-entropy"] | None = setting(
         None,
         "l1: the paper's and Feature-3DGS'; cross-entropy: of labels, weighted by confidence; "
         "default: that for labels that a source brings, else length",
     )
-    label_temperature: float = number(0.1, "of the logits that cross-entropy is of", 1e-4, 1e4)
     weight_shape: float = number(1.0, "of encodings' distance to their members' features; 0: the printed loss", 0, 1e4)
     weight_mask: float = number(1e-2, "of the penalty that closes pruning masks", 0, 1e4)
     weight_sh: float = number(4e-5, "of the penalty that closes SH bands", 0, 1e4)
-    weight_exposure: float = number(1e-2, "of the pull of a photo's exposure towards the others'", 0, 1e4)
     weight_depth: float | None = number(
         None, "of the relative distance to measured depth; default: 0.8 where views agree on it, else 0", 0, 1e4
     )
@@ -226,8 +203,6 @@ class TrainSection(Section):
     def _fits_together(self) -> TrainSection:
         if self.sh_prune and self.densify != "off" and self.densify_until > self.sh_freeze:
             raise ValueError("densify_until must not lie after sh_freeze, when SH bands are closed for good")
-        if self.grow_nearest >= self.grow_farthest:
-            raise ValueError(f"grow_nearest {self.grow_nearest} must lie below grow_farthest {self.grow_farthest}")
         if self.encoder == "transformer" and self.width % self.n_heads:
             raise ValueError(f"width {self.width} must be a multiple of n_heads {self.n_heads}")
         return self

@@ -12,19 +12,16 @@ from torch import Tensor
 
 @dataclass
 class View:
-    """One camera at one resolution. K [3, 3] pixels, viewmat [4, 4], float32; twist: [6] zeros that take the gradient
-    of moving it (`training/poses.py`), or None.
-    """
+    """One camera at one resolution. K [3, 3] pixels, viewmat [4, 4], float32."""
 
     K: Tensor
     viewmat: Tensor
     width: int
     height: int
-    twist: Tensor | None = None
 
     def to(self, device: str | torch.device) -> View:
         """The same camera, its matrices on a device."""
-        return View(self.K.to(device), self.viewmat.to(device), self.width, self.height, self.twist)
+        return View(self.K.to(device), self.viewmat.to(device), self.width, self.height)
 
 
 def in_frustum(means: Tensor, view: View, reach: Tensor, margin: float = 0.15) -> Tensor:

@@ -6,9 +6,10 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from typing_extensions import TypedDict
+
 from chebsplat.errors import InputError
 from chebsplat.formats.artifact import sha256_file
-from chebsplat.formats.documents import TypedDict, conform
 from chebsplat.formats.files import atomic_write, parse_json
 from chebsplat.formats.names import check_names
 from chebsplat.formats.teacher_model import EMBEDDED
@@ -68,10 +69,18 @@ def read_calibration(model: Path) -> TeacherCalibration | None:
 
     Raises: InputError naming the file where it is damaged, or of another model than the one beside it.
     """
+    from pydantic import TypeAdapter, ValidationError
+
     path = beside(model)
     if not path.is_file():
         return None
-    document = conform(parse_json(path, REMEDY, finite=True), Document, path, REMEDY)
+    document = parse_json(path, REMEDY, finite=True)
+    try:
+        TypeAdapter(Document).validate_python(document, strict=True)
+    except ValidationError as error:
+        first = error.errors()[0]
+        field = ".".join(str(part)[:60] for part in first["loc"]) or "the document"
+        raise InputError(f"{path}: {field}: {first['msg']}; {REMEDY}") from None
     if document.pop("schema") != SCHEMA:
         raise InputError(f"{path} is not of {SCHEMA}; {REMEDY}")
     found = TeacherCalibration(**document)

@@ -8,10 +8,8 @@ from typing import Any
 
 import numpy as np
 
-from chebsplat.errors import InputError
 from chebsplat.formats import artifact
-from chebsplat.formats.documents import Positive, TypedDict, read_document, write_document
-from chebsplat.formats.manifest import remedy_of
+from chebsplat.formats.documents import read_document, write_document
 from chebsplat.formats.tensors import Spec, read_tensors, write_tensors
 
 SCHEMA = "chebsplat.descriptors/1"
@@ -20,11 +18,6 @@ SPECS: dict[str, Spec] = {
     "members": ("int64", "m", "n"),
     "values": ("float32", "m", "n", "j", "d"),
 }
-
-
-class Settings(TypedDict):
-    radius: Positive
-    share: Positive
 
 
 @dataclass
@@ -52,8 +45,5 @@ def read_descriptors(path: Path) -> Descriptors:
     path = Path(path)
     manifest = artifact.read_manifest(path, SCHEMA)
     arrays = read_tensors(path, manifest, "descriptors.safetensors", SPECS)
-    centers, members = arrays["centers"], arrays["members"]
-    if min(centers.min(initial=0), members.min(initial=0) + 1) < 0:
-        raise InputError(f"{path / 'descriptors.safetensors'}: an index is negative; {remedy_of(path)}")
-    settings = read_document(path, manifest, "settings.json", Settings)
+    settings = read_document(path, manifest, "settings.json")
     return Descriptors(**{name: arrays[name] for name in SPECS}, settings=settings)

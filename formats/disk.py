@@ -5,72 +5,33 @@ from __future__ import annotations
 import errno
 import os
 import shutil
-import uuid
 from collections.abc import Iterator
-from contextlib import contextmanager, suppress
+from contextlib import contextmanager
 from pathlib import Path
 
 from chebsplat.errors import ChebsplatError, DiskFailure, InputError
 
-FULL = {getattr(errno, name) for name in ("ENOSPC", "EDQUOT") if hasattr(errno, name)}
 CLOSED = {errno.EROFS, errno.EACCES, errno.EPERM}
-REFUSALS = FULL | CLOSED
-# What libraries say that hide the system's error behind their own.
-WORDS = {"No space left on device": errno.ENOSPC, "Disk quota exceeded": errno.EDQUOT, "os error 28": errno.ENOSPC}
-PROBE = 1 << 20  # bytes; of what has just failed, less may be missing
+REFUSALS = {errno.ENOSPC, errno.EDQUOT} | CLOSED
 
 
 @contextmanager
-def explained(folder: Path, passed: tuple[type[Exception], ...] = ()) -> Iterator[None]:
+def explained(folder: Path) -> Iterator[None]:
     """What fails within because `folder`, or a file that the error names, cannot be written is a DiskFailure.
 
-    Args: passed: errors that are left as they are.
-    Choices: after an error that says nothing of the disk (numpy, safetensors and torch have such), writing is tried.
     Raises: DiskFailure; InputError naming a file that may not be read.
     """
     try:
         yield
+    except ChebsplatError:
+        raise
     except Exception as error:
-        if isinstance(error, (ChebsplatError, *passed)):
-            raise
-        fault = _of_disk(error) or (None if isinstance(error, FileNotFoundError) else refusal(folder))
+        fault: BaseException | None = error
+        while fault is not None and not (isinstance(fault, OSError) and fault.errno in REFUSALS):
+            fault = fault.__cause__
         if fault is None:
             raise
         raise _failure(fault, folder) from error
-
-
-def check(folder: Path, words: str) -> None:
-    """Raise DiskFailure if a disk takes no more, or if the last `words` of a program say so."""
-    if fault := _of_disk(RuntimeError(words)) or refusal(folder):
-        raise _failure(fault, folder)
-
-
-def _of_disk(error: BaseException | None) -> OSError | None:
-    """The disk's own error among those that led to this one."""
-    seen: set[int] = set()
-    while error is not None and id(error) not in seen:
-        seen.add(id(error))
-        if isinstance(error, OSError) and error.errno in REFUSALS:
-            return error
-        if number := next((number for words, number in WORDS.items() if words in str(error)), None):
-            return OSError(number, os.strerror(number))
-        error = error.__cause__ or error.__context__
-    return None
-
-
-def refusal(folder: Path) -> OSError | None:
-    """The error with which a disk refuses to take a little more; None if it does not."""
-    if not folder.is_dir():
-        return None
-    probe = folder / f".probe-{uuid.uuid4().hex}"
-    try:
-        probe.write_bytes(bytes(PROBE))
-    except OSError as error:
-        return error
-    finally:
-        with suppress(OSError):
-            probe.unlink(missing_ok=True)
-    return None
 
 
 def _failure(fault: OSError, folder: Path) -> ChebsplatError:

@@ -4,33 +4,13 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Any, Literal
-
-from annotated_types import Ge, Le
+from typing import Any
 
 from chebsplat.formats import artifact
-from chebsplat.formats.documents import Count, NotRequired, TypedDict, read_document, write_document
+from chebsplat.formats.documents import read_document, write_document
 
 SCHEMA = "chebsplat.encoder/2"
 FLOAT, DYNAMIC, FUSED = "encoder.onnx", "encoder.int8.onnx", "fusion.onnx"
-
-
-class Settings(TypedDict):
-    describe: dict[str, Any]
-    n_covers: Annotated[int, Ge(1), Le(64)]
-    described: bool
-    context: bool
-    position: NotRequired[Literal["region", "center", "both"]]  # region before there was a choice
-    n_inputs: Count
-    n_channels: Count
-
-
-class Contract(TypedDict):
-    """What a reader needs of `stages.contract`."""
-
-    encoder: dict[str, Any]
-    fusion: dict[str, Any]
-    settings: Settings
 
 
 @dataclass
@@ -58,5 +38,5 @@ def read_encoder(path: Path) -> Encoder:
     path = Path(path)
     manifest = artifact.read_manifest(path, SCHEMA)
     models = {name: artifact.checked(path, manifest, name) for name in (FLOAT, DYNAMIC, FUSED)}
-    contract = read_document(path, manifest, "contract.json", Contract)
-    return Encoder(models, contract, read_document(path, manifest, "parity.json", dict[str, list[dict[str, Any]]]))
+    contract = read_document(path, manifest, "contract.json")
+    return Encoder(models, contract, read_document(path, manifest, "parity.json"))

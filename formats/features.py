@@ -1,4 +1,4 @@
-"""`features/1`: per-view semantic features of a 2D teacher, and the labels they can be asked for."""
+"""`features/2`: per-view semantic features of a 2D teacher, and the labels they can be asked for."""
 
 from __future__ import annotations
 
@@ -8,37 +8,20 @@ import shutil
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any, ClassVar
 
 import numpy as np
 
-from chebsplat.errors import InputError
-from chebsplat.formats import artifact
-from chebsplat.formats.arrays import StoredArray, create_array, has_array, open_array
-from chebsplat.formats.channels import SPECS, ChannelMap, from_parts, tensors
-from chebsplat.formats.channels import Document as ChannelsDocument
-from chebsplat.formats.documents import NotRequired, TypedDict, read_document, write_document
+from chebsplat.formats.channels import ChannelMap
 from chebsplat.formats.files import atomic_write, sync
-from chebsplat.formats.manifest import remedy_of
 from chebsplat.formats.names import check_names
-from chebsplat.formats.tensors import read_tensors, write_tensors
+from chebsplat.formats.record import METADATA, Array, Record, Stack, create_array, layout_of
 
-SCHEMA = "chebsplat.features/1"
-AXES = ("view", "row", "column", "channel")
-DTYPES = {"features": np.float16, "pseudo_labels": np.int16, "confidence": np.float16}
-LARGEST = 65_504.0  # of float16
-PATCH = 64  # longest side, in feature pixels, of a patch that is read on its own
-
-
-class Document(TypedDict):
-    names: list[str]
-    label_names: list[str]
-    convention: dict[str, Any]
-    projection: NotRequired[ChannelsDocument]  # `Features.channels`; on disk the name stays, so that older files open
+PIXELS = ("view", "row", "column")
 
 
 @dataclass
-class Features:
+class Features(Record):
     """Features of V views at the teacher's resolution h x w.
 
     names:            of the views, for joins.
@@ -50,12 +33,13 @@ class Features:
     channels:         from the teacher's channels to these C; None: they are the teacher's own.
     """
 
+    SCHEMA: ClassVar[str] = "chebsplat.features/2"
     names: list[str]
-    features: np.ndarray | StoredArray
+    features: Annotated[Stack, Array("float16", (*PIXELS, "channel"), by_view=True)]
     label_names: list[str]
-    label_embeddings: np.ndarray
-    pseudo_labels: np.ndarray | StoredArray | None = None
-    confidence: np.ndarray | StoredArray | None = None
+    label_embeddings: Annotated[np.ndarray, Array("float32", ("label", "channel"))]
+    pseudo_labels: Annotated[Stack | None, Array("int16", PIXELS, "label index, -1 none", by_view=True)] = None
+    confidence: Annotated[Stack | None, Array("float16", PIXELS, "0 to 1", by_view=True)] = None
     convention: dict[str, Any] = field(default_factory=dict)
     channels: ChannelMap | None = None
 
@@ -141,42 +125,34 @@ class FeatureWriter:
         absent = [name for view, name in enumerate(self.names) if view not in self._holds]
         if absent:
             raise ValueError(f"view {absent[0]} was not added ({len(absent)} such)")
+        stored = {}
         for name in sorted({name for held in self._holds.values() for name in held}):
-            self._array(name)  # its metadata
+            stored[name] = self._array(name)
             for view, held in self._holds.items():
                 if name not in held:
                     raise ValueError(f"view {self.names[view]} was added without {name}")
                 file = self._file(name, view)
                 _link(file, out / file.relative_to(self.folder))
-            _link(self.folder / name / "zarr.json", out / name / "zarr.json")
+            _link(self.folder / name / METADATA, out / name / METADATA)
         check_names(label_names, "label names", "features", "correct the labels")
-        write_tensors(out / "labels.safetensors", {"embeddings": label_embeddings.astype(np.float32)})
-        document: dict[str, Any] = {"names": self.names, "label_names": label_names, "convention": convention}
-        if channels is not None:
-            write_tensors(out / "projection.safetensors", tensors(channels))
-            document["projection"] = {"teacher": channels.teacher, "notes": channels.notes}
-        write_document(out / "features.json", document)
+        fixed = (label_names, label_embeddings)
+        Features(self.names, stored.pop("features"), *fixed, **stored, convention=convention, channels=channels).write(
+            out
+        )
 
     def _array(self, name: str) -> Any:
         """The open array. Metadata are written anew, always the same; what chunks there are stay."""
         if name not in self._arrays:
-            h, w, c = self.shape
-            path, n_views = self.folder / name, len(self.names)
-            (path / "zarr.json").unlink(missing_ok=True)
-            if name == "features":
-                counts = (-(-h // PATCH), -(-w // PATCH))
-                patch = (-(-h // counts[0]), -(-w // counts[1]))
-                shard = (1, patch[0] * counts[0], patch[1] * counts[1], c)
-                found = create_array(path, (n_views, h, w, c), DTYPES[name], AXES, "", (1, *patch, c), shard)
-            else:
-                units = "label index" if name == "pseudo_labels" else ""
-                found = create_array(path, (n_views, h, w), DTYPES[name], AXES[:3], units)
-            self._arrays[name] = found
+            spec = layout_of(Features).arrays[name]
+            shape = (len(self.names), *self.shape)[: len(spec.axes)]
+            (self.folder / name / METADATA).unlink(missing_ok=True)
+            self._arrays[name] = create_array(self.folder / name, shape, spec)
         return self._arrays[name]
 
     def _file(self, name: str, view: int) -> Path:
-        """Where a view's values lie; every view is one file."""
-        return self.folder / name / "c" / str(view) / ("0/0/0" if name == "features" else "0/0")
+        """The chunk that holds a view's values."""
+        zeros = ["0"] * (len(layout_of(Features).arrays[name].axes) - 1)
+        return self.folder.joinpath(name, "c", str(view), *zeros)
 
 
 def _link(source: Path, target: Path) -> None:
@@ -188,43 +164,9 @@ def _link(source: Path, target: Path) -> None:
         shutil.copyfile(source, target)
 
 
-def write_features(out: Path, features: Features) -> None:
-    """Fill the directory that `artifact.publish` yields. Raises ValueError naming a view with a non-finite value."""
-    _, h, w, c = features.features.shape
-    writer = FeatureWriter(out / ".writer", features.names, (h, w, c))
-    extra = (features.pseudo_labels, features.confidence)
-    for view in range(len(features.names)):
-        writer.add(view, features.features[view], *(None if array is None else array[view] for array in extra))
-    writer.finish(out, features.label_names, features.label_embeddings, features.convention, features.channels)
-    shutil.rmtree(writer.folder)
+SCHEMA = Features.SCHEMA
+read_features = Features.read
 
 
-def read_features(path: Path) -> Features:
-    """Features stay on disk until indexed. Raises InputError naming the damaged file and the remedy."""
-    path = Path(path)
-    manifest = artifact.read_manifest(path, SCHEMA)
-    document, file = read_document(path, manifest, "features.json", Document), path / "features.json"
-    names, label_names = document["names"], document["label_names"]
-    check_names(names, "names", file, remedy_of(path))
-    check_names(label_names, "label names", file, remedy_of(path))
-    features = open_array(path, manifest, "features", (len(names), None, None, None), "float16", (-LARGEST, LARGEST))
-    spec = {"embeddings": ("float32", len(label_names), features.shape[3])}
-    embeddings = read_tensors(path, manifest, "labels.safetensors", spec)["embeddings"]
-    kinds = {"pseudo_labels": ("int16", (-1, len(label_names) - 1)), "confidence": ("float16", (0, 1))}
-    optional = {
-        name: open_array(path, manifest, name, features.shape[:3], dtype, within)
-        for name, (dtype, within) in kinds.items()
-        if has_array(manifest, name)
-    }
-    longest = np.linalg.norm(embeddings, axis=1).max(initial=0)
-    if longest > 1 + 1e-3:
-        raise InputError(
-            f"{path / 'labels.safetensors'}: an embedding is {longest:.3g} long, at most 1 is right; {remedy_of(path)}"
-        )
-    channels = None
-    if "projection" in document:
-        specs = SPECS | {"matrix": ("float32", "C", features.shape[3])}
-        arrays = read_tensors(path, manifest, "projection.safetensors", specs)
-        channels = from_parts(arrays, document["projection"])
-    return Features(names, features, label_names, embeddings, **optional, convention=document["convention"],
-                    channels=channels)  # fmt: skip
+def write_features(out, record):  # temporary, until the branches are merged
+    record.write(out)

@@ -1,4 +1,4 @@
-"""`gaussians/1`: the checkpoint of a trained scene, all raw parameters, and the trace of its training."""
+"""`gaussians/2`: the checkpoint of a trained scene, all raw parameters, and the trace of its training."""
 
 from __future__ import annotations
 
@@ -6,54 +6,18 @@ import csv
 import math
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any, ClassVar
 
 import numpy as np
-from annotated_types import Ge, Le
 
 from chebsplat.errors import InputError
 from chebsplat.formats import artifact
-from chebsplat.formats.cameras import POSES, Cameras, check_cameras, read_cameras, write_cameras
-from chebsplat.formats.documents import Count, NotRequired, TypedDict, conform, read_document, write_document
+from chebsplat.formats.cameras import Cameras
 from chebsplat.formats.files import read_text
 from chebsplat.formats.manifest import Manifest, remedy_of
-from chebsplat.formats.ply import REST
-from chebsplat.formats.tensors import Spec, read_tensors, write_tensors
+from chebsplat.formats.record import Array, Record, layout_of, reading
 
-SCHEMA = "chebsplat.gaussians/1"
-SPECS: dict[str, Spec] = {
-    "means": ("float32", "n", 3),
-    "log_scales": ("float32", "n", 3),
-    "quats": ("float32", "n", 4),
-    "logit_opacities": ("float32", "n"),
-    "sh0": ("float32", "n", 1, 3),
-    "shN": ("float32", "n", "k", 3),
-    "degrees": ("uint8", "n"),
-}
-SEMANTIC: dict[str, Spec] = {"features": ("float32", "n", "c"), "fused": ("float32", "n", "c")}
-
-
-class EncoderSettings(TypedDict):
-    n_inputs: Annotated[int, Ge(0), Le(10_000)]
-    n_channels: Annotated[int, Ge(1), Le(1024)]
-    width: Annotated[int, Ge(1), Le(1024)]
-    n_layers: Annotated[int, Ge(0), Le(64)]
-    n_heads: Annotated[int, Ge(1), Le(64)]
-    n_positions: NotRequired[Literal[3, 6]]  # 3 before there was a choice
-
-
-class Notes(TypedDict):
-    left_out: NotRequired[dict[str, str]]
-    n_initial: NotRequired[Count]
-    encoder: NotRequired[EncoderSettings]
-
-
-class Row(TypedDict):
-    """What a trace says in every row; the losses that there are besides."""
-
-    step: float
-    seconds: float
-    psnr: float
+TRACE = "trace.csv"
 
 
 @dataclass
@@ -65,19 +29,15 @@ class Gaussians:
                 semantic branch, `features` [N,C] and `fused` [N,C].
     cameras:    of the views it was trained and may be evaluated on.
     modules:    weights of the encoder, gate and masks by dotted name; empty where they were left out.
-    optimizer:  moments and step counts, so that a training can be resumed.
     trace:      one row a report interval: error against run time.
     notes:      encoder sizes, label names, and what the scene left out and why.
-    given_poses: f64 [V, 4, 4] cam_from_world that the cameras had before the training refined them; None: it did not.
     """
 
     parameters: dict[str, np.ndarray]
     cameras: Cameras
     modules: dict[str, np.ndarray] = field(default_factory=dict)
-    optimizer: dict[str, np.ndarray] = field(default_factory=dict)
     trace: list[dict[str, float]] = field(default_factory=list)
     notes: dict[str, Any] = field(default_factory=dict)
-    given_poses: np.ndarray | None = None
 
     def encoder(self) -> tuple[dict[str, int], dict[str, np.ndarray]]:
         """Settings and weights of the local encoder. Raises InputError if the scene was trained without one."""
@@ -88,6 +48,33 @@ class Gaussians:
         return self.notes["encoder"], weights
 
 
+@dataclass
+class Checkpoint(Record):
+    """`Gaussians` as stored: uncompressed, since random mantissas hardly shrink, and without SH bands that none keeps.
+
+    modules: f32 [W], all weights one after the other, in the order of module_shapes.
+    """
+
+    SCHEMA: ClassVar[str] = "chebsplat.gaussians/2"
+    COMPRESSED: ClassVar[bool] = False
+    means: Annotated[np.ndarray, Array("float32", ("gaussian", 3), "scene units")]
+    log_scales: Annotated[np.ndarray, Array("float32", ("gaussian", 3), "ln of scene units")]
+    quats: Annotated[np.ndarray, Array("float32", ("gaussian", 4), "wxyz")]
+    logit_opacities: Annotated[np.ndarray, Array("float32", ("gaussian",))]
+    sh0: Annotated[np.ndarray, Array("float32", ("gaussian", 1, 3))]
+    shN: Annotated[np.ndarray, Array("float32", ("gaussian", "coefficient", 3))]
+    degrees: Annotated[np.ndarray, Array("uint8", ("gaussian",), "highest SH band")]
+    cameras: Cameras
+    modules: Annotated[np.ndarray, Array("float32", ("weight",))]
+    module_shapes: dict[str, list[int]]
+    notes: dict[str, Any]
+    features: Annotated[np.ndarray | None, Array("float32", ("gaussian", "channel"))] = None
+    fused: Annotated[np.ndarray | None, Array("float32", ("gaussian", "channel"))] = None
+
+
+SCHEMA = Checkpoint.SCHEMA
+
+
 def write_gaussians(out: Path, gaussians: Gaussians) -> None:
     """Fill the directory that `artifact.publish` yields. Raises ValueError on a non-finite parameter.
 
@@ -95,14 +82,15 @@ def write_gaussians(out: Path, gaussians: Gaussians) -> None:
     """
     degrees, shN = gaussians.parameters["degrees"], gaussians.parameters["shN"]
     kept = shN[:, : (int(degrees.max(initial=0)) + 1) ** 2 - 1]
-    write_tensors(out / "parameters.safetensors", gaussians.parameters | {"shN": kept})
-    write_cameras(out, gaussians.cameras)
-    write_document(out / "notes.json", gaussians.notes)
-    given = {} if gaussians.given_poses is None else {"cam_from_world": gaussians.given_poses}
-    for name, arrays in (("modules", gaussians.modules), ("optimizer", gaussians.optimizer), ("given", given)):
-        if arrays:
-            write_tensors(out / f"{name}.safetensors", arrays)
-    with (out / "trace.csv").open("w", newline="") as handle:
+    weights = [np.zeros(0, np.float32), *map(np.ravel, gaussians.modules.values())]
+    Checkpoint(
+        **gaussians.parameters | {"shN": kept},
+        cameras=gaussians.cameras,
+        modules=np.concatenate(weights),
+        module_shapes={name: list(values.shape) for name, values in gaussians.modules.items()},
+        notes=gaussians.notes,
+    ).write(out)
+    with (out / TRACE).open("w", newline="") as handle:
         columns = list(gaussians.trace[0]) if gaussians.trace else ["step", "seconds"]
         writer = csv.DictWriter(handle, columns)
         writer.writeheader()
@@ -114,45 +102,22 @@ def read_gaussians(path: Path) -> Gaussians:
 
     Raises: InputError naming the damaged file and the remedy.
     """
-    manifest = artifact.read_manifest(path, SCHEMA)
-    file, remedy = path / "parameters.safetensors", remedy_of(path)
-    parameters = read_tensors(path, manifest, file.name, SPECS)
-    if semantic := {name: spec for name, spec in SEMANTIC.items() if name in parameters}:
-        parameters = read_tensors(path, manifest, file.name, SPECS | semantic)
-    n, shN = len(parameters["means"]), parameters["shN"]
-    if parameters["degrees"].max(initial=0) > 3 or shN.shape[1] not in REST.values():
-        raise InputError(f"{file}: SH {shN.shape} or a degree beyond 3 make no scene; {remedy}")
-    parameters["shN"] = np.concatenate([shN, np.zeros((n, 15 - shN.shape[1], 3), np.float32)], 1)
-    optional = {
-        name: read_tensors(path, manifest, f"{name}.safetensors") if f"{name}.safetensors" in manifest.files else {}
-        for name in ("modules", "optimizer")
-    }
-    cameras, given = read_cameras(path, manifest), None
-    if "given.safetensors" in manifest.files:
-        specs = {"cam_from_world": POSES["cam_from_world"]}
-        given = read_tensors(path, manifest, "given.safetensors", specs)["cam_from_world"]
-        check_cameras(cameras.names, cameras.Ks, given, path / "given.safetensors", remedy)
-    return Gaussians(
-        parameters,
-        cameras,
-        optional["modules"],
-        optional["optimizer"],
-        read_trace(path, manifest),
-        read_document(path, manifest, "notes.json", Notes),
-        given,
-    )
+    stored = Checkpoint.read(path)
+    values = {name: getattr(stored, name) for name in layout_of(Checkpoint).arrays if name != "modules"}
+    parameters = {name: value for name, value in values.items() if value is not None}
+    n, n_kept = stored.shN.shape[:2]
+    parameters["shN"] = np.concatenate([stored.shN, np.zeros((n, 15 - n_kept, 3), np.float32)], 1)
+    ends = np.cumsum([math.prod(shape) for shape in stored.module_shapes.values()])
+    parts = np.split(stored.modules, ends[:-1]) if len(ends) else []
+    shapes = stored.module_shapes.items()
+    modules = {name: part.reshape(shape) for (name, shape), part in zip(shapes, parts, strict=True)}
+    trace = read_trace(path, artifact.read_manifest(path))
+    return Gaussians(parameters, stored.cameras, modules, trace, stored.notes)
 
 
 def read_trace(path: Path, manifest: Manifest) -> list[dict[str, float]]:
     """The trace alone, without the parameters. Raises InputError naming file and remedy."""
-    file, remedy = artifact.checked(path, manifest, "trace.csv"), remedy_of(path)
-    try:
-        table = csv.DictReader(read_text(file, remedy).splitlines())
-        trace = [{name: float(value) for name, value in row.items()} for row in table]
-        if not {"step", "seconds"} <= set(table.fieldnames or ()):
-            raise ValueError("it has no columns step and seconds")
-    except (csv.Error, ValueError, TypeError) as error:
-        raise InputError(f"{file} is no table of numbers ({error}); {remedy}") from None
-    if not all(map(math.isfinite, (value for row in trace for value in row.values()))):
-        raise InputError(f"{file} holds values that are not finite; {remedy}")
-    return conform(trace, list[Row], file, remedy)
+    file = artifact.checked(path, manifest, TRACE)
+    with reading(path):
+        table = csv.DictReader(read_text(file, remedy_of(path)).splitlines())
+        return [{name: float(value) for name, value in row.items()} for row in table]

@@ -8,10 +8,8 @@ from typing import Any
 
 import numpy as np
 
-from chebsplat.errors import InputError
 from chebsplat.formats import artifact
-from chebsplat.formats.documents import TypedDict, read_document, write_document
-from chebsplat.formats.manifest import remedy_of
+from chebsplat.formats.documents import read_document, write_document
 from chebsplat.formats.tensors import read_tensors, write_tensors
 
 SCHEMA = "chebsplat.knowledge/1"
@@ -19,20 +17,11 @@ ENCODER = "encoder.onnx"  # the same encoder, for onnxruntime; the stage writes 
 SHIPPED = Path(__file__).parents[1] / "teachers/knowledge"  # of the embedded teacher; ships with the package
 
 
-class Document(TypedDict):
-    teacher: str
-    digest: str
-    encoder: dict[str, int]
-    describe: dict[str, Any]
-    words: list[str]
-    card: dict[str, Any]
-
-
 @dataclass
 class Knowledge:
     """What a scene starts from.
 
-    teacher:  its name; digest: of its files, as in `channels/1`.
+    teacher:  its name; digest: of its files, as in `channels/2`.
     encoder:  constructor settings of the point encoder; weights: its arrays by name.
     matrix:   f32 [C, d], from the teacher's C channels to the d that the encoder answers in; columns orthonormal.
     describe: settings of the descriptors that it sees.
@@ -61,24 +50,16 @@ def write_knowledge(out: Path, knowledge: Knowledge) -> None:
 
 def read_card(path: Path) -> dict[str, Any]:
     """All but the arrays. Raises InputError naming the damaged file and the remedy."""
-    document: dict[str, Any] = read_document(path, artifact.read_manifest(path, SCHEMA), "knowledge.json", Document)
-    return document
+    card: dict[str, Any] = read_document(path, artifact.read_manifest(path, SCHEMA), "knowledge.json")
+    return card
 
 
 def read_knowledge(path: Path) -> Knowledge:
     """Raises InputError naming the damaged file and the remedy."""
     path = Path(path)
     manifest = artifact.read_manifest(path, SCHEMA)
-    document = read_document(path, manifest, "knowledge.json", Document)
+    document = read_document(path, manifest, "knowledge.json")
     weights = read_tensors(path, manifest, "weights.safetensors")
     specs: dict[str, tuple[str | int, ...]] = {"matrix": ("float32", "C", "d"), "embeddings": ("float16", "W", "d")}
     channels = read_tensors(path, manifest, "channels.safetensors", specs)
-    matrix = channels["matrix"]
-    if document["encoder"].get("n_channels") != matrix.shape[1]:
-        raise InputError(
-            f"{path / 'knowledge.json'}: the encoder answers in {document['encoder'].get('n_channels')} channels, "
-            f"channels.safetensors has {matrix.shape[1]}; {remedy_of(path)}"
-        )
-    if len(document["words"]) != len(channels["embeddings"]):
-        raise InputError(f"{path / 'knowledge.json'}: words and their embeddings differ in number; {remedy_of(path)}")
-    return Knowledge(**document, weights=weights, matrix=matrix, embeddings=channels["embeddings"])
+    return Knowledge(**document, weights=weights, matrix=channels["matrix"], embeddings=channels["embeddings"])

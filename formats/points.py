@@ -1,34 +1,17 @@
-"""`points/1`: registered cameras, and points with normals and local anisotropic covariances, and swept depth."""
+"""`points/2`: registered cameras, and points with normals and local anisotropic covariances, and swept depth."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
-from pathlib import Path
-from typing import Any
+from typing import Annotated, Any, ClassVar
 
 import numpy as np
 
-from chebsplat.errors import InputError
-from chebsplat.formats import artifact
-from chebsplat.formats.cameras import POSES, check_cameras
-from chebsplat.formats.documents import TypedDict, read_document, write_document
-from chebsplat.formats.manifest import remedy_of
-from chebsplat.formats.names import check_names
-from chebsplat.formats.tensors import FLOAT, Spec, read_tensors, write_tensors
-
-SCHEMA = "chebsplat.points/1"
-SPECS: dict[str, Spec] = POSES | {
-    "means": (FLOAT, "n", 3),
-    "colors": ("uint8", "n", 3),
-    "normals": (FLOAT, "n", 3),
-    "covariances": (FLOAT, "n", 3, 3),
-    "tracks": ("int32 or int64", "t", 2),
-}
-SWEPT = "swept.safetensors"  # of depths, where photos were swept for it
+from chebsplat.formats.record import Array, Record
 
 
 @dataclass
-class Points:
+class Points(Record):
     """Registered views and the points seen by them.
 
     names:          of the registered views; the others could not be posed.
@@ -40,21 +23,19 @@ class Points:
     depths:         f32 [V, h, w] z that a sweep of the photos, reduced to this size, found; 0: none; None: no sweep.
     """
 
+    SCHEMA: ClassVar[str] = "chebsplat.points/2"
     names: list[str]
-    Ks: np.ndarray
-    cam_from_world: np.ndarray
-    means: np.ndarray
-    colors: np.ndarray
-    normals: np.ndarray
-    covariances: np.ndarray
-    tracks: np.ndarray
+    Ks: Annotated[np.ndarray, Array("float64", ("view", 3, 3), "pixels")]
+    cam_from_world: Annotated[np.ndarray, Array("float64", ("view", 4, 4), "scene units")]
+    means: Annotated[np.ndarray, Array("float64", ("point", 3), "scene units")]
+    colors: Annotated[np.ndarray, Array("uint8", ("point", 3), "sRGB")]
+    normals: Annotated[np.ndarray, Array("float32", ("point", 3))]
+    covariances: Annotated[np.ndarray, Array("float32", ("point", 3, 3), "scene units squared")]
+    tracks: Annotated[np.ndarray, Array("int32", ("observation", 2), "index of a point, of a view")]
     notes: dict[str, Any] = field(default_factory=dict)
-    depths: np.ndarray | None = None
-
-
-class Document(TypedDict):
-    names: list[str]
-    notes: dict[str, Any]
+    depths: Annotated[np.ndarray | None, Array("float32", ("view", "row", "column"), "scene units, z; 0 unknown")] = (
+        None
+    )
 
 
 def thinned(points: Points, most: int, seed: int) -> Points:
@@ -66,30 +47,9 @@ def thinned(points: Points, most: int, seed: int) -> Points:
     return replace(points, **fewer, tracks=points.tracks[:0])
 
 
-def write_points(out: Path, points: Points) -> None:
-    """Fill the directory that `artifact.publish` yields. Raises ValueError on a non-finite value."""
-    arrays = {name: getattr(points, name) for name in SPECS}
-    write_tensors(out / "points.safetensors", arrays)
-    if points.depths is not None:
-        write_tensors(out / SWEPT, {"depths": points.depths})
-    write_document(out / "points.json", {"names": points.names, "notes": points.notes})
+SCHEMA = Points.SCHEMA
+read_points = Points.read
 
 
-def read_points(path: Path) -> Points:
-    """Registered views and points at `path`, all in memory.
-
-    Raises: InputError naming the damaged file and the remedy.
-    """
-    path = Path(path)
-    manifest = artifact.read_manifest(path, SCHEMA)
-    document, file = read_document(path, manifest, "points.json", Document), path / "points.safetensors"
-    names = document["names"]
-    check_names(names, "names", path / "points.json", remedy_of(path))
-    arrays = read_tensors(path, manifest, file.name, SPECS)
-    check_cameras(names, arrays["Ks"], arrays["cam_from_world"], file, remedy_of(path))
-    depths = None
-    if SWEPT in manifest.files:
-        depths = read_tensors(path, manifest, SWEPT, {"depths": ("float32", "v", "h", "w")})["depths"]
-        if len(depths) != len(names):
-            raise InputError(f"{path / SWEPT} has depth of {len(depths)} views, not {len(names)}; {remedy_of(path)}")
-    return Points(names, **{name: arrays[name] for name in SPECS}, notes=document["notes"], depths=depths)
+def write_points(out, record):  # temporary, until the branches are merged
+    record.write(out)

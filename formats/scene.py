@@ -1,39 +1,28 @@
-"""`scene/2`: the exported scene: PLY for viewers, ragged arrays for us, a label dictionary and a summary."""
+"""`scene/3`: the exported scene: PLY for viewers, ragged arrays for us, a label dictionary and a summary."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any, ClassVar
 
 import numpy as np
 
-from chebsplat.errors import InputError
 from chebsplat.formats import artifact
-from chebsplat.formats.arrays import has_array, open_array, write_array
-from chebsplat.formats.cameras import Cameras, read_cameras, write_cameras
-from chebsplat.formats.documents import Count, NotRequired, TypedDict, read_document, write_document
-from chebsplat.formats.manifest import Manifest, remedy_of
-from chebsplat.formats.names import check_names
+from chebsplat.formats.cameras import Cameras
+from chebsplat.formats.documents import read_document, write_document
+from chebsplat.formats.manifest import Manifest
 from chebsplat.formats.ply import REST, write_ply
-from chebsplat.formats.tensors import read_tensors, write_tensors
+from chebsplat.formats.record import Array, Record
 
-SCHEMA = "chebsplat.scene/2"
-FINITE = (-3.4e38, 3.4e38)
-FEATURES = {"features", "raw_features"}
-_FLAT = {"means": 3, "log_scales": 3, "quats": 4, "sh0": 3}
-
-
-class Summary(TypedDict):
-    bytes: dict[str, Count]
-    max_degree: Count
-    n: Count
-    left_out: NotRequired[dict[str, str]]
+LABELS = "labels.json"
+SEMANTIC = ("features", "raw_features")
+RAGGED = ("means", "log_scales", "quats", "sh0", "logit_opacities", "sh1", "sh2", "sh3")
 
 
 @dataclass
 class Scene:
-    """N Gaussians sorted by SH degree, stably; raw float32 parameters as in `gaussians/1`.
+    """N Gaussians sorted by SH degree, stably; raw float32 parameters as in `gaussians/2`.
 
     parameters: `means`, `log_scales`, `quats`, `logit_opacities`, `sh0` [N,1,3], `shN` [N,15,3] (zero above a
                 Gaussian's degree), `degrees` u8 [N] ascending; where there are semantics `features` [N,C], refined or
@@ -53,12 +42,42 @@ class Scene:
     summary: dict[str, Any] = field(default_factory=dict)
 
 
-def write_scene(out: Path, scene: Scene, split_by_degree: bool = True) -> dict[str, int]:
+@dataclass
+class RaggedScene(Record):
+    """`Scene` as stored: a Gaussian pays only for the SH bands that it keeps, and for features in 16-bit fixed point.
+
+    All but `degrees` are in order of degree. sh1, sh2, sh3: rows of the Gaussians that keep the band. steps: what an
+    integer of `features` and of `raw_features` counts.
+    """
+
+    SCHEMA: ClassVar[str] = "chebsplat.scene/3"
+    means: Annotated[np.ndarray, Array("float32", ("gaussian", 3), "scene units")]
+    log_scales: Annotated[np.ndarray, Array("float32", ("gaussian", 3), "ln of scene units")]
+    quats: Annotated[np.ndarray, Array("float32", ("gaussian", 4), "wxyz")]
+    logit_opacities: Annotated[np.ndarray, Array("float32", ("gaussian",))]
+    sh0: Annotated[np.ndarray, Array("float32", ("gaussian", 3))]
+    degrees: Annotated[np.ndarray, Array("uint8", ("gaussian",), "highest SH band, in the checkpoint's order")]
+    cameras: Cameras
+    steps: dict[str, float]
+    summary: dict[str, Any]
+    sh1: Annotated[np.ndarray | None, Array("float32", ("gaussian_1", 9))] = None
+    sh2: Annotated[np.ndarray | None, Array("float32", ("gaussian_2", 15))] = None
+    sh3: Annotated[np.ndarray | None, Array("float32", ("gaussian_3", 21))] = None
+    features: Annotated[np.ndarray | None, Array("int16", ("gaussian", "channel"), "a step")] = None
+    raw_features: Annotated[np.ndarray | None, Array("int16", ("gaussian", "channel"), "a step")] = None
+    labels: Annotated[np.ndarray | None, Array("int32", ("gaussian",), "class index, -1 none")] = None
+    label_embeddings: Annotated[np.ndarray | None, Array("float32", ("label", "channel"))] = None
+
+
+SCHEMA = RaggedScene.SCHEMA
+
+
+def write_scene(out: Path, scene: Scene) -> dict[str, int]:
     """Fill the directory that `artifact.publish` yields; returns bytes by part.
 
     Choices: `scene.ply` is trimmed to the highest degree in use; `scene_d<k>.ply` hold each degree apart, each valid
-    on its own; `ragged/` holds SH by bands, so a Gaussian pays only for the bands it keeps. Features are 16-bit fixed
-    point: as small as halves, 20 times as exact. Degrees are stored in the checkpoint's order, which they then tell.
+    on its own. Features are 16-bit fixed point: as small as halves, 20 times as exact. Degrees are stored in the
+    checkpoint's order, which they then tell.
     """
     p, degrees = scene.parameters, scene.parameters["degrees"]
     unsorted = np.empty_like(degrees)
@@ -67,93 +86,68 @@ def write_scene(out: Path, scene: Scene, split_by_degree: bool = True) -> dict[s
         raise ValueError("Gaussians are not sorted by degree, stably")
     top = int(degrees.max(initial=0))
     write_ply(out / "scene.ply", p, top, scene.labels, scene.label_names)
-    if split_by_degree and len(np.unique(degrees)) > 1:
+    if len(np.unique(degrees)) > 1:
         for degree in np.unique(degrees):
             chosen = degrees == degree
             part = {name: values[chosen] for name, values in p.items()}
             labels = None if scene.labels is None else scene.labels[chosen]
             write_ply(out / f"scene_d{degree}.ply", part, int(degree), labels, scene.label_names)
-    for name, width in _FLAT.items():
-        _write_flat(out / "ragged" / name, p[name].reshape(-1, width))
-    _write_flat(out / "ragged/logit_opacities", p["logit_opacities"][:, None])
+    bands = {}
     for band in range(1, top + 1):
         rows = p["shN"][degrees >= band, REST[band - 1] : REST[band]]
-        _write_flat(out / f"ragged/sh{band}", rows.reshape(len(rows), -1))
-    for name in FEATURES & set(p):
-        step = float(np.abs(p[name]).max(initial=0)) / 32767 or 1.0
-        _write_flat(out / "semantic" / name, np.round(p[name] / step).astype(np.int16), step)
-    write_tensors(out / "degrees.safetensors", {"degrees": unsorted.astype(np.uint8)})
-    write_cameras(out, scene.cameras)
-    if scene.labels is not None and scene.label_embeddings is not None:
-        labelled = {"labels": scene.labels.astype(np.int32), "embeddings": scene.label_embeddings.astype(np.float32)}
-        write_tensors(out / "labels.safetensors", labelled)
-    write_document(out / "labels.json", dict(enumerate(scene.label_names or [])))
+        bands[f"sh{band}"] = rows.reshape(len(rows), -1)
+    steps = {name: float(np.abs(p[name]).max(initial=0)) / 32767 or 1.0 for name in SEMANTIC if name in p}
+    fixed = {name: np.round(p[name] / step).astype(np.int16) for name, step in steps.items()}
+    stored = RaggedScene(
+        **{name: p[name] for name in ("means", "log_scales", "quats", "logit_opacities")},
+        sh0=p["sh0"][:, 0],
+        degrees=unsorted.astype(np.uint8),
+        cameras=scene.cameras,
+        steps=steps,
+        summary=scene.summary | {"max_degree": top, "n": len(degrees)},
+        labels=scene.labels,
+        label_embeddings=scene.label_embeddings,
+        **bands,
+        **fixed,
+    )
+    stored.write(out)
+    write_document(out / LABELS, dict(enumerate(scene.label_names or [])))
     sizes = {
         "unpruned_ply": 62 * 4 * len(degrees),
         "ply": (out / "scene.ply").stat().st_size,
-        "split": sum(f.stat().st_size for f in out.glob("scene_d*.ply")),
-        **{
-            part: sum(f.stat().st_size for f in (out / part).rglob("*") if f.is_file())
-            for part in ("ragged", "semantic")
-        },
+        "split": sum(file.stat().st_size for file in out.glob("scene_d*.ply")),
+        "ragged": _bytes_of(out, RAGGED),
+        "semantic": _bytes_of(out, SEMANTIC),
     }
-    write_document(out / "summary.json", scene.summary | {"bytes": sizes, "max_degree": top, "n": len(degrees)})
+    stored.summary["bytes"] = sizes
+    stored.write_attributes(out)
     return sizes
 
 
 def read_scene(path: Path) -> Scene:
     """The exported scene at `path`, all in memory. Raises InputError naming the damaged file and the remedy."""
     path = Path(path)
-    manifest = artifact.read_manifest(path, SCHEMA)
-    unsorted = read_tensors(path, manifest, "degrees.safetensors", {"degrees": ("uint8", "n")})["degrees"]
-    if len(unsorted) == 0 or unsorted.max() > 3:
-        raise InputError(f"{path / 'degrees.safetensors'} holds a degree beyond 3, or none; {remedy_of(path)}")
-    order = np.argsort(unsorted, kind="stable")
-    n, degrees = len(order), unsorted[order]
-
-    def flat(name: str, rows: int, width: int) -> np.ndarray:
-        return open_array(path, manifest, f"ragged/{name}", (rows, width), "float32", FINITE)[:]
-
-    parameters = {name: flat(name, n, width) for name, width in _FLAT.items()}
-    parameters["sh0"] = parameters["sh0"][:, None]
-    parameters["logit_opacities"] = flat("logit_opacities", n, 1)[:, 0]
-    parameters["shN"] = np.zeros((n, 15, 3), np.float32)
+    stored = RaggedScene.read(path)
+    order = np.argsort(stored.degrees, kind="stable")
+    degrees = stored.degrees[order]
+    parameters = {name: getattr(stored, name) for name in ("means", "log_scales", "quats", "logit_opacities")}
+    parameters["sh0"] = stored.sh0[:, None]
+    parameters["shN"] = np.zeros((len(order), 15, 3), np.float32)
     for band in range(1, int(degrees.max(initial=0)) + 1):
-        kept = degrees >= band
         width = REST[band] - REST[band - 1]
-        rows = flat(f"sh{band}", int(kept.sum()), 3 * width).reshape(-1, width, 3)
-        parameters["shN"][kept, REST[band - 1] : REST[band]] = rows
+        rows = getattr(stored, f"sh{band}").reshape(-1, width, 3)
+        parameters["shN"][degrees >= band, REST[band - 1] : REST[band]] = rows
     parameters["degrees"] = degrees
-    cameras = read_cameras(path, manifest)
-    summary = read_document(path, manifest, "summary.json", Summary)
-    for name in FEATURES:
-        if has_array(manifest, f"semantic/{name}"):
-            array = open_array(path, manifest, f"semantic/{name}", (n, None), "int16")
-            parameters[name] = array[:] * np.float32(array.scale_factor)
-    if "features" not in parameters:
-        return Scene(parameters, cameras, order, summary=summary)
-    names = read_label_names(path, manifest)
-    specs = {"labels": ("int32", n), "embeddings": ("float32", len(names), parameters["features"].shape[1])}
-    tensors = read_tensors(path, manifest, "labels.safetensors", specs)
-    labels = tensors["labels"]
-    if not -1 <= labels.min() <= labels.max() < len(names):
-        raise InputError(
-            f"{path / 'labels.safetensors'}: labels {labels.min()} to {labels.max()} of {len(names)}; "
-            + remedy_of(path)
-        )
-    return Scene(parameters, cameras, order, labels, names, tensors["embeddings"], summary)
+    for name, step in stored.steps.items():
+        parameters[name] = getattr(stored, name) * np.float32(step)
+    names = read_label_names(path, artifact.read_manifest(path)) if stored.labels is not None else None
+    return Scene(parameters, stored.cameras, order, stored.labels, names, stored.label_embeddings, stored.summary)
 
 
 def read_label_names(path: Path, manifest: Manifest) -> list[str]:
     """The label dictionary alone, in order of ids. Raises InputError naming file and remedy."""
-    names_by_id = read_document(path, manifest, "labels.json", dict[str, str])
-    names, file = list(names_by_id.values()), path / "labels.json"
-    if list(names_by_id) != [str(k) for k in range(len(names))]:
-        raise InputError(f"{file}: the ids are not 0, 1, ... in order; {remedy_of(path)}")
-    check_names(names, "labels", file, remedy_of(path))
-    return names
+    return list(read_document(path, manifest, LABELS).values())
 
 
-def _write_flat(path: Path, rows: np.ndarray, scale_factor: float | None = None) -> None:
-    chunk = (max(min(len(rows), 65_536), 1), max(rows.shape[1], 1))
-    write_array(path, np.ascontiguousarray(rows), ("gaussian", "value"), chunks=chunk, scale_factor=scale_factor)
+def _bytes_of(out: Path, names: tuple[str, ...]) -> int:
+    return sum(file.stat().st_size for name in names for file in (out / name).rglob("*") if file.is_file())

@@ -57,7 +57,7 @@ class TeacherModel:
 
     @property
     def channels(self) -> Path:
-        """The folder of its channel map, `channels/1`, where it brings one."""
+        """The folder of its channel map, `channels/2`, where it brings one."""
         return self.path.with_suffix(".channels")
 
     def verify(self) -> None:

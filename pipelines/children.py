@@ -14,24 +14,27 @@ from contextlib import contextmanager, suppress
 from pathlib import Path
 from types import FrameType
 
-from chebsplat.stages.stopping import LIFELINE, PATIENCE
+from chebsplat.stages.stopping import PATIENCE
 
-# Snakemake's own words go to a file; its jobs inherit the real stderr, which may be a terminal. Its standard input, and
-# theirs, is the lifeline (stages/stopping.py): without a run it ends at once, and its jobs stop by themselves. Its
-# cache lies beside its other files, not in the home folder, which may be full or read-only.
+# Snakemake's own words go to a file; its jobs inherit the real stderr, which may be a terminal. Its
+# standard input is a pipe that ends with the run, however that ends: its session is then stopped, and
+# killed if it does not listen. Its cache lies beside its other files, not in the home folder, which may
+# be full or read-only.
 SNAKEMAKE = """
-import json, os, subprocess, sys, threading
+import atexit, json, os, signal, subprocess, sys, threading, time
+patience, words, beside, cache = float(sys.argv.pop(1)), *(sys.argv.pop(1) for _ in range(3))
 def watch():
     while os.read(0, 1):
         pass
-    os._exit(143)
+    os.killpg(0, signal.SIGTERM)
+    time.sleep(patience)
+    os.killpg(0, signal.SIGKILL)
 threading.Thread(target=watch, daemon=True).start()
-sys.stderr = open(sys.argv.pop(1), "w", 1)
-beside = json.loads(sys.argv.pop(1))
-if beside:
-    subprocess.Popen(beside, stderr=subprocess.DEVNULL)
+sys.stderr = open(words, "w", 1)
+if json.loads(beside):
+    atexit.register(subprocess.Popen(json.loads(beside), stderr=subprocess.DEVNULL).kill)
 import platformdirs, snakemake.common
-own = type("Own", (platformdirs.PlatformDirs,), {"user_cache_dir": sys.argv.pop(1)})
+own = type("Own", (platformdirs.PlatformDirs,), {"user_cache_dir": cache})
 snakemake.common.APPDIRS = own("snakemake", "snakemake")
 from snakemake.cli import main
 main()
@@ -44,22 +47,24 @@ def snakemake(
     """Run Snakemake; returns its exit code when it and all that it has started are gone.
 
     Args: words: a file for what it says; cache: a folder for its own; environment: variables beside our own; beside: a
-      command of ours that runs meanwhile, and watches the lifeline.
+      command of ours that runs meanwhile.
     """
     reader, writer = os.pipe()
-    with open(reader, "rb") as lifeline, open(writer, "wb") as held:
-        environment = {LIFELINE: str(os.fstat(reader).st_ino), "PYTHONSAFEPATH": "1", **environment}
-        # -P and PYTHONSAFEPATH: a module where the user stands, or in the work folder, is never run. A session of its
-        # own: a terminal's Ctrl-C reaches the run alone, which ends its jobs in good order.
-        process = subprocess.Popen([sys.executable, "-P", "-c", SNAKEMAKE, str(words), json.dumps(beside), str(cache),
-                                    *arguments],
-                                   stdin=lifeline, stdout=subprocess.DEVNULL, start_new_session=True,
-                                   env=os.environ | environment)  # fmt: skip
+    # -P and PYTHONSAFEPATH: a module where the user stands, or in the work folder, is never run
+    command = [sys.executable, "-P", "-c", SNAKEMAKE, str(PATIENCE), str(words), json.dumps(beside)]
+    environment = os.environ | {"PYTHONSAFEPATH": "1", **environment}
+    with open(reader, "rb") as standard_input, open(writer, "wb"):
+        # a session of its own: a terminal's Ctrl-C reaches the run alone, which ends its jobs
+        process = subprocess.Popen(
+            [*command, str(cache), *arguments],
+            stdin=standard_input, stdout=subprocess.DEVNULL, env=environment, start_new_session=True,
+        )  # fmt: skip
         try:
             with paused_together(process):
-                return process.wait()
+                while process.poll() is None:  # a signal that another thread takes wakes no `wait`
+                    time.sleep(0.02)
+            return process.returncode
         finally:
-            held.close()
             if process.poll() != 0:
                 end(process)
 
@@ -81,15 +86,16 @@ def paused_together(process: subprocess.Popen[bytes]) -> Iterator[None]:
 
 
 def end(process: subprocess.Popen[bytes]) -> None:
-    """Wait for the session of a process, whose lifeline has ended; kill what is left of it."""
-    until = time.monotonic() + PATIENCE
-    with suppress(ProcessLookupError):
-        os.killpg(process.pid, signal.SIGCONT)  # a stop may come in the middle of a pause
-        while time.monotonic() < until:
-            process.poll()
-            os.killpg(process.pid, 0)
-            time.sleep(0.02)
-        os.killpg(process.pid, signal.SIGKILL)
+    """Stop what is left of a process's session, and kill it if it does not listen."""
+    with suppress(ProcessLookupError):  # it is gone
+        for number in (signal.SIGTERM, signal.SIGKILL):
+            os.killpg(process.pid, number)
+            os.killpg(process.pid, signal.SIGCONT)  # a stop may come in the middle of a pause
+            until = time.monotonic() + PATIENCE
+            while time.monotonic() < until:
+                process.poll()
+                os.killpg(process.pid, 0)
+                time.sleep(0.02)
     process.wait()
 
 
@@ -109,6 +115,7 @@ def in_turn(command: Callable[[list[str]], None], calls: list[list[str]]) -> int
         finally:
             process.terminate()  # does nothing to one that has ended
             process.join(PATIENCE)
+            process.kill()
         if process.exitcode:
             return process.exitcode if process.exitcode > 0 else 128 - process.exitcode
     return 0

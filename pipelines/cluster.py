@@ -1,7 +1,7 @@
 """A run on a cluster: what its jobs ask for, which steps go there together, and that they end with the run.
 
 Snakemake submits a job, and on its node starts one step after the other, each in a process of its own as on one
-machine. The pipe that ends jobs with their run (stages/stopping.py) does not reach another machine: there, a thread
+machine. The pipe that ends jobs with their run (children.py) does not reach another machine: there, a thread
 watches the run's lease on the shared store.
 """
 
@@ -11,6 +11,7 @@ import shutil
 import subprocess
 import threading
 import time
+from contextlib import suppress
 from dataclasses import dataclass
 from importlib.util import find_spec
 from pathlib import Path
@@ -23,7 +24,7 @@ from chebsplat.pipelines import leases, store
 from chebsplat.pipelines.store import say
 from chebsplat.settings import MOST_STEPS
 from chebsplat.stages.registry import MODEL_FREE
-from chebsplat.stages.stopping import stop
+from chebsplat.stages.stopping import end_itself
 
 HERE = Path(__file__).parent
 LOCAL, SLURM = "local", "slurm"
@@ -197,8 +198,11 @@ def watch_run(plan: Path) -> None:
     """Stop this process, a job on a node, when the run of its plan ends: it lets go of its lease, or falls silent."""
 
     def watch() -> None:
-        while leases.is_held(store.run_lease(plan.parent)):
+        goes_on = True
+        while goes_on:
             time.sleep(leases.EVERY)
-        stop("its run has ended")
+            with suppress(OSError):  # a file system that does not answer for a while is asked again
+                goes_on = store.is_held(store.run_lease(plan.parent))
+        end_itself()
 
     threading.Thread(target=watch, daemon=True).start()

@@ -50,13 +50,13 @@ def scene_folder(scene: str) -> Path:
         raise InputError(f"{path} belongs to no scene in {store.work()}; name the scene")
     if links(path):
         return path
-    name = folders.known(Path(os.path.realpath(path))) if is_source(os.path.expanduser(scene)) else scene
+    name = folders.name_of(Path(os.path.realpath(path))) if is_source(path) else scene
     runs = [title for title in titles() if title.partition("@")[0] == name]
     if len(runs) == 1 or name in runs:
         return store.work() / (name if name in runs else runs[0])
     if runs:
         raise ConfigError(f"{shown(scene)} was run with different settings: name one of {', '.join(runs)}")
-    raise unknown(scene, name)
+    raise unknown(scene)
 
 
 def holder(artifact: Path) -> Path | None:
@@ -70,7 +70,7 @@ def holder(artifact: Path) -> Path | None:
     return None
 
 
-def unknown(scene: str, name: str | None) -> ConfigError | InputError:
+def unknown(scene: str) -> ConfigError | InputError:
     """The error for a scene that is not there, with the nearest names."""
     where = f"no finished scene in {store.work()}"
     if is_source(os.path.expanduser(scene)):
@@ -89,8 +89,7 @@ def artifact_of(scene: str, stage: str) -> Path:
 
     Raises: as `scene_folder`; ConfigError if the scene has no such artifact.
     """
-    path = Path(os.path.expanduser(scene))
-    if ("/" in scene or not links(store.work() / scene)) and is_artifact(path):
+    if path := _named(scene):
         return path
     folder = scene_folder(scene)
     if not is_artifact(folder / stage):
@@ -109,7 +108,12 @@ def teacher_of(scene: str) -> Path | None:
 
 def artifacts(scene: str) -> list[Path]:
     """All that a scene's links name, or the artifact alone that is named."""
+    path = _named(scene)
+    return [path] if path else list(links(scene_folder(scene)).values())
+
+
+def _named(scene: str) -> Path | None:
+    """The artifact that is named itself, if one is rather than a scene."""
     path = Path(os.path.expanduser(scene))
-    if ("/" in scene or not links(store.work() / scene)) and is_artifact(path):
-        return [path]
-    return list(links(scene_folder(scene)).values())
+    is_scene = "/" not in scene and links(store.work() / scene)
+    return path if is_artifact(path) and not is_scene else None

@@ -2,19 +2,21 @@
 
 from __future__ import annotations
 
-import json
 import os
 import time
 from collections import Counter
 from dataclasses import dataclass
 from itertools import chain
 from pathlib import Path
-from typing import Any
 
 from chebsplat.errors import ConfigError, InputError
+from chebsplat.formats import artifact
+from chebsplat.formats.manifest import Manifest
 from chebsplat.pipelines import folders, store, summary
 from chebsplat.pipelines.finished import is_artifact, links, scene_folder, titles
 from chebsplat.stages.registry import STAGES
+
+PAGE = "view.html"  # of `chebsplat view`, in a scene's folder
 
 
 @dataclass(frozen=True)
@@ -58,28 +60,25 @@ def scenes() -> list[Scene]:
     return rows
 
 
-def _manifest(path: Path) -> Any:
+def _manifest(path: Path) -> Manifest | None:
     try:
-        return json.loads((path / "artifact.json").read_text())
-    except (OSError, ValueError, RecursionError):
+        return artifact.read_manifest(path)
+    except InputError:
         return None
 
 
-def _size(manifest: Any) -> int:
-    try:
-        return sum(int(entry["bytes"]) for entry in manifest["files"].values())
-    except (TypeError, KeyError, AttributeError, ValueError):
-        return 0
+def _size(manifest: Manifest | None) -> int:
+    return sum(entry["bytes"] for entry in manifest.files.values()) if manifest else 0
 
 
-def _source(title: str, ingest: Any) -> str:
+def _source(title: str, ingest: Manifest | None) -> str:
     """Where a scene comes from: the folder that its name stands for, or what its capture was made of."""
     try:
-        if folders.record(name := title.partition("@")[0]).exists():
-            return folders.owner(name) or ""
-        source = ingest["config"]["source"]
+        if folder := folders.owner(title.partition("@")[0]):
+            return folder
+        source = ingest.config["source"] if ingest else {}
         return source["path"] or f"generated {source['preset']}, seed {source['seed']}"
-    except (InputError, TypeError, KeyError):
+    except (TypeError, KeyError):
         return "damaged"
 
 
@@ -108,7 +107,7 @@ def untouched(age: float) -> list[Path]:
     return [store.work() / title for title, paths in ours.items() if min(map(store.age, paths.values())) >= age]
 
 
-def _made_of(title: str, manifests: dict[str, Any]) -> set[str]:
+def _made_of(title: str, manifests: dict[str, Manifest | None]) -> set[str]:
     """Keys of the artifacts in the store that a folder's links lead to, directly and as inputs."""
     found: set[str] = set()
     waiting = [Path(os.path.realpath(link)).name for link in links(store.work() / title).values()]
@@ -117,22 +116,20 @@ def _made_of(title: str, manifests: dict[str, Any]) -> set[str]:
         if key in found or key not in manifests:
             continue
         found.add(key)
-        inputs = manifests[key].get("inputs") if isinstance(manifests[key], dict) else None
-        entries = inputs.values() if isinstance(inputs, dict) else ()
-        waiting += [str(entry["key"]) for entry in entries if isinstance(entry, dict) and "key" in entry]
+        manifest = manifests[key]
+        waiting += [entry["key"] for entry in manifest.inputs.values()] if manifest else []
     return found
 
 
 def others(folder: Path) -> list[str]:
     """What lies in a scene's folder and is none of ours; it is never removed."""
-    return sorted(e.name for e in os.scandir(folder) if not e.is_symlink())
+    return sorted(e.name for e in os.scandir(folder) if not e.is_symlink() and e.name != PAGE)
 
 
 def unlink(folder: Path) -> None:
-    """Remove a scene's links, its name among folders, and the folder if that leaves it empty."""
+    """Remove a scene's links and page, and the folder if that leaves it empty."""
     for entry in list(os.scandir(folder)):
-        if entry.is_symlink():
+        if entry.is_symlink() or entry.name == PAGE:
             os.unlink(entry.path)
     if not others(folder):
         folder.rmdir()
-    folders.release(folder.name.partition("@")[0])

@@ -11,13 +11,13 @@ from importlib import import_module
 from pathlib import Path
 from typing import Any
 
-from chebsplat.errors import ChebsplatError, ConfigError, DataFailure, InputError
-from chebsplat.formats import disk
+from chebsplat.errors import ConfigError, DataFailure, InputError
 from chebsplat.pipelines import leases, store
 from chebsplat.pipelines.raw import unchanged
 from chebsplat.pipelines.rehearsal import rehearsed
 from chebsplat.pipelines.store import say
-from chebsplat.stages.command import exit_code, n_threads, publish
+from chebsplat.stages.command import n_threads, publish
+from chebsplat.stages.stopping import exit_code
 
 FINAL = {error.exit_code for error in (ConfigError, InputError, DataFailure)}
 CODE = "{:<4d}"  # of a job, written over in place: a full disk does not keep it from being told
@@ -28,16 +28,14 @@ def run(plan: Path, key: str, again: bool = False) -> int:
 
     Args: again: it may be another attempt, with more memory. What settings or data do not allow is not tried again.
     """
-    step, files = read_step(plan, key)
-    if again and (earlier := int(Path(f"{files}.exit").read_text())) in FINAL:
+    _, files = read_step(plan, key)
+    exit_file = Path(f"{files}.exit")
+    if again and (earlier := int(exit_file.read_text())) in FINAL:
         return earlier
-    try:
-        with disk.explained(plan.parent), logged(Path(f"{files}.log")):
-            code = exit_code(lambda: make(plan, key))
-    except ChebsplatError as error:  # there cannot be a log
-        say(f"{step['stage']}: {error}")
-        code = error.exit_code
-    with Path(f"{files}.exit").open("r+") as handle:
+    os.utime(exit_file)  # `status` says how long ago
+    with logged(Path(f"{files}.log")):
+        code = exit_code(lambda: make(plan, key), plan.parent)
+    with exit_file.open("r+") as handle:
         handle.write(CODE.format(code))
     return code
 
@@ -72,7 +70,7 @@ def make(plan: Path, key: str) -> None:
     def wait(machine: str) -> None:
         say(f"{stage}: another run is making it on {machine}; waiting")
 
-    with disk.explained(plan.parent), leases.held(lease, wait):
+    with leases.held(lease, wait):
         store.remove_half(out)
         config, hashes = Path(f"{files}.json"), json.loads(Path(f"{files}.raw.json").read_text())
         module = import_module(f"chebsplat.stages.{stage}")
@@ -92,8 +90,11 @@ def prepared(step: dict[str, Any], hashes: dict[str, Any]) -> Iterator[None]:
 
 @contextmanager
 def logged(path: Path) -> Iterator[None]:
-    """What is logged within goes to a file as well."""
-    log = _Log(path)
+    """What is logged within goes to a file as well; a full disk costs the log, not the stage."""
+    try:
+        log: logging.Handler = _Log(path)
+    except OSError:
+        log = logging.NullHandler()
     logging.getLogger("chebsplat").addHandler(log)
     try:
         yield
@@ -104,7 +105,5 @@ def logged(path: Path) -> Iterator[None]:
 
 
 class _Log(logging.FileHandler):
-    """A full disk costs the log, not the stage; that meets the disk itself."""
-
     def handleError(self, record: logging.LogRecord) -> None:
         pass

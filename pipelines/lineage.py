@@ -110,7 +110,7 @@ def verify(path: Path | None, earlier: Path | None) -> str:
         return "not in this store: nothing to check"
     artifact.verify(path, SCHEMA)
     basis, manifest = read_basis(path), artifact.read_manifest(path)
-    share = artifact.stated(path, manifest, "config", "cks", "max_rank", kind=(int, float))
+    share = manifest.config["cks"]["max_rank"]
     for name, columns in basis.bases.items():
         before = last_report(basis.lineage, name)["rank_before"]
         if columns.shape[1] > max(int(share * len(columns)), before):

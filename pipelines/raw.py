@@ -106,22 +106,19 @@ def content_hash(entries: Hashes, root: Path | None) -> str:
 
 @contextmanager
 def unchanged(stage: str, sections: dict[str, Any], planned: Hashes) -> Iterator[None]:
-    """A stage reads its raw files within: they are what the plan, and so the key, says, from first to last.
+    """A stage reads its raw files within, before and after which they are what the key says.
 
-    Raises: InputError naming the file that is another now, or was touched meanwhile, is new or gone.
+    Raises: InputError naming the file that is another now, is new or gone.
     """
     memo = {path: entry for path, entry in planned.items() if entry[2]}
 
-    def check() -> Hashes:
+    def check() -> None:
         now = hashes(raw_files(stage, sections)[1], memo)
         for path in (*planned, *now):
             if path not in now or path not in planned or now[path][1] != planned[path][1]:
                 what = "is gone" if path not in now else "is new" if path not in planned else "has changed"
                 raise InputError(f"{path} {what} since the run was planned; run again")
-        return now
 
-    before = check()
+    check()
     yield
-    for path, entry in check().items():
-        if entry[0] != before[path][0]:
-            raise InputError(f"{path} was touched while it was read; run again")
+    check()

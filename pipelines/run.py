@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import hashlib
 import json
 import os
 import shlex
@@ -10,6 +9,7 @@ import shutil
 import subprocess
 import sys
 import time
+import uuid
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field
@@ -124,6 +124,8 @@ def snakemake(
         finally:
             if code != 0 and on != cluster.LOCAL:
                 cluster.withdraw(plan, on)
+            elif code != 0:
+                store.remove_halves([step.path for step in steps])
             if not code:
                 shutil.rmtree(folder, ignore_errors=True)
 
@@ -133,15 +135,9 @@ def plan_of(entries: list[dict[str, Any]], on: str = cluster.LOCAL) -> Iterator[
     """The plan of a run, in a folder of its own with each job's config; as long as the block runs, `clean-stale` on any
     machine spares what it names.
     """
-    text = json.dumps([leases.here(), entries])
-    folder = store.work() / ".plans" / f"{hashlib.sha256(text.encode()).hexdigest()[:16]}-{os.getpid()}"
-    lease = store.run_lease(folder)
-    try:
-        with leases.held(lease):
-            yield write_plan(folder, entries, cluster.jobs_of(entries, on))
-    finally:
-        if not folder.exists():
-            shutil.rmtree(lease, ignore_errors=True)
+    folder = store.work() / ".plans" / f"{uuid.uuid4().hex[:16]}-{os.getpid()}"
+    with leases.held(store.run_lease(folder)):
+        yield write_plan(folder, entries, cluster.jobs_of(entries, on))
 
 
 def write_plan(folder: Path, entries: list[dict[str, Any]], jobs: dict[str, dict[str, Any]]) -> Path:
@@ -171,7 +167,9 @@ def failures(steps: list[Step], folder: Path, words: Path) -> Outcome:
             failed[step.key], killed = (1, "killed before it could report", log), True
             say(f"{step.stage} was killed before it could report; log: {log}")
     if killed or not failed:
-        disk.check(store.work(), words.read_text(errors="replace") if words.is_file() else "")
+        with disk.explained(store.work()):  # whoever failed could not say whether the disk is full
+            atomic_write(folder / "room", bytes(1 << 20))
+            (folder / "room").unlink()
     if not failed:
         say(f"the run stopped before a stage began; log: {words}")
     return Outcome(max((code for code, *_ in failed.values()), default=1), failed)
@@ -225,9 +223,9 @@ def rehearsal_command(entries: list[dict[str, Any]]) -> list[str]:
 
 
 def job_command(plan: Path, of_job: dict[str, Any]) -> str:
-    """The shell line that the Snakefile runs for a job: its steps one after the other."""
+    """The shell line of a job, its steps one after the other; a signal meets no shell before it."""
     command = [sys.executable, "-P", "-m", "chebsplat.pipelines.cli", "job", *["--elsewhere"] * of_job["elsewhere"]]
-    return shlex.join([*command, str(plan), *of_job["keys"]])
+    return "exec " + shlex.join([*command, str(plan), *of_job["keys"]])
 
 
 def seconds(steps: list[Step], ran: set[str]) -> None:

@@ -9,8 +9,10 @@ from pathlib import Path
 from typing import Any
 
 from chebsplat.errors import ConfigError, InputError
+from chebsplat.formats.files import parse_toml
 from chebsplat.formats.names import suggest
 from chebsplat.formats.videos import is_video
+from chebsplat.pipelines.store import is_name
 
 CONFIGS = Path(__file__).parent / "configs"
 ONE = {"scenes": "scene", "ablations": "ablation", "sequences": "sequence", "studies": "study"}
@@ -28,6 +30,18 @@ def read_toml(kind: str, name: str) -> dict[str, Any]:
         near = suggest(name, names(kind)) or names(kind)
         raise ConfigError(f"no {ONE[kind]} is called {shown(name)}; did you mean {', '.join(near)}?")
     return tomllib.loads((CONFIGS / kind / f"{name}.toml").read_text())
+
+
+def read_named(kind: str, name: str) -> dict[str, Any]:
+    """A config of ours by name, or a file of the user's that ends in .toml, after which links are called.
+
+    Raises ConfigError naming the file, or the nearest names.
+    """
+    if not is_name(Path(name).stem):
+        raise ConfigError(f"no {ONE[kind]} can be called {name}: its links lie in the work folder")
+    if name.endswith(".toml"):
+        return parse_toml(Path(os.path.expanduser(name)), "correct it", ConfigError)
+    return read_toml(kind, name)
 
 
 def shown(text: str) -> str:
@@ -73,12 +87,11 @@ def scene_values(scene: str) -> tuple[str, dict[str, Any]]:
     return scene, values
 
 
-def folder_name(folder: Path, more: int = 0) -> str:
-    """A source's name as that of links: its last part, those above it up to one with a letter, and `more` parts."""
+def folder_name(folder: Path) -> str:
+    """A source's name: the last part of its path, and those above it up to one with a letter."""
     parts = (folder.with_suffix("") if is_video(folder.name) else folder).parts[1:]
     words = next((k for k in range(1, len(parts)) if re.search(r"[a-zA-Z]", parts[-k])), 1)  # "dense/0" is no "0"
-    name = re.sub(r"[^\w.-]+", "-", "-".join(parts[-words - more :])).lstrip(".") or "scene"
-    return name + ("-scene" if name == "store" else "")  # links lie beside the store
+    return re.sub(r"[^\w.-]+", "-", "-".join(parts[-words:])).lstrip(".") or "scene"
 
 
 def data_of(scene: str) -> tuple[str, Path] | None:

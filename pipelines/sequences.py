@@ -2,15 +2,12 @@
 
 from __future__ import annotations
 
-import os
 from pathlib import Path
 
 from chebsplat.errors import ConfigError
-from chebsplat.formats.files import parse_toml
 from chebsplat.formats.names import unprintable
 from chebsplat.pipelines.plan import Plan, Planner
-from chebsplat.pipelines.scenes import read_toml
-from chebsplat.pipelines.store import is_name
+from chebsplat.pipelines.scenes import read_named
 
 LONGEST = 1000  # scenes of a sequence
 
@@ -20,12 +17,7 @@ def scenes_of(name: str) -> list[str]:
 
     Raises: ConfigError naming the file, or the nearest sequence's name.
     """
-    if not is_name(Path(name).stem):
-        raise ConfigError(f"no sequence can be called {name}: its links lie in the work folder")
-    if name.endswith(".toml"):
-        values = parse_toml(Path(os.path.expanduser(name)), "correct it", ConfigError)
-    else:
-        values = read_toml("sequences", name)
+    values = read_named("sequences", name)
     scenes = values.get("scenes")
     if set(values) != {"scenes"} or not isinstance(scenes, list) or not 0 < len(scenes) <= LONGEST:
         raise ConfigError(f'sequence {name}: it says scenes = ["...", ...], at most {LONGEST}, and nothing else')

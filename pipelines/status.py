@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import time
 from collections import Counter
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -31,14 +32,19 @@ def state_of(folder: Path, step: dict[str, Any]) -> State:
     stage, key, file = step["stage"], step["key"], folder / f"{step['stage']}-{step['key']}"
     if store.is_fresh(Path(step["path"])):
         return State(stage, key, DONE)
-    if by := leases.holder(store.lease(folder.parents[1], file.name)):
-        return State(stage, key, RUNS, f"{by[1]:.0f} s on {by[0]}")
+    if machine := leases.holder(store.lease(folder.parents[1], file.name)):
+        return State(stage, key, RUNS, f"{seconds(file.with_suffix('.exit'))} s on {machine}")
     log, is_over = file.with_suffix(".log"), leases.holder(store.run_lease(folder)) is None
     if code := int(file.with_suffix(".exit").read_text()):
         return State(stage, key, FAILED, f"exit code {code}", last_lines(log))
     if log.is_file() and is_over:
         return State(stage, key, FAILED, "killed before it could report", last_lines(log))
     return State(stage, key, LEFT if is_over else WAITS)
+
+
+def seconds(file: Path) -> int:
+    """Since a file was written, which what it belongs to does as it begins."""
+    return max(int(time.time() - file.stat().st_mtime), 0)
 
 
 def last_lines(log: Path) -> tuple[str, ...]:
@@ -61,8 +67,9 @@ def runs() -> Iterator[tuple[str, list[State]]]:
         except (OSError, ValueError, TypeError, KeyError, AttributeError, RecursionError):
             yield f"{plan} is damaged; remove {plan.parent} if no run is under way", []
             continue
-        by = leases.holder(store.run_lease(plan.parent))
-        yield f"run {plan.parent.name}" + (f" on {by[0]}, {by[1]:.0f} s" if by else ", over"), states
+        machine = leases.holder(store.run_lease(plan.parent))
+        since = f" on {machine}, {seconds(plan)} s" if machine else ", over"
+        yield f"run {plan.parent.name}{since}", states
 
 
 def lines() -> Iterator[str]:

@@ -6,8 +6,10 @@ import json
 import os
 import shutil
 import sys
+import tempfile
 import time
-from collections.abc import Container
+from collections.abc import Container, Iterable
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
@@ -33,7 +35,7 @@ def make_work() -> None:
 
 def lease(base: Path, name: str) -> Path:
     """The lease of a work folder on what is called so: an artifact's stage and key, a run."""
-    return base / ".leases" / name
+    return base / ".held" / name
 
 
 def run_lease(plans: Path) -> Path:
@@ -138,17 +140,20 @@ def unnamed(without: Container[Path] = ()) -> list[tuple[Path, int]]:
 
 def age(path: Path) -> float:
     """Seconds since an artifact was finished, or a leftover was last changed, by the clock of the file system."""
-    clock = work() / ".cache/.clock"
-    clock.parent.mkdir(exist_ok=True)
-    clock.touch()
     done = path / "artifact.json"
-    return clock.stat().st_mtime - (done if done.is_file() else path).lstat().st_mtime
+    changed = (done if done.is_file() else path).lstat().st_mtime
+    with tempfile.TemporaryFile(dir=work()) as clock:
+        return os.fstat(clock.fileno()).st_mtime - changed
 
 
 def sweep() -> None:
-    """Remove what Snakemake remembers of earlier runs, and their locks; nothing while a run is under way."""
+    """Remove leases of the dead, and where no run is under way what Snakemake remembers."""
+    for path in work().glob(".held/*"):
+        with suppress(FileNotFoundError):
+            if age(path) > leases.EXPIRES:
+                path.unlink()
     if not any(map(is_under_way, work().glob(".plans/*"))):
-        for name in (".snakemake", ".leases", ".locks", ".done"):  # earlier versions had the last two
+        for name in (".snakemake", ".leases", ".names"):  # earlier versions had the last two
             shutil.rmtree(work() / name, ignore_errors=True)
 
 
@@ -175,7 +180,14 @@ def _running(base: Path) -> set[Path]:
 
 def is_under_way(plans: Path) -> bool:
     """Whether the run that a folder of `.plans` belongs to goes on, here or on another machine."""
-    return _owner_lives(plans) or leases.is_held(run_lease(plans))
+    return _owner_lives(plans) or is_held(run_lease(plans))
+
+
+def is_held(path: Path) -> bool:
+    """Whether someone holds a lease and gives signs of life, by the clock of the file system."""
+    with suppress(FileNotFoundError):  # it has just been let go
+        return leases.holder(path) is not None and age(path) < leases.EXPIRES
+    return False
 
 
 def _in_use(path: Path, running: set[Path]) -> bool:
@@ -194,6 +206,13 @@ def remove_half(path: Path) -> None:
     for half in path.parent.glob(f".tmp-{path.name}-*"):
         if not _owner_lives(half):
             shutil.rmtree(half, ignore_errors=True)
+
+
+def remove_halves(paths: Iterable[Path]) -> None:
+    """Remove what killed jobs have left of artifacts, but for those that another run makes."""
+    for path in paths:
+        if leases.holder(lease(path.parents[2], f"{path.parent.name}-{path.name}")) is None:
+            remove_half(path)
 
 
 def _owner_lives(path: Path) -> bool:

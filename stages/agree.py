@@ -16,6 +16,7 @@ if TYPE_CHECKING:
     from chebsplat.formats.points import Points
 
 log = logging.getLogger("chebsplat")
+SEED = 0  # of the choice among points
 
 
 def run(job: Job) -> None:
@@ -26,7 +27,7 @@ def run(job: Job) -> None:
     import numpy as np
 
     from chebsplat.cameras import centers
-    from chebsplat.formats.agreement import OfLabel, ViewAgreement, write_agreement
+    from chebsplat.formats.agreement import ViewAgreement, write_agreement
     from chebsplat.formats.capture import read_capture
     from chebsplat.formats.features import read_features
     from chebsplat.formats.points import read_points
@@ -37,9 +38,8 @@ def run(job: Job) -> None:
     points, features = read_points(job.inputs["points"]), read_features(job.inputs["features"])
     views = training_views(capture, points, features)
     rows = even(points)
-    chosen = np.sort(
-        np.random.default_rng(settings.seed).choice(rows, min(settings.n_points, len(rows)), replace=False)
-    )
+    rng = np.random.default_rng(SEED)
+    chosen = np.sort(rng.choice(rows, min(settings.n_points, len(rows)), replace=False))
     said = labels_of(job, capture, points, features, views, chosen)
     eyes = centers(points.cam_from_world)[[place for _, place, _ in views]]
     row, first, second = far_pairs(points.means[chosen], eyes, said >= 0).T
@@ -47,7 +47,7 @@ def run(job: Job) -> None:
     found = between(said[row, first], said[row, second], len(names))
     value = float(found.value) if len(row) else None
     labels = {
-        name: OfLabel(share=float(share), agreement=float(of_label))
+        name: {"share": float(share), "agreement": float(of_label)}
         for name, share, of_label in zip(names, found.share, found.by_label, strict=True)
         if share > 0
     }

@@ -11,23 +11,27 @@ from chebsplat.cameras import centers, common_up, upright
 from chebsplat.errors import ConfigError
 from chebsplat.stages.opened import Camera, OpenedScene
 
+ROUND = 120  # frames of an orbit
 LEAST_SURE = 0.5  # of `cameras.common_up`, below which the orbit's plane is that of the cameras
 
 
-def path_of(scene: OpenedScene, path: str, n_frames: int) -> list[Camera]:
-    """`capture`: the capture's cameras; `orbit`: `n_frames` of an orbit among them; otherwise a .json file's.
+def path_of(scene: OpenedScene, path: str, n_frames: int | None) -> list[Camera]:
+    """`capture`: the capture's cameras; `orbit`: an orbit among them; otherwise a .json file's.
 
+    Args:   n_frames: of the orbit (None: 120), or of a path through the cameras (None: no path).
     Raises: ConfigError if it is none of these; InputError if the file's cameras cannot be used.
     """
     from chebsplat.stages.camera_files import read_cameras
 
-    if path == "capture":
-        return scene.cameras
     if path == "orbit":
-        return orbit(scene.cameras, n_frames)
-    if path.endswith(".json"):
-        return read_cameras(Path(path).expanduser())
-    raise ConfigError(f"--path {path}: orbit, capture or a .json of cameras is needed")
+        return orbit(scene.cameras, n_frames or ROUND)
+    if path == "capture":
+        cameras = scene.cameras
+    elif path.endswith(".json"):
+        cameras = read_cameras(Path(path).expanduser())
+    else:
+        raise ConfigError(f"--path {path}: orbit, capture or a .json of cameras is needed")
+    return cameras if n_frames is None else between(cameras, n_frames)
 
 
 def orbit(cameras: list[Camera], n_frames: int) -> list[Camera]:
@@ -59,26 +63,29 @@ def orbit(cameras: list[Camera], n_frames: int) -> list[Camera]:
 
 
 def between(keys: list[Camera], n_frames: int) -> list[Camera]:
-    """A path through cameras of one lens and size, `n_frames` in all, at an even pace from each to the next.
+    """A path through cameras of one size, `n_frames` in all, at an even pace from each to the next.
 
-    Choices: centres lie on the piecewise cubic through the keys that does not overshoot (PCHIP), rotations turn by the
-      shortest arc from key to key.
-    Raises: ConfigError on fewer than two keys or frames.
+    Choices: centres and lenses lie on the piecewise cubic through the keys that does not overshoot
+      (PCHIP), rotations turn by the shortest arc from key to key.
+    Raises: ConfigError on fewer than two keys or frames, or keys of several sizes.
     """
     from scipy.interpolate import PchipInterpolator
     from scipy.spatial.transform import Rotation, Slerp
 
     if len(keys) < 2 or n_frames < 2:
-        raise ConfigError("a path needs two cameras and two frames at least")
+        raise ConfigError("a path through cameras needs two of them, and --frames 2 at least")
+    if len({(key.width, key.height) for key in keys}) > 1:
+        raise ConfigError("a path needs cameras of one size; without --frames each is rendered alone")
     poses, times = np.stack([camera.cam_from_world for camera in keys]), np.arange(len(keys))
     at = np.linspace(0, len(keys) - 1, n_frames)
     turns = Slerp(times, Rotation.from_matrix(poses[:, :3, :3]))(at).as_matrix()
     eyes = PchipInterpolator(times, centers(poses))(at)
+    Ks = PchipInterpolator(times, np.stack([key.K for key in keys]))(at)
     path = []
     for k in range(n_frames):
         pose = np.eye(4)
         pose[:3, :3], pose[:3, 3] = turns[k], -turns[k] @ eyes[k]
-        path.append(replace(keys[0], name=f"path_{k:04d}", cam_from_world=pose))
+        path.append(replace(keys[0], name=f"path_{k:04d}", K=Ks[k], cam_from_world=pose))
     return path
 
 

@@ -11,6 +11,7 @@ if TYPE_CHECKING:
     from chebsplat.formats.gaussians import Gaussians
 
 GEOMETRY = ("means", "quats", "log_scales")
+KAPPA = 1.0  # κ of ρ′ = ρ (1 + κ σ_f) in Eq 15: what the spread of shape within regions counts
 
 
 def run(job: Job) -> None:
@@ -30,7 +31,7 @@ def run(job: Job) -> None:
 
     from chebsplat.shape.cks import update
 
-    encoder = restored_encoder(job.inputs["gaussians"], checkpoint)
+    encoder = restored_encoder(checkpoint)
     if not encoder.blocks:
         raise DataFailure("the encoder has no attention weights (train.encoder = mlp); there is no knowledge to carry")
     maps = encoder.linear_maps()
@@ -54,7 +55,7 @@ def run(job: Job) -> None:
             max_added=settings.max_added,
             n_scenes=settings.n_scenes,
             rule=settings.energy_rule,
-            novelty=1 + settings.kappa * sigma,
+            novelty=1 + KAPPA * sigma,
             update_rule=settings.update_rule,
         )
         bases[name] = grown.numpy()
@@ -85,4 +86,4 @@ def descriptor_spread(job: Job, gaussians: Gaussians) -> float:
     means, quats, log_scales = (torch.from_numpy(gaussians.parameters[name]) for name in GEOMETRY)
     regions = regions_of(means.double().numpy(), describe)
     members = torch.from_numpy(regions.members)
-    return spread(Descriptors(describe).update(means, quats, log_scales, members, regions.radius), members >= 0)
+    return spread(Descriptors(describe).update(means, quats, log_scales, members), members >= 0)

@@ -14,14 +14,13 @@ from typing import Any
 
 import click
 
-from chebsplat.errors import ChebsplatError, Stopped
-from chebsplat.formats import artifact, disk
+from chebsplat.formats import artifact
 from chebsplat.formats.manifest import Manifest
 from chebsplat.stages import config as configs
 from chebsplat.stages.device import DEVICES, resolve
 from chebsplat.stages.progress import Progress
 from chebsplat.stages.registry import STAGES
-from chebsplat.stages.stopping import half_made, heeded
+from chebsplat.stages.stopping import exit_code
 
 log = logging.getLogger("chebsplat")
 
@@ -58,7 +57,7 @@ def command(name: str, run: Callable[[Job], None]) -> click.Command:
             publish(name, run, out, inputs, **options)
             print(out.absolute())
 
-        sys.exit(exit_code(action))
+        sys.exit(exit_code(action, out.absolute().parent))
 
     params: list[click.Parameter] = [
         click.Option(
@@ -80,22 +79,6 @@ def command(name: str, run: Callable[[Job], None]) -> click.Command:
     return click.Command(name, params=params, callback=invoke, help=stage.help)
 
 
-def exit_code(action: Callable[[], None]) -> int:
-    """Exit code of an action, 0 if it ends; what ends it early, a typed error, a stop or a crash, is logged."""
-    try:
-        action()
-    except ChebsplatError as error:
-        log.error("%s", error)
-        return error.exit_code
-    except Stopped as stop:
-        log.warning("%s", stop)
-        return stop.exit_code
-    except Exception:
-        log.exception("crashed; nothing was published")
-        return 1
-    return 0
-
-
 def publish(
     name: str,
     run: Callable[[Job], None],
@@ -115,7 +98,7 @@ def publish(
     Args: inputs: artifacts by role; config: TOML or JSON, otherwise defaults; key, code: identities given by the
           planner; within: what the stage reads and computes within; what it raises at its end keeps the artifact from
           being published.
-    Raises: ChebsplatError, Stopped.
+    Raises: ChebsplatError.
     """
     line = f"%(asctime)s {name}: %(message)s"
     logging.basicConfig(stream=sys.stderr, format=line, datefmt="%H:%M:%S", level="WARNING", force=True)
@@ -125,32 +108,31 @@ def publish(
         log.info("already there")
         return
     inputs, shown = {role: path.absolute() for role, path in inputs.items()}, Progress()
-    with heeded(), disk.explained(out.parent):
-        chosen = configs.load(config) if config else configs.Config()
-        schemas = {role: STAGES[of].schema for role, of in stage.roles.items()}
-        manifests = {role: artifact.read_manifest(path, schemas[role]) for role, path in inputs.items()}
-        settings = chosen.sections(stage.sections)
-        sources = {role: {"key": m.key, "schema": m.schema} for role, m in manifests.items()}
-        device, why = resolve(device)
-        device = stage.device(device, settings)
-        computed = {} if device == "cpu" else {"device": device}
-        key = key or artifact.digest({"stage": name, "config": settings, "inputs": sources} | computed)
-        artifact.check_place(out, stage.schema, key, force)
-        seed = next((settings[s]["seed"] for s in reversed(stage.sections) if "seed" in settings[s]), None)
-        if why:
-            log.info("%s", why)
-        manifest = Manifest(
-            stage.schema, key, name, sources, settings, seed, device=device, threads=n_threads(), code=code or {}
-        )
-        scratch = out.parent / f".part-{out.name}"
-        began = time.perf_counter()
-        with artifact.publish(out, manifest, force) as tmp, half_made(tmp), within or nullcontext():
-            job = Job(inputs, chosen, tmp, scratch, device, shown, manifest.facts)
-            with shown.log_to(tmp / "log.jsonl"):
-                run(job)
-            manifest.seconds = round(time.perf_counter() - began, 3)
-            manifest.versions = _versions()
-        artifact.discard(scratch)
+    chosen = configs.load(config) if config else configs.Config()
+    schemas = {role: STAGES[of].schema for role, of in stage.roles.items()}
+    manifests = {role: artifact.read_manifest(path, schemas[role]) for role, path in inputs.items()}
+    settings = chosen.sections(stage.sections)
+    sources = {role: {"key": m.key, "schema": m.schema} for role, m in manifests.items()}
+    device, why = resolve(device)
+    device = stage.device(device, settings)
+    computed = {} if device == "cpu" else {"device": device}
+    key = key or artifact.digest({"stage": name, "config": settings, "inputs": sources} | computed)
+    artifact.check_place(out, stage.schema, key, force)
+    seed = next((settings[s]["seed"] for s in reversed(stage.sections) if "seed" in settings[s]), None)
+    if why:
+        log.info("%s", why)
+    manifest = Manifest(
+        stage.schema, key, name, sources, settings, seed, device=device, threads=n_threads(), code=code or {}
+    )
+    scratch = out.parent / f".part-{out.name}"
+    began = time.perf_counter()
+    with artifact.publish(out, manifest, force) as tmp, within or nullcontext():
+        job = Job(inputs, chosen, tmp, scratch, device, shown, manifest.facts)
+        with shown.log_to(tmp / "log.jsonl"):
+            run(job)
+        manifest.seconds = round(time.perf_counter() - began, 3)
+        manifest.versions = _versions()
+    artifact.discard(scratch)
     if (jit := sys.modules.get("chebsplat.kernels.jit")) and jit.compilation.kernels:
         log.info("compiled %d kernels in %.0f s, once", jit.compilation.kernels, jit.compilation.seconds)
     log.info("done in %.1f s", manifest.seconds)

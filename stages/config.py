@@ -42,11 +42,9 @@ class Config(Section):
     lift: parts.LiftSection = parts.LiftSection()
     refine: parts.RefineSection = parts.RefineSection()
     knowledge: parts.KnowledgeSection = parts.KnowledgeSection()
-    export: parts.ExportSection = parts.ExportSection()
     onnx: parts.OnnxSection = parts.OnnxSection()
     cks: parts.CksSection = parts.CksSection()
     evaluate: parts.EvaluateSection = parts.EvaluateSection()
-    report: parts.ReportSection = parts.ReportSection()
 
     def sections(self, names: tuple[str, ...]) -> dict[str, Any]:
         """The named sections as plain JSON-able values."""

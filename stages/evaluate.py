@@ -32,7 +32,6 @@ def run(job: Job) -> None:
     from chebsplat.formats.evaluation import Evaluation, write_evaluation
     from chebsplat.formats.scene import read_scene
     from chebsplat.render import SceneRenderer
-    from chebsplat.stages.alignment import aligned_renders
     from chebsplat.stages.fidelity import frame_split, image_figures, perceptual, timing
 
     settings = job.config.evaluate
@@ -71,10 +70,6 @@ def run(job: Job) -> None:
     pictures |= {name: np.stack(maps) for name, maps in shown.items()}
     masks = None if capture.loss_mask is None else [capture.loss_mask[row[name]] for name in names]
     figures["image"] = image_figures(pictures["renders"], pictures["truth"], masks, lpips)
-    if settings.poses == "refined":
-        aligned = aligned_renders(job, renderer, cameras, pictures["truth"], masks)
-        figures["image_aligned"] = image_figures(aligned, pictures["truth"], masks, lpips)
-        job.facts["psnr_aligned"] = figures["image_aligned"]["psnr"]
     figures["n_gaussians"] = len(scene.parameters["means"])
     figures["bytes"] = scene.summary["bytes"]
     figures |= {"frames_per_second": {}, "milliseconds": {}}

@@ -58,12 +58,10 @@ def run(job: Job) -> None:
     counts = np.bincount(parameters["degrees"], minlength=4).tolist()
     for degree in range(int(parameters["degrees"].max(initial=0)) + 1, 4):
         job.left_out(f"SH band {degree}", "no Gaussian keeps it")
-    if not job.config.export.split_by_degree:
-        job.left_out("split PLY files", "export.split_by_degree is false")
     left_out = gaussians.notes.get("left_out", {}) | job.facts.get("left_out", {})
     summary = {"left_out": left_out, "by_degree": counts, "n_initial": gaussians.notes.get("n_initial")}
     scene = Scene(parameters, gaussians.cameras, order, **labelled, summary=summary)
-    sizes = write_scene(job.out, scene, job.config.export.split_by_degree)
+    sizes = write_scene(job.out, scene)
     job.facts |= {"n_gaussians": len(order), "by_degree": counts, "bytes": sizes}
 
 

@@ -18,18 +18,17 @@ TEACHERS = {"segformer-b0-ade": "Xenova/segformer-b0-finetuned-ade-512-512"}  # 
 REPOSITORY = re.compile(r"hf:([\w.-]+/[\w.-]+?)(?:@([\w./-]+))?")
 GRAPH, CLASSES, PREPARATION = "onnx/model.onnx", "config.json", "preprocessor_config.json"
 WIDER = 4 / 3  # of a photo than of the square that a segmenter is trained on
-CHUNK = 2**16  # bytes, after which they are written
-AGAIN = "run the same command again: what is there is not fetched again"
+AGAIN = "run the same command again"
 
 
 def get_teacher(name: str, out: Path | None = None, graph: str = GRAPH) -> tuple[Path, list[tuple[str, str]]]:
-    """Fetch a teacher into a folder, as NAME.onnx, NAME.toml and NAME.txt; the .onnx, and what `check-teacher` finds.
+    """Fetch a teacher into a folder, as NAME.onnx, NAME.toml and NAME.txt; the .onnx, and what
+    `check-teacher` finds.
 
-    Args: name: of TEACHERS, or hf:OWNER/NAME[@REVISION]; out: the folder, otherwise one called like the teacher, here;
-          graph: the ONNX file in the repository.
-    Raises: ConfigError on a name or folder that cannot be; InputError naming what is missing, damaged or not reached.
-    Choices: a file is taken from the hub's cache where it is there, whole; otherwise a download goes on where an an
-      earlier one was stopped. The checksum is the hub's: sha256 of what Git LFS holds, git's own of the small files.
+    Args: name: of TEACHERS, or hf:OWNER/NAME[@REVISION]; out: the folder, otherwise one called
+          like the teacher, here; graph: the ONNX file in the repository.
+    Raises: ConfigError on a name or folder that cannot be; InputError naming what is missing,
+            damaged or not reached.
     """
     from chebsplat.stages.teacher_check import check
 
@@ -41,25 +40,24 @@ def get_teacher(name: str, out: Path | None = None, graph: str = GRAPH) -> tuple
         if not model.is_file() or read_teacher(model).origin != origin:
             raise ConfigError(f"{folder} exists and is not {origin}; remove it, or choose another --out")
         return model, check(model)
+    held = {file: fetched(repository, file, revision) for file in (CLASSES, PREPARATION, graph)}
     part = folder.with_name(f".part-{folder.name}")
-    part.mkdir(parents=True, exist_ok=True)
-    held = {file: fetched(repository, file, revision, part) for file in (CLASSES, PREPARATION, graph)}
-    ready = part / "ready"
-    shutil.rmtree(ready, ignore_errors=True)
-    ready.mkdir()
-    shutil.copyfile(held[graph], ready / model.name)
-    classes = class_names(held[CLASSES], repository)
-    (ready / f"{short}.txt").write_text("\n".join(classes) + "\n", encoding="utf-8")
-    values = {"name": short, "output": "logits", "labels": f"{short}.txt", "origin": origin}
-    values |= {"sha256": sha256_file(ready / model.name)} | preparation(held[PREPARATION], repository)
-    text = "".join(f"{key} = {json.dumps(value, ensure_ascii=False)}\n" for key, value in values.items())
-    (ready / f"{short}.toml").write_text(text, encoding="utf-8")
-    ready.rename(folder)
-    shutil.rmtree(part)
+    shutil.rmtree(part, ignore_errors=True)
+    part.mkdir(parents=True)
     try:
+        made = part / model.name
+        shutil.copyfile(held[graph], made)
+        classes = class_names(held[CLASSES], repository)
+        made.with_suffix(".txt").write_text("\n".join(classes) + "\n", encoding="utf-8")
+        values = {"name": short, "output": "logits", "labels": f"{short}.txt", "origin": origin}
+        values |= {"sha256": sha256_file(made)} | preparation(held[PREPARATION], repository)
+        lines = (f"{k} = {json.dumps(value, ensure_ascii=False)}\n" for k, value in values.items())
+        made.with_suffix(".toml").write_text("".join(lines), encoding="utf-8")
+        part.rename(folder)
         return model, check(model)
     except ChebsplatError:  # what was fetched is no teacher
-        shutil.rmtree(folder)
+        shutil.rmtree(part, ignore_errors=True)
+        shutil.rmtree(folder, ignore_errors=True)
         raise
 
 
@@ -73,67 +71,34 @@ def parsed(name: str) -> tuple[str, str, str]:
     return found[1], found[2] or "main", found[1].rpartition("/")[2].lower()
 
 
-def fetched(repository: str, file: str, revision: str, part: Path) -> Path:
-    """A file of a repository, of the right checksum: in the hub's cache, or in the folder `part`."""
+def fetched(repository: str, file: str, revision: str) -> Path:
+    """A file of a repository in the hub's cache, of the right checksum; downloaded if need be."""
     try:
         import httpx2
-        from huggingface_hub import constants, get_hf_file_metadata, hf_hub_url, try_to_load_from_cache
-        from huggingface_hub.errors import HfHubHTTPError, OfflineModeIsEnabled
+        from huggingface_hub import constants, errors, hf_hub_download
     except ImportError:
         raise ConfigError(
             "get-teacher needs the package huggingface_hub: .venv/bin/pip install -e '.[hub]' installs it"
         ) from None
 
+    where = f"{repository}: {file}"
     try:
-        known = get_hf_file_metadata(hf_hub_url(repository, file, revision=revision))
-    except (httpx2.TransportError, OfflineModeIsEnabled) as fault:
-        cached = try_to_load_from_cache(repository, file, revision=revision)
-        if isinstance(cached, str):
-            return verified(Path(cached), Path(cached).resolve().name)  # the cache calls a file by its checksum
-        offline = isinstance(fault, OfflineModeIsEnabled)
-        why = "HF_HUB_OFFLINE is set" if offline else f"{constants.ENDPOINT} is not reached"
-        raise InputError(
-            f"{repository}: {file} is not in the hub's cache and {why}; connect, or set HF_ENDPOINT to a mirror, and "
-            + AGAIN
-        ) from None
-    except HfHubHTTPError as fault:
+        return verified(Path(hf_hub_download(repository, file, revision=revision)))
+    except errors.LocalEntryNotFoundError as fault:
+        why = f"{constants.ENDPOINT} is not reached"
+        if isinstance(fault.__cause__, errors.OfflineModeIsEnabled):
+            why = "HF_HUB_OFFLINE is set"
+        elif isinstance(fault.__cause__, errors.FileMetadataError):
+            why = f"{constants.ENDPOINT} answers as no hub does"
+        remedy = f"connect, or set HF_ENDPOINT to a mirror, and {AGAIN}"
+        raise InputError(f"{where} is not in the hub's cache and {why}; {remedy}") from None
+    except errors.HfHubHTTPError as fault:
         raise InputError(refusal(fault, repository, file, revision)) from None
-    if known.etag is None or known.size is None:
-        told = f"{constants.ENDPOINT} tells no checksum or size of {repository}'s {file}"
-        raise InputError(f"{told}; correct HF_ENDPOINT")
-    cached = try_to_load_from_cache(repository, file, revision=known.commit_hash)
-    if isinstance(cached, str):
-        return verified(Path(cached), known.etag)
-    path = part / re.sub(r"\W", "_", known.etag)
-    try:
-        download(known.location, path, known.size, known.location.startswith(constants.ENDPOINT))
-    except HfHubHTTPError as fault:
-        raise InputError(refusal(fault, repository, file, revision)) from None
-    except httpx2.TransportError:
-        done = path.stat().st_size if path.is_file() else 0
-        raise InputError(f"{repository}: {file} broke off at {done:,} of {known.size:,} bytes; {AGAIN}") from None
-    return verified(path, known.etag, ours=True)
-
-
-def download(address: str, path: Path, size: int, of_hub: bool) -> None:
-    """Bring a file to its size, from where it ends.
-
-    Choices: the hub's client begins again after a stop, and holds 10 MB back before it writes; of a connection that
-      breaks here nothing is lost. Who asks is told to the hub alone, not to where it sends its large files.
-    """
-    from huggingface_hub import get_session
-    from huggingface_hub.utils import build_hf_headers, hf_raise_for_status  # type: ignore[attr-defined]
-
-    done = path.stat().st_size if path.is_file() else 0
-    if done >= size > 0:
-        return
-    headers = (build_hf_headers() if of_hub else {}) | {"Accept-Encoding": "identity"}
-    headers |= {"Range": f"bytes={done}-"} if done else {}
-    with get_session().stream("GET", address, headers=headers, follow_redirects=True) as response:
-        hf_raise_for_status(response)
-        with path.open("ab" if response.status_code == 206 else "wb") as handle:  # some servers begin anew
-            for chunk in response.iter_bytes(CHUNK):
-                handle.write(chunk)
+    except (httpx2.TransportError, OSError, RuntimeError) as fault:
+        if isinstance(fault, OSError) and fault.errno is not None:  # of the disk
+            raise
+        said = str(fault).partition("\n")[0]
+        raise InputError(f"{where} broke off ({said}); {AGAIN}") from None
 
 
 def refusal(fault: Any, repository: str, file: str, revision: str) -> str:
@@ -146,22 +111,27 @@ def refusal(fault: Any, repository: str, file: str, revision: str) -> str:
     return f"hf:{repository}: the hub answers {fault.response.status_code} for {file}; {AGAIN}"
 
 
-def verified(path: Path, checksum: str, ours: bool = False) -> Path:
-    """The file itself, if it has the checksum that the hub gives it; one of our own that has not is removed.
+def verified(path: Path) -> Path:
+    """A file of the hub's cache, if it has the checksum by which the cache calls it: sha256 of what
+    Git LFS holds, git's own of small files.
 
     Raises: InputError naming the file and both checksums.
     """
+    if not path.is_symlink():
+        raise InputError(
+            f"{path} is no link, as the hub's cache has them to files called by their checksums; set "
+            f"HF_HOME to a folder of another disk, and {AGAIN}"
+        )
+    checksum, blob = path.readlink().name, path.resolve()
     if re.fullmatch(r"[0-9a-f]{64}", checksum):
-        found = sha256_file(path)
+        found = sha256_file(blob)
     else:
-        data = path.read_bytes()
+        data = blob.read_bytes()
         found = hashlib.sha1(b"blob %d\0" % len(data) + data).hexdigest()
     if found != checksum:
-        if ours:
-            path.unlink()
-        advice = AGAIN if ours else "remove it from the hub's cache, and run again"
-        raise InputError(f"{path} has the checksum {found}, {checksum} is right: damaged on the way; {advice}")
-    return path
+        told = f"{blob} has the checksum {found}, {checksum} is right"
+        raise InputError(f"{told}: damaged on the way; remove it, and {AGAIN}")
+    return blob
 
 
 def document(path: Path) -> dict[str, Any]:

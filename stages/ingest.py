@@ -116,14 +116,14 @@ def thinned(fields: dict[str, Any], max_train_views: int | None) -> dict[str, An
     """Those of a capture's fields that hold a thing a view, with at most so many training views, evenly chosen."""
     import numpy as np
 
-    from chebsplat.formats.capture import OPTIONAL
+    from chebsplat.formats.capture import MAPS
 
     training = np.flatnonzero(~fields["is_test"])
     if max_train_views is None or len(training) <= max_train_views:
         return {}
     chosen = training[np.linspace(0, len(training) - 1, max_train_views).round().astype(int)]
     kept = np.union1d(np.flatnonzero(fields["is_test"]), chosen)
-    held = {name: fields.get(name) for name in ("images", "Ks", "cam_from_world", "is_test", *OPTIONAL)}
+    held = {name: fields.get(name) for name in ("images", "Ks", "cam_from_world", "is_test", *MAPS)}
     views = {name: np.asarray(values[:])[kept] for name, values in held.items() if values is not None}
     if fields.get("tracks") is not None:
         point, row = fields["tracks"].T
@@ -176,7 +176,7 @@ def run(job: Job) -> None:
 
         if fields.get("cam_from_world") is None and any(strengths[1:]):
             raise ConfigError("ingest.disturb_degrees and disturb_shift change poses, and this source has none")
-        fields |= disturbed(fields, *strengths, settings.disturb_seed)
+        fields |= disturbed(fields, *strengths)
     if settings.classes is not None:
         fields |= renamed(fields, settings.classes)
     without = {what: f"the {source.kind} source has none" for what in ("depth", "labels") if fields.get(what) is None}

@@ -8,7 +8,6 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 from chebsplat.errors import DataFailure, InputError
-from chebsplat.formats.manifest import remedy_of
 
 if TYPE_CHECKING:
     import numpy as np
@@ -128,12 +127,7 @@ def answered(path: Path, knowledge: Knowledge, cloud: Cloud, up: np.ndarray, uni
 
     describe = checked(DescribeSection, knowledge.describe, f"{path / 'knowledge.json'}: describe", InputError)
     inputs = point_inputs(*cloud, up=up, unit=unit, describe=describe)
-    try:
-        encoder = PointEncoder.restored(knowledge.encoder, knowledge.weights)
-    except (RuntimeError, TypeError, ValueError) as error:  # torch's, of names and shapes
-        line = " ".join(str(error).split())[:200]
-        raise InputError(f"{path / 'weights.safetensors'} does not fit ({line}); {remedy_of(path)}") from None
-    return encoder.predict(inputs)
+    return PointEncoder.restored(knowledge.encoder, knowledge.weights).predict(inputs)
 
 
 def into_channels(path: Path, knowledge: Knowledge, features: Features) -> Callable[[np.ndarray], np.ndarray]:

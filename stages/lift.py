@@ -16,7 +16,9 @@ if TYPE_CHECKING:
     from chebsplat.formats.features import Features
     from chebsplat.rasterize.lift import Lifted
     from chebsplat.stages.progress import Progress
-    from chebsplat.stages.settings import LiftSection
+
+MEDIAN_STEPS = 5  # of Weiszfeld's, from the mean of the views towards their geometric median
+LEAST_WEIGHT = 0.1  # pixels that a Gaussian makes up of a view that sees it
 
 
 def run(job: Job) -> None:
@@ -31,7 +33,7 @@ def run(job: Job) -> None:
 
     capture, gaussians = read_capture(job.inputs["capture"]), read_gaussians(job.inputs["gaussians"])
     features = read_features(job.inputs["features"])
-    lifted = lifted_from(capture, gaussians.cameras, gaussians.parameters, features, job.config.lift, job.progress)
+    lifted = lifted_from(capture, gaussians.cameras, gaussians.parameters, features, job.config.lift.gate, job.progress)
     n = len(lifted.features)
     job.facts |= {
         "n_gaussians": n,
@@ -47,11 +49,13 @@ def lifted_from(
     cameras: Cameras,
     parameters: dict[str, np.ndarray],
     features: Features,
-    settings: LiftSection,
+    gate: float,
     progress: Progress,
+    median_steps: int = MEDIAN_STEPS,
 ) -> Any:
     """The features of Gaussians with these raw parameters, by the training views among these cameras.
 
+    Args: gate: `lift.gate`; median_steps: from the mean of the views on.
     Returns: `formats.lifted.Lifted`.
     Raises:  InputError if artifacts do not belong together, DataFailure if no view sees a Gaussian.
     """
@@ -61,7 +65,7 @@ def lifted_from(
     from chebsplat.lifting.observations import estimate, gathered
 
     names = training_names(capture, cameras, features)
-    views = lifted_views(capture, cameras, parameters, features, names, settings.gate)
+    views = lifted_views(capture, cameras, parameters, features, names, gate)
     rounds = progress.track(views, len(names), "lift")
     n, n_channels = len(parameters["means"]), features.features.shape[-1]
     observations = gathered(n, n_channels, (view for view, _ in rounds))
@@ -70,7 +74,7 @@ def lifted_from(
             "no training view sees a Gaussian that the teacher has features for; check that splat and cameras are in "
             "the same frame"
         )
-    found = estimate(observations, settings.median_steps, settings.min_weight)
+    found = estimate(observations, median_steps, LEAST_WEIGHT)
     notes = {"views": names, "n_observations": len(observations.views)}
     return Lifted(**{name: np.ascontiguousarray(values) for name, values in vars(found).items()}, notes=notes)
 

@@ -31,17 +31,16 @@ def run(job: Job) -> None:
     from chebsplat.formats.encoder import DYNAMIC, FLOAT, FUSED, write_encoder
     from chebsplat.formats.gaussians import read_gaussians
     from chebsplat.stages.onnx_graphs import encoder_model, fusion_model
-    from chebsplat.stages.restored import fitting, restored_encoder, trained_with
+    from chebsplat.stages.restored import restored_encoder, trained_with
 
     path = job.inputs["gaussians"]
     gaussians = read_gaussians(path)
-    encoder = restored_encoder(path, gaussians)
+    encoder = restored_encoder(gaussians)
     config = trained_with(path)
-    fusion = fitting(path, lambda: restored_fusion(gaussians, encoder.n_channels, config["train"]))
+    fusion = restored_fusion(gaussians, encoder.n_channels, config["train"])
     agreed = contract(encoder, config)
-    opset = job.config.onnx.opset
-    onnx.save(encoder_model(encoder, opset), job.out / FLOAT)
-    onnx.save(fusion_model(fusion, opset), job.out / FUSED)
+    onnx.save(encoder_model(encoder), job.out / FLOAT)
+    onnx.save(fusion_model(fusion), job.out / FUSED)
     quantize(job.out / FLOAT, job.out / DYNAMIC)
     for name in (FLOAT, FUSED, DYNAMIC):
         annotate(job.out / name, agreed)

@@ -18,6 +18,7 @@ if TYPE_CHECKING:
     from chebsplat.shape.encoder import Attention, Block, RegionEncoder
     from chebsplat.shape.fusion import Fusion
 
+OPSET = 18  # of the ONNX files
 Value = Any  # the name of what a node makes, a torch tensor, or a NumPy constant
 
 
@@ -63,7 +64,7 @@ class Graph:
         """values[:, :count]."""
         return self.add("Slice", values, whole(0), whole(count), whole(1))
 
-    def model(self, name: str, opset: int, **outputs: tuple[str, list[int | str]]) -> ModelProto:
+    def model(self, name: str, **outputs: tuple[str, list[int | str]]) -> ModelProto:
         """outputs: by name, the float32 value that it is, and its shape. Raises onnx.checker.ValidationError."""
         from onnx import checker
 
@@ -71,7 +72,7 @@ class Graph:
             self.nodes.append(helper.make_node("Identity", [value], [output]))
         made = [helper.make_tensor_value_info(o, TensorProto.FLOAT, shape) for o, (_, shape) in outputs.items()]
         graph: GraphProto = helper.make_graph(self.nodes, name, self.inputs, made, self.constants)
-        opsets = [helper.make_opsetid("", opset)]
+        opsets = [helper.make_opsetid("", OPSET)]
         version = helper.find_min_ir_version_for(opsets)
         model = helper.make_model(graph, opset_imports=opsets, ir_version=version, producer_name="chebsplat")
         checker.check_model(model)
@@ -88,7 +89,7 @@ def whole(*values: int) -> np.ndarray:
     return np.array(values, np.int64)
 
 
-def encoder_model(encoder: RegionEncoder, opset: int) -> ModelProto:
+def encoder_model(encoder: RegionEncoder) -> ModelProto:
     """`RegionEncoder.forward`: inputs [regions, members, n_inputs], positions, mask -> encodings [regions, C]."""
     from chebsplat.shape.encoder import N_FREQUENCIES
 
@@ -112,7 +113,7 @@ def encoder_model(encoder: RegionEncoder, opset: int) -> ModelProto:
     pooled = _attended(graph, encoder, tokens) if len(encoder.blocks) else _pooled(graph, tokens)
     first, _, second = encoder.decode
     pooled = graph.linear(graph.gelu(graph.linear(graph.layer_norm(pooled, encoder.norm), first)), second)
-    return graph.model("encoder", opset, encodings=(pooled, ["regions", encoder.n_channels]))
+    return graph.model("encoder", encodings=(pooled, ["regions", encoder.n_channels]))
 
 
 def _attended(graph: Graph, encoder: RegionEncoder, tokens: str) -> str:
@@ -158,7 +159,7 @@ def _pooled(graph: Graph, tokens: str) -> str:
     return graph.add("Where", graph.add("Cast", members, to=TensorProto.BOOL), highest, number(0))
 
 
-def fusion_model(fusion: Fusion, opset: int) -> ModelProto:
+def fusion_model(fusion: Fusion) -> ModelProto:
     """`Fusion.forward`: features, encodings and where regions lie -> fused, gate [gaussians, C]."""
     linear, kind = fusion.gate.linear, TensorProto.FLOAT
     n_channels = linear.out_features
@@ -183,7 +184,7 @@ def fusion_model(fusion: Fusion, opset: int) -> ModelProto:
     rest = graph.add("Mul", graph.add("Sub", number(1), share), shape)
     fused = graph.add("Add", graph.add("Mul", share, "features"), rest)
     size: list[int | str] = ["gaussians", n_channels]
-    return graph.model("fusion", opset, fused=(fused, size), gate=(share, size))
+    return graph.model("fusion", fused=(fused, size), gate=(share, size))
 
 
 def _propagation_weights(graph: Graph, index: str, fusion: Fusion) -> str:

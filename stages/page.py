@@ -47,14 +47,14 @@ def write_page(
     scene: Scene, name: str, teacher: Path | None, out: Path, sh_degree: int = 0, phrases: Sequence[str] = (),
     more: Sequence[str] = (),
 ) -> dict[str, int]:  # fmt: skip
-    """Write the page; never overwrites.
+    """Write the page, in the place of what is there.
 
     Args:
       scene:     from `formats.scene.read_scene`, or `foreign`; name: the page's title.
       teacher:   the scene's `features` artifact, whose teacher's words are embedded; None: the labels alone.
       sh_degree: 0 or 1; phrases: what words are weighed against, as of `query`; more: words beside the teacher's own.
     Returns: counts: Gaussians, views, labels, words, bytes.
-    Raises:  ConfigError if `out` exists, InputError where the teacher is not the scene's or does not know a word.
+    Raises:  InputError where the teacher is not the scene's or does not know a word.
     """
     import numpy as np
 
@@ -63,8 +63,6 @@ def write_page(
     from chebsplat.stages.pages.pictures import palette, warm
     from chebsplat.stages.pages.template import rendered
 
-    if out.exists():
-        raise ConfigError(f"{out} exists; remove it, or choose another --out")
     means = scene.parameters["means"].astype(np.float64)
     center = np.median(means, axis=0)
     up, extent = up_and_extent(scene)

@@ -15,7 +15,7 @@ if TYPE_CHECKING:
     from chebsplat.shape.point_encoder import PointEncoder, Scale
 
 
-def point_model(encoder: PointEncoder, opset: int) -> ModelProto:
+def point_model(encoder: PointEncoder) -> ModelProto:
     """`PointEncoder.answers`: the arrays of `PointInputs`, neighbours as int64 -> answers [points, C]."""
     n_scales, n_channels = encoder.settings["n_scales"], encoder.settings["n_channels"]
     n_descriptors, kind = encoder.settings["n_descriptors"], TensorProto.FLOAT
@@ -40,7 +40,7 @@ def point_model(encoder: PointEncoder, opset: int) -> ModelProto:
     for layer in list(encoder.decode)[:-1:2]:
         answers = _silu(graph, graph.linear(answers, layer))
     answers = graph.linear(answers, encoder.decode[-1])
-    return graph.model("points", opset, answers=(answers, ["points", n_channels]))
+    return graph.model("points", answers=(answers, ["points", n_channels]))
 
 
 def _silu(graph: Graph, values: str) -> str:

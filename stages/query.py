@@ -100,12 +100,10 @@ class Relevancy:
 
 def taught(path: Path) -> tuple[Features, str | None]:
     """A scene's `features` artifact, and the model that it was made with; None: the embedded one."""
-    from types import NoneType
-
-    from chebsplat.formats.artifact import read_manifest, stated
+    from chebsplat.formats.artifact import read_manifest
     from chebsplat.formats.features import read_features
 
-    return read_features(path), stated(path, read_manifest(path), "config", "teacher", "model", kind=(str, NoneType))
+    return read_features(path), read_manifest(path).config["teacher"]["model"]
 
 
 def is_closed(features: Features) -> bool:

@@ -13,6 +13,7 @@ if TYPE_CHECKING:
 
     from chebsplat.formats.gaussians import Gaussians
 
+N_PICTURES = 4  # test views in the report
 LARGEST = 20_000_000  # bytes of the page
 STAGE_OF = {
     "capture": "ingest",
@@ -50,23 +51,19 @@ def run(job: Job) -> None:
     import shlex
 
     from chebsplat.formats.artifact import read_manifest
-    from chebsplat.formats.documents import conform
     from chebsplat.formats.evaluation import read_evaluation
     from chebsplat.formats.gaussians import read_gaussians
-    from chebsplat.formats.manifest import remedy_of
     from chebsplat.stages.pages import parts
     from chebsplat.stages.pages import pictures as draw
     from chebsplat.stages.pages.template import REPORT, rendered
-    from chebsplat.stages.report_facts import Reported, facts_of
 
     evaluation = read_evaluation(job.inputs["evaluation"])
     gaussians = read_gaussians(job.inputs["gaussians"])
     if not gaussians.trace:
         raise DataFailure("the training left no trace of error against run time; train the scene again")
     manifests = {role: read_manifest(job.inputs[role]) for role in STAGE_OF if role in job.inputs}
-    facts = {role: facts_of(role, job.inputs[role], manifest) for role, manifest in manifests.items()}
-    evaluated = job.inputs["evaluation"]
-    figures = conform(evaluation.figures, Reported, evaluated / "figures.json", remedy_of(evaluated))
+    facts = {role: manifest.facts for role, manifest in manifests.items()}
+    figures = evaluation.figures
     left_out = absent_stages(job, gaussians) | figures["left_out"]
     for of_input in facts.values():
         left_out |= of_input.get("left_out", {})
@@ -83,7 +80,7 @@ def run(job: Job) -> None:
     write_table(job.out / "trace.csv", [list(gaussians.trace[0]), *(list(row.values()) for row in gaussians.trace)])
     names = parts.label_names(job.inputs, figures)
     colors = {name: "#" + bytes(color).hex() for name, color in zip(names, draw.palette(len(names)), strict=True)}
-    pictures, pixels = parts.picture_rows(evaluation, names, job.config.report.n_pictures, job.out)
+    pictures, pixels = parts.picture_rows(evaluation, names, N_PICTURES, job.out)
     text = rendered(
         REPORT,
         name=figures["source"].get("name") or figures["source"].get("kind", "scene"),
@@ -107,7 +104,7 @@ def run(job: Job) -> None:
         settings=json.dumps(settings, indent=1, sort_keys=True),
     )
     if len(text) > LARGEST:
-        raise DataFailure(f"the page would have {len(text) / 1e6:.0f} MB; lower report.n_pictures or ingest.max_side")
+        raise DataFailure(f"the page would have {len(text) / 1e6:.0f} MB; lower ingest.max_side")
     (job.out / "report.html").write_text(text)
     job.facts |= {"page": "report.html", "psnr": figures["image"]["psnr"]}
     if "descriptors" in facts:
@@ -162,8 +159,6 @@ def summary_rows(figures: dict[str, Any], by_degree: list[int] | None, trained: 
         ["SSIM (window 11, σ 1.5)", f"{image['ssim']:.4f}", ""],
         ["LPIPS (vgg, images in [0, 1])", shown(figures["lpips"], "{:.3f}"), ""],
     ]
-    if "image_aligned" in figures:
-        rows.insert(3, ["PSNR at poses refined on the test photos, dB", f"{figures['image_aligned']['psnr']:.2f}", ""])
     segmentation = figures.get("segmentation") or {}
     names = {"miou": "mIoU", "macc": "mAcc", "oa": "OA", "boundary_miou": "mIoU in the boundary band",
              "rarest_miou": "mIoU of the five rarest classes", "point_miou": "mIoU of 3D points"}  # fmt: skip

@@ -2,12 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, TypeVar
+from typing import TYPE_CHECKING, Any
 
 from chebsplat.errors import InputError
-from chebsplat.formats.manifest import remedy_of
 
 if TYPE_CHECKING:
     import numpy as np
@@ -15,8 +13,6 @@ if TYPE_CHECKING:
 
     from chebsplat.formats.gaussians import Gaussians
     from chebsplat.shape.encoder import RegionEncoder
-
-T = TypeVar("T")
 
 
 def trained_with(path: Path) -> dict[str, Any]:
@@ -34,23 +30,11 @@ def trained_with(path: Path) -> dict[str, Any]:
     }
 
 
-def restored_encoder(path: Path, gaussians: Gaussians) -> RegionEncoder:
-    """Raises: InputError if the checkpoint at `path` has no encoder, or weights of another one."""
+def restored_encoder(gaussians: Gaussians) -> RegionEncoder:
+    """The local encoder of a checkpoint. Raises InputError if the scene was trained without one."""
     from chebsplat.shape.encoder import RegionEncoder
 
-    settings, weights = gaussians.encoder()
-    return fitting(path, lambda: RegionEncoder.restored(settings, weights))
-
-
-def fitting(path: Path, build: Callable[[], T]) -> T:
-    """What `build` makes of the weights of the checkpoint at `path`. Raises InputError if they do not fit."""
-    try:
-        return build()
-    except (RuntimeError, ValueError, TypeError) as error:  # torch's, of names, shapes and dtypes
-        line = " ".join(str(error).split())[:200]
-        raise InputError(
-            f"{path / 'modules.safetensors'} does not fit notes.json ({line}); {remedy_of(path)}"
-        ) from None
+    return RegionEncoder.restored(*gaussians.encoder())
 
 
 def without_basis(maps: dict[str, Tensor], bases: dict[str, np.ndarray]) -> tuple[list[str], list[str]]:

@@ -6,7 +6,6 @@ import logging
 import time
 from typing import Any
 
-from chebsplat.formats import disk
 from chebsplat.formats.artifact import digest, read_manifest
 from chebsplat.formats.files import atomic_path
 from chebsplat.stages.command import Job, n_threads
@@ -56,17 +55,9 @@ class Saves:
             return
         import torch
 
-        self.saved = time.monotonic()
-        fault = None
+        self.saved, held = time.monotonic(), {"identity": self.identity, "state": state()}
         try:
-            with atomic_path(self.file) as temporary:
-                try:
-                    with temporary.open("wb") as handle:
-                        torch.save({"identity": self.identity, "state": state()}, handle)
-                except (OSError, RuntimeError):  # torch has its own word for a full disk
-                    fault = disk.refusal(temporary.parent)  # while the half file still takes its room
-                    raise
-        except (OSError, RuntimeError):
-            if (fault := fault or disk.refusal(self.file.parent)) is None:
-                raise
-            log.warning("%s cannot be saved (%s): the training goes on without", self.file, fault.strerror)
+            with atomic_path(self.file) as temporary, temporary.open("wb") as handle:
+                torch.save(held, handle)
+        except (OSError, RuntimeError) as error:  # torch has its own word for a full disk
+            log.warning("%s cannot be saved (%s): the training goes on without", self.file, error)

@@ -63,7 +63,6 @@ class IngestSection(Section):
     disturb_colors: float = number(0.0, "exposures at random, in stops; a quarter of it in white balance", 0, 8)
     disturb_degrees: float = number(0.0, "turns of the cameras at random", 0, 180)
     disturb_shift: float = number(0.0, "shifts of the cameras at random, in scene units", 0, 1e6)
-    disturb_seed: int = seed("of these disturbances")
     min_views: int = number(3, "fewer usable views are an error", 1, 100_000)
 
 
@@ -72,7 +71,6 @@ class SfmSection(Section):
     spacing: Literal["color", "even"] = setting(
         "color", "of points of measured depth: closer where colours change, or as far apart everywhere"
     )
-    n_neighbors: int = number(16, "neighbours that give a point its normal and covariance", 4, 64)
     peak_threshold: float = number(0.001, "of SIFT: lower finds more features, and worse ones", 1e-6, 1)
     max_features: int = number(8192, "of a view: the largest are kept; matching takes their square", 64, 100_000)
     matching: Literal["auto", "exhaustive", "posed", "sequential"] = setting(
@@ -120,7 +118,7 @@ class ChannelsSection(Section):
     """What a teacher's channels are reduced to, for all scenes alike.
 
     Choices: at most 32 channels. The embedded teacher's features span fewer (the artifact's facts say how many) and
-      lose nothing. Of 512 channels stood in for LSeg's (make bench-store) 32 keep 99.8 % of the decisions between 150
+      lose nothing. Of 512 channels stood in for LSeg's 32 keep 99.8 % of the decisions between 150
       words where the spectrum falls as k^-3 and 95 % where it falls as k^-1; 13 keep 98 and 77 %. 48 are needed for
       1 % relative error in the first case; in the second no 57 channels, the most that 20 MB a view hold, come below
       18 %.
@@ -141,7 +139,6 @@ class AgreeSection(Section):
 
     n_points: int = number(5000, "points that views are compared on, at most", 16, 1_000_000)
     low: float = number(0.15, "agreement below which a warning says that the teacher does not know the scene", 0, 1)
-    seed: int = seed("of the choice among points")
 
 
 class LiftSection(Section):
@@ -152,8 +149,6 @@ class LiftSection(Section):
     """
 
     gate: float = number(0.05, "a pixel belongs to Gaussians of this part of its largest weight; 0: to all", 0, 1)
-    median_steps: int = number(5, "from the mean of the views towards their geometric median", 0, 100)
-    min_weight: float = number(0.1, "pixels that a Gaussian makes up of a view that sees it", 0, 1e6)
 
 
 class RefineSection(Section):
@@ -191,12 +186,7 @@ class KnowledgeSection(Section):
     seed: int = seed("of what is drawn in teaching")
 
 
-class ExportSection(Section):
-    split_by_degree: bool = setting(True, "write a PLY for each SH degree, too")
-
-
 class OnnxSection(Section):
-    opset: int = number(18, "of the ONNX files", 18, 25)
     tolerance: float = number(1e-5, "largest difference from torch", 1e-12, 1)
 
 
@@ -212,19 +202,13 @@ class CksSection(Section):
     update_rule: Literal["residual", "printed"] = setting(
         "residual", "what decides if a scene adds: its relative residual ρ; printed: ρ′ = ρ (1 + κ σ_f)"
     )
-    kappa: float = number(1.0, "weight in ρ′ of the spread of shape within a scene's regions (κ)", 0, 1e6)
 
 
 class EvaluateSection(Section):
     boundary: int = number(5, "pixels, half width of the boundary band", 1, 100)
     timing_repeats: int = number(3, "of every frame; 0: no timing; studies then evaluate in parallel", 0, 1000)
-    poses: Literal["given", "refined"] = setting(
-        "given", "of test views; refined: aligned to the scene by their photos, for figures of their own beside"
-    )
     lpips_weights: Text | None = setting(
         None, ".safetensors or .pth with VGG-16 and LPIPS' taps; default: LPIPS is not measured"
     )
 
 
-class ReportSection(Section):
-    n_pictures: int = number(4, "test views in the report", 1, 100)

@@ -20,6 +20,7 @@ if TYPE_CHECKING:
 
 log = logging.getLogger("chebsplat")
 Cloud = dict[str, Any]  # the fields of `Points` but the local shape, and seen_from [N]: the view that a point is from
+N_NEIGHBORS = 16  # that give a point its normal and covariance
 CANDIDATES = 16  # pixels with depth that are looked at, for each point that is wanted
 EVEN = 0.55  # of the points wanted: there whatever the colours are, for shape is read off these
 
@@ -63,7 +64,7 @@ def run(job: Job) -> None:
     means = cloud["means"]
     if len(means) < 16:
         raise DataFailure(f"only {len(means)} points were found, at least 16 are needed; add views with more overlap")
-    covariances, normals = local_shape(means, settings.n_neighbors)
+    covariances, normals = local_shape(means, N_NEIGHBORS)
     eye = centers(cloud["cam_from_world"])[cloud["seen_from"]]
     away = np.einsum("ni,ni->n", normals, eye - means) < 0
     normals[away] *= -1

@@ -1,131 +1,102 @@
-"""How our processes end when they are asked to: by SIGINT, SIGTERM or SIGHUP, or because their run has ended.
+"""How our processes end: well, with a typed error, a crash, or by SIGINT, SIGTERM or SIGHUP.
 
-A signal raises `Stopped` in the main thread, so that nothing half made is left; a loop that can reach a better place
-within a moment defers it. A job of a run has a pipe for its standard input, the lifeline, whose other end only the run
-holds: however the run ends, the pipe does, and the job stops. Whoever is not done within a few seconds (a kernel is
-being compiled) is ended from a thread.
+A signal raises `Stopped` in the main thread, so that nothing half made is left; a loop that can reach
+a better place within a moment defers it. Whoever cannot listen (a kernel is being compiled) is killed
+by its run.
 """
 
 from __future__ import annotations
 
+import logging
 import os
-import shutil
 import signal
-import stat
 import sys
 import threading
 import time
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager, suppress
+from contextlib import contextmanager
 from pathlib import Path
 from types import FrameType
 from typing import Any
 
-from chebsplat.errors import Stopped
+import click
 
-SIGNALS = tuple(getattr(signal, name) for name in ("SIGINT", "SIGTERM", "SIGHUP") if hasattr(signal, name))
-LIFELINE = "CHEBSPLAT_LIFELINE"  # the number of the pipe; of another pipe or file nothing is to be concluded
-SECONDS = 2.5  # from being asked to the end of a job
-PATIENCE = SECONDS + 0.7  # of a run with its jobs, before it kills them
+from chebsplat.errors import ChebsplatError, Stopped
+from chebsplat.formats import disk
+
+log = logging.getLogger("chebsplat")
+SIGNALS = signal.SIGINT, signal.SIGTERM, signal.SIGHUP
+PATIENCE = 2.5  # seconds from being asked to being killed
+KEPT = "what was finished is kept, and the same command goes on from there"
+
+
+def exit_code(action: Callable[[], int | None], folder: Path, tell: Callable[[str], object] = log.error) -> int:
+    """The door that all commands leave by: the action's code (None: 0), or that of what ends it.
+
+    Args: folder: of a disk's error that names no file; tell: says a typed error or a stop.
+    """
+    try:
+        with heeded(), disk.explained(folder):
+            return action() or 0
+    except (ChebsplatError, Stopped) as error:
+        tell(str(error))
+        return error.exit_code
+    except (click.ClickException, click.Abort, click.exceptions.Exit):
+        raise
+    except Exception:
+        log.exception("crashed; nothing was published")
+        return 1
 
 
 class Asked:
     """What this process has been asked. `stop`: not at all, or what is raised."""
 
     def __init__(self) -> None:
-        self.seconds = PATIENCE + 0.8  # from the signal to the end, whatever happens
-        self.reason = ""
         self.stop: Stopped | None = None
         self.deferred = False
-        self.half: set[Path] = set()  # folders that are worth nothing if the process ends now
 
-    def heed(self, number: int, _frame: FrameType | None = None) -> None:
-        """The signals' handler. Whoever is ending already is left to it."""
-        if self.stop is None:
-            self.stop = self.stop_by(number)
-            if not self.deferred:
-                raise self.stop
-
-    def stop_by(self, number: int) -> Stopped:
-        return Stopped(number, self.reason or f"stopped by {signal.Signals(number).name}")
-
-    def insist(self, wakened: int, over: threading.Event) -> None:
-        """A thread's work: once asked, leave in time, whether the main thread has come to hear of it or not.
-
-        wakened: file descriptor where signals arrive.
-        """
-        while (data := os.read(wakened, 1)) and data[0] not in SIGNALS:
-            pass
-        until = time.monotonic() + self.seconds
-        while data and not over.wait(0.1):
-            if time.monotonic() > until:
-                self.leave(self.stop or self.stop_by(data[0]))
-            if self.stop is None:  # the signal woke this thread, and the main one may sleep on in a system call
-                signal.pthread_kill(threading.main_thread().ident or 0, data[0])
-
-    def leave(self, stop: Stopped) -> None:
-        """End the process at once, without what is half made."""
-        for folder in list(self.half):
-            shutil.rmtree(folder, ignore_errors=True)
-        with suppress(OSError, ValueError):
-            print(stop, file=sys.stderr, flush=True)
-        os._exit(stop.exit_code)
-
-    def ignored(self, hook: Callable[[Any], object]) -> Callable[[Any], None]:
-        """A hook for what Python has to ignore: in a destructor a stop is none, and no fault either."""
-
-        def unless_stopped(unraisable: Any) -> None:
-            if self.stop is None:
-                hook(unraisable)
-
-        return unless_stopped
+    def heed(self, number: int, _frame: FrameType | None) -> None:
+        """The signals' handler."""
+        self.stop = Stopped(number, f"stopped by {signal.Signals(number).name}; {KEPT}")
+        if not self.deferred:
+            raise self.stop
 
 
 _asked: Asked | None = None
 
 
 @contextmanager
-def _unbroken() -> Iterator[None]:
-    """What breaks because a stop has come, an import that it fell into, is the stop and no crash."""
+def heeded() -> Iterator[None]:
+    """Signals raise `Stopped` within; one that is ignored (nohup) stays so. The outermost rules.
+
+    What breaks because a stop has come, an import that it fell into, is the stop and no crash; a
+    destructor, where nothing can be raised, says nothing of it.
+    """
+    global _asked
+    outermost = _asked is None and threading.current_thread() is threading.main_thread()
+    asked, hook = _asked or Asked(), sys.unraisablehook
+    before = {number: signal.getsignal(number) for number in SIGNALS} if outermost else {}
+
+    def unless_stopped(unraisable: Any) -> None:
+        if asked.stop is None:
+            hook(unraisable)
+
+    if outermost:
+        _asked, sys.unraisablehook = asked, unless_stopped
+    for number, handler in before.items():
+        if handler is not signal.SIG_IGN:
+            signal.signal(number, asked.heed)
     try:
         yield
     except Exception as error:
-        if _asked is not None and _asked.stop is not None:
-            raise _asked.stop from error
+        if asked.stop is not None:
+            raise asked.stop from error
         raise
-
-
-@contextmanager
-def heeded() -> Iterator[None]:
-    """Signals raise `Stopped` within; one that is ignored (nohup) stays so. Of nested ones the outermost rules."""
-    global _asked
-    if _asked is not None or threading.current_thread() is not threading.main_thread():
-        with _unbroken():
-            yield
-        return
-    _asked, over, (reader, writer) = Asked(), threading.Event(), os.pipe()
-    os.set_blocking(writer, False)
-    thread = threading.Thread(target=_asked.insist, args=(reader, over), daemon=True)
-    thread.start()
-    earlier = signal.set_wakeup_fd(writer, warn_on_full_buffer=False)
-    before = {number: signal.getsignal(number) for number in SIGNALS}
-    for number, handler in before.items():
-        if handler is not signal.SIG_IGN:
-            signal.signal(number, _asked.heed)
-    hook, sys.unraisablehook = sys.unraisablehook, _asked.ignored(sys.unraisablehook)
-    try:
-        with _unbroken():
-            yield
     finally:
-        sys.unraisablehook = hook
         for number, handler in before.items():
             signal.signal(number, handler)
-        signal.set_wakeup_fd(earlier)
-        _asked = None
-        over.set()
-        os.close(writer)
-        thread.join()
-        os.close(reader)
+        if outermost:
+            _asked, sys.unraisablehook = None, hook
 
 
 @contextmanager
@@ -141,34 +112,8 @@ def deferred() -> Iterator[Asked]:
         raise asked.stop
 
 
-@contextmanager
-def half_made(folder: Path) -> Iterator[None]:
-    """A folder that goes with the process if that has to end within."""
-    half = set() if _asked is None else _asked.half
-    half.add(folder)
-    try:
-        yield
-    finally:
-        half.discard(folder)
-
-
-def watch_lifeline() -> None:
-    """Stop this process, a job, when its run ends. Does nothing without a lifeline (on another machine, by hand)."""
-    state = os.fstat(0)
-    if stat.S_ISFIFO(state.st_mode) and os.environ.get(LIFELINE) == str(state.st_ino):
-        if _asked is not None:
-            _asked.seconds = SECONDS
-        threading.Thread(target=_watch, daemon=True).start()
-
-
-def stop(reason: str) -> None:
-    """Ask this process to end, from any of its threads."""
-    if _asked is not None:
-        _asked.reason = reason
+def end_itself() -> None:
+    """Ask this process to end, from a thread of its own, and kill it if it does not listen."""
     signal.pthread_kill(threading.main_thread().ident or 0, signal.SIGTERM)
-
-
-def _watch() -> None:
-    while os.read(0, 1):
-        pass
-    stop("its run has ended")
+    time.sleep(PATIENCE)
+    os._exit(128 + signal.SIGTERM)

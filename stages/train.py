@@ -9,8 +9,8 @@ from typing import TYPE_CHECKING, Any
 
 from chebsplat.errors import DataFailure
 from chebsplat.stages.command import Job, n_threads
+from chebsplat.stages.exposures import exposures
 from chebsplat.stages.measured_depth import with_depth_loss
-from chebsplat.stages.photo_models import camera_models, exposures, facts, reached
 from chebsplat.stages.resume import Saves
 from chebsplat.stages.stopping import deferred
 from chebsplat.stages.train_inputs import (
@@ -68,7 +68,6 @@ def run(job: Job) -> None:
     views = training_views(capture, points, features, bool(train.weight_depth), undone).to(job.device)
     if features is not None:
         begin_features(job, model, capture, points, features, len(views.names))
-    models = camera_models(job, capture, points, views)
     trainer = Trainer(
         model,
         views,
@@ -77,7 +76,6 @@ def run(job: Job) -> None:
         basis=knowledge(job, model, train),
         regions=regions,
         descriptors=described_values,
-        cameras=models,
     )
     trace = follow(job, trainer, train)
     parameters, population = trainer.finish(), trainer.population
@@ -89,9 +87,7 @@ def run(job: Job) -> None:
     modules = {
         f"{n}.{k}": v.detach().cpu().numpy() for n, m in model.modules.items() for k, v in m.state_dict().items()
     }
-    cameras = Cameras(points.names, points.Ks, reached(models, views, points), *capture.size)
-    given_poses = None if models.poses is None else points.cam_from_world
-    job.facts |= facts(models)
+    cameras = Cameras(points.names, points.Ks, points.cam_from_world, *capture.size)
     notes: dict[str, Any] = {"left_out": job.facts.get("left_out", {}), "n_added": population.n_added}
     notes |= {"n_removed": population.n_removed, "n_broken": population.n_broken, "n_initial": n_initial}
     if features is not None:
@@ -117,8 +113,7 @@ def run(job: Job) -> None:
     if job.device == "cuda":
         job.facts["peak_device_bytes"] = torch.cuda.max_memory_allocated()
     job.facts["milliseconds"] = {part: 1e3 * seconds / timed for part, seconds in trainer.laps.seconds.items()}
-    moments = optimizer_state(trainer)
-    write_gaussians(job.out, Gaussians(parameters, cameras, modules, moments, trace, notes, given_poses))
+    write_gaussians(job.out, Gaussians(parameters, cameras, modules, trace, notes))
 
 
 def agreement(alone: np.ndarray, features: np.ndarray, embeddings: np.ndarray) -> dict[str, float]:
@@ -253,13 +248,3 @@ def state(
     """All that a resumed training goes on from."""
     resumed = job.facts.get("resumed_at", [])
     return {"trainer": trainer.state_dict(), "trace": trace, "since": since, "resumed_at": resumed}
-
-
-def optimizer_state(trainer: Trainer) -> dict[str, np.ndarray]:
-    """Adam's moments of the per-Gaussian parameters, and the step count."""
-    arrays: dict[str, np.ndarray] = {}
-    for group in trainer.optimizer.param_groups:
-        state = trainer.optimizer.state.get(group["params"][0], {})
-        if group["name"] not in ("modules", "gates") and "exp_avg" in state:
-            arrays |= {f"{group['name']}.{k}": state[k].cpu().numpy() for k in ("exp_avg", "exp_avg_sq")}
-    return arrays

@@ -178,7 +178,8 @@ def start_features(model: SceneModel, capture: Capture, points: Points, features
     cameras = Cameras(points.names, points.Ks, points.cam_from_world, *capture.size)
     parameters = {name: value.detach().cpu().numpy() for name, value in model.raw.items()}
     try:
-        lifted = lifted_from(capture, cameras, parameters, features, LiftSection(median_steps=0), progress)
+        gate = LiftSection().gate
+        lifted = lifted_from(capture, cameras, parameters, features, gate, progress, median_steps=0)
     except DataFailure:
         return 0
     with torch.no_grad():

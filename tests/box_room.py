@@ -1,4 +1,4 @@
-"""A generated scene for pages and viewers: the inside of a box with a sofa and a chair, and a teacher of ten words."""
+"""A generated scene for pages: the inside of a box with a sofa and a chair, and a teacher of ten words."""
 
 import numpy as np
 from shared import KEY
@@ -84,12 +84,12 @@ def made(folder, calibrated=False):
     views = ["a.png", "b.png", "c.png"]
     cameras = Cameras(views, np.stack([K] * 3), poses, *SIZE)
     held = Scene(parameters, cameras, order, labels, LABELS, words()[:5])
-    with artifact.publish(folder / "export", Manifest("chebsplat.scene/2", KEY, "export")) as tmp:
+    with artifact.publish(folder / "export", Manifest("chebsplat.scene/3", KEY, "export")) as tmp:
         write_scene(tmp, held)
     convention = {"kind": "onnx", "output": "features", "sha256": sha256_file(model)}
     features = Features(views, np.zeros((3, 2, 2, 8), np.float16), LABELS, words()[:5], convention=convention)
     facts = {"config": {"teacher": {"model": str(model)}}}
-    with artifact.publish(folder / "teacher", Manifest("chebsplat.features/1", KEY, "teacher", **facts)) as tmp:
+    with artifact.publish(folder / "teacher", Manifest("chebsplat.features/2", KEY, "teacher", **facts)) as tmp:
         write_features(tmp, features)
     return folder, read_scene(folder / "export")
 

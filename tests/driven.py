@@ -24,7 +24,7 @@ class Driven:
         self.group = group
         self._send, self._receive = send, receive
         self._number, self._held, self._session = 0, b"", None
-        self.complaints, self.requested, self._loaded = [], [], False
+        self.complaints, self.requested = [], []
 
     def call(self, method, timeout=60, **parameters):
         self._number += 1
@@ -73,6 +73,7 @@ class Driven:
         self.size(width, height)
         theme = {"name": "prefers-color-scheme", "value": "dark" if dark else "light"}
         self.call("Emulation.setEmulatedMedia", features=[theme])
+        self._loaded = False
         self.call("Page.navigate", url=page if isinstance(page, str) else page.as_uri())
         until = time.monotonic() + 60
         while not self._loaded:

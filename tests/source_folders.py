@@ -9,7 +9,6 @@ from chebsplat.stages.settings import IngestSection
 
 SETTINGS = IngestSection(max_side=160, min_views=2)
 SMALL = IngestSection(max_side=160, max_views=6, min_views=2)
-ROW = "1 0 0 {} 0 1 0 0 0 0 1 0 0 0 0 1\n"  # camera-to-world, moved along x
 
 
 def image(path, size=(8, 6), value=100, mode="RGB"):
@@ -22,6 +21,18 @@ def image(path, size=(8, 6), value=100, mode="RGB"):
 def save(path, data):
     path.parent.mkdir(parents=True, exist_ok=True)
     Image.fromarray(np.asarray(data)).save(path)
+
+
+def tiny(n=3, size=(8, 6)):
+    """Fields of n views of one grey, depth and label each, moved along x by 1 m a view: what `layouts` writes."""
+    width, height = size
+    number = np.broadcast_to(np.arange(n)[:, None, None], (n, height, width))
+    poses = np.tile(np.eye(4), (n, 1, 1))
+    poses[:, 0, 3] = -np.arange(n)
+    return {"images": np.repeat(number[..., None], 3, 3).astype(np.uint8), "depth": 1 + number / 1000,
+            "labels": (number % 3 - 1).astype(np.int16), "class_names": ["wall", "floor"],
+            "Ks": np.tile([[10, 0, width / 2], [0, 10, height / 2], [0, 0, 1]], (n, 1, 1)), "cam_from_world": poses,
+            "points": np.eye(3, dtype=np.float32), "point_colors": np.zeros((3, 3), np.uint8)}  # fmt: skip
 
 
 def write_transforms(folder, n=3, **changes):
@@ -57,26 +68,4 @@ def write_colmap(folder, model="PINHOLE 8 6 10 10 4 3", names=("a.png", "b.png",
         image(folder / "depth" / name, size, mode="I;16", value=1500)
         image(folder / "semantic" / name, size, mode="L", value=7)
     (folder / "labels.json").write_text(json.dumps({"7": "sofa", "8": "void", "9": "lamp"}))
-    return folder
-
-
-def write_nice_slam(folder, n=3, **changes):
-    for k in range(n):
-        image(folder / f"results/frame{k:06d}.jpg")
-        image(folder / f"results/depth{k:06d}.png", mode="I;16", value=13107)
-    (folder / "traj.txt").write_text("".join(ROW.format(k) for k in range(n)))
-    camera = {"w": 8, "h": 6, "fx": 10, "fy": 10, "cx": 3.5, "cy": 2.5, "scale": 6553.5} | changes
-    (folder.parent / "cam_params.json").write_text(json.dumps({"camera": camera}))
-    return folder
-
-
-def write_semantic_nerf(folder, n=11):
-    sequence = folder / "Sequence_1"
-    for k in range(n):
-        image(sequence / f"rgb/rgb_{k}.png", value=k)
-        image(sequence / f"depth/depth_{k}.png", mode="I;16", value=1000 + k)
-        image(sequence / f"semantic_class/semantic_class_{k}.png", mode="L", value=k % 3)
-    (sequence / "traj_w_c.txt").write_text("".join(ROW.format(k) for k in range(n)))
-    classes = [{"id": 0, "name": "undefined"}, {"id": 1, "name": "wall"}, {"id": 2, "name": "floor"}]
-    (folder / "info_semantic.json").write_text(json.dumps({"classes": classes}))
     return folder

@@ -84,22 +84,6 @@ def test_a_command_that_only_looks_makes_no_folder(command, quick_plans, tmp_pat
     assert list(tmp_path.iterdir()) == []
 
 
-@pytest.mark.parametrize(
-    ("call", "code", "message"),
-    [
-        (["run", "--scene", "ofice0"], 2, "office0"),
-        (["run", "--scene", "./nowhere/"], 3, "not a folder"),
-        (["study", "methd"], 2, "no study is called methd; did you mean method"),
-        (["basis", "show", "ofices"], 2, "offices"),
-        (["encode", "x.ply", "--out", "x.npz"], 2, "--encoder"),
-        (["run", "--nonsense"], 2, "No such option"),
-    ],
-)
-def test_commands_leave_with_the_documented_codes(quick_plans, call, code, message):
-    found = asked(*call)
-    assert (found.exit_code, message in found.stderr) == (code, True), found.stderr
-
-
 def test_make_says_the_code_that_it_cannot_leave_with():
     done = subprocess.run(
         ["make", "-o", ".venv/.ready", "plan", "scene=./nowhere/"], cwd=ROOT, capture_output=True, text=True

@@ -80,13 +80,6 @@ def test_a_masked_gaussian_has_no_opacity_and_no_size_but_keeps_its_parameters()
 # densification by regions
 
 
-def test_region_gradient_is_the_mean_over_members_not_over_padding():
-    gradient = torch.tensor([1.0, 3.0, 5.0])
-    members = torch.tensor([[0, 1, -1], [2, -1, -1], [-1, -1, -1]])
-    assert densify.region_gradients(gradient, members).tolist() == [2.0, 5.0, 0.0]
-    assert densify.region_gradients(torch.zeros(0), members[2:]).tolist() == [0.0]
-
-
 def test_a_gradient_that_is_nan_outside_a_region_does_not_reach_it():
     found = densify.region_gradients(torch.tensor([torch.nan, 2.0]), torch.tensor([[1, -1], [0, 1]]))
     assert found[0] == 2

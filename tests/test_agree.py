@@ -1,12 +1,16 @@
 """Agreement of views: chance is 0, certainty is 1, and what hides a point is seen to."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
-from malformed.artifacts import LABELS, N, artifacts, copied
-from shared import run_stage
+from malformed.artifacts import LABELS, N, artifacts
+from shared import KEY, run_stage
 
+from chebsplat.formats import capture, points
 from chebsplat.formats.agreement import read_agreement
-from chebsplat.formats.artifact import read_manifest
+from chebsplat.formats.artifact import publish, read_manifest
+from chebsplat.formats.manifest import Manifest
 from chebsplat.labels.agreement import between, far_pairs, project, unhidden
 
 K, SIZE = np.array([[50.0, 0, 32], [0, 50, 24], [0, 0, 1]]), (64, 48)
@@ -95,31 +99,29 @@ def test_the_stage_warns_of_a_teacher_that_says_one_thing_and_records_it(tmp_pat
     assert "doubt" not in read_manifest(tmp_path / "calm").facts
 
 
-def test_points_that_no_two_views_see_leave_the_figure_open(tmp_path, capsys):
-    from malformed.artifacts import resealed, set_tensor
+def with_points(path, **changes):
+    """The small points, changed."""
+    with publish(path, Manifest(points.SCHEMA, KEY, "test")) as tmp:
+        points.write_points(tmp, replace(points.read_points(artifacts() / "sfm"), **changes))
+    return path
 
-    far = copied("sfm", tmp_path)
-    set_tensor(far / "points.safetensors", "means", lambda means: means + 1000)
-    inputs = {role: artifacts() / name for role, name in INPUTS.items()} | {"points": resealed(far)}
+
+def test_points_that_no_two_views_see_leave_the_figure_open(tmp_path, capsys):
+    means = points.read_points(artifacts() / "sfm").means + 1000
+    far = with_points(tmp_path / "far", means=means)
+    inputs = {role: artifacts() / name for role, name in INPUTS.items()} | {"points": far}
     assert run_stage("agree", tmp_path / "out", inputs, {}) == 0
     assert read_agreement(tmp_path / "out").agreement is None
     assert "not known" in capsys.readouterr().err
 
 
 def test_tracks_tell_who_sees_a_point_where_there_is_no_depth(tmp_path):
-    from malformed.artifacts import resealed, set_tensor
-
-    from chebsplat.formats.artifact import publish
-    from chebsplat.formats.capture import SCHEMA, read_capture, write_capture
-    from chebsplat.formats.manifest import Manifest
-
-    capture = read_capture(artifacts() / "ingest")
-    capture.depth = None
-    with publish(tmp_path / "capture", Manifest(SCHEMA, "0" * 16, "test")) as tmp:
-        write_capture(tmp, capture)
-    tracked = copied("sfm", tmp_path)
+    record = capture.read_capture(artifacts() / "ingest")
+    record.depth = None
+    with publish(tmp_path / "capture", Manifest(capture.SCHEMA, KEY, "test")) as tmp:
+        capture.write_capture(tmp, record)
     tracks = np.array([[0, 1], [0, 2], [1, 1], [2, 0], [2, 2]], np.int32)  # view 0 is a test view
-    set_tensor(tracked / "points.safetensors", "tracks", lambda _: tracks)
-    inputs = {"capture": tmp_path / "capture", "points": resealed(tracked), "features": artifacts() / "teacher"}
+    tracked = with_points(tmp_path / "tracked", tracks=tracks)
+    inputs = {"capture": tmp_path / "capture", "points": tracked, "features": artifacts() / "teacher"}
     assert run_stage("agree", tmp_path / "out", inputs, {}) == 0
     assert read_agreement(tmp_path / "out").n_points == 1  # of the three, one is in two training views

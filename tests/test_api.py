@@ -76,17 +76,6 @@ def test_a_part_is_a_scene_and_a_ply(scene, tmp_path):
         part.to_ply(path)
 
 
-def test_a_query_is_that_of_the_command(toy):
-    from chebsplat.stages.opened import OpenedScene
-
-    held = read_scene(toy["export"])
-    scene = OpenedScene(held, toy["export"], toy["teacher"])
-    name = held.label_names[0]
-    scores = scene.query(name, against=held.label_names[1:])
-    assert scores.shape == (len(scene),)
-    assert scores[held.labels == 0].mean() > scores[held.labels > 0].mean()
-
-
 def test_what_cannot_be_is_said(scene):
     with pytest.raises(ConfigError, match="no view zzz"):
         scene.camera("zzz")

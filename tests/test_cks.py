@@ -1,4 +1,4 @@
-"""The knowledge basis stays orthonormal and bounded, whatever it is fed."""
+"""The knowledge basis stays orthonormal and bounded; extreme weights are cases of the stability suite."""
 
 import math
 
@@ -32,30 +32,6 @@ def weights(q=32, p=32, rank=None, seed=0):
 def orthonormality(basis):
     error = basis.double().T @ basis.double() - torch.eye(basis.shape[1], dtype=torch.float64)
     return error.abs().max().item() if error.numel() else 0.0
-
-
-EXTREMES = {
-    "huge": weights() * 1e25,
-    "tiny": weights() * 1e-25,
-    "rank one": weights(rank=1),
-    "parallel": weights(rank=1) + 1e-7 * weights(seed=1),
-    "one entry": torch.zeros(32, 32).index_put((torch.tensor(3), torch.tensor(4)), torch.tensor(1.0)),
-    "one column": weights(32, 1),
-    "mixed scales": weights() * torch.logspace(-20, 15, 32),
-    "float64 at its limits": weights().double() * 1e300,
-}
-
-
-@pytest.mark.parametrize("rule", ["total", "residual"])
-@pytest.mark.parametrize("case", EXTREMES)
-def test_extreme_weights_give_a_finite_orthonormal_basis(case, rule):
-    basis, report = update(None, EXTREMES[case], rule=rule)
-    assert orthonormality(basis) < ORTHONORMAL
-    again, second = update(basis, EXTREMES[case], rule=rule)
-    assert orthonormality(again) < ORTHONORMAL
-    assert report["rho"] == pytest.approx(1.0, abs=1e-12)
-    assert 0 <= second["rho"] <= 1
-    assert report["rank_after"] == report["added"] >= 1
 
 
 @settings(deadline=None, derandomize=True, max_examples=40)
@@ -137,38 +113,6 @@ def test_total_rule_reaches_its_energy_with_as_few_columns_as_it_can(energy):
     assert (fewer**2).sum() / (W.double() ** 2).sum() < energy
 
 
-def test_total_rule_adds_fewer_columns_than_the_residual_rule():
-    basis, _ = update(None, weights(rank=6), energy=0.9999)
-    new = weights(rank=6) + weights(seed=5)
-    total, _ = update(basis, new, rule="total", max_added=1.0, n_scenes=1)
-    residual, _ = update(basis, new, rule="residual", max_added=1.0, n_scenes=1)
-    assert basis.shape[1] <= total.shape[1] < residual.shape[1]
-
-
-def test_two_hundred_updates_never_reach_the_full_space():
-    basis = None
-    for seed in range(200):
-        basis, _ = update(basis, weights(seed=seed))
-    assert basis.shape[1] == 28
-    assert orthonormality(basis) < ORTHONORMAL
-
-
-def test_two_hundred_tiny_updates_keep_columns_orthonormal_and_rho_finite():
-    basis, _ = update(None, weights(64, 2))
-    for seed in range(200):
-        basis, report = update(basis, weights(64, 1, seed=seed) * 1e-20, tolerance=1e-3, max_rank=0.9)
-        assert 0 <= report["rho"] <= 1
-    assert basis.shape[1] <= 57
-    assert orthonormality(basis) < ORTHONORMAL
-
-
-def test_a_residual_of_a_millionth_is_no_news():
-    basis, _ = update(None, weights(rank=4), energy=0.999999)
-    same, report = update(basis, weights(rank=4) + 1e-6 * weights(seed=9))
-    assert torch.equal(same, basis)
-    assert 0 < report["rho"] < 1e-5
-
-
 def test_a_residual_of_a_millionth_that_is_asked_for_is_found_exactly():
     basis = torch.eye(32)[:, :4]
     hidden = torch.nn.functional.normalize(weights(28, 1)[:, 0].double(), dim=0)
@@ -202,25 +146,6 @@ def test_captured_and_residual_are_orthogonal_and_add_up():
     assert torch.allclose(captured + residual, W.double(), rtol=1e-14)
     assert (basis.double().T @ residual).abs().max() < 1e-6  # the basis' own float32 rounding squared, times 1e6
     assert captured.dtype == residual.dtype == torch.float64
-
-
-def test_regulariser_is_zero_inside_and_scale_free_outside():
-    basis, _ = update(None, weights(rank=4), energy=0.999999)
-    inside, outside = weights(rank=4), weights(seed=3)
-    assert basis_loss({"a": inside}, {"a": basis}).item() < 1e-8
-    found = [basis_loss({"a": outside * s}, {"a": basis}).item() for s in (1.0, 1e3, 1e25, 1e-25)]
-    assert found == pytest.approx(found[:1] * 4, rel=1e-4)
-    assert 0 < found[0] <= 1
-
-
-@pytest.mark.parametrize("size", [0.0, 1e-25, 1.0, 1e25])
-def test_regulariser_has_finite_gradients_at_any_size(size):
-    W = (weights() * size).requires_grad_(True)
-    regularizer(W, torch.eye(32)[:, :4]).backward()
-    assert torch.isfinite(W.grad).all()
-    if size == 1:
-        assert W.grad[:4].abs().max() < 1e-7
-        assert W.grad[4:].abs().min() > 0
 
 
 def test_the_gradient_of_the_regulariser_is_that_of_its_formula():
@@ -277,15 +202,6 @@ def test_the_modulated_loss_is_the_printed_formula():
     found = alpha(encodings.mean(0)) * basis_loss({"": W}, {"": B})
     expected = printed_alpha(sum(encodings) / 40, alpha.linear.weight[0], alpha.linear.bias[0]) * printed_share(W, B)
     assert found.item() == pytest.approx(expected.item(), rel=1e-12)
-    W.requires_grad_(True)
-    (alpha(encodings.mean(0)) * regularizer(W, B)).backward()
-    rest = W.detach() - B @ B.T @ W.detach()
-    factor, step = alpha(encodings.mean(0)), 1e-6
-    for i, j in ((0, 0), (5, 7), (15, 23)):
-        moved = torch.zeros_like(rest)
-        moved[i, j] = step
-        ends = [((rest + sign * (moved - B @ B.T @ moved)) ** 2).sum() / (W.detach() ** 2).sum() for sign in (1, -1)]
-        assert W.grad[i, j].item() == pytest.approx((factor * (ends[0] - ends[1]) / (2 * step)).item(), rel=1e-5)
 
 
 def test_modulation_differs_with_the_shapes_in_view_and_is_taught_by_nothing():
@@ -296,13 +212,6 @@ def test_modulation_differs_with_the_shapes_in_view_and_is_taught_by_nothing():
     assert alpha.linear.weight.grad is None and alpha.linear.bias.grad is None
     assert alpha(torch.zeros(4)).item() == pytest.approx(1.0, abs=1e-6)
     assert alpha(torch.ones(4)).item() != pytest.approx(1.0, abs=1e-3)
-
-
-@pytest.mark.parametrize("size", [0.0, 1e-20, 1e20, -1e20])
-def test_modulation_stays_within_its_bounds(size):
-    alpha = Modulation(4)
-    value = alpha(size * alpha.linear.weight[0].detach().sign())
-    assert 1e-3 <= value.item() <= 10 + 1e-6
 
 
 def test_a_drawn_modulation_leaves_what_is_drawn_after_it_as_it_was():
@@ -325,34 +234,6 @@ def test_the_spread_of_shape_is_the_printed_formula_over_members_that_exist():
             deviation = ((region[members] - region[members].mean(0)) ** 2).mean(0).sqrt()
             sigmas.append(deviation.norm().item() / math.sqrt(10))
     assert spread(descriptors, mask) == pytest.approx(sum(sigmas) / len(sigmas), rel=1e-12)
-
-
-@pytest.mark.parametrize("size", [1e-20, 1.0, 1e20])
-def test_the_spread_of_shape_scales_with_descriptors_and_is_zero_where_they_do_not_vary(size):
-    descriptors = torch.randn(5, 8, 6, generator=torch.Generator().manual_seed(1))
-    everyone = torch.ones(5, 8, dtype=torch.bool)
-    assert spread(descriptors * size, everyone) == pytest.approx(size * spread(descriptors, everyone), rel=1e-5)
-    assert spread(torch.full((5, 8, 6), size), everyone) <= 1e-15 * size
-    assert spread(descriptors, torch.zeros(5, 8, dtype=torch.bool)) == 0
-    assert spread(torch.zeros(0, 8, 6), torch.zeros(0, 8, dtype=torch.bool)) == 0
-
-
-def test_of_two_scenes_of_equal_rho_only_the_one_of_rich_shapes_adds_by_the_printed_rule():
-    basis, _ = update(None, weights(rank=4), energy=0.999999)
-    W = weights(rank=4) + 0.25 * weights(seed=9)
-    everyone = torch.ones(12, 8, dtype=torch.bool)
-    descriptors = torch.randn(12, 8, 14, generator=torch.Generator().manual_seed(2))
-    tolerance = 1.4 * update(basis, W)[1]["rho"]
-    added = {}  # (by `total`, energy 0.96 is reached where ρ is 0.2: there both rules decide alike)
-    for name, shapes in {"flat": 0.05 * descriptors, "rich": descriptors}.items():
-        for rule in ("printed", "residual"):
-            novelty = 1 + 1.0 * spread(shapes, everyone)
-            _, report = update(basis, W, tolerance=tolerance, rule="residual", novelty=novelty, update_rule=rule)
-            assert report["rho_printed"] == pytest.approx(report["rho"] * novelty)
-            added[name, rule] = report["added"] > 0
-    assert added == {
-        ("flat", "printed"): False, ("rich", "printed"): True, ("flat", "residual"): False, ("rich", "residual"): False
-    }  # fmt: skip
 
 
 def test_a_scene_takes_a_share_of_the_room_and_leaves_some_to_those_after_it():

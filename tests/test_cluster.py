@@ -9,9 +9,7 @@ import time
 import pytest
 from shared import ROOT
 from slurm_nodes import MISSING, WHY, slurm
-from soak.tiny import contents, different, hidden
-
-from chebsplat.pipelines import leases
+from soak.tiny import artifacts, contents, different, hidden
 
 pytestmark = [
     pytest.mark.slow,
@@ -65,12 +63,6 @@ def finished(process):
     return time.monotonic() - began
 
 
-def holders(work):
-    """How many have ended well of those that have held the lease of each artifact, and how many there were."""
-    locks = [path for path in (work / ".leases").iterdir() if path.name.partition("-")[0] not in ("run", "names")]
-    return {path.name: (len(list(path.glob("*.over"))), leases.newest_of(path)) for path in locks}
-
-
 def test_a_node_that_falls_costs_time_alone(cluster, tmp_path):
     values, whole, work = {"seeds": [0], "budgets": [12]}, tmp_path / "local", tmp_path / "work"
     finished(studied(tmp_path / "study", whole, "local", cluster, **values))
@@ -94,18 +86,15 @@ def test_a_node_that_falls_costs_time_alone(cluster, tmp_path):
             cluster.start_node(fallen)
     assert different(work, contents(whole), finished=True) == ""
     assert not hidden(work)
-    made = holders(work)
-    assert made.pop(f"train-{key}") == (1, 2)  # the first holder died
-    assert set(made.values()) == {(1, 1)}  # nothing else was begun twice
     cluster.wait_for(lambda: cluster.states().count("idle") == 3, "slurmctld", 60)
 
 
-def test_sixty_steps_give_the_bytes_of_one_machine_each_made_once_and_are_timed(cluster, tmp_path):
+def test_sixty_steps_give_the_bytes_of_one_machine_and_are_timed(cluster, tmp_path):
     values, seconds = {"seeds": [0, 1], "budgets": [12, 18, 24]}, {}
     for on in ("local", "slurm"):
         seconds[on] = finished(studied(tmp_path / "study", tmp_path / on, on, cluster, **values))
-    n_jobs = len(contents_of := holders(tmp_path / "slurm"))
-    assert n_jobs >= 60 and set(contents_of.values()) == {(1, 1)}
+    n_jobs = len(artifacts(tmp_path / "slurm"))
+    assert n_jobs >= 60
     assert different(tmp_path / "slurm", contents(tmp_path / "local"), finished=True) == ""
     rows = [["steps", *seconds, "ratio"], [n_jobs, *(f"{s:.1f}" for s in seconds.values())]]
     rows[1].append(f"{seconds['slurm'] / seconds['local']:.2f}")

@@ -127,7 +127,7 @@ def test_a_job_on_a_node_stops_when_its_run_lets_go(monkeypatch, tmp_path):
 
     plan, told = store.work() / ".plans/abc-1/plan.json", threading.Event()
     monkeypatch.setattr(leases, "EVERY", 0.05)
-    monkeypatch.setattr(cluster, "stop", lambda reason: told.set())
+    monkeypatch.setattr(cluster, "end_itself", told.set)
     with leases.held(store.run_lease(plan.parent)):
         cluster.watch_run(plan)
         assert not told.wait(0.3)

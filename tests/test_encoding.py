@@ -1,4 +1,4 @@
-"""Regions cover their points, the encoder ignores padding and order, and fusion keeps what nothing covers."""
+"""The encoder ignores padding and order, and fusion keeps what nothing covers."""
 
 import numpy as np
 import pytest
@@ -8,8 +8,8 @@ from chebsplat.labels.class_codes import VOCABULARY, class_codes
 from chebsplat.labels.decode import decode, decode_labels
 from chebsplat.labels.noisy_teacher import confusable, confuse_segments, noisy_features, reduced
 from chebsplat.shape.encoder import RegionEncoder, Standardize
-from chebsplat.shape.fusion import Gate, propagate, propagation_weights
-from chebsplat.shape.regions import build_regions, covering
+from chebsplat.shape.fusion import Gate
+from chebsplat.shape.regions import build_regions
 from chebsplat.splats.gaussians import activated, covariances, initial_gaussians, local_shape
 from chebsplat.stages.config import Config
 from chebsplat.stages.train import agreement
@@ -18,30 +18,6 @@ from chebsplat.training.model import SceneModel
 
 def cloud(n=600, seed=0):
     return np.random.default_rng(seed).normal(size=(n, 3))
-
-
-def test_regions_cover_every_point_and_hold_their_centre():
-    points = cloud()
-    regions = build_regions(points, 40, 16)
-    assert (covering(points, points[regions.centers], regions.radius, 3)[:, 0] >= 0).all()
-    assert np.array_equal(regions.members[:, 0], regions.centers)
-    for row in regions.members:
-        kept = row[row >= 0]
-        assert len(set(kept)) == len(kept)
-        assert (np.linalg.norm(points[kept] - points[row[0]], axis=1) <= regions.radius * 1.001).all()
-
-
-@pytest.mark.parametrize("n", [0, 1, 2, 5])
-def test_few_points_make_few_regions(n):
-    regions = build_regions(cloud(n), 40, 16)
-    assert len(regions.centers) == n
-    assert (regions.members < max(n, 1)).all()
-
-
-def test_coincident_points_make_a_region():
-    regions = build_regions(np.zeros((30, 3)), 4, 8)
-    assert regions.radius > 0
-    assert len(regions.centers) >= 1
 
 
 def test_non_finite_points_are_refused():
@@ -82,28 +58,6 @@ def test_no_region_encodes_to_nothing_and_has_a_gradient(n_layers):
 def test_heads_must_divide_the_width():
     with pytest.raises(ValueError, match="multiple"):
         RegionEncoder(3, 4, width=30, n_heads=4)
-
-
-def propagation(means, centers, scale=0.1, cover=None, radius=1.0):
-    n, m = len(means), len(centers)
-    cover = torch.arange(m).expand(n, m) if cover is None else cover
-    return propagation_weights(means, cover, centers, torch.eye(3).expand(m, 3, 3), torch.full((m, 3), scale), radius)
-
-
-def test_propagation_weights_sum_to_one_even_for_needles():
-    means, centers = torch.rand(20, 3), torch.rand(4, 3)
-    for scale in (0.0, 1e-12, 1.0, 1e12):
-        weights = propagation(means, centers, scale)
-        assert torch.allclose(weights.sum(1), torch.ones(20))
-
-
-def test_the_nearer_region_weighs_more_and_an_uncovered_point_gets_nothing():
-    centers = torch.tensor([[0.0, 0, 0], [1.0, 0, 0]])
-    weights = propagation(torch.tensor([[0.1, 0, 0]]), centers)
-    assert weights[0, 0] > weights[0, 1]
-    bare = propagation(torch.zeros(1, 3), centers, cover=torch.tensor([[-1, -1]]))
-    assert (bare == 0).all()
-    assert (propagate(torch.ones(2, 5), torch.tensor([[-1, -1]]), bare) == 0).all()
 
 
 def test_the_gate_mixes_within_bounds_and_keeps_uncovered_features():
@@ -167,22 +121,6 @@ def test_noise_free_features_decode_to_their_labels():
     found, confidence = decode(features, codes)
     assert np.array_equal(found, labels)
     assert (confidence > 0.9).all()
-
-
-@pytest.mark.parametrize("unit", [1e-22, 1.0, 1e22])
-@pytest.mark.parametrize("temperature", [1e-9, 1.0])
-def test_propagation_weights_do_not_depend_on_units_and_stay_finite(unit, temperature):
-    g = torch.Generator().manual_seed(0)
-    means = (torch.rand(20, 3, generator=g) * unit).requires_grad_(True)
-    cover = torch.tensor([[0, 1, -1], [2, -1, -1], [-1, -1, -1], [0, 2, 1]]).repeat(5, 1)
-    rotmats, scales = torch.eye(3).expand(3, 3, 3), torch.full((3, 3), 0.1 * unit)
-    weights = propagation_weights(
-        means, cover, means.detach()[:3], rotmats, scales, 0.5 * unit, temperature=temperature
-    )
-    covered = (cover >= 0).any(1)
-    torch.testing.assert_close(weights.sum(1), covered.float())
-    (weights * torch.rand(weights.shape, generator=g)).sum().backward()
-    assert torch.isfinite(means.grad).all()
 
 
 def test_labels_are_told_in_parts_as_they_are_in_one():

@@ -47,16 +47,6 @@ def pictures(count=3, side=24):
     return np.random.default_rng(1).integers(0, 255, (count, side, side + 8, 3)).astype(np.uint8)
 
 
-def test_lpips_is_0_for_equal_images_symmetric_and_positive(weights):
-    lpips = Lpips(weights)
-    a, b, c = pictures()
-    assert lpips.distance(a, a) == 0
-    assert lpips.distance(a, b) == pytest.approx(lpips.distance(b, a), rel=1e-5)
-    assert lpips.distance(a, b) > 0
-    nearer = (0.9 * a + 0.1 * c).astype(np.uint8)
-    assert lpips.distance(a, nearer) < lpips.distance(a, c)
-
-
 @pytest.mark.parametrize(
     "names",
     [("features.{}", "lin{}.model.1"), ("net.slice1.{}", "lins.{}.model.1"), ("net.layers.{}", "lin.{}.1")],
@@ -162,8 +152,8 @@ def test_views_of_capture_and_teacher_in_another_order_change_no_figure(toy, tmp
             setattr(record, part, np.asarray(getattr(record, part)[:])[order])
         record.names = [record.names[k] for k in order]
     inputs = inputs_of(toy, "evaluate") | {
-        "capture": published(tmp_path / "c", "chebsplat.capture/1", write_capture, capture),
-        "features": published(tmp_path / "f", "chebsplat.features/1", write_features, features),
+        "capture": published(tmp_path / "c", "chebsplat.capture/2", write_capture, capture),
+        "features": published(tmp_path / "f", "chebsplat.features/2", write_features, features),
     }
     assert run_stage("evaluate", tmp_path / "out", inputs) == 0
     found, wanted = (read_evaluation(path).figures for path in (tmp_path / "out", toy["evaluate"]))
@@ -179,23 +169,12 @@ def test_points_are_measured_where_depth_and_poses_say_where_they_lie(toy, tmp_p
     record = read_capture(toy["ingest"])
     record.depth = None
     inputs = inputs_of(toy, "evaluate")
-    inputs["capture"] = published(tmp_path / "c", "chebsplat.capture/1", write_capture, record)
+    inputs["capture"] = published(tmp_path / "c", "chebsplat.capture/2", write_capture, record)
     assert run_stage("evaluate", tmp_path / "out", inputs) == 0
     figures = read_evaluation(tmp_path / "out").figures
     assert figures["segmentation"]["scene"]["point_miou"] is None
     assert "depth" in figures["left_out"]["3D point mIoU"]
     assert figures["segmentation"]["scene"]["miou"] == measured["scene"]["miou"]
-
-
-@pytest.mark.xdist_group("toy")
-@pytest.mark.parametrize("protocol", ["replica-f3", "deep-blending", "scannet-open", "scannet-closed"])
-def test_a_teacher_of_other_labels_than_the_protocols_is_exit_4(toy, protocol, tmp_path, capsys):
-    record = read_capture(toy["ingest"])
-    record.protocol = {"name": protocol}
-    inputs = inputs_of(toy, "evaluate")
-    inputs["capture"] = published(tmp_path / "c", "chebsplat.capture/1", write_capture, record)
-    assert run_stage("evaluate", tmp_path / "out", inputs) == 4
-    assert "teacher" in capsys.readouterr().err
 
 
 @pytest.mark.slow

@@ -1,4 +1,4 @@
-"""Splats that others wrote, 150,000 of them, open in the viewer, the page and the renderer: what is shown is theirs."""
+"""Splats that others wrote, 150,000 of them, open in the page and the renderer: what is shown is theirs."""
 
 import chebsplat.kernels.jit  # noqa: F401  # isort: skip  # gsply runs on numba too: the threading layer is chosen first
 
@@ -20,7 +20,6 @@ from chebsplat.pipelines.plan import Planner
 from chebsplat.render import SceneRenderer
 from chebsplat.stages.opened import OpenedScene
 from chebsplat.stages.page import foreign
-from chebsplat.stages.viewing import Shown, Viewing
 
 N = 150_000
 
@@ -45,21 +44,19 @@ def trained_elsewhere():
 
 
 def shown_in_both(ply, tmp_path):
-    """The scene as opened, the viewer's first picture of it, what its page holds, and the page."""
+    """The scene as opened, the first picture of it, what its page holds, and the page."""
     opened = OpenedScene(foreign(ply), ply)
-    viewing = Viewing(opened)
-    assert viewing.modes == ["color", "depth", "density"]
-    images = {mode: viewing.picture(opened.cameras[0], Shown(mode)) for mode in viewing.modes}
-    assert all(image.any() for image in images.values())
+    shown = opened.render(opened.cameras[0])
+    assert shown.color.any() and np.isfinite(shown.depth).any()
     out = tmp_path / "theirs.html"
     done = CliRunner().invoke(main, ["page", str(ply), "--out", str(out), "--sh", "1"])
     assert done.exit_code == 0, done.output
     about, arrays = held_in(out)
     held = unpack(Packed({name: values for name, values in arrays.items() if name != "views"}, about["ranges"]))
-    return opened, images["color"], held, out
+    return opened, shown.color, held, out
 
 
-def test_150000_splats_of_gsply_open_in_viewer_and_page(written_by_gsply, tmp_path):
+def test_150000_splats_of_gsply_open_in_renderer_and_page(written_by_gsply, tmp_path):
     parameters, ply = written_by_gsply
     opened, image, held, _ = shown_in_both(ply, tmp_path)
     assert len(opened) == len(held["means"]) == N
@@ -72,7 +69,7 @@ def test_150000_splats_of_gsply_open_in_viewer_and_page(written_by_gsply, tmp_pa
 
 
 @pytest.mark.data
-def test_a_splat_trained_elsewhere_opens_in_viewer_and_page(trained_elsewhere, tmp_path):
+def test_a_splat_trained_elsewhere_opens_in_renderer_and_page(trained_elsewhere, tmp_path):
     opened, _, held, _ = shown_in_both(trained_elsewhere, tmp_path)
     assert len(opened) == len(held["means"]) == 90_854
     assert opened.parameters["degrees"].max() == 0
@@ -83,8 +80,7 @@ def test_a_splat_trained_elsewhere_opens_in_viewer_and_page(trained_elsewhere, t
 @pytest.mark.slow
 @pytest.mark.skipif(BROWSER is None, reason="neither chromium nor google-chrome is installed")
 def test_in_a_browser_150000_splats_are_drawn_as_we_draw_them(written_by_gsply, tmp_path):
-    opened, _, _, out = shown_in_both(written_by_gsply[1], tmp_path)
-    truth = opened.render(opened.cameras[0]).color
+    _, truth, _, out = shown_in_both(written_by_gsply[1], tmp_path)
     with driven(tmp_path) as browser:
         browser.open(out, 960, 720)
         browser.run("scene.ready")

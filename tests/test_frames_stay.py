@@ -40,7 +40,7 @@ def moved(mixed, tmp_path_factory):
     poses = checkpoint.cameras.cam_from_world
     poses[:, :3, 3] = SCALE * poses[:, :3, 3] - poses[:, :3, :3] @ TURN.T @ SHIFT
     poses[:, :3, :3] = poses[:, :3, :3] @ TURN.T
-    with artifact.publish(root / "gaussians", Manifest("chebsplat.gaussians/1", KEY, "train")) as tmp:
+    with artifact.publish(root / "gaussians", Manifest("chebsplat.gaussians/2", KEY, "train")) as tmp:
         write_gaussians(tmp, checkpoint)
     return checkpoint, run_stage("export", root / "scene/export", {"gaussians": root / "gaussians"})
 

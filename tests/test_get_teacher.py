@@ -1,21 +1,88 @@
 """Teachers from a stand-in of the hub: whole, interrupted, damaged, out of reach. The hub itself is never asked."""
 
+import hashlib
+import json
 import os
-import shutil
+import re
 import subprocess
 import sys
+import threading
+from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
+from pathlib import Path
 
 import numpy as np
 import pytest
-import stand_in_hub
-from stand_in_hub import COMMIT, REPOSITORY, Hub, serving
+from onnx import helper
+from tiny_teachers import write_model
 
 from chebsplat.errors import ConfigError, InputError
 from chebsplat.formats.teacher_model import read_teacher
 from chebsplat.stages import teacher_check
 from chebsplat.stages.get_teacher import get_teacher, parsed
 
+REPOSITORY, COMMIT, CLASSES = "some/Segmenter-B0", "c" * 40, ["wall", "floor", "sofa: a seat", "wall"]
 NAME, SHORT = f"hf:{REPOSITORY}", "segmenter-b0"
+PREPARATION = {"size": {"height": 64, "width": 64}, "image_mean": [0.485, 0.456, 0.406], "image_std": [0.2, 0.2, 0.2]}
+
+
+def segmenter(path):
+    """Bytes of a segmenter whose logits are [1, C, h / 4, w / 4], and that is large enough to break off."""
+    rng = np.random.default_rng(0)
+    constants = {"kernel": rng.normal(size=(len(CLASSES), 3, 4, 4)), "padding": rng.normal(size=100_000)}
+    constants = {name: values.astype(np.float32) for name, values in constants.items()}
+    node = helper.make_node("Conv", ["image", "kernel"], ["logits"], strides=[4, 4])
+    shape = ("batch_size", "num_channels", "height", "width")
+    write_model(path, [node], ("logits",), shape, constants=constants)
+    return path.read_bytes()
+
+
+class Hub(ThreadingHTTPServer):
+    """Of one repository, whose checksums may be false (`sums`) and whose answers are `cut`; `asked`: its requests."""
+
+    daemon_threads = True
+
+    def __init__(self, folder):
+        super().__init__(("127.0.0.1", 0), Answer)
+        self.address = f"http://127.0.0.1:{self.server_port}"
+        self.sums, self.cut, self.asked, self.revisions = {}, None, [], ("main", COMMIT)
+        self.files = {
+            "config.json": json.dumps({"id2label": dict(enumerate(CLASSES))}).encode(),
+            "preprocessor_config.json": json.dumps(PREPARATION).encode(),
+            "onnx/model.onnx": segmenter(folder / "served.onnx"),
+        }
+
+    def checksum(self, name):
+        data = self.files[name]
+        true = hashlib.sha256(data) if name.endswith(".onnx") else hashlib.sha1(b"blob %d\0" % len(data) + data)
+        return self.sums.get(name, true.hexdigest())
+
+
+class Answer(BaseHTTPRequestHandler):
+    def log_message(self, *_):
+        pass
+
+    def do_HEAD(self):
+        hub = self.server
+        hub.asked.append((self.command, self.path))
+        found = re.fullmatch(rf"/{REPOSITORY}/resolve/(\w+)/(.+)", self.path)
+        code, headers, data = 200, {"X-Repo-Commit": COMMIT}, b""
+        if not found:
+            code, headers = 401, {"X-Error-Code": "RepoNotFound"}
+        elif found[1] not in hub.revisions:
+            code, headers = 404, {"X-Error-Code": "RevisionNotFound"}
+        elif found[2] not in hub.files:
+            code, headers = 404, {"X-Error-Code": "EntryNotFound"}
+        else:
+            data = hub.files[found[2]]
+            headers |= {"ETag": f'"{hub.checksum(found[2])}"'}
+        self.send_response(code)
+        for header in {"Content-Length": str(len(data)), **headers}.items():
+            self.send_header(*header)
+        self.end_headers()
+        if self.command == "GET":
+            self.wfile.write(data[: hub.cut])
+
+    do_GET = do_HEAD
 
 
 @pytest.fixture
@@ -29,11 +96,13 @@ def hub(constants, tmp_path, monkeypatch):
     photo = np.random.default_rng(0).integers(0, 255, (48, 64, 3), np.uint8)
     monkeypatch.setattr(teacher_check, "shown", lambda _: ("photo", photo))
     monkeypatch.setattr(constants, "HF_HUB_CACHE", str(tmp_path / "cache"))
+    monkeypatch.setattr("time.sleep", lambda _: None)  # where the client waits, and tries again
     monkeypatch.chdir(tmp_path)
-    found = Hub(stand_in_hub.files(tmp_path))
-    with serving(found) as address:
-        ask(constants, monkeypatch, address)
+    with Hub(tmp_path) as found:
+        threading.Thread(target=found.serve_forever, daemon=True).start()
+        ask(constants, monkeypatch, found.address)
         yield found
+        found.shutdown()
 
 
 def ask(constants, monkeypatch, address):
@@ -61,28 +130,38 @@ def test_a_repository_becomes_a_teacher_of_three_files(hub, tmp_path):
     assert hub.asked == []
 
 
-def test_a_download_that_broke_off_goes_on_where_it_was(hub, tmp_path):
+def test_a_download_that_broke_off_leaves_nothing_half(hub, tmp_path):
     hub.cut = 200_000
-    with pytest.raises(InputError, match=r"broke off at [\d,]+ of 40\d,\d+ bytes; run the same command again"):
+    with pytest.raises(InputError, match=r"onnx/model.onnx broke off \(.*\); run the same command again"):
         get_teacher(NAME)
-    assert not (tmp_path / SHORT).exists()
-    there = (tmp_path / f".part-{SHORT}" / hub.checksum("onnx/model.onnx")).stat().st_size
-    assert 0 < there <= hub.cut
+    assert not list(tmp_path.glob("*segmenter*")) and not list(tmp_path.rglob("*.incomplete"))
     hub.cut, _ = None, hub.asked.clear()
     model, _ = get_teacher(NAME)
     assert model.read_bytes() == hub.files["onnx/model.onnx"]
-    got = [(path, part) for method, path, part in hub.asked if method == "GET"]
-    assert got == [("/large/onnx/model.onnx", f"bytes={there}-")]  # and the small files not again
+    got = [path for method, path in hub.asked if method == "GET"]
+    assert got == [f"/{REPOSITORY}/resolve/main/onnx/model.onnx"]  # and the small files not again
 
 
 @pytest.mark.parametrize("name", ["onnx/model.onnx", "config.json"])
-def test_a_wrong_checksum_is_refused_and_nothing_stays(hub, tmp_path, name):
+def test_a_wrong_checksum_is_refused_and_its_file_named(hub, tmp_path, name):
     hub.sums[name] = "0" * len(hub.checksum(name))
-    with pytest.raises(InputError, match=r"has the checksum \w+, 0+ is right: damaged"):
+    with pytest.raises(InputError, match=r"has the checksum \w+, 0+ is right: damaged .*; remove it") as error:
         get_teacher(NAME)
     assert not (tmp_path / SHORT).exists()
     del hub.sums[name]
+    Path(str(error.value).split(" has the checksum")[0]).unlink()
     assert get_teacher(NAME)[0].is_file()
+
+
+def test_a_revision_stays_pinned_and_what_the_cache_has_of_it_is_not_fetched_again(hub, tmp_path):
+    hub.revisions = (COMMIT,)
+    with pytest.raises(InputError, match=f"{REPOSITORY}@main is not there"):
+        get_teacher(NAME)
+    get_teacher(f"{NAME}@{COMMIT}", tmp_path / "a")
+    hub.asked.clear()
+    model, _ = get_teacher(f"{NAME}@{COMMIT}", tmp_path / "b")
+    assert read_teacher(model).origin == f"{NAME}@{COMMIT}/onnx/model.onnx"
+    assert hub.asked == []
 
 
 def test_an_encoder_that_was_replaced_later_is_refused(hub):
@@ -94,36 +173,6 @@ def test_an_encoder_that_was_replaced_later_is_refused(hub):
     with pytest.raises(InputError, match="damaged or replaced"):
         get_teacher(NAME)
     assert model.is_file()
-
-
-def cached(hub, constants):
-    """What the hub's own client leaves in its cache."""
-    from pathlib import Path
-
-    folder = Path(constants.HF_HUB_CACHE) / f"models--{REPOSITORY.replace('/', '--')}"
-    (folder / "refs").mkdir(parents=True)
-    (folder / "blobs").mkdir()
-    (folder / "refs/main").write_text(COMMIT)
-    for name, data in hub.files.items():
-        blob = folder / "blobs" / hub.checksum(name)
-        blob.write_bytes(data)
-        pointer = folder / "snapshots" / COMMIT / name
-        pointer.parent.mkdir(parents=True, exist_ok=True)
-        pointer.symlink_to(blob)
-    return folder / "blobs"
-
-
-def test_the_hub_s_cache_serves_where_there_is_no_network(hub, constants, monkeypatch, tmp_path):
-    blobs = cached(hub, constants)
-    get_teacher(NAME)
-    assert not [path for method, path, _ in hub.asked if method == "GET"]  # only asked what is right
-    shutil.rmtree(tmp_path / SHORT)
-    ask(constants, monkeypatch, "http://127.0.0.1:9")
-    assert get_teacher(NAME)[0].is_file()
-    shutil.rmtree(tmp_path / SHORT)
-    (blobs / hub.checksum("onnx/model.onnx")).write_bytes(b"damaged")
-    with pytest.raises(InputError, match="remove it from the hub's cache"):
-        get_teacher(NAME)
 
 
 @pytest.mark.parametrize(
@@ -167,17 +216,21 @@ def command(tmp_path, *arguments, **environment):
     return subprocess.run(call, cwd=tmp_path, env=environment, capture_output=True, text=True)
 
 
-def test_the_command_takes_the_hub_that_the_environment_names(constants, tmp_path):
-    with serving(Hub(stand_in_hub.files(tmp_path))) as address:
-        done = command(tmp_path, NAME, "--out", "mine", HF_ENDPOINT=address)
+def test_the_command_takes_the_hub_that_the_environment_names(hub, tmp_path):
+    done = command(tmp_path, NAME, "--out", "mine", HF_ENDPOINT=hub.address)
     assert (done.returncode, done.stdout) == (0, f"mine/{SHORT}.onnx\n"), done.stderr
     assert "teacher.model=mine/" in done.stderr and "sees" in done.stderr
 
 
-@pytest.mark.parametrize("environment", [{"HF_ENDPOINT": "http://127.0.0.1:9"}, {"HF_HUB_OFFLINE": "1"}])
-def test_no_network_is_one_line_and_exit_code_3(constants, tmp_path, environment):
-    done = command(tmp_path, "segformer-b0-ade", **environment)
-    assert done.returncode == 3
-    assert done.stdout == "" and len(done.stderr.splitlines()) == 1
-    assert "is not in the hub's cache" in done.stderr and "HF_ENDPOINT" in done.stderr
+def test_without_a_network_the_cache_serves_and_what_it_has_not_is_one_line_with_its_remedy(
+    hub, constants, tmp_path, monkeypatch
+):
+    get_teacher(NAME, tmp_path / "a")
+    ask(constants, monkeypatch, "http://127.0.0.1:9")
+    assert get_teacher(NAME, tmp_path / "b")[0].is_file()
+    with pytest.raises(InputError, match=r"cache and http://127.0.0.1:9 is not reached; connect, or set HF_ENDPOINT"):
+        get_teacher("segformer-b0-ade")
+    done = command(tmp_path, "segformer-b0-ade", HF_HUB_OFFLINE="1")
+    assert (done.returncode, done.stdout, len(done.stderr.splitlines())) == (3, "", 1)
+    assert "is not in the hub's cache and HF_HUB_OFFLINE is set; connect" in done.stderr
     assert not (tmp_path / "segformer-b0-ade").exists()

@@ -3,8 +3,8 @@
 import chebsplat  # noqa: F401  # isort: skip
 import pytest
 import torch
-from shared import ROOT
 
+from benchmarks.cost import trainer_from
 from chebsplat.stages import config as configs
 
 pytestmark = pytest.mark.gpu
@@ -12,10 +12,8 @@ SETTINGS = {"densify": "off", "encoder": "transformer", "encode_from": 0.1, "pru
 
 
 @pytest.fixture
-def trainer_on(up_to_teacher, monkeypatch):
+def trainer_on(up_to_teacher):
     """Makes a trainer of the toy scene before its first step, by device and settings."""
-    monkeypatch.syspath_prepend(str(ROOT))
-    from benchmarks.scene import trainer_from
 
     def make(device, **settings):
         chosen = configs.build({"train": SETTINGS | settings}, "toy")

@@ -7,8 +7,7 @@ import time
 
 import numpy as np
 import pytest
-from malformed.edits import declared_png
-from malformed.photos import EPS
+from malformed.edits import EPS, declared_png
 from PIL import Image, ImageOps
 from source_folders import SETTINGS, image
 

@@ -1,128 +1,71 @@
-"""A lease has one holder at a time, outlives none, and needs neither locks nor clocks that agree."""
+"""A lease has one holder at a time, and outlives none."""
 
 import os
-import random
+import socket
 import subprocess
 import sys
-import threading
 import time
 
 import pytest
-from shared import ROOT
 
-from chebsplat.pipelines import leases
+from chebsplat.pipelines import leases, store
 
-COUNTING = """
-import fcntl, os, sys
+ENDLESS = """
+import sys, time
 from pathlib import Path
 from chebsplat.pipelines import leases
-
-def refused(*_):
-    raise OSError("no locks here")
-
-fcntl.flock = fcntl.lockf = refused
-root, who, inside = Path(sys.argv[1]), sys.argv[2], Path(sys.argv[1]) / "inside"
-for number in range(int(sys.argv[3])):
-    with leases.held(root / "lease"):
-        if inside.exists() and leases.started(int(inside.read_text())):
-            sys.exit("two at once")
-        fresh = inside.with_name(f"inside-{who}")
-        fresh.write_text(str(os.getpid()))
-        os.replace(fresh, inside)
-        text = (root / "count").read_text()
-        if f" {who}-{number} " not in text:
-            fresh.write_text(f"{text}{who}-{number} ")
-            os.replace(fresh, root / "count")
-        inside.unlink()
+with leases.held(Path(sys.argv[1])):
+    print("held", flush=True)
+    time.sleep(600)
 """
 
 
-def test_of_processes_that_are_killed_one_at_a_time_holds_a_lease_and_nothing_is_lost(tmp_path):
-    (tmp_path / "count").write_text(" ")
+def test_who_is_killed_is_followed_at_once_and_nobody_before(tmp_path):
+    path = tmp_path / "held/lease"
+    holder = subprocess.Popen([sys.executable, "-c", ENDLESS, path], stdout=subprocess.PIPE, text=True)
+    assert holder.stdout.readline() == "held\n"
+    told = []
 
-    def start(who):
-        command = [sys.executable, "-c", COUNTING, tmp_path, str(who), "60"]
-        return subprocess.Popen(command, cwd=ROOT, stderr=subprocess.PIPE, text=True)
+    def kill(machine):
+        time.sleep(0.2)
+        told.append((machine, leases.holder(path)))
+        holder.kill()
+        holder.communicate()
 
-    running, rng, killed = {who: start(who) for who in range(4)}, random.Random(0), 0
-    while running:
-        time.sleep(rng.uniform(0, 0.2))
-        for who, process in list(running.items()):
-            if process.poll() is not None:
-                _, error = process.communicate()
-                assert process.returncode == 0, error
-                del running[who]
-        if running and killed < 12:
-            who = rng.choice(sorted(running))
-            running[who].kill()
-            running[who].communicate()
-            running[who] = start(who)
-            killed += 1
-    assert killed >= 1
-    assert sorted((tmp_path / "count").read_text().split()) == sorted(f"{w}-{n}" for w in range(4) for n in range(60))
+    with leases.held(path, kill):
+        assert told == [(socket.gethostname(), socket.gethostname())]
+        assert leases.holder(path) == socket.gethostname()
+    assert leases.holder(path) is None
+    assert list(path.parent.iterdir()) == []
 
 
-@pytest.fixture
-def quick(monkeypatch):
+def elsewhere(path):
+    """A lease that a process of another machine holds."""
+    path.parent.mkdir(exist_ok=True)
+    seconds = leases.EXPIRES
+    path.write_text(f"filelock/2\npid=17\nhost=node7\nmode=lease\ntoken=0\nduration={seconds}\n")
+    return path
+
+
+def test_a_holder_elsewhere_lives_as_long_as_it_gives_signs_of_life(tmp_path, monkeypatch):
+    monkeypatch.setenv("CHEBSPLAT_WORK", str(tmp_path))
+    path = elsewhere(tmp_path / ".held/run")
+    assert leases.holder(path) == "node7" and store.is_held(path)
+    store.sweep()
+    assert path.exists()
+    os.utime(path, (time.time() - 61, time.time() - 61))
+    assert not store.is_held(path)
+    store.sweep()
+    assert not path.exists()
+
+
+@pytest.mark.parametrize("machine", ["node7", None])  # None: it was killed before it could say
+def test_who_is_silent_elsewhere_is_followed_after_a_while(tmp_path, monkeypatch, machine):
     monkeypatch.setattr(leases, "EVERY", 0.1)
     monkeypatch.setattr(leases, "EXPIRES", 1.0)
-
-
-def elsewhere(folder, number=1):
-    """A lease that a process of another machine holds."""
-    folder.mkdir(exist_ok=True)
-    (folder / str(number)).symlink_to("boot-4026 17 999 token node7")
-    beat = folder / f"{number}.beat"
-    beat.touch()
-    return beat
-
-
-@pytest.mark.usefixtures("quick")
-def test_a_holder_elsewhere_lives_as_long_as_its_beat_moves_whatever_its_clock_says(tmp_path):
-    beat, over = elsewhere(tmp_path / "lease"), threading.Event()
-
-    def wander():
-        stamp = 10**9
-        while not over.wait(0.1):
-            stamp = -stamp if stamp > 0 else 10**18 - stamp
-            os.utime(beat, ns=(abs(stamp), abs(stamp)))
-
-    thread = threading.Thread(target=wander)
-    thread.start()
-    try:
-        assert leases.is_held(tmp_path / "lease")
-    finally:
-        over.set()
-        thread.join()
-    os.utime(beat, (4e9, 4e9))  # the far future, and never again
-    began = time.monotonic()
-    assert not leases.is_held(tmp_path / "lease")
-    assert time.monotonic() - began > 0.9
-
-
-@pytest.mark.usefixtures("quick")
-def test_who_waits_is_told_for_which_machine_and_follows_when_it_falls_silent(tmp_path):
-    elsewhere(tmp_path / "lease")
-    told = []
-    with leases.held(tmp_path / "lease", told.append):
-        assert told == ["node7"]
-        assert leases.newest_of(tmp_path / "lease") == 2
-        assert leases.is_held(tmp_path / "lease")
-    assert not leases.is_held(tmp_path / "lease")
-
-
-def test_who_is_done_is_followed_at_once_and_no_number_is_taken_twice(tmp_path):
-    began = time.monotonic()
-    for number in range(1, 4):
-        with leases.held(tmp_path / "lease"):
-            assert leases.newest_of(tmp_path / "lease") == number
-            time.sleep(0.01)
-    elsewhere(tmp_path / "lease", 4).rename(tmp_path / "lease/4.over")
-    assert not leases.is_held(tmp_path / "lease")
-    assert time.monotonic() - began < leases.EXPIRES / 4
-
-
-def test_another_process_of_a_dead_one_s_number_holds_nothing(tmp_path):
-    (tmp_path / "1").symlink_to(f"{leases.here()} {os.getpid()} 1 token here")
-    assert leases.started(os.getpid()) != "1"
-    assert not leases.is_held(tmp_path)
+    path, told, began = elsewhere(tmp_path / "lease"), [], time.monotonic()
+    if machine is None:
+        path.write_text("")
+    with leases.held(path, told.append):
+        assert told == [machine or "this machine"]
+        assert time.monotonic() - began >= leases.EXPIRES

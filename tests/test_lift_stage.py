@@ -2,11 +2,11 @@
 
 import numpy as np
 import pytest
-from malformed.artifacts import VIEWS, N, artifacts, copied
+from malformed.artifacts import VIEWS, N, artifacts
 from shared import KEY, run_stage
 
 from chebsplat.errors import DataFailure, InputError
-from chebsplat.formats import artifact
+from chebsplat.formats import artifact, gaussians
 from chebsplat.formats.capture import SCHEMA, read_capture, write_capture
 from chebsplat.formats.features import read_features
 from chebsplat.formats.gaussians import read_gaussians
@@ -71,13 +71,11 @@ def test_a_splat_in_another_frame_and_a_capture_without_poses_are_refused(tmp_pa
 
 
 def test_features_of_another_number_of_gaussians_are_refused(lifted, tmp_path, capsys):
-    from malformed.artifacts import resealed
-    from safetensors.numpy import load_file, save_file
-
-    inputs = {"gaussians": copied("train", tmp_path), "features": artifacts() / "teacher", "lifted": lifted}
-    file = inputs["gaussians"] / "parameters.safetensors"
-    save_file({name: np.ascontiguousarray(values[:-1]) for name, values in load_file(file).items()}, file)
-    resealed(inputs["gaussians"])
+    fewer = read_gaussians(artifacts() / "train")
+    fewer.parameters = {name: values[:-1] for name, values in fewer.parameters.items()}
+    with artifact.publish(tmp_path / "train", Manifest(gaussians.SCHEMA, KEY, "test")) as tmp:
+        gaussians.write_gaussians(tmp, fewer)
+    inputs = {"gaussians": tmp_path / "train", "features": artifacts() / "teacher", "lifted": lifted}
     assert run_stage("export", tmp_path / "export", inputs, {}) == 3
     assert "make it again" in capsys.readouterr().err
 

@@ -3,6 +3,9 @@
 import base64
 import json
 import re
+import shutil
+import subprocess
+import webbrowser
 
 import numpy as np
 import pytest
@@ -10,6 +13,7 @@ from box_room import CALIBRATION, LABELS, MORE, RIVALS, SIZE, N, foreign_ply, ma
 from browser import BROWSER
 from click.testing import CliRunner
 from driven import driven
+from shared import ROOT
 
 from chebsplat.errors import ConfigError
 from chebsplat.formats.packed import BYTES, C0, from_bytes, pack, to_bytes, unpack
@@ -18,6 +22,7 @@ from chebsplat.labels.relevancy import relevancy
 from chebsplat.pipelines.api import load
 from chebsplat.pipelines.cli import main
 from chebsplat.render import SceneRenderer
+from chebsplat.stages.camera_files import read_cameras
 from chebsplat.stages.evaluate import camera
 from chebsplat.stages.page import write_page
 
@@ -190,6 +195,71 @@ def test_an_existing_file_stays(scene, tmp_path):
     assert (done.exit_code, out.read_text()) == (2, "mine")
 
 
+def test_viewing_writes_the_page_anew_beside_the_scene_and_opens_it(scene, tmp_path, monkeypatch):
+    opened, ply = [], foreign_ply(tmp_path / "theirs.ply")
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setenv("BROWSER", "a browser")
+    monkeypatch.setattr(webbrowser, "open", lambda address: opened.append(address) or True)
+    pages = {scene[0]: scene[0] / "view.html", ply: tmp_path / "theirs.view.html"}
+    for viewed, out in pages.items():
+        out.write_text("an older page")
+        done = CliRunner().invoke(main, ["view", str(viewed)])
+        assert (done.exit_code, done.stdout) == (0, f"{out}\n"), done.output
+        assert "views" in held_in(out)[0]
+    assert opened == [out.as_uri() for out in pages.values()]
+    for name in ("BROWSER", "DISPLAY", "WAYLAND_DISPLAY"):
+        monkeypatch.delenv(name, raising=False)
+    done = CliRunner().invoke(main, ["view", str(ply)])
+    assert (done.exit_code, len(opened)) == (0, 2)
+    assert "no browser can be opened from here" in done.stderr
+
+
+def in_node(script, given):
+    """What an expression gives for `given`, with the functions of the page's cameras."""
+    source = (ROOT / "stages/pages/scene/cameras.js").read_text()
+    program = f"{source}\nconst given = {json.dumps(given)};\nconsole.log(JSON.stringify({script}))"
+    done = subprocess.run(["node", "-"], input=program, capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr
+    return json.loads(done.stdout)
+
+
+@pytest.mark.skipif(shutil.which("node") is None, reason="node is not installed")
+def test_the_page_s_camera_path_is_a_file_that_render_flies_along(scene, page, tmp_path):
+    about, arrays = held_in(page)
+    rows = arrays["views"].reshape(-1, 16).tolist()
+    path = []
+    for view in (0, 2):
+        pose = np.reshape(rows[view][:12], (3, 4))
+        eye = -pose[:, :3].T @ pose[:, 3]
+        path.append({"turn": pose[:, :3].ravel().tolist(), "eye": eye.tolist(), "view": view})
+    given = {"path": path, "about": about, "views": rows}
+    wanted = "file_of(given.path, given.about, Float32Array.from(given.views.flat()))"
+    file = tmp_path / "room.cameras.json"
+    file.write_text(json.dumps(in_node(wanted, given)))
+    found, cameras = read_cameras(file), load(scene[0]).cameras
+    for key, view in zip(found, (cameras[0], cameras[2]), strict=True):
+        np.testing.assert_allclose(key.cam_from_world, view.cam_from_world, atol=1e-5)
+        np.testing.assert_allclose(key.K, view.K)
+        assert (key.width, key.height) == (view.width, view.height)
+    command = ["render", scene[0], "--path", file, "--frames", 3, "--out", tmp_path / "frames"]
+    assert CliRunner().invoke(main, list(map(str, command))).exit_code == 0
+    names = sorted(frame.name for frame in (tmp_path / "frames/color").iterdir())
+    assert names == ["path_0000.png", "path_0001.png", "path_0002.png"]
+
+
+@pytest.mark.skipif(shutil.which("node") is None, reason="node is not installed")
+def test_a_link_holds_the_camera_and_one_that_does_not_gives_none():
+    about = {"views": ["a", "b"], "center": [4.0, -2.5, 100.0]}
+    turn = [0.8, 0, 0.6, 0, 1, 0, -0.6, 0, 0.8]
+    at = {"view": 1, "pivot": 0.25, "eye": [1.0, -2.0, 0.5], "turn": turn}
+    found = in_node("camera_of(link_of(given[0], given[1]), given[1])", [at, about])
+    for name, value in at.items():
+        np.testing.assert_allclose(found[name], value, atol=1e-5)
+    good = in_node("link_of(given[0], given[1])", [at, about])
+    bad = [good.replace("=1,", "=2,"), good + ",1", good.replace("0.25", "-1"), "#camera=", good + "x"]
+    assert in_node("given[0].map(hash => camera_of(hash, given[1]))", [bad, about]) == [None] * 5
+
+
 in_a_browser = pytest.mark.skipif(BROWSER is None, reason="neither chromium nor google-chrome is installed")
 
 
@@ -264,6 +334,35 @@ def test_in_a_browser_a_page_shows_names_and_answers_as_we_do(scene, page, tmp_p
         assert min(np.linalg.norm(np.diff(eyes, axis=0), axis=1)) > 0.01
         assert browser.complaints == []
         assert [url for url in browser.requested if not url.startswith("blob:")] == [page.as_uri()]
+
+
+@pytest.mark.slow
+@in_a_browser
+def test_in_a_browser_a_path_is_saved_and_a_link_leads_back(scene, page, tmp_path):
+    with driven(tmp_path) as browser:
+        browser.open(page, 960, 720)
+        browser.run("scene.ready")
+        browser.run("document.querySelectorAll('details').forEach(part => { part.open = true; })")
+        browser.run("scene.look(1); get('keep').click()")
+        browser.drag((300, 300), (420, 330))
+        browser.run("get('keep').click(); get('link').click()")
+        turn, eye, link = browser.run("[camera.turn, camera.eye, location.href]")
+        written = "new Promise(done => { offer = blob => done(blob.text()); get('write').click(); })"
+        (tmp_path / "room.json").write_text(browser.run(written))
+        browser.screenshot(tmp_path / "path.png")
+        keys, center = read_cameras(tmp_path / "room.json"), held_in(page)[0]["center"]
+        view = load(scene[0]).cameras[1]
+        np.testing.assert_allclose(keys[0].cam_from_world, view.cam_from_world, atol=1e-5)
+        np.testing.assert_allclose(keys[1].cam_from_world[:3, :3].ravel(), turn, atol=1e-5)
+        np.testing.assert_allclose(keys[1].position, np.add(eye, center), atol=1e-5)
+        assert np.linalg.norm(keys[1].position - keys[0].position) > 0.05
+        browser.open(link, 960, 720)
+        browser.run("scene.ready")
+        np.testing.assert_allclose(browser.run("camera.turn"), turn, atol=1e-5)
+        np.testing.assert_allclose(browser.run("camera.eye"), eye, atol=1e-5)
+        told = "new Promise(done => addEventListener('hashchange', () => done(get('kept').textContent)))"
+        assert "leads to no camera" in browser.run(f"location.hash = '#camera=3'; {told}")
+        assert browser.complaints == []
 
 
 @pytest.mark.slow

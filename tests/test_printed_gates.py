@@ -1,10 +1,10 @@
-"""The printed pruning gate and SH mask network: against their formulas, by finite differences, and in extreme cases."""
+"""The printed pruning gate and SH mask network: against their formulas, and by finite differences."""
 
 import numpy as np
 import pytest
 import torch
-from shared import ROOT
 
+from benchmarks.stability.training import tiny_trainer
 from chebsplat.splats.sh import basis
 from chebsplat.stages.train import guidance
 from chebsplat.training import prune, sh_mask_network
@@ -148,23 +148,10 @@ def test_penalties_reach_gate_and_histogram_weights_only_where_guidance_is_on(sc
 
 def test_masks_are_nested_binary_and_pass_the_gradient_of_what_they_threshold():
     delta = torch.tensor([[0.9, 0.05, 0.9, 0.9], [0.05, 0.9, 0.9, 0.05], [0.5, 0.4, 0.3, 0.9]], requires_grad=True)
-    masks = nested(delta, 0.1)
+    masks = nested(delta)
     assert masks.detach().tolist() == [[1, 0, 0, 0], [0, 1, 1, 0], [1, 1, 1, 1]]
     masks.sum().backward()
     assert (delta.grad > 0).all()
-
-
-@pytest.mark.parametrize("size", [0.0, 1e-20, 1e20])
-def test_features_of_any_size_give_finite_masks_and_gradients(scene, size):
-    features = (size * scene["features"]).float()
-    gate, network = prune.PrintedGate(C), BandMaskNetwork(C)
-    found = region_histograms(*(scene[k].float() for k in ("coefficients", "directions")), scene["members"], 8)
-    soft = gate(features, scene["logits"].float() * 1e20)
-    delta = network(scene["band_logits"].float() * 1e20, features, found, scene["nearest"])
-    (soft.sum() + delta.sum()).backward()
-    for module in (gate, network):
-        assert all(value.grad is None or value.grad.isfinite().all() for value in module.parameters())
-    assert soft.isfinite().all() and delta.isfinite().all()
 
 
 def test_regions_without_members_or_of_one_colour_have_finite_histograms(scene):
@@ -195,10 +182,7 @@ def test_what_guidance_changed_is_read_off_a_finished_training():
     assert alone["labels_changed"] is None and alone["mask_spread"] is None
 
 
-def test_without_guidance_a_training_has_no_gate_and_no_histogram_to_teach(monkeypatch):
-    monkeypatch.syspath_prepend(str(ROOT))
-    from benchmarks.stability.training import tiny_trainer
-
+def test_without_guidance_a_training_has_no_gate_and_no_histogram_to_teach():
     chosen = {"prune_gate": "printed", "sh_masks": "printed"}
     guided, alone = tiny_trainer(**chosen), tiny_trainer(**chosen, prune_semantic=False, sh_guided=False)
     assert isinstance(guided.model.semantic_gate, prune.PrintedGate)

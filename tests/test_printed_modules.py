@@ -9,7 +9,7 @@ from scipy.special import erf
 
 from chebsplat.shape.cks import update
 from chebsplat.shape.encoder import N_FREQUENCIES, RegionEncoder, positional_encoding
-from chebsplat.shape.fusion import Fusion, Gate, fuse_in_view, propagate, propagation_weights
+from chebsplat.shape.fusion import Fusion, Gate, propagate, propagation_weights
 from chebsplat.shape.region_inputs import in_scene
 from chebsplat.splats.rotations import rotation_matrices
 from chebsplat.training.densify import densify, region_gradients
@@ -106,16 +106,6 @@ def test_gradients_of_printed_propagation_and_gate_agree_with_finite_differences
 
     weight = fusion.gate.linear.weight.detach().clone().requires_grad_()
     assert torch.autograd.gradcheck(gated, weight, **DIFFERENCES)
-
-
-def test_the_compiled_fusion_is_the_printed_formula_to_float32(room):
-    gate = randomized(Gate(C))
-    wanted, _ = printed_fusion(room, gate, 1.0)
-    features, encodings = room["features"].float(), room["encodings"].float()
-    none = torch.zeros(0, dtype=torch.int64)
-    index, weights = torch.arange(N).flip(0), weights_of(room).float()
-    found = fuse_in_view(gate.float(), features, (encodings, encodings[:0], none), room["cover"], weights, index)
-    assert np.abs(found.detach().numpy() - wanted[::-1]).max() < 3e-6
 
 
 def test_the_printed_position_is_the_centre_in_its_scene_and_its_octaves():

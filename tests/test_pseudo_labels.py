@@ -52,7 +52,7 @@ def test_a_scene_learns_from_its_source_s_pseudo_labels(toy, tmp_path, capsys):
     truth = np.asarray(record.labels[:])
     record.pseudo_labels, record.confidence = truth.copy(), np.ones(truth.shape, np.float16)
     record.pseudo_labels[:, :8] = -1
-    with publish(tmp_path / "capture", Manifest("chebsplat.capture/1", KEY, "ingest")) as tmp:
+    with publish(tmp_path / "capture", Manifest("chebsplat.capture/2", KEY, "ingest")) as tmp:
         write_capture(tmp, record)
     config = TOY | {"teacher": {"kind": "given", "downscale": 4}}
     assert run_stage("teacher", tmp_path / "teacher", {"capture": tmp_path / "capture"}, config) == 0

@@ -58,9 +58,9 @@ def write_toy(folder, teacher=None):
     K = np.array([[40, 0, SIZE[1] / 2], [0, 40, SIZE[0] / 2], [0, 0, 1]], float)
     views, Ks, poses = ["a.png", "b.png"], np.stack([K, K]), np.stack([np.eye(4)] * 2)
     scene = Scene(parameters, Cameras(views, Ks, poses, SIZE[1], SIZE[0]), np.arange(n), labels, LABELS, known)
-    published(folder / "export", "scene/2", write_scene, scene)
+    published(folder / "export", "scene/3", write_scene, scene)
     capture = Capture(views, np.zeros((2, *SIZE, 3), np.uint8), Ks, poses, np.array([False, True]))
-    published(folder / "ingest", "capture/1", write_capture, capture)
+    published(folder / "ingest", "capture/2", write_capture, capture)
     convention, model = {"kind": "labels"}, None
     if teacher is not None:
         convention, model = {"kind": "onnx", "output": "features", "sha256": sha256_file(teacher)}, str(teacher)
@@ -68,7 +68,7 @@ def write_toy(folder, teacher=None):
         views, np.zeros((2, 2, 2, known.shape[1]), np.float16), LABELS, known, convention=convention,
         channels=None if teacher is None else channels,
     )  # fmt: skip
-    published(folder / "teacher", "features/1", write_features, features, config={"teacher": {"model": model}})
+    published(folder / "teacher", "features/2", write_features, features, config={"teacher": {"model": model}})
 
 
 @pytest.fixture(scope="module")

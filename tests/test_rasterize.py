@@ -78,22 +78,6 @@ def test_means2d_keep_their_gradient_for_densification():
     assert meta["means2d"].grad.abs().sum() > 0
 
 
-def test_extreme_shapes_stay_finite():
-    given = scene(4)
-    given["scales"] = torch.tensor([[1e3, 1e-9, 1e-9], [1e6, 1e6, 1e6], [1e-12] * 3, [1, 0, 0]], dtype=torch.float64)
-    given = {k: v.requires_grad_() for k, v in given.items()}
-    image, _, _ = rasterize(**given, **camera())
-    image.sum().backward()
-    assert torch.isfinite(image).all()
-    assert all(torch.isfinite(v.grad).all() for v in given.values())
-
-
-def test_order_of_gaussians_does_not_matter():
-    given = scene(8)
-    shuffled = {k: v[torch.randperm(8, generator=torch.Generator().manual_seed(1))] for k, v in given.items()}
-    torch.testing.assert_close(rasterize(**given, **camera())[0], rasterize(**shuffled, **camera())[0])
-
-
 @pytest.mark.parametrize("length", [1e-10, 1.0, 1e20])
 def test_length_of_a_quaternion_does_not_matter(length):
     quats = scene()["quats"]

@@ -38,26 +38,6 @@ def render(arguments, **options):
     return rasterize(arguments[0].as_subclass(OnGpu), *arguments[1:], *camera(), max_alpha=CEILING, **options)
 
 
-def test_gsplat_is_asked_for_unpacked_absolute_gradients(asked):
-    meta = render(scene(channels=3), rasterize_mode="antialiased", absgrad=True)[2]
-    wanted = {
-        "packed": False,
-        "absgrad": True,
-        "sh_degree": None,
-        "render_mode": "RGB",
-        "rasterize_mode": "antialiased",
-    }
-    assert {name: asked[name] for name in wanted} == wanted
-    assert {name: meta[name].ndim for name in meta} == {"means2d": 3, "conics": 3, "depths": 2, "radii": 2}
-
-
-@pytest.mark.parametrize("channels", [3, 32, 35, 64])
-def test_gsplat_takes_all_channels_at_once(channels, asked):
-    # in chunks, each would overwrite the absolute gradient of the one before
-    render(scene(channels=channels))
-    assert asked["channel_chunk"] >= channels
-
-
 def test_gsplat_takes_cell_colors_as_channels_on_black(asked):
     image, _, meta = render(scene(channels=3), backgrounds=torch.ones(1, 3), cell_colors=torch.rand(150, 5))
     assert asked["channel_chunk"] >= 8 and asked["backgrounds"].tolist() == [[1.0] * 3 + [0.0] * 5]

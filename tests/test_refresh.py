@@ -72,25 +72,6 @@ def test_added_and_removed_gaussians_touch_only_their_regions():
     assert_same(shape, raw)
 
 
-def test_tolerance_spares_small_changes_and_no_large_ones():
-    shape, raw = shape_of(refresh_tolerance=1e-2), scene()
-    shape.refresh(raw)
-    raw["means"] += 1e-4 * shape.regions.radius
-    assert described_by(shape, raw) == 0
-    raw["means"][shape.members[3, 0]] += 0.05 * shape.regions.radius
-    assert 0 < described_by(shape, raw) < 40
-
-
-def test_small_changes_add_up():
-    shape, raw = shape_of(refresh_tolerance=1e-2), scene()
-    shape.refresh(raw)
-    for _ in range(4):  # 1.6 tolerances together
-        raw["means"] += 4e-3 * shape.regions.radius / 3
-        raw["means"][:, 0] += 8e-3 * shape.regions.radius / 3
-        shape.refresh(raw)
-    assert shape.described.n_described == 80
-
-
 def test_anew_owes_nothing_to_earlier_refreshes():
     shape, raw = shape_of(), scene()
     shape.refresh(raw)

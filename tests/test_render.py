@@ -6,6 +6,7 @@ import signal
 import subprocess
 import sys
 import time
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -197,6 +198,19 @@ def test_an_orbit_goes_round_what_the_cameras_look_at():
     np.testing.assert_allclose(places[:, 2], 0.9)
     np.testing.assert_allclose(np.linalg.norm(np.diff(places, axis=0), axis=1), 6 * np.sin(np.pi / 8), rtol=1e-6)
     assert len(camera_paths.orbit([next(ring())] * 2, 3)) == 3  # in one place, looking one way
+
+
+def test_a_path_flies_through_its_keys_at_their_lenses():
+    keys = list(ring())[:3]
+    keys[2] = replace(keys[2], K=keys[2].K * [[2.0], [2.0], [1.0]])
+    path = camera_paths.between(keys, 5)
+    for k, key in ((0, 0), (2, 1), (4, 2)):
+        np.testing.assert_allclose(path[k].cam_from_world, keys[key].cam_from_world, atol=1e-9)
+        np.testing.assert_allclose(path[k].K, keys[key].K)
+    assert np.linalg.norm(path[1].position - path[0].position) > 0.5
+    for wrong, n in ((keys[:1], 5), (keys, 1), ([keys[0], keys[1].resized(50, 40)], 5)):
+        with pytest.raises(ConfigError, match=r"a path .*needs"):
+            camera_paths.between(wrong, n)
 
 
 def test_another_size_shows_all_of_the_view_in_square_pixels():

@@ -165,13 +165,14 @@ def test_a_browser_would_notice_an_error_a_request_and_a_page_too_wide(tmp_path)
 
 @pytest.mark.filterwarnings("ignore:No artists with labels")  # the small trace has one row
 def test_the_page_tells_how_far_views_agree_and_doubts_labels_where_they_do_not(tmp_path):
-    from malformed.artifacts import artifacts, copied, set_value
+    from malformed.artifacts import artifacts, copied
+    from malformed.edits import changed
 
     inputs = {"evaluation": artifacts() / "evaluate", "gaussians": artifacts() / "train"}
     agreed = copied("agree", tmp_path)
     assert run_stage("report", tmp_path / "sure", inputs | {"agreement": agreed}, {}) == 0
     assert "agreement of views on labels of 40 points" in (tmp_path / "sure/figures.csv").read_text()
     assert "in doubt" not in (tmp_path / "sure/report.html").read_text()
-    set_value(agreed / "artifact.json", ("facts", "doubt"), "views agree by 0.01")
+    changed("artifact.json", lambda said: said["facts"].update(doubt="views agree by 0.01"))(agreed)
     assert run_stage("report", tmp_path / "unsure", inputs | {"agreement": agreed}, {}) == 0
     assert "Labels are in doubt:</b> views agree by 0.01." in (tmp_path / "unsure/report.html").read_text()

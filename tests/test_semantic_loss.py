@@ -1,13 +1,12 @@
 """What a teacher has no label for pulls nothing, and what it is unsure of pulls less."""
 
 import math
-import tomllib
 
 import numpy as np
 import pytest
 import torch
-from shared import ROOT
 
+from benchmarks.stability.training import CHANNELS, four_views, tiny_trainer
 from chebsplat.errors import ConfigError
 from chebsplat.formats.features import Features
 from chebsplat.labels.noisy_teacher import IGNORE, noisy_features
@@ -81,14 +80,6 @@ def test_masked_pixels_do_not_count_and_nothing_left_is_no_loss():
     assert label_entropy(render, labels, torch.zeros_like(mask), 1.0).item() == 0
 
 
-@pytest.mark.parametrize("size", [1e-20, 1e10])
-def test_renders_of_any_size_give_a_finite_loss(size):
-    render, labels = view(torch.float32)
-    loss = label_entropy(render * size, labels, None, 0.1)
-    assert loss.isfinite()
-    assert gradient(loss, render).isfinite().all()
-
-
 def test_where_every_cell_has_a_label_distances_are_as_without():
     render, labels = view(torch.float32)
     every = labels._replace(classes=labels.classes.clamp_min(0))
@@ -121,23 +112,14 @@ def test_ignored_pixels_of_the_labels_teacher_are_zero_not_noise():
     assert np.allclose(np.linalg.norm(features[labels != IGNORE], axis=-1), 1)
 
 
-@pytest.mark.parametrize("kind", ["paper", "cross-entropy"])
-def test_a_training_as_printed_and_one_of_labels_run_to_a_finite_end(monkeypatch, kind):
-    monkeypatch.syspath_prepend(str(ROOT))
-    from benchmarks.stability.training import CHANNELS, four_views, tiny_trainer
-
+def test_a_training_of_labels_runs_to_a_finite_end():
     views = four_views()
     g = torch.Generator().manual_seed(0)
     index, codes = torch.randint(-1, L, (10, 12), generator=g), torch.randn(L, CHANNELS, generator=g)
-    views.labels = lambda _: TaughtLabels(index, torch.rand(10, 12, generator=torch.Generator().manual_seed(1)), codes)
-    settings = {"train": {"feature_loss": kind}}
-    if kind == "paper":
-        settings = tomllib.loads((ROOT / "pipelines/configs/ablations/paper.toml").read_text())
-    trainer = tiny_trainer(None, views, settings.get("describe"), **settings["train"])
+    confidence = torch.rand(10, 12, generator=g)
+    views.labels = lambda _: TaughtLabels(index, confidence, codes)
+    trainer = tiny_trainer(views=views, feature_loss="cross-entropy")
     figures = list(trainer.steps())
     assert all(math.isfinite(value) for row in figures for value in row.values())
     assert figures[-1]["n"] != figures[0]["n"]
     assert all(np.isfinite(value).all() for value in trainer.finish().values())
-    if kind == "paper":
-        assert trainer.model.shape.encoder.n_inputs == 8 * 9  # degrees from 0
-        assert 0 <= trainer.model.shape.share_undefined <= 1

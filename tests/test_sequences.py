@@ -3,7 +3,7 @@
 import pytest
 from shared import ROOT
 
-from chebsplat.errors import ConfigError, InputError
+from chebsplat.errors import ConfigError
 from chebsplat.pipelines.cli.runs import checked_stage, plans
 from chebsplat.pipelines.plan import Planner
 from chebsplat.pipelines.run import wanted_steps
@@ -102,34 +102,6 @@ def test_without_a_basis_the_stage_is_left_out_and_said():
     (plan,) = ask("toy", settings="")
     assert "cks" not in plan.targets
     assert plan.left_out["cks"] == "no sequence is named"
-
-
-@pytest.mark.parametrize(
-    ("arguments", "error", "message"),
-    [
-        ({"basis": "ofices@2"}, ConfigError, "did you mean offices"),
-        ({"basis": "offices@4"}, ConfigError, "offices has 3 revisions; there is no offices@4"),
-        ({"basis": "offices@0"}, ConfigError, "NAME@REVISION"),
-        ({"basis": "offices@last"}, ConfigError, "NAME@REVISION"),
-        ({"basis": "@2"}, ConfigError, "NAME@REVISION"),
-        ({"basis": "./tests/"}, InputError, "not a finished artifact"),
-        ({"basis": "./nowhere/"}, ConfigError, "no basis is called"),
-        ({"basis": "offices@2", "ablation": "no-shape"}, ConfigError, "holds no knowledge: train.encoder is off"),
-        ({"basis": "offices@2", "ablation": "no-tle"}, ConfigError, "holds no knowledge: train.encoder is mlp"),
-        ({"scene": None, "sequence": "offices", "basis": "offices@2"}, ConfigError, "starts from nothing"),
-        ({"scene": None, "sequence": "ofices"}, ConfigError, "offices"),
-    ],
-)
-def test_a_basis_or_sequence_that_cannot_be_used_is_an_error_that_says_why(arguments, error, message):
-    with pytest.raises(error, match=message):
-        ask(**{"scene": "toy"} | arguments)
-
-
-@pytest.mark.parametrize("text", ["scenes = []", "scenes = [1]", "scene = ['toy']", "scenes = ['toy']\nextra = 1", "x"])
-def test_a_sequence_file_holds_scenes_and_nothing_else(tmp_path, text):
-    (tmp_path / "bad.toml").write_text(text)
-    with pytest.raises(ConfigError, match=r"bad\.toml"):
-        scenes_of(str(tmp_path / "bad.toml"))
 
 
 def test_a_sequence_of_scenes_without_encoder_carries_nothing(sequence):

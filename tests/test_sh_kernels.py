@@ -55,9 +55,3 @@ def test_a_band_that_is_not_used_gets_no_gradient():
     assert [band.grad is not None for band in bands] == [True, True, False, False]
     with pytest.raises(ValueError, match="degree 4"):
         colors_in_view(bands, None, index, means, eye, 4)
-
-
-def test_bands_that_do_not_exist_add_nothing():
-    parameters, index, means, eye = scene()
-    some = colors_in_view(parameters[:2], None, index, means, eye, 3)
-    assert torch.equal(some, colors_in_view(parameters[:4], None, index, means, eye, 1))

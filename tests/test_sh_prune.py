@@ -94,27 +94,6 @@ def test_histogram_has_mass_one_no_negative_bin_and_finite_gradients(n, n_bins, 
     assert torch.isfinite(values.grad).all()
 
 
-@pytest.mark.parametrize("case", ["constant", "constant far off", "one", "two far apart", "outside the bounds"])
-def test_histogram_of_an_extreme_has_mass_one_and_finite_gradients(case):
-    values = {
-        "constant": torch.full((30,), 0.3),
-        "constant far off": torch.full((30,), 1e6),
-        "one": torch.tensor([0.5]),
-        "two far apart": torch.tensor([-1e6, 1e6]),
-        "outside the bounds": torch.tensor([-9.0, 9.0, 1e30]),
-    }[case].requires_grad_(True)
-    low, high = values.detach().aminmax()
-    if case == "outside the bounds":
-        low, high = torch.tensor(0.0), torch.tensor(1.0)
-    bounds = [b.clone().requires_grad_(True) for b in (low, high)]
-    found = sh_prune.soft_histogram(values, torch.ones(len(values), dtype=torch.bool), 8, *bounds)
-    assert abs(found.sum().item() - 1) < 1e-6
-    if "constant" in case or case == "one":
-        assert found[0].item() == pytest.approx(1.0)
-    (found**2).sum().backward()
-    assert all(torch.isfinite(x.grad).all() for x in (values, *bounds))
-
-
 def test_histogram_of_well_placed_values_is_the_plain_one():
     values = torch.tensor([0.05, 0.15, 0.15, 0.35, 0.95])
     found = sh_prune.soft_histogram(values, torch.ones(5, dtype=torch.bool), 10, torch.tensor(0.0), torch.tensor(1.0))
@@ -127,17 +106,6 @@ def test_a_histogram_can_be_taught():
     valid = torch.ones(2, dtype=torch.bool)
     sh_prune.soft_histogram(values, valid, 5, torch.tensor(0.0), torch.tensor(1.0))[1].backward()
     assert values.grad[0] > 0
-
-
-def test_what_is_not_valid_leaves_no_trace_even_if_it_is_nan():
-    values = torch.tensor([[0.1, 0.9, torch.nan], [torch.inf, torch.nan, 0.5], [torch.nan] * 3], requires_grad=True)
-    valid = torch.tensor([[True, True, False], [False, False, True], [False] * 3])
-    found = sh_prune.soft_histogram(values, valid, 4, torch.zeros(3), torch.ones(3))
-    alone = sh_prune.soft_histogram(torch.tensor([0.1, 0.9]), valid[0, :2], 4, torch.tensor(0.0), torch.tensor(1.0))
-    assert torch.equal(found[0], alone)
-    assert found.sum(1).tolist() == pytest.approx([1, 1, 0], abs=1e-6)
-    (found**2).sum().backward()
-    assert torch.isfinite(values.grad).all()
 
 
 # guidance

@@ -1,7 +1,6 @@
 """COLMAP models and photos become pinhole views of one size, and nothing vanishes without a note."""
 
 import json
-import shutil
 
 import numpy as np
 import pytest
@@ -9,7 +8,7 @@ from PIL import Image
 from shared import run_stage
 from source_folders import SETTINGS, image, save, write_colmap
 
-from chebsplat.errors import DataFailure, InputError
+from chebsplat.errors import DataFailure
 from chebsplat.stages.settings import IngestSection
 from chebsplat.stages.sources import colmap, colmap_model, common, photos
 
@@ -170,44 +169,6 @@ def test_focal_lengths_follow_each_side_as_it_was_rounded(tmp_path):
     assert np.allclose(fields["Ks"][0], [[50 * 20 / 101, 0, 10], [0, 50 * 7 / 37, 3.5], [0, 0, 1]])
 
 
-def test_an_unsupported_camera_model_is_named(tmp_path):
-    with pytest.raises(InputError, match="OPENCV_FISHEYE"):
-        colmap.read(write_colmap(tmp_path, "OPENCV_FISHEYE 8 6 10 10 4 3 0 0 0 0"), SETTINGS)
-
-
-@pytest.mark.parametrize(
-    "damage",
-    ["truncated image", "small depth", "8-bit depth", "coloured labels", "no depth", "no images", "no model",
-     "text model", "cut model", "empty model", "list", "labels", "test_every"],
-)  # fmt: skip
-def test_a_damaged_colmap_source_is_named(tmp_path, damage):
-    folder = write_colmap(tmp_path)
-    if damage == "truncated image":
-        file = folder / "images/b.png"
-        file.write_bytes(file.read_bytes()[:-30])
-    elif damage == "small depth":
-        image(folder / "depth/b.png", (4, 3), 1500, "I;16")
-    elif damage == "8-bit depth":
-        image(folder / "depth/b.png", mode="L")
-    elif damage == "coloured labels":
-        image(folder / "semantic/b.png")
-    elif damage == "no depth":
-        (folder / "depth/b.png").unlink()
-    elif damage in ("no images", "no model"):
-        shutil.rmtree(folder / ("images" if damage == "no images" else "sparse"))
-    elif damage == "text model":
-        (folder / "sparse/0/cameras.txt").write_text("nonsense\n")
-    elif damage in ("cut model", "empty model"):
-        for name in ("cameras", "images", "points3D"):
-            content = b"" if damage == "empty model" else b"\x05" + bytes(40)
-            (folder / f"sparse/0/{name}.bin").write_bytes(content)
-    else:
-        document = {"list": [], "labels": {"labels": {"a": 1}}, "test_every": {"test_every": "x"}}[damage]
-        (folder / "scene.json").write_text(json.dumps(document))
-    with pytest.raises(InputError, match=str(folder)):
-        colmap.read(folder, SETTINGS)
-
-
 def test_labels_without_a_name_are_noted_and_class_names_can_be_given(tmp_path):
     folder = write_colmap(tmp_path)
     image(folder / "semantic/b.png", mode="L", value=9)
@@ -262,20 +223,6 @@ def test_transparent_pixels_do_not_count(tmp_path):
         pixels[:, : 2 * k, 3] = 0
         save(tmp_path / f"{k}.png", pixels)
     assert photos.read(tmp_path, SETTINGS)["loss_mask"].sum((1, 2)).tolist() == [48, 36, 24]
-
-
-@pytest.mark.parametrize("bad", ["same stem", "16 bit", "text"])
-def test_photos_that_cannot_be_told_apart_or_read_are_named(tmp_path, bad):
-    image(tmp_path / "a.png")
-    image(tmp_path / "b.png")
-    if bad == "same stem":
-        image(tmp_path / "a.jpg")
-    elif bad == "16 bit":
-        image(tmp_path / "c.png", mode="I;16", value=30000)
-    else:
-        (tmp_path / "c.jpg").write_text("<html>")
-    with pytest.raises(InputError, match=str(tmp_path)):
-        photos.read(tmp_path, SETTINGS)
 
 
 def test_images_are_reduced_but_never_enlarged(tmp_path):

@@ -13,7 +13,7 @@ from click.testing import CliRunner
 from soak.tiny import Run, artifacts, contents, hidden, kill
 
 from chebsplat.errors import Stopped
-from chebsplat.pipelines import store
+from chebsplat.pipelines import children, store
 from chebsplat.pipelines.cli.group import Guarded
 from chebsplat.stages import stopping
 
@@ -47,15 +47,15 @@ def test_a_stopped_command_says_what_is_kept_and_leaves_as_shells_know_it(number
     assert f"stopped by {number.name}; what was finished is kept" in result.stderr
 
 
-def is_paused(number):
-    return Path(f"/proc/{number}/stat").read_text().rpartition(")")[2].split()[0] == "T"
+def is_in_state(number, state):
+    return Path(f"/proc/{number}/stat").read_text().rpartition(")")[2].split()[0] == state
 
 
 def test_a_run_pauses_with_its_jobs_and_ends_with_them_and_leaves_nothing_half(tmp_path):
     run = in_a_job(Run(tmp_path / "work"))
     kill(run.process.pid, signal.SIGTSTP)
     until = time.monotonic() + 10
-    while not all(is_paused(number) for number in run.alive()):
+    while not all(is_in_state(number, "T") for number in run.alive()):
         assert time.monotonic() < until
         time.sleep(0.02)
     kill(run.process.pid, signal.SIGCONT)
@@ -80,23 +80,23 @@ def test_jobs_end_with_a_run_that_is_killed(tmp_path):
 
 
 BUSY = """
-import hashlib, sys
-from pathlib import Path
-from chebsplat.stages.stopping import deferred, half_made, heeded
-folder = Path(sys.argv[1])
-with heeded(), half_made(folder), deferred():  # or else it could still listen on its way out of mkdir
-    folder.mkdir()
+import hashlib, os, sys, time
+from chebsplat.stages.stopping import heeded
+with heeded():
+    print(os.getpid(), flush=True)
     hashlib.pbkdf2_hmac("sha256", b"", b"", 10**9)
 """
 
 
-def test_a_process_that_cannot_listen_is_ended_and_leaves_nothing_half(tmp_path):
-    process = subprocess.Popen([sys.executable, "-P", "-c", BUSY, tmp_path / "half"])
-    while not (tmp_path / "half").is_dir():
-        time.sleep(0.01)
-    process.send_signal(signal.SIGTERM)
-    assert process.wait(10) == 143
-    assert not (tmp_path / "half").exists()
+def test_of_a_session_that_is_ended_nothing_is_left_though_it_cannot_listen():
+    command = f"{sys.executable} -P -c '{BUSY}' & wait"
+    process = subprocess.Popen(["sh", "-c", command], stdout=subprocess.PIPE, start_new_session=True, text=True)
+    number = int(process.stdout.readline())
+    began = time.monotonic()
+    children.end(process)
+    assert time.monotonic() - began < 2 * stopping.PATIENCE
+    assert not Path(f"/proc/{number}").exists() or is_in_state(number, "Z")
+    process.stdout.close()
 
 
 def test_a_signal_is_heeded_where_the_block_looks_for_it():
@@ -134,7 +134,7 @@ def test_an_ignored_signal_stays_ignored():
 
 def test_what_runs_leave_beside_the_store_is_swept_when_none_is_under_way(tmp_path, monkeypatch):
     monkeypatch.setenv("CHEBSPLAT_WORK", str(tmp_path))
-    for name in (".snakemake/log", ".leases", ".done", f".plans/abc-{os.getpid()}"):
+    for name in (".snakemake/log", ".leases", ".names", f".plans/abc-{os.getpid()}"):
         (tmp_path / name).mkdir(parents=True)
     store.sweep()
     assert (tmp_path / ".snakemake/log").is_dir()

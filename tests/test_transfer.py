@@ -1,15 +1,14 @@
-"""What a study of sequences says of knowledge: steps to reach, ends, returns, and pairs."""
+"""What a study of sequences says of knowledge: gains, returns, pairs, and how soon a variant is as good."""
 
 import pytest
 from shared import ROOT
 from test_study import finish, study
 
 from chebsplat.errors import ConfigError
-from chebsplat.pipelines.studies import transfer
+from chebsplat.pipelines.studies import reaching, transfer
 from chebsplat.pipelines.studies.page import write
 from chebsplat.pipelines.studies.results import row_of
-from chebsplat.pipelines.studies.study import expand
-from chebsplat.pipelines.studies.transfer import Reach, reach
+from chebsplat.pipelines.studies.study import Budgets, expand
 
 
 @pytest.fixture(autouse=True)
@@ -20,19 +19,19 @@ def work(tmp_path, monkeypatch):
 
 
 @pytest.mark.parametrize(
-    ("points", "found"),
+    ("points", "x", "share"),
     [
-        ([(10, 0.4), (20, 0.6)], Reach(15)),
-        ([(20, 0.6), (10, 0.4)], Reach(15)),  # whatever their order
-        ([(10, 0.5), (20, 0.6)], Reach(10, "≤")),
-        ([(10, 0.5)], Reach(10)),
-        ([(10, 0.1), (20, 0.4)], Reach(20, ">")),
-        ([(10, 0.1), (20, 0.6), (30, 0.3)], Reach(18)),  # it got there, though it did not stay
+        ([(10, 0.4), (20, 0.6)], 15, "60 %"),
+        ([(20, 0.6), (10, 0.4)], 15, "60 %"),  # whatever their order
+        ([(10, 0.5), (20, 0.6)], 10, "≤ 40 %"),
+        ([(10, 0.5)], 10, "40 %"),
+        ([(10, 0.1), (20, 0.4)], 20, "> 80 %"),
+        ([(10, 0.1), (20, 0.6), (30, 0.3)], 18, "72 %"),  # it got there, though it did not stay
     ],
 )
-def test_a_curve_reaches_a_value_where_its_line_first_does(points, found):
-    answer = reach(points, 0.5)
-    assert (answer.x, answer.bound) == (pytest.approx(found.x), found.bound)
+def test_a_curve_reaches_a_value_where_its_line_first_does(points, x, share):
+    found = reaching.reach(points, 0.5)
+    assert (found.x, found.share(25)) == (pytest.approx(x), share)
 
 
 BUDGETS = {"steps": [10, 20]}
@@ -59,30 +58,35 @@ def finished(tmp_path):
 
 def test_the_sections_say_what_a_hand_works_out(finished, tmp_path):
     asked, runs, rows = finished
-    found = {section.heading: section for section in transfer.sections(tmp_path / "out", asked, rows)}
-    # scratch ends with 0.55; both has 0.50 after 10 steps (30 s), 0.56 after 20 (40 s), so 0.55 after 18.3 (38.3 s)
-    steps = dict(zip(*found["Steps to reach what scratch ends with"].table, strict=True))
-    assert (steps["steps"], steps["seconds"], steps["runs"]) == ("92 %", "96 %", "2")
-    assert steps["runs that reach it"] == "2 of 2"
-    assert steps["median"] == "68 %"  # office0 (0.5 − 0.4) / 0.14 of the way from 10 to 20: 17.1; office1 at once: 10
-    assert steps["mIoU at the end"].startswith("+1.0 [")
-    assert steps["worst scene"] == "-2.0 office1"
+    some = transfer.sections(asked, rows) + reaching.sections(asked, rows)
+    found = {section.heading: section for section in some}
+    ends = dict(zip(*found["What is gained over scratch"].table, strict=True))
+    assert (ends["sequence"], ends["pairs of runs"], ends["worst scene"]) == ("loop", "2", "-2.0 office1")
+    assert ends["mIoU"].startswith("+1.0 [")
+    # both has office0's 0.5 (0.5 − 0.4) / 0.14 of the way from 30 to 40 s, and office1's 0.6 at once
+    _, *lines = found["Seconds to what scratch ends with"].table
+    assert [line[:5] for line in lines] == [
+        ["office0", "both", "50.0", "40", "37 (93 %)"],
+        ["office1", "both", "60.0", "40", "≤30 (≤ 75 %)"],
+    ]
     again = found["The first scenes again, with the last basis"].table[1]
     assert again == ["both", "loop", "toy", "1", "70.0", "+40.0", "+40.0"]
     pair = found["Variants against each other"].table[2]
     assert pair[0] == "both − scratch"
     assert pair[2:4] == ["20 steps", "2"]
     page = write(tmp_path / "out", asked, runs, rows, "c", list(found.values())).read_text()
-    assert "92 %" in page and "-2.0 office1" in page and page.count("data:image/png") == 2
-    assert "![Steps to reach what scratch ends with](transfer.png)" in (tmp_path / "out/results.md").read_text()
+    assert "93 %" in page and "-2.0 office1" in page
+    assert "### What is gained over scratch" in (tmp_path / "out/results.md").read_text()
 
 
 def test_a_variant_that_has_not_finished_leaves_nothing_to_compare(finished, tmp_path):
     asked, _, rows = finished
     for row in rows:
-        if row["variant"] == "both" and row["budget"] == "10 steps":
+        if row["variant"] == "both":
             row["miou"] = None
-    assert transfer.sections(tmp_path, asked, rows) == []
+    assert transfer.sections(asked, rows) == []
+    assert reaching.sections(asked, [row for row in rows if row["variant"] == "both"]) == []
+    assert reaching.sections(asked.model_copy(update={"budgets": Budgets(steps=[20])}), rows) == []
 
 
 def test_pairs_name_variants():

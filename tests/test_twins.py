@@ -3,8 +3,8 @@
 import chebsplat  # noqa: F401  # isort: skip
 import pytest
 import torch
-from shared import ROOT
 
+from benchmarks.cost import trainer_from
 from chebsplat.shape import cks
 from chebsplat.stages import config as configs
 from chebsplat.training.losses import feature_distance
@@ -14,10 +14,8 @@ LIMIT = 2 / 255  # what a pair at the limit of 1/255 may change, where rounding 
 
 
 @pytest.fixture
-def trainer_of(up_to_teacher, monkeypatch):
+def trainer_of(up_to_teacher):
     """Makes a trainer of the toy scene before its first step, by backend and settings."""
-    monkeypatch.syspath_prepend(str(ROOT))
-    from benchmarks.scene import trainer_from
 
     def make(backend, **train):
         return trainer_from(up_to_teacher, configs.build({"train": {"steps": STEPS} | train}, "toy"), backend)

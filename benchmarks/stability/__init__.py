@@ -1,1 +1,1 @@
-"""Every stiff and extreme case, through the naive formula and through ours."""
+"""Every stiff and extreme case of the maths, each with its oracle."""

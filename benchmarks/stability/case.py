@@ -1,4 +1,4 @@
-"""What a case is, and what the naive formula made of it."""
+"""What a case is, and how one is run."""
 
 from __future__ import annotations
 
@@ -15,8 +15,6 @@ import numpy as np
 class Outcome(NamedTuple):
     """What a case returns; it passes if error <= tolerance, so NaN fails."""
 
-    condition: str  # what makes it hard: a condition number or the stiff parameter
-    naive: str  # what the naive formula makes of it: an error, a NaN share, an exception's name
     error: float  # of our float32 result, relative to the oracle's largest value unless the module says otherwise
     tolerance: float
 
@@ -24,8 +22,6 @@ class Outcome(NamedTuple):
 class Row(NamedTuple):
     module: str
     case: str
-    condition: str
-    naive: str
     error: float
     tolerance: float
     passed: bool
@@ -63,26 +59,9 @@ def run(key: tuple[str, str]) -> Row:
             warnings.simplefilter("error")
             outcome, note = CASES[key](), ""
     except Exception as error:
-        outcome, note = Outcome("?", "?", float("inf"), 0.0), f"{type(error).__name__}: {error}"
+        outcome, note = Outcome(float("inf"), 0.0), f"{type(error).__name__}: {error}"
     passed = bool(outcome.error <= outcome.tolerance)
     return Row(*key, *outcome, passed, note, time.perf_counter() - began)
-
-
-def naive(attempt: Callable[[], str]) -> str:
-    """What became of the naive formula, its exception's name if it raised one; its warnings do not count."""
-    try:
-        with warnings.catch_warnings(), np.errstate(all="ignore"):
-            warnings.simplefilter("ignore")
-            return attempt()
-    except Exception as error:
-        return type(error).__name__
-
-
-def verdict(found: Any, exact: Any, of: str = "error") -> str:
-    """A share of NaN or infinite entries if there are any, else the largest error relative to the largest value."""
-    found, exact = np.asarray(found), np.asarray(exact)
-    bad = 1 - np.isfinite(found).mean() if found.size else 0.0
-    return f"{100 * bad:.0f} % NaN" if bad else f"{of} {relative(found, exact):.1e}"
 
 
 def relative(found: Any, exact: Any) -> float:

@@ -12,7 +12,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from benchmarks.stability.case import Outcome, case, naive, relative
+from benchmarks.stability.case import Outcome, case, relative
 from chebsplat.shape.fusion import LEAST, propagation_weights, share_undefined
 from chebsplat.splats.rotations import rotation_matrices
 
@@ -34,14 +34,6 @@ def room(scale: Any = (0.3, 0.3, 0.03), units: float = 1.0, offset: float = 0.0)
     return means, cover, centers, rotmats, scales.float(), 0.5 * units
 
 
-def printed(means: Tensor, cover: Tensor, centers: Tensor, rotmats: Tensor, scales: Tensor, radius: float) -> Tensor:
-    """exp(−Δᵀ Σ⁻¹ Δ), normalised."""
-    inverse = torch.linalg.inv(rotmats @ torch.diag_embed(scales**2) @ rotmats.transpose(1, 2))
-    delta = means[:, None] - centers
-    weights = torch.exp(-torch.einsum("nmi,mij,nmj->nm", delta, inverse, delta)) * (cover >= 0)
-    return weights / weights.sum(1, keepdim=True)
-
-
 def exact_weights(
     means: Tensor, cover: Tensor, centers: Tensor, rotmats: Tensor, scales: Tensor, radius: float,
     temperature: float = 1.0, inflation: float = 0.25,
@@ -60,8 +52,10 @@ def exact_weights(
         return (weights / np.where(total > 0, total, mpmath.mpf(1))).astype(np.float64), least.astype(np.float64)
 
 
-def compare(arguments: tuple[Any, ...], condition: str, **options: float) -> Outcome:
-    """Ours against 60 digits; raises ValueError if a gradient is not finite."""
+def compare(arguments: tuple[Any, ...], **options: float) -> Outcome:
+    """Ours against 60 digits. Raises ValueError if a gradient is not finite, or, without inflation, if other points
+    than those that are 0 / 0 in print count as guarded.
+    """
     means, cover, centers, rotmats, scales, radius = arguments
     inputs = [v.clone().requires_grad_(True) for v in (means, centers, rotmats, scales)]
     found = propagation_weights(inputs[0], cover, *inputs[1:], radius, **options)
@@ -69,22 +63,13 @@ def compare(arguments: tuple[Any, ...], condition: str, **options: float) -> Out
     if not all(torch.isfinite(slope).all() for slope in slopes):
         raise ValueError("a gradient is not finite")
 
-    def attempt() -> str:
-        weights = printed(*arguments)
-        reached = (cover >= 0).any(1)
-        bad = 1 - torch.isfinite(weights[reached]).all(1).double().mean().item()
-        if bad:
-            return f"{100 * bad:.0f} % of points NaN"
-        return f"{1 / weights[reached].square().sum(1).mean():.1f} regions of {N_REGIONS}"
-
     exact, least = exact_weights(*arguments, **options)
     if options.get("inflation") == 0:
         covered, share = least[np.isfinite(least)], share_undefined(*arguments)
         surely, perhaps = ((covered > limit).mean() if len(covered) else 0.0 for limit in reversed(UNDERFLOWS))
         if not surely - 1e-6 <= share <= perhaps + 1e-6:
             raise ValueError(f"guarded {share}, not {surely} to {perhaps}")
-        condition = f"{condition}, guarded {100 * share:.0f} %"
-    return Outcome(condition, naive(attempt), relative(found.detach(), exact), TOLERANCE)
+    return Outcome(relative(found.detach(), exact), TOLERANCE)
 
 
 SPLATS: dict[str, tuple[float, ...]] = {
@@ -103,36 +88,35 @@ SPLATS: dict[str, tuple[float, ...]] = {
 
 @case("{name}", name=SPLATS)
 def splats(name: str) -> Outcome:
-    scale = SPLATS[name]
-    return compare(room(scale), f"deviation/radius {min(scale) / 5:.0e}")
+    return compare(room(SPLATS[name]))
 
 
-@case("units {units:.0e}", units=[1e-15, 1e-6, 1e6, 1e15])
+@case("units {units:.0e}", units=[1e-22, 1e-6, 1e6, 1e22])
 def units(units: float) -> Outcome:
-    return compare(room(units=units), f"unit {units:.0e}")
+    return compare(room(units=units))
 
 
 @case("offset {offset:.0e}", offset=[1e3, 1e6])
 def offset(offset: float) -> Outcome:
-    return compare(room(offset=offset), f"offset/radius {2 * offset:.0e}")
+    return compare(room(offset=offset))
 
 
 @case("coincident centres and points")
 def coincident() -> Outcome:
     means, cover, centers, *rest = room()
-    return compare((means * 0, cover, centers * 0, *rest), "all distances 0")
+    return compare((means * 0, cover, centers * 0, *rest))
 
 
 @case("points that nothing covers")
 def uncovered() -> Outcome:
     means, cover, *rest = room()
     cover[::2] = -1
-    return compare((means, cover, *rest), "every second point")
+    return compare((means, cover, *rest))
 
 
-@case("temperature {temperature:.0e}", temperature=[1e-6, 1e-3, 1e6])
+@case("temperature {temperature:.0e}", temperature=[1e-9, 1e-3, 1e6])
 def temperatures(temperature: float) -> Outcome:
-    return compare(room(), f"temperature {temperature:.0e}", temperature=temperature)
+    return compare(room(), temperature=temperature)
 
 
 # as printed: a centre's own deviations, without inflation
@@ -153,5 +137,4 @@ PRINTED: dict[str, tuple[Any, ...]] = {
 
 @case("as printed, {name}", name=PRINTED)
 def as_printed(name: str) -> Outcome:
-    """Weights, gradients, and the share of points that the guard is counted for: those that are 0 / 0 in print."""
-    return compare(PRINTED[name], f"s/r {PRINTED[name][4].min() / PRINTED[name][5]:.0e}", inflation=0.0)
+    return compare(PRINTED[name], inflation=0.0)

@@ -9,10 +9,9 @@ from __future__ import annotations
 import math
 from typing import NamedTuple
 
-import numpy as np
 import torch
 
-from benchmarks.stability.case import Outcome, case, naive
+from benchmarks.stability.case import Outcome, case
 from chebsplat.training.densify import densify
 
 N, MOST = 120, 32
@@ -43,7 +42,7 @@ REGIONS: dict[str, Growing] = {
 
 @case("Eq 12, {name}", name=REGIONS)
 def printed_count(name: str) -> Outcome:
-    """Raises ValueError where none came and some should, or the reverse. Naive: the count of the print, in float32."""
+    """Raises ValueError where none came and some should, or the reverse."""
     region = REGIONS[name]
     g = torch.Generator().manual_seed(0)
     raw = {"means": region.unit * torch.rand(N, 3, generator=g), "quats": torch.randn(N, 4, generator=g)}
@@ -61,9 +60,4 @@ def printed_count(name: str) -> Outcome:
     error = float(1 - values.isfinite().double().mean()) if len(values) else 0.0
     if len(away) > MOST or bool((away > radius * (1 + 1e-5)).any()):
         error = 1.0
-
-    def attempt() -> str:
-        volume = 4 / 3 * np.pi * np.float32(radius) ** 3
-        return f"{np.ceil(np.float32(10) * volume * (np.float32(region.gradient) - 1)):.1e} new"
-
-    return Outcome(f"volume {4 / 3 * math.pi * radius**3:.0e}", naive(attempt), error, 0.0)
+    return Outcome(error, 0.0)

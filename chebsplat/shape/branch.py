@@ -61,7 +61,7 @@ class ShapeBranch(nn.Module):
         self.gate = Gate(n_channels, train.gate_start)
         self.modulation = cks.Modulation(n_channels) if train.alpha == "network" else None
         self.regions: Regions | None = None
-        self.described = Descriptors(describe, train.refresh_tolerance)
+        self.described = Descriptors(describe)
         self.ids = GaussianIds()
         self.share_undefined = 0.0  # of covered Gaussians, where Eq 8 as printed is 0 / 0
 
@@ -109,7 +109,7 @@ class ShapeBranch(nn.Module):
         if not self.n_described:
             described = torch.zeros(*members.shape, 0)
         else:
-            described = self.described.update(means, quats, log_scales, members, regions.radius, descriptors)
+            described = self.described.update(means, quats, log_scales, members, descriptors)
         rows = described[members >= 0]
         if self.n_described and len(rows) and not self.keeps_norm:
             self.encoder.norm_input.set(0, rows.mean(0), rows.std(0, unbiased=False))

@@ -42,15 +42,11 @@ class GaussianIds:
 class Descriptors:
     """Descriptors of regions beside the Gaussians that they were computed from.
 
-    Args:
-      settings:  of the descriptor.
-      tolerance: what a region's members may change by before it is described anew: centres as a fraction of the
-        region's radius, log-scales and quaternions as they are. At 0 the values are those of `describe_members`,
-        bit for bit.
+    Their values are those of `describe_members`, bit for bit. Args: settings: of the descriptor.
     """
 
-    def __init__(self, settings: DescribeSection, tolerance: float = 0.0):
-        self.settings, self.tolerance = settings, tolerance
+    def __init__(self, settings: DescribeSection):
+        self.settings = settings
         self.n_described = self.n_regions = 0  # over all calls
         self.forget()
 
@@ -88,7 +84,6 @@ class Descriptors:
         quats: Tensor,
         log_scales: Tensor,
         members: Tensor,
-        radius: float,
         known: Tensor | None = None,
     ) -> Tensor:
         """Descriptors [M, n, J P] of Gaussians [N] gathered by members [M, n], -1 where padded.
@@ -105,8 +100,7 @@ class Descriptors:
         if self.values.shape[1] != members.shape[1]:
             self.forget(members.shape[1])
         n_before = min(len(self.values), len(members))
-        limit = self.tolerance * given.new_tensor([radius] * 3 + [1.0] * 7)
-        same = ((given[:n_before] - self.given[:n_before]).abs() <= limit).all(-1).all(-1)
+        same = (given[:n_before] == self.given[:n_before]).all(-1).all(-1)
         same &= (mask[:n_before] == self.mask[:n_before]).all(-1)
         changed = torch.cat([~same, torch.ones(len(members) - n_before, dtype=torch.bool)])
         gaussians = means.numpy(), quats.numpy(), log_scales.exp().numpy()

@@ -43,11 +43,3 @@ def substantial(means: np.ndarray, scales: np.ndarray, chosen: np.ndarray, least
     if len(sizes):
         kept[chosen] = sizes[numbers[chosen]] >= least * sizes[0]
     return kept
-
-
-def connected_to(seed: int, means: np.ndarray, scales: np.ndarray, chosen: np.ndarray) -> np.ndarray:
-    """The chosen in the part of one of them: bool [N]. Raises ValueError if the Gaussian `seed` is none of them."""
-    if not chosen[seed]:
-        raise ValueError(f"Gaussian {seed} is not among those to connect")
-    numbers = parts(means, scales, chosen)
-    return np.asarray(numbers == numbers[seed])

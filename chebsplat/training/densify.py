@@ -2,19 +2,21 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 import torch
 from torch import Tensor
 
-from chebsplat.settings import TrainSection
 from chebsplat.splats.rotations import rotation_matrices
 
 if TYPE_CHECKING:
     from scipy.spatial import cKDTree
 
 SHRINK = 1.6  # 3DGS's divisor of the scales of two Gaussians that replace one
+DENSITY = 0.05  # α of Eq 12: candidates per unit of a region's volume
+MOST_CANDIDATES = 32  # of a region
+NEAREST, FARTHEST = 0.5, 1.5  # from a new Gaussian to the nearest one, in local spacings
 LARGEST = 1e300  # of the excess: no volume grows nothing, however steep
 
 
@@ -37,17 +39,6 @@ def region_gradients(gradients: Tensor, members: Tensor) -> Tensor:
     return values.sum(1) / present.sum(1).clamp_min(1)
 
 
-def growth_rule(settings: TrainSection) -> dict[str, Any]:
-    """The keywords of `densify`."""
-    return {
-        "density": settings.grow_density,
-        "max_candidates": settings.grow_candidates,
-        "nearest": settings.grow_nearest,
-        "farthest": settings.grow_farthest,
-        "printed": settings.grow_rule == "printed",
-    }
-
-
 def densify(
     raw: dict[str, Tensor],
     members: Tensor,
@@ -56,10 +47,10 @@ def densify(
     budget: int,
     generator: torch.Generator,
     *,
-    density: float = 0.05,
-    max_candidates: int = 32,
-    nearest: float = 0.5,
-    farthest: float = 1.5,
+    density: float = DENSITY,
+    max_candidates: int = MOST_CANDIDATES,
+    nearest: float = NEAREST,
+    farthest: float = FARTHEST,
     printed: bool = False,
 ) -> Additions:
     """New Gaussians in the regions whose mean gradient exceeds the threshold (Eq 12).

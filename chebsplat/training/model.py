@@ -17,7 +17,6 @@ from chebsplat.splats.planes import at_pixels, planes_in_view
 from chebsplat.splats.rows import take
 from chebsplat.splats.sh_colors import colors_in_view
 from chebsplat.training import prune, sh_mask_network, sh_prune
-from chebsplat.training.poses import moved
 from chebsplat.training.sh_mask_network import BandMaskNetwork
 from chebsplat.views import View, in_frustum
 
@@ -91,13 +90,12 @@ class SceneModel:
         self.shape: ShapeBranch | None = None
         if n_channels and train.trains_encoder:
             self.shape = ShapeBranch(n_channels, describe, train, backend)
-        self.threshold = train.mask_threshold
         self.semantic_gate: prune.SemanticGate | prune.PrintedGate | None = None
         if n_channels and train.prune and train.prune_semantic:
             self.semantic_gate = GATES[train.prune_gate](n_channels)
         self.band_network: BandMaskNetwork | None = None
         if "sh_logits" in self.raw and train.sh_masks == "printed":
-            self.band_network = BandMaskNetwork(n_channels or 0, train.sh_bins, guided=train.sh_guided)
+            self.band_network = BandMaskNetwork(n_channels or 0, guided=train.sh_guided)
         self.members = self.nearest = torch.zeros(0, dtype=torch.int64)  # of the regions whose colours guide SH masks
         for module in self.modules.values():  # drawn on the CPU: the same values wherever they are used
             module.to(device)
@@ -167,10 +165,10 @@ class SceneModel:
             return None, None
         logits = take(self.raw["sh_logits"], index)
         if self.band_network is None:
-            return sh_prune.band_mask(logits, self.threshold), None
+            return sh_prune.band_mask(logits), None
         directions = torch.nn.functional.normalize(self.raw["means"].detach() - eye, dim=-1)
         delta = self._delta(logits, index, features, directions[None])
-        return sh_mask_network.nested(delta, self.threshold)[:, 1:], delta
+        return sh_mask_network.nested(delta)[:, 1:], delta
 
     def _delta(self, logits: Tensor, index: Tensor, features: Tensor | None, directions: Tensor) -> Tensor:
         """δ [V, 4] of the printed network; histograms are means over `directions` [Q, N or 1, 3]."""
@@ -195,10 +193,10 @@ class SceneModel:
         """Masks [N, 3] as the freeze makes them final: of no view, but of ten directions alike; features [N, C]."""
         logits = self.raw["sh_logits"]
         if self.band_network is None:
-            return sh_prune.band_mask(logits, self.threshold)
+            return sh_prune.band_mask(logits)
         directions = sh_prune.guidance_directions()[:, None].to(logits)
         delta = self._delta(logits, self.rows, features, directions)
-        return sh_mask_network.nested(delta, self.threshold)[:, 1:]
+        return sh_mask_network.nested(delta)[:, 1:]
 
     def render(
         self,
@@ -223,8 +221,6 @@ class SceneModel:
             reach = 3 * raw["log_scales"].amax(1).exp()
             index = in_frustum(raw["means"], view, reach)
         means, quats = take(raw["means"], index), take(raw["quats"], index)
-        if view.twist is not None:
-            means, quats = moved(means, quats, view)
         scales, opacities = take(raw["log_scales"], index).exp(), take(raw["logit_opacities"], index).sigmoid()
         auxiliary = Auxiliary()
         features = None
@@ -238,7 +234,7 @@ class SceneModel:
             features = take(raw["features"], index)
         if masked and (soft := self.soft_mask(index, features)) is not None:
             auxiliary.soft_mask = soft
-            scales, opacities = prune.apply_mask(prune.hard_mask(soft, self.threshold), scales, opacities)
+            scales, opacities = prune.apply_mask(prune.hard_mask(soft), scales, opacities)
         eye = -view.viewmat[:3, :3].T @ view.viewmat[:3, 3]
         masks = None
         if masked and degree > 0:

@@ -96,8 +96,8 @@ class Population:
             additions = densify.clone_or_split(raw, gradient, threshold, 0.01 * self.extent, budget, generator)
         else:
             mean = densify.region_gradients(gradient, members)
-            rule = densify.growth_rule(settings)
-            additions = densify.densify(raw, members, mean, threshold, budget, generator, **rule)
+            printed = settings.grow_rule == "printed"
+            additions = densify.densify(raw, members, mean, threshold, budget, generator, printed=printed)
         self.n_added += len(additions.parents)
         optimizer_rows.apply_additions(optimizer, self.model.raw, additions)
 
@@ -106,7 +106,7 @@ class Population:
         """Hard-prune what is faint or, of the first Gaussians, closed by their soft mask; `min_gaussians` stay."""
         strength = self.model.raw["logit_opacities"].sigmoid()
         if mask is not None:
-            strength[: len(mask)] *= prune.hard_mask(mask, self.settings.mask_threshold)
+            strength[: len(mask)] *= prune.hard_mask(mask)
         keep = strength >= FAINT
         if keep.sum() < self.settings.min_gaussians:
             keep[strength.topk(min(self.settings.min_gaussians, len(strength))).indices] = True

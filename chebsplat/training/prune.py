@@ -9,7 +9,7 @@ from torch import Tensor, nn
 
 MAX_LOGIT = 10.0  # beyond, the sigmoid's gradient is lost in float32
 MAX_FEATURE = 1e3
-THRESHOLD = 0.1  # a Gaussian whose soft mask is below is removed
+THRESHOLD = 0.1  # of a soft mask: below, a Gaussian or an SH band is closed
 
 
 class SemanticGate(nn.Module):
@@ -72,9 +72,9 @@ def soft_mask(render_logits: Tensor, semantic_logits: Tensor | None) -> Tensor:
     return soft if semantic_logits is None else soft * semantic_logits.clamp(-MAX_LOGIT, MAX_LOGIT).sigmoid()
 
 
-def hard_mask(soft: Tensor, threshold: float = THRESHOLD) -> Tensor:
-    """Exactly 0 or 1 by threshold, with the gradient of `soft` (straight-through)."""
-    return (soft > threshold).to(soft.dtype) + (soft - soft.detach())
+def hard_mask(soft: Tensor) -> Tensor:
+    """Exactly 0 or 1 by THRESHOLD, with the gradient of `soft` (straight-through)."""
+    return (soft > THRESHOLD).to(soft.dtype) + (soft - soft.detach())
 
 
 def apply_mask(mask: Tensor, scales: Tensor, opacities: Tensor) -> tuple[Tensor, Tensor]:

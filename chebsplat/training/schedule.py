@@ -10,6 +10,8 @@ from chebsplat.training.model import SceneModel
 from chebsplat.training.prune import SemanticGate
 
 TRAVEL, MOST = 10.0, 5e-2  # a rate that is not given: less than TRAVEL over all steps does not arrive
+LR_OPACITIES = 5e-2  # of opacities before the sigmoid, 3DGS's
+LR_MODULES, LR_GATES = 3e-3, 1e-2  # of the encoder, and of the printed gates' weights
 FASTER = {"means": 0.01, "features": 0.01, "modules": 0.01}  # what a rate has fallen to at the end; 0.1 elsewhere
 
 
@@ -64,7 +66,7 @@ def rates(settings: TrainSection) -> dict[str, float]:
         "means": by_steps(settings.lr_means, 1.6e-4, 0.61, steps),
         "log_scales": by_steps(settings.lr_scales, 5e-3, 0.52, steps),
         "quats": by_steps(settings.lr_quats, 1e-3, 0.52, steps),
-        "logit_opacities": settings.lr_opacities,
+        "logit_opacities": LR_OPACITIES,
         "sh0": by_steps(settings.lr_sh0, 2.5e-3, 0.41, steps),
         "sh1": sh,
         "sh2": sh,
@@ -86,7 +88,7 @@ def adam(model: SceneModel, settings: TrainSection, extent: float) -> torch.opti
         rate = base_rates[name] * (extent if name == "means" else 1)
         groups.append({"params": [value], "rate": rate, "name": name})
     printed = {part for part in (model.semantic_gate, model.band_network) if not isinstance(part, SemanticGate)}
-    for name, rate, own in (("modules", settings.lr_encoder, False), ("gates", settings.lr_gates, True)):
+    for name, rate, own in (("modules", LR_MODULES, False), ("gates", LR_GATES, True)):
         weights = [p for module in model.modules.values() if (module in printed) == own for p in module.parameters()]
         if weights:
             groups.append({"params": weights, "rate": rate, "name": name})

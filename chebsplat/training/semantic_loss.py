@@ -9,6 +9,8 @@ from chebsplat.settings import TrainSection
 from chebsplat.training.losses import cell_shares, feature_distance
 from chebsplat.views import TaughtLabels
 
+TEMPERATURE = 0.1  # of the logits that cross-entropy is of
+
 
 def semantic_loss(
     render: Tensor,
@@ -27,7 +29,7 @@ def semantic_loss(
     if settings.feature_loss == "cross-entropy":
         if labels is None:
             raise ValueError("cross-entropy needs labels with a confidence")
-        return label_entropy(render, labels, mask, settings.label_temperature)
+        return label_entropy(render, labels, mask, TEMPERATURE)
     counted = None if labels is None or labels.complete else labels.classes >= 0
     return feature_distance(render, features, mask, settings.feature_loss or "length", counted, backend)
 

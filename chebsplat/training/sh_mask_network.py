@@ -9,6 +9,7 @@ from chebsplat.splats.sh import basis
 from chebsplat.training.prune import MAX_FEATURE, MAX_LOGIT, hard_mask
 from chebsplat.training.sh_prune import soft_histogram
 
+N_BINS = 8  # of the histogram of a region's colours (Eq 13)
 BANDS = ((0, 1), (1, 4), (4, 9), (9, 16))  # coefficients of bands 0 to 3
 WEIGHTS = (1.0, 3.0, 5.0, 7.0)  # 2 l + 1
 
@@ -52,7 +53,7 @@ class BandMaskNetwork(nn.Module):
       nested by a cumulative product, as the ragged arrays need it. ψ is clamped to ±10, features to ±1000.
     """
 
-    def __init__(self, n_channels: int, n_bins: int = 8, width: int = 8, *, guided: bool = True):
+    def __init__(self, n_channels: int, n_bins: int = N_BINS, width: int = 8, *, guided: bool = True):
         super().__init__()
         self.guided, self.n_bins, self.n_channels = guided, n_bins, n_channels if guided else 0
         n_channels = self.n_channels
@@ -84,9 +85,9 @@ class BandMaskNetwork(nn.Module):
         return delta
 
 
-def nested(delta: Tensor, threshold: float) -> Tensor:
+def nested(delta: Tensor) -> Tensor:
     """Masks [V, 4] in {0, 1} of δ [V, 4], with a straight-through gradient; bands 1 to 3 by a cumulative product."""
-    return hard_mask(torch.cat([delta[:, :1], delta[:, 1:].cumprod(-1)], -1), threshold)
+    return hard_mask(torch.cat([delta[:, :1], delta[:, 1:].cumprod(-1)], -1))
 
 
 def sh_loss(delta: Tensor) -> Tensor:

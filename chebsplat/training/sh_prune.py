@@ -11,9 +11,9 @@ from chebsplat.training.prune import MAX_LOGIT, hard_mask
 BANDS = ((0, 3), (3, 8), (8, 15))  # columns of shN by band 1, 2, 3
 
 
-def band_mask(logits: Tensor, threshold: float = 0.1) -> Tensor:
+def band_mask(logits: Tensor) -> Tensor:
     """Masks [N, 3] in {0, 1} of bands 1 to 3, nested by a cumulative product, with a straight-through gradient."""
-    return hard_mask(logits.clamp(-MAX_LOGIT, MAX_LOGIT).sigmoid().cumprod(-1), threshold)
+    return hard_mask(logits.clamp(-MAX_LOGIT, MAX_LOGIT).sigmoid().cumprod(-1))
 
 
 def masked_sh(shN: Tensor, mask: Tensor) -> Tensor:

@@ -17,7 +17,6 @@ from chebsplat.evaluation.metrics import psnr
 from chebsplat.settings import TrainSection
 from chebsplat.shape.regions import Regions, regions_of
 from chebsplat.training import sh_mask_network, sh_prune
-from chebsplat.training.camera_models import CameraModels
 from chebsplat.training.laps import Laps
 from chebsplat.training.losses import depth_distance, photometric
 from chebsplat.training.model import Rendered, SceneModel
@@ -27,6 +26,7 @@ from chebsplat.training.semantic_loss import semantic_loss
 from chebsplat.views import Views
 
 PROGRESS = ("step", "seconds", "order", "members", "guidance")
+WEIGHT_SSIM = 0.2  # share of SSIM in the colour loss, 3DGS's λ
 READ_EVERY = 10  # steps on a GPU from one that waits for its figures to the next
 
 
@@ -55,7 +55,6 @@ class Trainer:
         basis: dict[str, Tensor] | None = None,
         regions: Regions | None = None,
         descriptors: Tensor | None = None,
-        cameras: CameraModels | None = None,
     ):
         self.feature_every = feature_every(settings, len(views.names))
         known = {"feature_every": self.feature_every, "steps": n_steps(settings, math.prod(views.images.shape[:3]))}
@@ -63,7 +62,6 @@ class Trainer:
         self.model, self.views, self.settings, self.extent = model, views, settings, extent
         given = basis if basis and model.shape is not None else {}
         self.basis = {name: value.to(model.device) for name, value in given.items()}
-        self.cameras = cameras or CameraModels()
         self.schedule = Schedule(settings)
         self.guidance: Tensor | None = None
         self.optimizer = adam(self.model, self.settings, self.extent)
@@ -165,7 +163,6 @@ class Trainer:
             "order_generator": self.order_generator.bit_generator.state,
             "generator": self.generator.get_state(),
             "population": self.population.state_dict(),
-            "cameras": self.cameras.state_dict(),
             "progress": {name: getattr(self, name) for name in PROGRESS},
         }
 
@@ -185,7 +182,6 @@ class Trainer:
         for name, value in state["progress"].items():
             setattr(self, name, value)
         self.population.load_state_dict(state["population"])
-        self.cameras.load_state_dict(state["cameras"])
 
     def _encodes(self, share: float) -> bool:
         return self.model.shape is not None and self.schedule.encodes(share)
@@ -225,7 +221,7 @@ class Trainer:
         placed = self.views.depth if self.step % settings.depth_every == 0 else None
         surface = None if placed is None else placed(index, factor)
         rendered = self.model.render(
-            self.cameras.camera(self.views, index, factor),
+            self.views.camera(index, factor),
             self.schedule.degree(share),
             masked=pruning,
             semantic=taught,
@@ -235,8 +231,7 @@ class Trainer:
             depth=surface is not None,
         )
         self.laps.mark("render")
-        rendered.rgb = self.cameras.taken(rendered.rgb, index)
-        losses = self._losses(rendered, target, mask, wanted, index) | self.cameras.losses()
+        losses = self._losses(rendered, target, mask, wanted, index)
         if surface is not None and rendered.inverse_depth is not None:
             distance = depth_distance(rendered.inverse_depth, rendered.alpha, surface, mask)
             losses["depth"] = (settings.weight_depth or 0) * distance
@@ -257,7 +252,6 @@ class Trainer:
         self.laps.mark("backward")
         self.optimizer.step()
         self.population.bound_scales()
-        self.cameras.step(index, share)
         self.laps.mark("optimizer")
         figures = {"loss": loss.detach()} | {f"loss_{k}": v.detach() for k, v in losses.items()}
         if not self.reads:
@@ -269,11 +263,10 @@ class Trainer:
     ) -> dict[str, Tensor]:
         """Weighted losses by name (docs/method.md, section 8), those that this training and step have."""
         settings, auxiliary, backend = self.settings, rendered.auxiliary, self.model.backend
-        losses = {"color": photometric(rendered.rgb, target, mask, settings.weight_ssim, backend)}
+        losses = {"color": photometric(rendered.rgb, target, mask, WEIGHT_SSIM, backend)}
         if rendered.features is not None and wanted is not None:
             labels = None if self.views.labels is None else self.views.labels(view)
-            distance = semantic_loss(rendered.features, wanted, labels, mask, settings, backend)
-            losses["features"] = settings.weight_features * distance
+            losses["features"] = semantic_loss(rendered.features, wanted, labels, mask, settings, backend)
         if auxiliary.soft_mask is not None:
             losses["mask"] = settings.weight_mask * auxiliary.soft_mask.mean()
         if auxiliary.shape_distance is not None and settings.weight_shape > 0:
@@ -291,9 +284,9 @@ class Trainer:
         """Mean PSNR over training views at full resolution, dB."""
         scores = []
         for index in indices:
-            camera, degree = self.cameras.camera(self.views, index, 1, False), self.schedule.degree(self.share)
+            camera, degree = self.views.camera(index, 1), self.schedule.degree(self.share)
             rendered = self.model.render(camera, degree, semantic=False)
-            image = (self.cameras.taken(rendered.rgb, index).clamp(0, 1) * 255).round().byte().cpu().numpy()
+            image = (rendered.rgb.clamp(0, 1) * 255).round().byte().cpu().numpy()
             mask = None if self.views.masks is None else self.views.masks[index].cpu().numpy()
             truth = self.views.images[index].cpu().numpy()
             scores.append(psnr(image, truth) if mask is None else psnr(image[mask], truth[mask]))

@@ -8,18 +8,13 @@ import logging
 import sys
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
+from functools import partial
 from typing import NoReturn
 
 import click
 
-from chebsplat.errors import ChebsplatError, Stopped
-from chebsplat.formats.disk import explained
 from chebsplat.pipelines import store
-from chebsplat.stages.stopping import heeded
-
-KEPT = "what was finished is kept, and the same command goes on from there"
-
-CLICK = (click.ClickException, click.Abort, click.exceptions.Exit)
+from chebsplat.stages.stopping import exit_code
 
 
 def say(text: str) -> None:
@@ -56,16 +51,7 @@ class Guarded(click.Group):
     """A group whose commands return an exit code (nothing: 0) and may raise typed errors."""
 
     def invoke(self, context: click.Context) -> NoReturn:
-        try:
-            with heeded(), explained(store.work(), CLICK):
-                code = super().invoke(context)
-        except ChebsplatError as error:
-            say(f"{error}")
-            code = error.exit_code
-        except Stopped as stop:
-            say(f"{stop}; {KEPT}")
-            code = stop.exit_code
-        context.exit(code or 0)
+        context.exit(exit_code(partial(super().invoke, context), store.work(), say))
 
     def list_commands(self, context: click.Context) -> list[str]:
         """In the order in which they were added."""

@@ -1,23 +1,39 @@
-"""A finished scene from other cameras: render, cameras, view."""
+"""What is seen of a finished scene: render, cameras, page, view."""
 
 from __future__ import annotations
 
-import logging
+import os
 import sys
-import time
+import webbrowser
 from contextlib import suppress
 from pathlib import Path
 
 import click
 
-from chebsplat.errors import ConfigError, InputError
-from chebsplat.pipelines.cli.options import AGAINST
+from chebsplat.errors import InputError
+from chebsplat.pipelines.cli.options import AGAINST, NewPath
 
 PATH = click.option(
     "--path", default="capture", show_default=True, help="orbit, capture, or a cameras.json or transforms.json"
 )
-FRAMES = click.option("--frames", type=click.IntRange(1, 100_000), default=120, show_default=True, help="of an orbit")
+FRAMES = click.option(
+    "--frames",
+    type=click.IntRange(1, 100_000),
+    help="of an orbit (default: 120), or of a flight through other cameras (default: none)",
+)
 SIZE = click.option("--size", help="WIDTHxHEIGHT in pixels, such as 1280x960; default: the cameras' own")
+SH = click.option(
+    "--sh",
+    type=click.IntRange(0, 1),
+    default=0,
+    show_default=True,
+    help="SH degree of the colours",
+)
+WORDS = click.option(
+    "--words",
+    type=click.Path(path_type=Path),
+    help="text file of more words to ask for, one a line",
+)
 
 
 @click.command()
@@ -33,7 +49,7 @@ SIZE = click.option("--size", help="WIDTHxHEIGHT in pixels, such as 1280x960; de
 def render(
     scene: str,
     path: str,
-    frames: int,
+    frames: int | None,
     what: str,
     query: str | None,
     against: list[str],
@@ -68,7 +84,7 @@ def render(
 @FRAMES
 @SIZE
 @click.option("--out", type=click.Path(path_type=Path), required=True, help="the folder to write into")
-def cameras(scene: str, path: str, frames: int, size: str | None, out: Path) -> None:
+def cameras(scene: str, path: str, frames: int | None, size: str | None, out: Path) -> None:
     """Write the cameras of a SCENE as COLMAP's text model, transforms.json and 3DGS' cameras.json."""
     from chebsplat.pipelines.api import load
     from chebsplat.stages.camera_files import write_cameras
@@ -81,48 +97,60 @@ def cameras(scene: str, path: str, frames: int, size: str | None, out: Path) -> 
 
 @click.command()
 @click.argument("scene")
-@click.option(
-    "--port", type=click.IntRange(0, 65535), default=8080, show_default=True, help="the next free one from it"
-)
-@click.option("--host", default="127.0.0.1", show_default=True, help="0.0.0.0: whoever reaches this machine may look")
-@click.option("--frames", type=click.Path(path_type=Path), help="where camera paths go; default: frames-of-SCENE, here")
-def view(scene: str, port: int, host: str, frames: Path | None) -> None:
-    """Look at a finished SCENE (or a .ply) in a browser, live: fly, point at things, ask for words. Ctrl-C ends it."""
-    import gc
-    import os
-    import warnings
+@click.option("--out", type=NewPath(), required=True, help="the .html to write")
+@SH
+@WORDS
+@AGAINST
+def page(scene: str, out: Path, sh: int, words: Path | None, against: list[str]) -> None:
+    """Write a finished SCENE (or a .ply) as one HTML page to fly through and ask in words: no server, no network."""
+    _write_page(scene, out, sh, words, against)
 
-    from chebsplat.pipelines.finished import artifact_of, links, scene_folder
-    from chebsplat.stages.view import Viewer, photos_of
 
-    logging.basicConfig(stream=sys.stderr, format="view: %(message)s", level="WARNING", force=True)
-    warnings.filterwarnings("ignore", "Queued a .* closed connection", UserWarning)  # a page was closed; all is well
+@click.command()
+@click.argument("scene")
+@SH
+@WORDS
+@AGAINST
+def view(scene: str, sh: int, words: Path | None, against: list[str]) -> None:
+    """Look at a finished SCENE (or a .ply): write it as `page` does, and open that in a browser.
+
+    The page lies in the scene's folder, that of a .ply where you stand; each call writes it anew.
+    """
+    from chebsplat.pipelines.finished import scene_folder
+    from chebsplat.pipelines.inventory import PAGE
+
+    out = Path(f"{_name(scene)}.{PAGE}")
+    if not scene.endswith(".ply"):
+        with suppress(InputError):  # an artifact of no scene
+            out = scene_folder(scene) / PAGE
+    out = out.absolute()
+    _write_page(scene, out, sh, words, against)
+    graphical = any(map(os.environ.get, ("BROWSER", "DISPLAY", "WAYLAND_DISPLAY")))
+    if not (graphical and webbrowser.open(out.as_uri())):  # without a screen it may be one of text
+        print("no browser can be opened from here; open this file in one", file=sys.stderr)
+
+
+def _name(scene: str) -> str:
+    path = Path(os.path.abspath(scene))
+    return path.stem if path.suffix == ".ply" else path.name
+
+
+def _write_page(scene: str, out: Path, sh: int, words: Path | None, against: list[str]) -> None:
+    """Write the page and say where it is."""
+    from chebsplat.formats.scene import read_scene
+    from chebsplat.formats.teacher_model import read_label_set
+    from chebsplat.pipelines.finished import artifact_of, teacher_of
+    from chebsplat.stages.page import foreign, write_page
+
     theirs = scene.endswith(".ply")
-    source = Path(os.path.expanduser(scene)) if theirs else artifact_of(scene, "export")
-    if theirs and not source.is_file():
-        raise InputError(f"{source} is missing; correct the path")
-    name = (source.stem if theirs else Path(os.path.abspath(scene)).name).partition("@")[0]
-    gc.disable()  # until the scene is there: what is imported stays, and looking for garbage costs a tenth of the wait
-    viewer = Viewer(name, host, port)
-    try:
-        print(f"http://{'localhost' if host == '0.0.0.0' else host}:{viewer.port}", flush=True)
-        if viewer.port != port:
-            print(f"port {port} is taken; this is the next free one", file=sys.stderr)
-        from chebsplat.pipelines.api import load
-        from chebsplat.stages.opened import OpenedScene
-        from chebsplat.stages.page import foreign
-        from chebsplat.stages.viewing import Viewing
-
-        opened, photos = OpenedScene(foreign(source), source) if theirs else load(scene), None
-        with suppress(ConfigError, InputError, KeyError):  # a .ply or an artifact alone has no photos
-            photos = None if theirs else photos_of(links(scene_folder(scene))["ingest"])
-        viewer.show(Viewing(opened, photos), (frames or Path(f"frames-of-{name}")).absolute())
-        gc.freeze()
-        gc.enable()
-        while True:
-            time.sleep(3600)
-    finally:
-        viewer.end()
+    if theirs:
+        opened, teacher = foreign(Path(scene).expanduser()), None
+    else:
+        opened, teacher = read_scene(artifact_of(scene, "export")), teacher_of(scene)
+    more = list(read_label_set(words)) if words else []
+    counts = write_page(opened, _name(scene), teacher, out, sh, against, more)
+    print(", ".join(f"{name} {number:,}" for name, number in counts.items()), file=sys.stderr)
+    print(out, flush=True)
 
 
-COMMANDS = (render, cameras, view)
+COMMANDS = (render, cameras, page, view)

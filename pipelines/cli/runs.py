@@ -138,9 +138,9 @@ def study(
     name: str, cores: int | None, threads: int, out: Path | None, only_plan: bool, no_run: bool, device: str, on: str
 ) -> int:
     """Run a study (of pipelines/configs/studies, or a .toml): its table, figure and page; goes on where it stopped."""
-    from chebsplat.pipelines import cluster, store
+    from chebsplat.pipelines import cluster
     from chebsplat.pipelines.run import Outcome, device_of, say
-    from chebsplat.pipelines.studies import kept, page, reaching, results, transfer
+    from chebsplat.pipelines.studies import page, reaching, results, transfer
     from chebsplat.pipelines.studies import study as studies
 
     where, asked = cluster.checked(on), studies.read_study(name)
@@ -157,19 +157,13 @@ def study(
 
     def write(failed: dict[str, tuple[int, str, Path]]) -> Path:
         rows = [results.row_of(run, failed) for run in runs]
-        more = transfer.sections(folder, asked, rows) if asked.sequences else reaching.sections(asked, rows)
+        more = reaching.sections(asked, rows) + (transfer.sections(asked, rows) if asked.sequences else [])
         return page.write(folder, asked, runs, rows, command, more).absolute()
 
     outcome = Outcome()
     if not no_run:
         outcome = studies.execute(Path(name).stem, runs, cores, used, computing, where, lambda: write({}))
-    whole = not outcome.failed and all(store.is_fresh(run.plan.targets[studies.LAST]) for run in runs)
-    now = kept.identity(asked, runs, command) if whole else ""
-    if not (whole and kept.is_current(folder, now)):
-        write(outcome.failed)
-        if whole:
-            kept.keep(folder, now)
-    print((folder / page.NAME).absolute())
+    print(write(outcome.failed))
     return outcome.code
 
 
@@ -182,15 +176,12 @@ def job(plan: Path, keys: tuple[str, ...], elsewhere: bool) -> int:
     from chebsplat.pipelines import job as jobs
     from chebsplat.pipelines.children import in_turn
     from chebsplat.pipelines.cluster import watch_run
-    from chebsplat.stages.stopping import watch_lifeline
 
     jobs.use_threads()
     if len(keys) > 1:
         return in_turn(_main, [["job", *["--elsewhere"] * elsewhere, str(plan), key] for key in keys])
     if elsewhere:
         watch_run(plan)
-    else:
-        watch_lifeline()
     return jobs.run(plan, keys[0], again=elsewhere)
 
 
@@ -201,9 +192,7 @@ def rehearse(semantic: bool) -> int:
     import os
 
     from chebsplat.pipelines.rehearsal import rehearsed
-    from chebsplat.stages.stopping import watch_lifeline
 
-    watch_lifeline()
     os.nice(5)
     with rehearsed(2, semantic):
         return 0

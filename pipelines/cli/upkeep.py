@@ -46,7 +46,7 @@ def list_scenes() -> None:
 @click.argument("scenes", nargs=-1, required=True)
 @click.option("--yes", is_flag=True, help="remove what is listed")
 def rm(scenes: tuple[str, ...], yes: bool) -> None:
-    """Remove SCENES: their links, and the artifacts that nothing else names."""
+    """Remove SCENES: their links and pages, and the artifacts that nothing else names."""
     from chebsplat.pipelines import inventory
 
     chosen = list(dict.fromkeys(inventory.in_work(scene) for scene in scenes))

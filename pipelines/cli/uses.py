@@ -1,5 +1,5 @@
-"""What is done with a finished scene, or before one: query, page, mesh, extract, encode, lift, label, check-teacher,
-get-teacher, knowledge, calibrate.
+"""What is done with a finished scene, or before one: query, mesh, extract, encode, lift, label,
+check-teacher, get-teacher, knowledge, calibrate.
 """
 
 from __future__ import annotations
@@ -221,33 +221,6 @@ def label(ply: Path, words: list[str] | None, up: str, unit: float | None, knowl
 
 @click.command()
 @click.argument("scene")
-@click.option("--out", type=click.Path(path_type=Path), required=True, help="the .html to write")
-@click.option("--sh", type=click.IntRange(0, 1), default=0, show_default=True, help="SH degree of the colours")
-@click.option("--words", type=click.Path(path_type=Path), help="text file of more words to ask for, one a line")
-@click.option("--against", default="", help="phrases that words are weighed against, as of query")
-def page(scene: str, out: Path, sh: int, words: Path | None, against: str) -> None:
-    """Write a finished SCENE (or a .ply) as one HTML page to fly through and ask in words: no server, no network."""
-    import logging
-
-    from chebsplat.formats.scene import read_scene
-    from chebsplat.formats.teacher_model import read_label_set
-    from chebsplat.pipelines.finished import artifact_of, teacher_of
-    from chebsplat.stages.page import foreign, write_page
-
-    logging.basicConfig(stream=sys.stderr, format="page: %(message)s", level="WARNING", force=True)
-    logging.getLogger("chebsplat").setLevel("INFO")
-    source = Path(scene)
-    opened = foreign(source) if scene.endswith(".ply") else read_scene(artifact_of(scene, "export"))
-    teacher = None if scene.endswith(".ply") else teacher_of(scene)
-    phrases = [word.strip() for word in against.split(",") if word.strip()]
-    name = source.stem if scene.endswith(".ply") else Path(os.path.abspath(scene)).name
-    counts = write_page(opened, name, teacher, out, sh, phrases, list(read_label_set(words)) if words else [])
-    print(", ".join(f"{name} {number:,}" for name, number in counts.items()), file=sys.stderr)
-    print(out)
-
-
-@click.command()
-@click.argument("scene")
 @click.option("--out", type=NewPath(".ply", ".glb"), required=True, help="the .ply or .glb to write")
 @click.option("--voxel", type=click.FloatRange(0, min_open=True), help="edge, scene units; default: 1/250 of the room")
 @click.option("--triangles", type=click.IntRange(4), default=200_000, show_default=True, help="at most")
@@ -265,4 +238,4 @@ def mesh(scene: str, out: Path, voxel: float | None, triangles: int, raw: bool) 
     told(facts, out)
 
 
-COMMANDS = (query, calibrate, check_teacher, get_teacher, extract, encode, lift, label, knowledge, page, mesh)
+COMMANDS = (query, calibrate, check_teacher, get_teacher, extract, encode, lift, label, knowledge, mesh)

@@ -21,7 +21,6 @@ from chebsplat.pipelines.studies.tables import (
     missing,
     scene_table,
     shown_figures,
-    stability,
     table_row,
     tables,
 )
@@ -29,7 +28,6 @@ from chebsplat.pipelines.studies.tables import (
 PAGE = Path(__file__).with_name("page.html")  # a jinja2 template; it fetches nothing from anywhere
 NAME = "study.html"
 PICTURE = "error-against-time.png"
-STABILITY = Path("build/bench/stability.csv")  # of `make stability`
 NARROW = 1100  # pixels of a screen; the comparison's tables take more
 
 
@@ -38,7 +36,7 @@ def write(
 ) -> Path:
     """Fill `out`; returns the page. Runs that failed or have not run are named, and count in no mean.
 
-    Args: more: further sections, whose pictures lie in `out` already.
+    Args: more: further sections.
     """
     out.mkdir(parents=True, exist_ok=True)
     with (out / "results.csv").open("w", newline="") as handle:
@@ -58,7 +56,6 @@ def write(
         "scenes": scene_table(rows),
         "missing": missing(rows),
         "note": note(study, rows),
-        "stability": stability(STABILITY),
         "more": more,
         "left_out": left_out(rows),
     }
@@ -67,15 +64,11 @@ def write(
     from chebsplat.stages.pages.template import rendered
     from chebsplat.stages.report import LARGEST
 
-    drawings = {
-        name: "data:image/png;base64," + base64.b64encode((out / name).read_bytes()).decode()
-        for name in (PICTURE, *(section.picture for section in more if section.picture))
-    }
+    drawing = base64.b64encode((out / PICTURE).read_bytes()).decode()
     page = rendered(
         PAGE,
         narrow=NARROW,
-        picture=drawings[PICTURE],
-        drawings=drawings,
+        picture=f"data:image/png;base64,{drawing}",
         **parts,
         **gallery(study, runs, rows),
     )
@@ -152,18 +145,14 @@ def markdown(parts: dict[str, Any]) -> str:
     text = [f"## {study.title}", "", study.about, "", *(f"- {what}: {value}" for what, value in parts["facts"])]
     text += ["", f"![error against run time]({PICTURE})", "", parts["note"], ""]
     rows = [[f"{a}<br>{f'**{b}**' if bold else b}" if b else a for a, b, bold in row] for _, row in parts["table"]]
-    tables = [("", "", "", [parts["header"], *rows])]
-    tables += [(f"### {s.heading}", s.note, s.picture, s.table) for s in parts["more"]]
-    for heading, note, picture, table in (*tables, ("### Each scene", "", "", parts["scenes"])):
+    tables = [("", "", [parts["header"], *rows])]
+    tables += [(f"### {s.heading}", s.note, s.table) for s in parts["more"]]
+    for heading, note, table in (*tables, ("### Each scene", "", parts["scenes"])):
         text += [heading, ""] if heading else []
         text += [note, ""] if note else []
-        text += [f"![{heading.strip('# ')}]({picture})", ""] if picture else []
         text += ["| " + " | ".join(row) + " |" for row in table[:1]]
         text += ["|" + "---|" * len(table[0])]
         text += ["| " + " | ".join(row) + " |" for row in table[1:]] + [""]
-    if parts["stability"]:
-        text += ["### Extreme cases (`make stability`)", "", "| part | cases | failed | largest error ÷ tolerance |"]
-        text += ["|---|---|---|---|", *(f"| {m} | {n} | {bad} | {e:.2g} |" for m, n, bad, e in parts["stability"]), ""]
     if parts["left_out"]:
         text += ["### Left out, and why", ""]
         text += [*(f"- {what}: {why} ({by})" for what, why, by in parts["left_out"]), ""]

@@ -4,14 +4,11 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Any
-
-from annotated_types import Len
+from typing import Any
 
 from chebsplat.evaluation import protocols
 from chebsplat.evaluation.statistics import Difference, Summary, paired_difference, summarize
 from chebsplat.formats import artifact
-from chebsplat.formats.documents import Count, TypedDict, read_document
 from chebsplat.formats.evaluation import read_figures
 from chebsplat.formats.gaussians import read_trace
 from chebsplat.pipelines.studies.study import Run
@@ -40,7 +37,6 @@ FIGURES = (
     Figure("point_miou", "mIoU of 3D points, %", 1, 100),
     Figure("psnr", "PSNR, dB", 2),
     Figure("psnr_fit", "PSNR after a colour fit, dB", 2),
-    Figure("psnr_aligned", "PSNR at aligned poses, dB", 2),
     Figure("ssim", "SSIM", 4),
     Figure("n_gaussians", "Gaussians", 0, 1, True),
     Figure("sh_kept", "SH coefficients kept, %", 1, 100),
@@ -56,10 +52,6 @@ OTHERS = ("miou_teacher", "protocol", "held_in_psnr", "steps", "threads", "devic
 IDENTITY = ("condition", "variant", "budget", "sequence", "place", "visit", "scene", "seed", "state")
 POOLED = ("miou", "miou_gain", "macc", "oa")  # what a protocol may work out over all scenes together
 COLUMNS = (*IDENTITY, *(figure.key for figure in FIGURES), *OTHERS)
-
-
-class ByDegree(TypedDict):
-    by_degree: Annotated[list[Count], Len(1, 4)]
 
 
 def row_of(run: Run, failed: dict[str, tuple[int, str, Path]]) -> Row:
@@ -82,11 +74,10 @@ def row_of(run: Run, failed: dict[str, tuple[int, str, Path]]) -> Row:
         return row | {"state": f"{stage} failed with exit code {code}: {message}"}
     evaluation, train, scene = (artifact.read_manifest(targets[stage]) for stage in ("evaluate", "train", "export"))
     figures = read_figures(targets["evaluate"], evaluation)
-    summary = read_document(targets["export"], scene, "summary.json", ByDegree)
     trace = read_trace(targets["train"], train)
     segmentation = figures.get("segmentation") or {}
     row |= segmented(segmentation.get("scene", {}), segmentation.get("teacher", {}))
-    counts, guidance = summary["by_degree"], train.facts.get("guidance", {})
+    counts, guidance = scene.facts["by_degree"], train.facts.get("guidance", {})
     kept = sum(n * (degree + 1) ** 2 for degree, n in enumerate(counts))
     return row | {
         "state": "done",
@@ -94,7 +85,6 @@ def row_of(run: Run, failed: dict[str, tuple[int, str, Path]]) -> Row:
         "left_out": figures["left_out"],
         "psnr": figures["image"]["psnr"],
         "psnr_fit": figures["image"].get("psnr_fit"),
-        "psnr_aligned": figures.get("image_aligned", {}).get("psnr"),
         "ssim": figures["image"]["ssim"],
         "n_gaussians": figures["n_gaussians"],
         "sh_kept": kept / (16 * sum(counts)),
@@ -137,12 +127,12 @@ def over_scenes(rows: list[Row]) -> list[Row]:
 
 def traces(runs: list[Run], rows: list[Row]) -> list[tuple[Row, list[dict[str, float]]]]:
     """The trace of every finished run, with its row."""
-    pairs = []
+    found = []
     for run, row in zip(runs, rows, strict=True):
         if row["state"] == "done":
             path = run.plan.targets["train"]
-            pairs.append((row, read_trace(path, artifact.read_manifest(path))))
-    return pairs
+            found.append((row, read_trace(path, artifact.read_manifest(path))))
+    return found
 
 
 @dataclass(frozen=True)
@@ -192,16 +182,16 @@ def compare(rows: list[Row], baseline: str) -> list[Line]:
             values = [row[figure.key] for row in mine if row[figure.key] is not None]
             if values:
                 summaries[figure.key] = summarize(values)
-            pairs = _pairs(mine, theirs, figure.key) if variant != baseline else []
-            if pairs:
-                scenes, own, other = zip(*pairs, strict=True)
+            found = pairs(mine, theirs, figure.key) if variant != baseline else []
+            if found:
+                scenes, own, other = zip(*found, strict=True)
                 difference = paired_difference(own, other, list(scenes), figure.ratio)
                 differences[figure.key] = difference
         lines.append(Line(condition, budget, variant, len(done), len(members), summaries, differences))
     return lines
 
 
-def _pairs(done: list[Row], against: list[Row], key: str) -> list[tuple[str, float, float]]:
+def pairs(done: list[Row], against: list[Row], key: str) -> list[tuple[str, float, float]]:
     """(scene, value, the baseline's) of the same scene, seed and place in a sequence.
 
     Choices: a scene in several sequences is one unit: its baseline is the same run in all of them.

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import itertools
-import os
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -12,12 +11,11 @@ from typing import Annotated, Any
 from pydantic import AfterValidator, Field, model_validator
 
 from chebsplat.errors import ConfigError
-from chebsplat.formats.files import parse_toml
 from chebsplat.pipelines import store
 from chebsplat.pipelines.cluster import LOCAL
 from chebsplat.pipelines.plan import Plan, Planner, Step, merged, suffix
 from chebsplat.pipelines.run import Outcome, say, snakemake, wanted_steps
-from chebsplat.pipelines.scenes import read_toml, scene_values
+from chebsplat.pipelines.scenes import read_named, read_toml, scene_values
 from chebsplat.pipelines.sequences import scenes_of
 from chebsplat.pipelines.studies.progress import reported
 from chebsplat.stages.config import checked
@@ -44,7 +42,8 @@ class Budgets(Section):
 
 
 class Study(Section):
-    """A file of `configs/studies`. `settings`, conditions and variants hold config sections.
+    """A file of `configs/studies`, alone or over another that it `extends` (`extended`). `settings`,
+    conditions and variants hold config sections.
 
     Conditions are what results are averaged within (a teacher, a noise level); variants are compared, each with
     `baseline`, under the same condition, budget, scene and seed. A variant may also name an `ablation`, and, in a study
@@ -116,16 +115,33 @@ def read_study(name: str) -> Study:
 
     Raises ConfigError naming the first bad key, or the nearest study's name.
     """
-    if not store.is_name(Path(name).stem):
-        raise ConfigError(f"no study can be called {name}: its links lie in the work folder")
-    if name.endswith(".toml"):
-        return checked_study(parse_toml(Path(os.path.expanduser(name)), "correct it", ConfigError), name)
-    return checked_study(read_toml("studies", name), f"study {name}")
+    return checked_study(read_named("studies", name), f"study {name}")
 
 
 def checked_study(values: dict[str, Any], origin: str) -> Study:
     """The study that a .toml's values describe. Raises ConfigError naming `origin` and the key."""
-    return checked(Study, values, origin)
+    return checked(Study, extended(values, origin) if "extends" in values else values, origin)
+
+
+def extended(values: dict[str, Any], origin: str) -> dict[str, Any]:
+    """A study's values over those of the study of ours that it `extends`, which extends none.
+
+    Its `variants` and `conditions` may be lists, of names of the other's.
+    Raises: ConfigError naming `origin` and what is wrong.
+    """
+    name = str(values["extends"])
+    other = read_toml("studies", name)
+    if "extends" in other:
+        raise ConfigError(f"{origin}: {name} itself extends {other['extends']}; extend that")
+    values = {key: value for key, value in values.items() if key != "extends"}
+    for key in ("variants", "conditions"):
+        if isinstance(chosen := values.get(key), list):
+            there = other.get(key, {})
+            if wrong := [name for name in chosen if name not in list(there)]:
+                known = ", ".join(there)
+                raise ConfigError(f"{origin}: {key}: {wrong[0]!r:.60} is none of {known}")
+            values[key] = {name: there[name] for name in chosen}
+    return other | values
 
 
 def expand(study: Study, running: bool = False, device: str = "cpu") -> list[Run]:
@@ -218,15 +234,16 @@ def execute(
         title = f"{run.sequence or run.scene}, seed {run.seed}" if on == LOCAL else name
         parts.setdefault(title, []).append(run)
     links = {run.name: run.plan.targets[LAST] for run in runs}
-    for title, part in parts.items():
-        if waiting := outstanding(part):
-            try:
-                say(f"  {title}: {describe(waiting)}; {cores // threads} at once, {threads} threads each")
-                with reported(runs, cores // threads if on == LOCAL else None, say, refresh):
-                    part_outcome = snakemake(waiting, cores, threads, device, on)
-                outcome = Outcome(max(outcome.code, part_outcome.code), outcome.failed | part_outcome.failed)
-            finally:  # a study that is stopped names what it has finished
-                store.link(f"study-{name}", links)
+    at_once = f"{cores // threads} at once, {threads} threads each"
+    with reported(runs, say, refresh):
+        for title, part in parts.items():
+            if waiting := outstanding(part):
+                try:
+                    say(f"  {title}: {describe(waiting)}; {at_once}")
+                    ended = snakemake(waiting, cores, threads, device, on)
+                    outcome = Outcome(max(outcome.code, ended.code), outcome.failed | ended.failed)
+                finally:  # a study that is stopped names what it has finished
+                    store.link(f"study-{name}", links)
     store.link(f"study-{name}", links)
     return outcome
 

@@ -2,10 +2,8 @@
 
 from __future__ import annotations
 
-import csv
 import math
 from dataclasses import dataclass
-from pathlib import Path
 
 from chebsplat.evaluation.statistics import Difference, Summary, summarize
 from chebsplat.pipelines.studies.results import FIGURES, Figure, Line, Row, counted, groups
@@ -16,12 +14,11 @@ BY_SCENE = ("miou", "miou_gain", "psnr", "n_gaussians", "train_seconds")
 
 @dataclass(frozen=True)
 class Section:
-    """A part of the page; `table` begins with its header, `picture` lies beside the page."""
+    """A part of the page; `table` begins with its header."""
 
     heading: str
     note: str
     table: list[list[str]]
-    picture: str = ""
 
 
 def number(value: float, figure: Figure) -> str:
@@ -119,20 +116,3 @@ def left_out(rows: list[Row]) -> list[tuple[str, str, str]]:
         for entry in row["left_out"].items():
             variants.setdefault(entry, {})[row["variant"]] = None
     return sorted((*entry, "all" if len(by) == len(every) else ", ".join(by)) for entry, by in variants.items())
-
-
-def stability(path: Path) -> list[tuple[str, int, int, float]]:
-    """(part, cases, cases failed, largest error ÷ its tolerance) of the last `make stability`; none if it never ran."""
-    if not path.is_file():
-        return []
-    with path.open(newline="") as handle:
-        modules = groups(list(csv.DictReader(handle)), "module")
-
-    def share(case: Row) -> float:
-        error, tolerance = float(case["error"]), float(case["tolerance"])
-        return error / tolerance if tolerance else 0.0 if error == 0 else math.inf
-
-    return [
-        (module, len(cases), sum(case["passed"] != "True" for case in cases), max(map(share, cases)))
-        for (module,), cases in modules.items()
-    ]

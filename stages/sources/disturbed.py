@@ -14,14 +14,16 @@ from scipy.spatial.transform import Rotation
 from chebsplat.cameras import centers
 from chebsplat.photos.exposures import relit
 
+SEED = 0  # of all disturbances: the studies compare trainings on the same ones
 
-def recolored(images: np.ndarray, is_test: np.ndarray, stops: float, seed: int) -> np.ndarray:
+
+def recolored(images: np.ndarray, is_test: np.ndarray, stops: float) -> np.ndarray:
     """Images u8 [V, H, W, 3] with an exposure of ± `stops` and a white balance of ± a quarter of it, by training view.
 
     Choices: linear light is multiplied, by uniform logarithms whose mean over the training views is 0; what is too
       bright is cut off, as a sensor does.
     """
-    rng, rows = np.random.default_rng(seed), np.flatnonzero(~is_test)
+    rng, rows = np.random.default_rng(SEED), np.flatnonzero(~is_test)
     logs = rng.uniform(-stops, stops, (len(rows), 1)) + rng.uniform(-stops / 4, stops / 4, (len(rows), 3))
     changed = images.copy()
     for row, own in zip(rows, logs - logs.mean(0), strict=True):
@@ -29,12 +31,12 @@ def recolored(images: np.ndarray, is_test: np.ndarray, stops: float, seed: int) 
     return changed
 
 
-def displaced(poses: np.ndarray, is_test: np.ndarray, degrees: float, shift: float, seed: int) -> np.ndarray:
+def displaced(poses: np.ndarray, is_test: np.ndarray, degrees: float, shift: float) -> np.ndarray:
     """Poses [V, 4, 4] turned about their centres by `degrees` and shifted by `shift` scene units, by training view.
 
     Choices: directions are random; the mean motion of the world that they amount to is taken out, to first order.
     """
-    rng, rows = np.random.default_rng(seed), np.flatnonzero(~is_test)
+    rng, rows = np.random.default_rng(SEED), np.flatnonzero(~is_test)
     turns, shifts = (rng.normal(size=(len(rows), 3)) for _ in range(2))
     turns *= np.radians(degrees) / np.linalg.norm(turns, axis=1, keepdims=True)
     shifts *= shift / np.linalg.norm(shifts, axis=1, keepdims=True)
@@ -50,15 +52,15 @@ def displaced(poses: np.ndarray, is_test: np.ndarray, degrees: float, shift: flo
     return changed
 
 
-def disturbed(fields: dict[str, Any], colors: float, degrees: float, shift: float, seed: int) -> dict[str, Any]:
+def disturbed(fields: dict[str, Any], colors: float, degrees: float, shift: float) -> dict[str, Any]:
     """Those fields of a capture that change, and a note of it. Poses that are None stay so."""
     changed: dict[str, Any] = {}
     is_test, notes = fields["is_test"], list(fields["source"].get("notes", []))
     if colors > 0:
-        changed["images"] = recolored(np.asarray(fields["images"][:]), is_test, colors, seed)
+        changed["images"] = recolored(np.asarray(fields["images"][:]), is_test, colors)
         notes.append(f"Exposures of the training views are disturbed by {colors:g} stops (ingest.disturb_colors).")
     if degrees > 0 or shift > 0:
-        changed["cam_from_world"] = displaced(fields["cam_from_world"], is_test, degrees, shift, seed)
+        changed["cam_from_world"] = displaced(fields["cam_from_world"], is_test, degrees, shift)
         changed["tracks"] = None  # they tell of the poses as they were
         notes.append(f"Poses of the training views are disturbed by {degrees:g}° and {shift:g} scene units.")
     strengths = {"colors": colors, "degrees": degrees, "shift": shift}

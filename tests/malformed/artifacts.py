@@ -1,21 +1,30 @@
-"""Small artifacts of every schema that fit together, made without a training; damaged copies with digests made anew."""
+"""Artifacts that are damaged, as input of every stage and of the commands that read them.
+
+Small artifacts of every schema that fit together, made without a training.
+"""
 
 from __future__ import annotations
 
 import atexit
 import functools
-import hashlib
-import json
+import pickle
 import shutil
 import tempfile
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
+from chebsplat.formats import artifact
+from chebsplat.formats.manifest import Manifest
+from chebsplat.stages.registry import STAGES
+from malformed.edits import DEEP, Edit, changed, cut, flipped, no_file, npy, put, remove
+from malformed.row import Arguments, Row, stage
+
 N, V, C, SIZE = 40, 3, 5, (24, 16)  # Gaussians, views, channels, width and height
 KEY = "0123456789abcdef"
+MEMBER = "data/values.bin"
 VIEWS, LABELS = [f"view_{k}" for k in range(V)], ["wall", "floor", "sofa"]
 NOTES = {"left_out": {}, "n_initial": N}
 DESCRIBED = {"n_angles": 2, "max_degree": 3, "anisotropy": 10.0, "bandwidth": 0.7, "spectrum": "full", "n_eigs": 16}
@@ -26,8 +35,8 @@ def artifacts() -> Path:
     """A folder with an artifact of each schema, by the name of its stage; made once a process."""
     root = Path(tempfile.mkdtemp(prefix="malformed-artifacts-"))
     atexit.register(shutil.rmtree, root, ignore_errors=True)
-    for stage, (schema, write) in WRITERS.items():
-        _publish(root / stage, schema, stage, write)
+    for name, (schema, write) in WRITERS.items():
+        _publish(root / name, schema, name, write)
     return root
 
 
@@ -36,49 +45,128 @@ def copied(stage: str, folder: Path) -> Path:
     return Path(shutil.copytree(artifacts() / stage, folder / stage))
 
 
-def resealed(path: Path) -> Path:
-    """Make a manifest fit its files again, however these were changed; files that are new are listed, too."""
-    manifest = json.loads((path / "artifact.json").read_text())
-    members = sorted(file for file in path.rglob("*") if file.is_file() and file.name != "artifact.json")
-    manifest["files"] = {
-        file.relative_to(path).as_posix(): {
-            "sha256": hashlib.sha256(file.read_bytes()).hexdigest(),
-            "bytes": file.stat().st_size,
-        }
-        for file in members
-    }
-    (path / "artifact.json").write_text(json.dumps(manifest))
+def fake(path: Path, of: str) -> Path:
+    """An artifact of stage `of` whose manifest is right, with one member that nobody gets as far as to read."""
+    with artifact.publish(path, Manifest(STAGES[of].schema, KEY, of)) as tmp:
+        put(MEMBER, bytes(64))(tmp)
     return path
 
 
-def set_value(file: Path, keys: tuple[Any, ...], value: Any) -> None:
-    """Put a value into a JSON document; no keys: in its place."""
-    document = json.loads(file.read_text())
-    if not keys:
-        document = value
-    else:
-        inner = document
-        for key in keys[:-1]:
-            inner = inner[key]
-        if value is ...:
-            del inner[keys[-1]]
-        else:
-            inner[keys[-1]] = value
-    file.write_text(json.dumps(document))
+def manifest(**values: Any) -> Edit:
+    """A manifest that says something else; None: not at all."""
+
+    def change(said: dict[str, Any]) -> dict[str, Any]:
+        return {name: value for name, value in (said | values).items() if value is not None}
+
+    return changed("artifact.json", change)
 
 
-def set_tensor(file: Path, name: str, change: Callable[[np.ndarray], np.ndarray | None]) -> None:
-    """Change one array of a safetensors file; None takes it away."""
-    from safetensors.numpy import load_file, save_file
+def listed(name: str) -> Edit:
+    """The one member under another name."""
+    return changed("artifact.json", lambda said: said | {"files": {name: said["files"][MEMBER]}})
 
-    arrays = load_file(file)
-    found = change(arrays.pop(name).copy())
-    save_file(arrays | ({} if found is None else {name: np.ascontiguousarray(found)}), file)
+
+Damage = tuple[str, Edit, str]  # what is wrong with an artifact, the edit, a word of the message
+OF_INPUTS: list[Damage] = [
+    ("gone", shutil.rmtree, "artifact.json is missing"),
+    ("no manifest", remove("artifact.json"), "artifact.json is missing"),
+    ("a manifest that leads to itself", no_file("artifact.json", "looping link"), "artifact.json is missing"),
+    ("another schema", manifest(schema="chebsplat.other/9"), "has schema chebsplat.other/9"),
+    ("a member gone", remove(MEMBER), "values.bin is missing"),
+    ("a member cut short", cut(MEMBER, 1), "has 63 bytes, expected 64"),
+]
+OF_ANY: list[Damage] = [
+    ("a key that climbs", manifest(key="../../../x"), "key"),
+    ("an absolute key", manifest(key="/tmp/elsewhere"), "key"),
+    ("an empty key", manifest(key=""), "key"),
+    ("a key with a line end", manifest(key=KEY + "\n"), "key"),
+    ("no key", manifest(key=None), "artifact.json"),
+    ("an input whose key climbs", manifest(inputs={"capture": {"key": "../x", "schema": "s/1"}}), "inputs"),
+    ("a file that climbs", listed("../in/" + MEMBER), "files"),
+    ("an absolute file", listed("/etc/hostname"), "files"),
+    ("a file's name with a null byte", listed("data/\0"), "files"),
+    ("a file's name too long", listed("x" * 300), "x" * 300),
+    ("a manifest that is empty", put("artifact.json", ""), "artifact.json does not parse"),
+    ("a manifest cut short", put("artifact.json", '{"schema": "chebsplat.'), "artifact.json does not parse"),
+    ("a manifest of other bytes", put("artifact.json", b"\xff\xfe\0"), "UTF-8"),
+    ("a manifest nested too deeply", put("artifact.json", DEEP), "nested too deeply"),
+    ("a manifest that is a list", put("artifact.json", "[]"), "artifact.json"),
+    ("a member that is a folder", no_file(MEMBER, "folder"), "values.bin is missing"),
+    ("a member that is a pipe", no_file(MEMBER, "pipe"), "values.bin is missing"),
+    ("another byte", flipped(MEMBER), "does not match its sha256"),
+    ("a file more", put("more", ""), "not listed"),
+]
+
+
+def met(name: str, ask: Callable[[Path], Arguments], word: str, edit: Edit, of: str = "cks") -> Row:
+    """A damaged artifact in folder/in."""
+
+    def build(folder: Path) -> Arguments:
+        edit(fake(folder / "in", of))
+        return ask(folder)
+
+    return Row("artifact", name, build, ("/in", word), alone="pipe" in name)
+
+
+def rows() -> Iterator[Row]:
+    for what, edit, word in OF_ANY:
+        yield met(f"{what}, in verify", lambda folder: ["verify", folder / "in"], word, edit)
+    for what, edit, word in (OF_ANY[0], OF_ANY[6], OF_INPUTS[5]):
+        yield met(f"{what}, in plan", lambda folder: ["plan", "--scene", "toy", "--basis", f"{folder}/in/"], word, edit)
+    roles = [(name, role) for name, one in STAGES.items() for role in one.roles]
+    for number, (name, role) in enumerate(roles):
+        what, edit, word = OF_INPUTS[number % len(OF_INPUTS)]
+
+        def ask(folder: Path, name: str = name, role: str = role) -> Arguments:
+            needed = {r: fake(folder / r, of) for r, of in STAGES[name].inputs if r != role}
+            return stage(name, folder, {}, **needed, **{role: folder / "in"})
+
+        yield met(f"{what}, in {name} --in-{role}", ask, word, edit, STAGES[name].roles[role])
+    for what, content, word in FEATURES:
+        yield encoded("features.npy", what, put("features.npy", content), word)
+    for what, content, word in SPLATS:
+        yield encoded("scene.ply", what, put("scene.ply", content), word)
+    for name in ("features.npy", "scene.ply"):
+        yield encoded(name, "a pipe", no_file(name, "pipe"), "a pipe", alone=True)
+
+
+# files from elsewhere, met by `encode`: features of Gaussians, and the Gaussians
+
+FEATURES: list[tuple[str, bytes, str]] = [
+    ("nothing", b"", "not a readable .npy"),
+    ("a pickle", pickle.dumps([1, 2]), "not a readable .npy"),
+    ("terabytes", npy(np.zeros(3, np.float32), shape=(10**6, 10**6)), "it declares"),
+    ("objects", npy(np.zeros(3), descr="|O"), "pickled objects"),
+    ("one dimension", npy(np.zeros(N, np.float32)), "one row a Gaussian"),
+    ("other rows", npy(np.zeros((3, C), np.float32)), "one row a Gaussian"),
+    ("nan", npy(np.full((N, C), np.nan, np.float32)), "finite"),
+    ("words", npy(np.full((N, C), "a")), "one row a Gaussian"),
+]
+HEADER = b"ply\nformat binary_little_endian 1.0\nelement vertex 2\nproperty float x\n"
+AXES = b"property float y\nproperty float z\nend_header\n"
+SPLATS: list[tuple[str, bytes, str]] = [
+    ("nothing", b"", "scene.ply"),
+    ("text", b"a splat\n", "scene.ply"),
+    ("a cloud", HEADER + AXES + bytes(24), "scene.ply"),
+    ("10^12 Gaussians", HEADER.replace(b"2", b"1000000000000") + AXES, "scene.ply"),
+]
+
+
+def encoded(named: str, what: str, edit: Edit, word: str, alone: bool = False) -> Row:
+    def build(folder: Path) -> Arguments:
+        shutil.copyfile(artifacts() / "export/scene.ply", folder / "scene.ply")
+        (folder / "features.npy").write_bytes(npy(np.zeros((N, C), np.float32)))
+        edit(folder)
+        given = ["--encoder", artifacts() / "onnx", "--features", folder / "features.npy", "--out", folder / "out.npz"]
+        return ["encode", folder / "scene.ply", *given]
+
+    return Row("encode", f"{named}: {what}", build, (named, word), alone=alone)
+
+
+# small artifacts of every schema
 
 
 def _publish(path: Path, schema: str, stage: str, write: Callable[[Path], Any]) -> None:
-    from chebsplat.formats import artifact
-    from chebsplat.formats.manifest import Manifest
     from chebsplat.stages.config import Config
 
     config = Config.model_validate({"describe": DESCRIBED | {"n_regions": 4, "region_size": 8}, "sfm": {}})

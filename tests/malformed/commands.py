@@ -1,208 +1,353 @@
-"""Odd uses of the commands: names that are none, paths of another kind, a damaged or occupied work folder."""
+"""Settings, documents, names and places that no command could use, and a work folder that is none or damaged."""
 
 from __future__ import annotations
 
-import json
-from collections.abc import Callable, Iterator
+import os
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 
-from malformed.case import Asked, Case
+from chebsplat.formats import artifact
+from chebsplat.formats.manifest import Manifest
+from chebsplat.stages.registry import STAGES
+from malformed.artifacts import fake
+from malformed.edits import DEEP, Edit, no_file, put, swollen
+from malformed.row import Arguments, Row, stage
 
+KEY = "0123456789abcdef"
 LONG = "x" * 300
-# (the command's arguments, what it must name, its exit code)
-NAMES: list[tuple[list[str], str, int]] = [
-    (["run"], "scene=", 2),
-    (["run", "--scene", "ofice0"], "office0", 2),
-    (["run", "--scene", ""], "scene=", 2),
-    (["run", "--scene", "a\nb"], r"'a\nb'", 2),
-    (["run", "--scene", "\x1b[31mred"], r"'\x1b[31mred'", 2),
-    (["run", "--scene", "toy\udcff"], r"'toy\udcff'", 2),
-    (["run", "--scene", LONG], LONG[:80], 2),
-    (["run", "--scene", f"./{LONG}"], LONG[:70], 3),
-    (["run", "--scene", "./nowhere"], "./nowhere", 3),
-    (["run", "--scene", "./file"], "./file", 3),
-    (["run", "--scene", "file"], "file", 2),
-    (["run", "--scene", "~nobody-of-this-name"], "~nobody-of-this-name", 2),
-    (["run", "--scene", "toy", "--sequence", "toys"], "sequence=", 2),
-    (["run", "--scene", "toy", "--stage", "trian"], "train", 2),
-    (["run", "--scene", "toy", "--stage", "cks"], "cks", 2),
-    (["run", "--scene", "toy", "--cores", "0"], "--cores", 2),
-    (["run", "--scene", "toy", "--device", "tpu"], "--device", 2),
-    (["run", "--scene", "toy", "--nonsense"], "--nonsense", 2),
-    (["run", "--scene", "toy", "--ablation", "no-tel"], "no-tle", 2),
-    (["run", "--scene", "toy", "--ablation", "../scenes/toy"], "../scenes/toy", 2),
-    (["run", "--scene", "../scenes/toy"], "../scenes/toy", 3),
-    (["run", "--sequence", "ofices"], "offices", 2),
-    (["run", "--sequence", ""], "sequence", 2),
-    (["run", "--sequence", "nowhere.toml"], "nowhere.toml", 2),
-    (["plan", "--scene", "toy", "--basis", "nobody"], "nobody", 2),
-    (["plan", "--scene", "toy", "--basis", "offices@99"], "offices@99", 2),
-    (["plan", "--scene", "toy", "--basis", "@"], "basis=@", 2),
-    (["study", "methd"], "method", 2),
-    (["study", ""], "study", 2),
-    (["study", "../studies/toys"], "../studies/toys", 2),
-    (["study", "nowhere.toml"], "nowhere.toml", 2),
-    (["study", "toys", "--threads", "0"], "--threads", 2),
-    (["settings", "trian"], "train", 2),
-    (["settings", "train.stpes"], "train.steps", 2),
-    (["settings", "\x1b[2J"], r"'\x1b[2J'", 2),
-    (["verify", "nowhere"], "nowhere", 2),
-    (["verify", "./nowhere"], "./nowhere", 3),
-    (["verify", ""], "''", 2),
-    (["verify", "file"], "file", 2),
-    (["verify", "/"], "/", 3),
-    (["rm", "nowhere", "--yes"], "nowhere", 2),
-    (["rm", ".", "--yes"], ".", 3),
-    (["rm", "..", "--yes"], "..", 3),
-    (["rm", "./file", "--yes"], "./file", 3),
-    (["query", "nowhere", "sofa"], "nowhere", 2),
-    (["query", "./file", "sofa"], "./file", 3),
-    (["extract", "office0", "--out", "x.ply"], "make scene=office0", 2),
-    (["extract", "./nowhere", "--out", "x.ply"], "./nowhere", 3),
-    (["encode", "nowhere", "--out", "x.npz"], "nowhere", 2),
-    (["encode", "nowhere.ply", "--out", "x.npz"], "--encoder", 2),
-    (["encode", "nowhere.ply", "--encoder", "./nowhere", "--out", "x.npz"], "./nowhere", 3),
-    (["encode", "nowhere.ply", "--encoder", "nowhere.onnx", "--out", "x.npz"], "nowhere.onnx", 2),
-    (["lift", "nowhere.ply", "--capture", "nowhere", "--out", "x"], "nowhere", 2),
-    (["lift", "nowhere.ply", "--capture", "./nowhere", "--out", "x"], "./nowhere", 3),
-    (["check-teacher", "nowhere.onnx"], "nowhere.onnx", 3),
-    (["basis", "show", "ofices"], "offices", 2),
-    (["basis", "log", "./nowhere"], "nowhere", 2),
-    (["basis", "diff", "offices@0", "offices"], "offices@0", 2),
-    (["basis", "extend", "a/b", "nowhere"], "nowhere", 2),
-    (["basis", "nonsense"], "nonsense", 2),
-    (["nonsense"], "nonsense", 2),
+SETTINGS: list[tuple[str, object, str]] = [  # a setting of a config, its value, a word of the message beside its name
+    ("scene.name", "a\nb", "scene.name"),
+    ("source.kind", "coLmap", "colmap"),
+    ("source.seed", 2**64, "source.seed"),
+    ("ingest.test_every", 1, "ingest.test_every"),
+    ("teacher.scales", [], "teacher.scales"),
+    ("teacher.scales", [0.0], "teacher.scales.0"),
+    ("teacher.scales", [1.0] * 100, "teacher.scales"),
+    ("describe.spectrum", ["full"], "describe.spectrum"),
+    ("train.encoder", "trnsformer", "'transformer'"),
+    ("train.seconds", float("inf"), "a finite number is needed"),
+    ("train.semantics", 1, "true or false is needed"),
+    ("train.densify_until", 0.9, "densify_until"),
+    ("train.stpes", 5, "did you mean train.steps"),
+    ("train.n_angles", 5, "did you mean describe.n_angles"),
+    ("trian.steps", 5, "did you mean train"),
+    ("projection.n_channels", 9, "did you mean channels.n_channels"),
+]
+SET = {  # --set: what stderr names
+    "train.steps": "section.key=value",
+    "train.steps=": "train.steps",
+    "=5": "=5",
+    "../x.y=1": "set=",
+    "train.steps.more=5": "train.steps.more",
+    "train.stps=3": "did you mean train.steps",
+    "train.steps=5, train.steps=6": "train.steps is given twice",
+    "train.lr_means=inf": "train.lr_means",
+    "train.steps=" + "9" * 5000: "train.steps",
+    "train.steps=" + DEEP: "train.steps",
+    "teacher.labels=a\nb": "teacher.labels",
+    "train.encoder=transformer,train.width=30": "width",
+    "describe.n_regions=200000,describe.n_angles=64": "descriptors of",
+}
+TOMLS: list[tuple[str, bytes, str]] = [  # what a config holds, a word of the message
+    ("cut short", b"[train", "does not parse"),
+    ("a key twice", b"[train]\nsteps = 1\nsteps = 2\n", "does not parse"),
+    ("deep lists", b"a = " + DEEP.encode(), "nested too deeply"),
+    ("an endless number", b"[train]\nsteps = " + b"9" * 5000, "does not parse"),
+    ("a section that is no table", b"train = 5\n", "train"),
+]
+JSONS: list[tuple[str, bytes, str]] = [
+    ("no UTF-8", b'{"a": "\xff"}', "UTF-8"),
+    ("deep lists", DEEP.encode(), "nested too deeply"),
+    ("a list", b"[]", "a.json"),
+    ("a section that is no table", b'{"train": [5]}', "train"),
+]
+STUDY = 'title = "M"\nabout = ""\nbaseline = "a"\nscenes = ["toy"]\n'
+STUDIES: list[tuple[str, str, str]] = [  # what is wrong, the text, what stderr names
+    ("cut short", "[variants", "does not parse"),
+    ("no title", STUDY.partition("\n")[2] + "[variants.a]\n", "title"),
+    ("scenes that are numbers", STUDY.replace('["toy"]', "[5]") + "[variants.a]\n", "scenes"),
+    ("an unknown key", STUDY + "sceens = []\n[variants.a]\n", "sceens"),
+    ("another baseline", STUDY.replace('"a"', '"b"') + "[variants.a]\n", "variants"),
+    ("no seeds", STUDY + "seeds = []\n[variants.a]\n", "seeds"),
+    ("infinite seconds", STUDY + "budgets.seconds = [inf]\n[variants.a]\n", "budgets.seconds"),
+    ("a section that is a number", STUDY + "settings = { train = 5 }\n[variants.a]\n", "settings.train"),
+    ("no scenes", STUDY.replace('"toy"', "") + "[variants.a]\n", "scenes or sequences"),
+    ("sequences, too", STUDY + 'sequences = ["toys"]\n[variants.a]\n', "scenes or sequences"),
+    ("an ablation that is a number", STUDY + "[variants.a]\nablation = 5\n", "variants.a.ablation"),
+    ("a condition that is a number", STUDY + "conditions = { x = 5 }\n[variants.a]\n", "conditions.x"),
+    ("pairs that are none", STUDY + 'pairs = [["a"]]\n[variants.a]\n', "pairs"),
+    ("a setting out of range", STUDY + "[variants.a.train]\nwidth = 100000\n", "train.width"),
+    ("an unknown setting", STUDY + "[variants.a.train]\nwitdh = 32\n", "train.witdh"),
+    ("an unknown ablation", STUDY + '[variants.a]\nablation = "no-tel"\n', "no-tel"),
+    ("an unknown scene", STUDY.replace("toy", "tyo") + "[variants.a]\n", "tyo"),
+]
+SEQUENCES = ["[scenes", "", "scenes = []", 'scenes = "toy"', "scenes = [1, 2]", 'scenes = ["toy", ""]',
+             'scenes = ["to\\ny"]', 'scenes = ["toy"]\nsteps = 5', "scenes = [" + '"toy",' * 2000 + "]"]  # fmt: skip
+NAMES: list[tuple[str, str, int]] = [  # a command's words, what it must name, its exit code
+    ("run", "scene=", 2),
+    ("run --scene ofice0", "office0", 2),
+    ("run --scene toy --sequence toys", "sequence=", 2),
+    ("run --scene toy --stage trian", "train", 2),
+    ("run --scene toy --stage ../train", "stage", 2),
+    ("run --scene toy --stage cks", "no sequence", 2),
+    ("run --scene toy --cores 0", "--cores", 2),
+    ("run --scene toy --device tpu", "--device", 2),
+    ("run --scene toy --nonsense", "No such option", 2),
+    ("run --scene toy --ablation no-tel", "no-tle", 2),
+    ("run --scene toy --ablation ../scenes/toy", "../scenes/toy", 2),
+    ("run --scene ./nowhere/", "not a folder", 3),
+    ("run --scene ./file", "./file", 3),
+    ("run --scene ../scenes/toy", "../scenes/toy", 3),
+    (f"run --scene ./{LONG}", LONG[:70], 3),
+    ("run --scene ~nobody-of-this-name", "~nobody-of-this-name", 2),
+    ("run --sequence ofices", "offices", 2),
+    ("run --sequence nowhere.toml", "nowhere.toml", 2),
+    (f"plan --sequence {LONG}.toml", LONG[:70], 2),
+    ("plan --scene toy --basis nobody", "nobody", 2),
+    ("plan --scene toy --basis offices@99", "offices@99", 2),
+    ("plan --scene toy --basis @", "NAME@REVISION", 2),
+    ("plan --scene toy --basis offices@0", "NAME@REVISION", 2),
+    ("plan --scene toy --basis offices@²", "NAME@REVISION", 2),
+    ("plan --scene toy --basis ../../x@1", "no basis is called ../../x", 2),
+    ("plan --scene toy --basis ./nowhere/", "no basis is called", 2),
+    ("plan --scene toy --basis ./", "not a finished artifact", 3),
+    ("plan --scene toy --basis offices@2 --ablation no-shape", "holds no knowledge: train.encoder is off", 2),
+    ("plan --scene toy --basis offices@2 --ablation no-tle", "holds no knowledge: train.encoder is mlp", 2),
+    ("plan --sequence offices --basis offices@2", "starts from nothing", 2),
+    ("study methd", "did you mean method", 2),
+    ("study ../studies/toys", "../studies/toys", 2),
+    ("study nowhere.toml", "nowhere.toml", 2),
+    ("study toys --threads 0", "--threads", 2),
+    ("settings trian", "train", 2),
+    ("settings train.stpes", "train.steps", 2),
+    ("verify nowhere", "no finished scene", 2),
+    ("verify ./nowhere", "./nowhere", 3),
+    ("rm . --yes", ".", 3),
+    ("rm .. --yes", "..", 3),
+    ("rm ./file --yes", "./file", 3),
+    ("query nowhere sofa", "nowhere", 2),
+    ("query ./file sofa", "./file", 3),
+    ("extract office0 --out x.ply", "make scene=office0", 2),
+    ("extract ./nowhere --out x.ply", "./nowhere", 3),
+    ("encode nowhere.ply --out x.npz", "--encoder", 2),
+    ("encode nowhere.ply --encoder ./nowhere --out x.npz", "./nowhere", 3),
+    ("lift nowhere.ply --capture ./nowhere --out x", "./nowhere", 3),
+    ("check-teacher nowhere.onnx", "nowhere.onnx", 3),
+    ("basis show ofices", "offices", 2),
+    ("basis log ./nowhere", "nowhere", 2),
+    ("basis diff offices@0 offices", "offices@0", 2),
+    ("basis nonsense", "nonsense", 2),
+    ("nonsense", "nonsense", 2),
+    ("sfm --out x", "Missing option '--in-capture'", 2),
 ]
 
 
-def _name(arguments: list[str], named: str, code: int) -> Case:
-    def build(folder: Path) -> Asked:
+def words(kind: str, arguments: Sequence[str], *named: str, code: int = 2, edit: Edit | None = None) -> Row:
+    """A command met in a folder with a file named `file`, and what `edit` puts there."""
+
+    def build(folder: Path) -> Arguments:
         (folder / "file").write_text("text")
-        return Asked(arguments, named)
+        if edit:
+            edit(folder)
+        return arguments
 
-    return Case("command", " ".join(ascii(word[:40])[1:-1] for word in arguments), build, (code,))
-
-
-def photos(folder: Path) -> Path:
-    from PIL import Image
-
-    folder.mkdir(parents=True)
-    for k in range(4):
-        Image.new("RGB", (32, 24), (60 * k, 0, 0)).save(folder / f"{k}.jpg")
-    return folder
+    name = " ".join(ascii(word[:40])[1:-1] for word in arguments)
+    return Row(kind, name, build, named, code)
 
 
-def linked(work: Path, title: str, stage: str, manifest: str) -> None:
+def settings() -> Iterator[Row]:
+    for setting, value, word in SETTINGS:
+        section, key = setting.split(".")
+
+        def build(folder: Path, section: str = section, key: str = key, value: object = value) -> Arguments:
+            return stage("sfm", folder, {section: {key: value}}, capture=folder / "none")
+
+        yield Row("setting", f"{setting} = {value!r:.30}", build, (word,), 2)
+    for text, word in SET.items():
+        yield words("set=", ["plan", "--scene", "toy", "--set", text], word)
+    for name, kind in STAGES.items():
+
+        def misspelt(folder: Path, name: str = name) -> Arguments:
+            of = STAGES[name]
+            given = {role: fake(folder / role, of.roles[role]) for role, _ in of.inputs}
+            return stage(name, folder, {of.sections[-1]: {"tets_every": 3}}, **given)
+
+        yield Row("setting", f"of {name}, misspelt", misspelt, (f"{kind.sections[-1]}.tets_every",), 2)
+
+
+def documents() -> Iterator[Row]:
+    def met(kind: str, what: str, edit: Edit, word: str, alone: bool = False) -> Row:
+        name = "a.json" if kind == "json config" else "a.toml"
+        asked: Callable[[Path], list[str | Path]] = {
+            "study": lambda folder: ["study", folder / name, "--plan"],
+            "sequence": lambda folder: ["plan", "--sequence", folder / name],
+        }.get(kind, lambda folder: ["sfm", "--config", folder / name, "--out", folder / "out", "--in-capture", folder])
+
+        def build(folder: Path) -> Arguments:
+            edit(folder)
+            return asked(folder)
+
+        return Row(kind, what[:40], build, (word,) if kind == "study" else (name, word), 2, alone)
+
+    for what, content, word in TOMLS:
+        yield met("config", what, put("a.toml", content), word)
+    for what, content, word in JSONS:
+        yield met("json config", what, put("a.json", content), word)
+    for what, text, word in STUDIES:
+        yield met("study", what, put("a.toml", text), word)
+    for text in SEQUENCES:
+        yield met("sequence", f"{text!r}", put("a.toml", text), "a.toml")
+    yield met("config", "missing", lambda folder: None, "is missing")
+    yield met("config", "a folder", no_file("a.toml", "folder"), "is a folder")
+    for kind in ("config", "study", "sequence"):
+        yield met(kind, "a pipe", no_file("a.toml", "pipe"), "a pipe", True)
+    yield met("config", "a device", no_file("a.toml", "device"), "a device", True)
+    yield met("json config", "a terabyte", lambda folder: (put("a.json", "")(folder), swollen("a.json")(folder)),
+              "are read", True)  # fmt: skip
+
+
+def names() -> Iterator[Row]:
+    for line, word, code in NAMES:
+        yield words("command", line.split(), word, code=code)
+    for word in ("a\nb", "\x1b[31mred", "toy\udcff"):
+        yield words("command", ["run", "--scene", word], repr(word))
+    for command, word in ((["run", "--scene"], "scene="), (["run", "--sequence"], "sequence"), (["study"], "study"),
+                          (["verify"], "''")):  # fmt: skip
+        yield words("command", [*command, ""], word)
+
+
+# Where nothing can be written, or what must stay: the place of an artifact and its key.
+
+
+def users(place: Path) -> None:
+    place.mkdir()
+    (place / "thesis.tex").write_text("years")
+
+
+def with_a_manifest(place: Path) -> None:
+    users(place)
+    (place / "artifact.json").write_text('{"title": "a list of my artifacts"}')
+
+
+def with_a_note(place: Path) -> None:
+    fake(place, "ingest")
+    (place / "thesis.tex").write_text("years")
+
+
+PLACES: dict[str, tuple[Callable[[Path], object], str, int]] = {  # what stands where, and the exit code
+    "a file": (lambda place: place.write_text("years"), "mine", 3),
+    "a folder of the user's": (users, "mine", 3),
+    "a folder with an artifact.json": (with_a_manifest, "mine", 3),
+    "another stage's artifact": (lambda place: fake(place, "train"), "mine", 3),
+    "a link to an artifact": (lambda place: place.symlink_to(fake(place.with_name("other"), "ingest")), "mine", 3),
+    "a link that leads nowhere": (lambda place: place.symlink_to("nothing"), "mine", 3),
+    "a link that leads to itself": (lambda place: place.symlink_to(place.name), "mine", 3),
+    "below a file": (lambda place: place.parents[1].write_text("years"), "mine/x/y", 2),
+    "a name too long": (lambda place: None, "x" * 250, 2),
+    "a name far too long": (lambda place: None, "x" * 5000, 2),
+    "a folder of the system's": (lambda place: None, "/proc/nothing/x", 2),
+}
+
+
+def places() -> Iterator[Row]:
+    def ingest(folder: Path) -> list[str | Path]:
+        """Of a folder that is not there: what is refused later names that."""
+        return stage("ingest", folder, {"source": {"kind": "photos", "path": "nowhere"}})
+
+    yield Row("setting", "source.path = 'nowhere'", ingest, ("nowhere", "source.path"))
+    for key in ("", "abc", "../../x", KEY.upper(), KEY + "0", KEY[:-1] + "\n", "0" * 15 + "²"):
+        yield Row("--key", f"{key!r}", lambda folder, key=key: [*ingest(folder), "--key", key], ("--key",), 2)
+    for what, (stands, place, code) in PLACES.items():
+        for force in (False, True) if place == "mine" else (False,):
+            if what == "a link to an artifact" and not force:
+                continue  # it is whole: there is nothing to do
+
+            def build(folder: Path, stands=stands, place: str = place, force: bool = force) -> Arguments:  # type: ignore[no-untyped-def]
+                stands(folder / place)
+                arguments = ingest(folder)
+                arguments[arguments.index("--out") + 1] = folder / place
+                return [*arguments, *["--force"] * force]
+
+            word = "mine" if "mine" in place else place[-60:]
+            remedy = "choose another --out" if code == 2 else "nothing was replaced"
+            yield Row("--out", f"{what}{', --force' * force}", build, (word, remedy), code)
+
+    def noted(folder: Path) -> Arguments:
+        with_a_note(folder / "out")
+        return [*ingest(folder), "--force"]
+
+    yield Row("--out", "an artifact with a note in it, --force", noted, ("thesis.tex", "no part of the artifact"))
+
+
+# What lies in work
+
+
+def linked(work: Path, title: str, of: str, manifest: str = "{}") -> None:
     """A scene's link to an artifact that is a manifest alone."""
-    artifact = work / f"store/{stage}/0123456789abcdef"
-    artifact.mkdir(parents=True, exist_ok=True)
-    (artifact / "artifact.json").write_text(manifest)
+    put(f"store/{of}/{KEY}/artifact.json", manifest)(work)
     (work / title).mkdir()
-    (work / title / stage).symlink_to(artifact)
+    (work / title / of).symlink_to(work / f"store/{of}/{KEY}")
 
 
-def _register(folder: Path, text: str) -> list[str]:
-    file = folder / "lair/.names/images.json"
-    file.parent.mkdir(parents=True)
-    file.write_text(text)
-    return ["plan", "--scene", f"{photos(folder / 'images')}/"]
-
-
-def _taken(folder: Path) -> list[str]:
-    from chebsplat.pipelines.folders import candidates
-
-    arguments = _register(folder, "{}")
-    for name in candidates(folder / "images"):
-        (folder / f"lair/.names/{name}.json").write_text(json.dumps({"source": "/elsewhere"}))
-    return arguments
-
-
-def _damaged(folder: Path, *arguments: str) -> list[str]:
-    linked(folder / "lair", "toy", "train", "{")
-    return list(arguments)
-
-
-def _plan(folder: Path, text: str | None) -> list[str]:
+def plan_under_way(text: str | None) -> Edit:
     """The plan of a run under way (process 1 always is), or a folder in its place."""
-    plan = folder / "lair/.plans/0123456789abcdef-1/plan.json"
-    (plan if text is None else plan.parent).mkdir(parents=True)
-    (folder / "lair/store").mkdir()
-    if text is not None:
-        plan.write_text(text)
-    return ["clean-stale", "--yes"]
+
+    def edit(folder: Path) -> None:
+        plan = folder / f"work/.plans/{KEY}-1/plan.json"
+        (plan if text is None else plan.parent).mkdir(parents=True)
+        (folder / "work/store").mkdir()
+        if text is not None:
+            plan.write_text(text)
+
+    return edit
 
 
-def _several(folder: Path) -> list[str]:
+def several(folder: Path) -> None:
     for steps in (5, 6):
-        linked(folder / "lair", f"toy@train.steps={steps}", "train", "{}")
-    return ["verify", "toy"]
+        linked(folder / "work", f"toy@train.steps={steps}", "train")
 
 
-def _unfinished(folder: Path, *arguments: str) -> list[str]:
-    linked(folder / "lair", "toy", "train", "{}")
-    return [*arguments, "--out", "x.ply"] if arguments[0] == "extract" else list(arguments)
+def head(name: str, target: str) -> Edit:
+    """A revision of a HEAD that is a link to `target`, relative to the HEAD's folder."""
+
+    def edit(folder: Path) -> None:
+        work = folder / "work"
+        (work / "basis-shared").mkdir(parents=True)
+        for key in (KEY, "another"):
+            with artifact.publish(work / "store/cks" / key, Manifest(STAGES["cks"].schema, KEY, "cks")):
+                pass
+        os.symlink(target, work / "basis-shared" / name)
+
+    return edit
 
 
-def _occupied(folder: Path) -> list[str]:
-    (folder / "lair").write_text("a file")
-    return ["run", "--scene", "toy"]
+def work() -> Iterator[Row]:
+    def damaged(folder: Path) -> None:
+        linked(folder / "work", "toy", "train", "{")
+
+    def unfinished(folder: Path) -> None:
+        linked(folder / "work", "toy", "train")
+
+    for line in ("verify toy", "rm toy", "clean-stale", "clean-stale --yes", "basis extend h toy"):
+        yield words("work, a manifest cut short", line.split(), "artifact.json", "does not parse", code=3, edit=damaged)
+    for what, text in (("cut short", "{"), ("of another kind", '{"steps": [3]}'), ("a folder", None)):
+        yield words(f"work, a plan {what}", ["clean-stale", "--yes"], "plan.json", code=3, edit=plan_under_way(text))
+    yield words("work, several settings", ["verify", "toy"], "toy@train.steps=5", edit=several)
+    yield words("work, unfinished", ["extract", "toy", "--out", "x.ply"], "export", edit=unfinished)
+    yield words("work, unfinished", ["query", "toy", "sofa"], "ingest", code=3, edit=unfinished)
+    yield words("work, a file", ["run", "--scene", "toy"], "work", edit=put("work", "a file"))
+    photo = put("images/a.jpg", "")
+    yield words("work, photos not run yet", ["query", "./images", "sofa"], "make scene=./images", code=3, edit=photo)
+    yield words("work, photos", ["extract", "images", "--out", "x.ply"], "images", code=3, edit=photo)
+    yield words("work, links elsewhere", ["rm", "./mine", "--yes"], "mine", code=3,
+                edit=lambda folder: linked(folder, "mine", "train"))  # fmt: skip
+    good = f"../store/cks/{KEY}"
+    for name, target in (("100000000", good), ("9", good), ("1", "../store/cks/nothing"), ("1", "1"), ("1", "../.."),
+                         ("1", "../store/cks/another")):  # fmt: skip
+        kind = f"work, revision {name} leads to {target}"
+        yield words(kind, ["basis", "log", "shared"], f"basis-shared/{name}", code=3, edit=head(name, target))
 
 
-def _photos(folder: Path, *arguments: str) -> list[str]:
-    photos(folder / "images")
-    return list(arguments)
-
-
-def _elsewhere(folder: Path) -> list[str]:
-    linked(folder, "mine", "train", "{}")
-    return ["rm", "./mine", "--yes"]
-
-
-# what is in work (here: `lair`), and what is asked: (what it is, its builder, what must be named, the exit code)
-WORK: list[tuple[str, Callable[[Path], list[str]], str, int]] = [
-    ("register cut short", lambda folder: _register(folder, "{"), "images.json", 3),
-    ("register of another kind", lambda folder: _register(folder, "[1]"), "images.json", 3),
-    ("register nested too deeply", lambda folder: _register(folder, "[" * 100_000), "images.json", 3),
-    ("register without a path", lambda folder: _register(folder, '{"source": 3}'), "images.json", 3),
-    ("every name is taken", _taken, "stand for other folders", 2),
-    ("verify of a damaged manifest", lambda folder: _damaged(folder, "verify", "toy"), "artifact.json", 3),
-    ("rm of a damaged manifest", lambda folder: _damaged(folder, "rm", "toy"), "artifact.json", 3),
-    ("clean-stale of a damaged manifest", lambda folder: _damaged(folder, "clean-stale"), "artifact.json", 3),
-    ("basis of a damaged scene", lambda folder: _damaged(folder, "basis", "extend", "h", "toy"), "artifact.json", 3),
-    ("clean-stale beside a plan cut short", lambda folder: _plan(folder, "{"), "plan.json", 3),
-    ("clean-stale beside a plan of another kind", lambda folder: _plan(folder, '{"steps": [3]}'), "plan.json", 3),
-    ("clean-stale beside a plan that is a folder", lambda folder: _plan(folder, None), "plan.json", 3),
-    ("a scene of several settings", _several, "toy@train.steps=5", 2),
-    (
-        "extract of an unfinished scene",
-        lambda folder: _unfinished(folder, "extract", "toy"),
-        "export",
-        2,
-    ),
-    ("query of an unfinished scene", lambda folder: _unfinished(folder, "query", "toy", "sofa"), "export", 2),
-    ("work is a file", _occupied, "lair", 2),
-    (
-        "photos not run yet",
-        lambda folder: _photos(folder, "query", "./images", "sofa"),
-        "make scene=./images",
-        3,
-    ),
-    ("extract of photos", lambda folder: _photos(folder, "extract", "images", "--out", "x.ply"), "images", 3),
-    ("rm of links elsewhere", _elsewhere, "mine", 3),
-    ("scene whose data is absent", lambda folder: ["run", "--scene", "fox"], "CHEBSPLAT_TEST_DATA", 3),
-]
-
-
-def _work(what: str, arrange: Callable[[Path], list[str]], named: str, code: int) -> Case:
-    def build(folder: Path) -> Asked:
-        env = {"CHEBSPLAT_WORK": str(folder / "lair"), "CHEBSPLAT_TEST_DATA": str(folder / "nowhere")}
-        return Asked(arrange(folder), named, env)
-
-    return Case("command", what, build, (code,))
-
-
-def cases() -> Iterator[Case]:
-    for row in NAMES:
-        yield _name(*row)
-    for entry in WORK:
-        yield _work(*entry)
+def rows() -> Iterator[Row]:
+    for part in (settings, documents, names, places, work):
+        yield from part()

@@ -1,4 +1,4 @@
-"""How a whole source is spoiled: small edits of its files, and cases that are one edit each."""
+"""How a folder or a file is spoiled: small edits that take the folder."""
 
 from __future__ import annotations
 
@@ -8,15 +8,16 @@ import os
 import shutil
 import struct
 import zlib
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-from malformed.case import Asked, Case, ingest
+import numpy as np
 
 Edit = Callable[[Path], Any]
-Row = tuple[str, str, Edit]  # the case's name, what stderr must name, the edit
+DEEP = "[" * 50_000
 NO_FILES = ("pipe", "device", "folder", "dangling link", "looping link")
+EPS = b"%!PS-Adobe-3.0 EPSF-3.0\n%%BoundingBox: 0 0 8 6\n%%EndComments\n0 0 moveto 8 6 lineto stroke\nshowpage\n"
 
 
 def put(place: str, content: str | bytes) -> Edit:
@@ -42,17 +43,24 @@ def cut(place: str, n_bytes: int) -> Edit:
     return lambda source: (source / place).write_bytes((source / place).read_bytes()[:-n_bytes])
 
 
-def grown(place: str, more: bytes) -> Edit:
-    return lambda source: (source / place).write_bytes((source / place).read_bytes() + more)
+def flipped(place: str) -> Edit:
+    """Another last byte."""
+
+    def edit(source: Path) -> None:
+        data = bytearray((source / place).read_bytes())
+        data[-1] ^= 1
+        (source / place).write_bytes(bytes(data))
+
+    return edit
 
 
-def swollen(place: str, size: int) -> Edit:
+def swollen(place: str, size: int = 10**12) -> Edit:
     """As large as that without taking a block of the disk."""
     return lambda source: os.truncate(source / place, size)
 
 
 def no_file(place: str, kind: str) -> Edit:
-    """Something else under a file's name."""
+    """Something else under a file's name: one of NO_FILES."""
 
     def edit(source: Path) -> None:
         path = source / place
@@ -107,42 +115,24 @@ def declared_png(width: int, height: int, color: int = 2) -> bytes:
     return b"\x89PNG\r\n\x1a\n" + chunk(b"IHDR", start) + chunk(b"IDAT", pixels) + chunk(b"IEND", b"")
 
 
-def no_files(*places: str, kinds: Sequence[str] = ("pipe", "dangling link")) -> Iterator[Row]:
-    """What is no file, under each of the names."""
-    for place in places:
-        for kind in kinds:
-            yield f"{place} is a {kind}", place.split("/")[-1], no_file(place, kind)
+def npy(array: np.ndarray, **header: Any) -> bytes:
+    """An .npy file whose `header` may declare what it does not hold."""
+    held = io.BytesIO()
+    said = {"descr": array.dtype.str, "fortran_order": False, "shape": array.shape} | header
+    np.lib.format.write_array_header_1_0(held, said)
+    return held.getvalue() + array.tobytes()
+
+
+def npz(**members: bytes) -> bytes:
+    """An .npz of such files."""
+    import zipfile
+
+    held = io.BytesIO()
+    with zipfile.ZipFile(held, "w", zipfile.ZIP_DEFLATED) as archive:
+        for name, content in members.items():
+            archive.writestr(f"{name}.npy", content)
+    return held.getvalue()
 
 
 def all_of(*edits: Edit) -> Edit:
     return lambda source: [edit(source) for edit in edits]
-
-
-def ingested(
-    kind: str, write: Callable[[Path], Any], rows: Iterable[Row], layout: str | None = None, **settings: Any
-) -> Iterator[Case]:
-    """Each edit of a source that `write` makes, met by the ingest stage; `layout`: the kind, None: as detected."""
-    for name, named, edit in rows:
-
-        def build(folder: Path, named: str = named, edit: Edit = edit) -> Asked:
-            return ingest(folder, _source(folder, write, edit), named, layout, **settings)
-
-        yield Case(kind, name, build)
-
-
-def planned(kind: str, write: Callable[[Path], Any], rows: Sequence[Row]) -> Iterator[Case]:
-    """The same met by `plan`, which reads what decides about keys."""
-    for name, named, edit in rows:
-
-        def build(folder: Path, named: str = named, edit: Edit = edit) -> Asked:
-            return Asked(["plan", "--scene", f"{_source(folder, write, edit)}/"], named)
-
-        yield Case(kind, f"{name}, in plan", build)
-
-
-def _source(folder: Path, write: Callable[[Path], Any], edit: Edit) -> Path:
-    source = folder / "shared/scene"  # tables may lie beside a scene
-    source.mkdir(parents=True)
-    write(source)
-    edit(source)
-    return source

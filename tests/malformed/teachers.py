@@ -2,119 +2,73 @@
 
 from __future__ import annotations
 
-import io
 import os
-import zipfile
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+from tiny_teachers import COLORS, color_teacher, write_model, write_table
 
-from malformed.case import Asked, Case
+from malformed.artifacts import artifacts
+from malformed.edits import DEEP, Edit, all_of, no_file, npy, npz, picture, put, remove
+from malformed.row import Arguments, Row, stage
 
-TOML: dict[str, list[Any]] = {  # key of tiny.toml: values as TOML writes them
-    "name": ['""', "5", '"a\\nb"'],
-    "output": ['"classes"', "5"],
-    "mean": ["[0.5]", "0.5", "[nan, 0.5, 0.5]", "[inf, 0.5, 0.5]", "[1e300, 0.5, 0.5]", '["a", "b", "c"]'],
-    "std": ["[0, 0.5, 0.5]", "[-1.0, 0.5, 0.5]", "[1e-300, 0.5, 0.5]", "[nan, 0.5, 0.5]"],
-    "size": ["[32]", "[0, 32]", "[-32, 32]", "[1000000, 1000000]", "[32.0, 32.0]", "32", "[30, 32]"],
-    "multiple": ["0", "-4", "1000000000000", "4.0", "true"],
-    "base": ["0", "-5", "1000000000000", "1e9"],
-    "labels": ['""', "5", '"nosuch.npz"', '".."', '"a\\u0000b"'],
-    "text": ["5", '"nosuch.onnx"', '"tiny.onnx"'],
-    "prompt": ['"{x}"', '"{0.x}"', '"a photo"', '"{} and {}"', "5", '"{}\\u0000"'],
-    "labls": ['"tiny.npz"'],
-}
-DOCUMENTS = {
-    "binary": b"\x93NUMPY\xff\xfe",
-    "deep": b"a = " + b"[" * 50_000,
-    "cut": b"mean = [0.5",
-    "a table": b"[mean]\na = 1\n",
-    "a key twice": b"base = 5\nbase = 6\n",
-}
-LABELS = {
-    "empty": b"",
-    "comments": b"# a\n# b\n",
-    "a name twice": b"red\nred\n",
-    "no name": b": crimson\n",
-    "binary": b"\xff\xfe\x00r",
-    "a null byte": b"re\0d\n",
-    "a long name": b"r" * 5000 + b"\n",
-    "a line of megabytes": b"r" * (2 << 20),
-    "half a character": b"\xed\xa0\x80\n",
-}
-
-
-def _teacher(folder: Path, **toml: Any) -> Path:
-    from tiny_teachers import color_teacher
-
-    model = color_teacher(folder)
-    lines = dict(line.split(" = ", 1) for line in (folder / "tiny.toml").read_text().splitlines())
-    (folder / "tiny.toml").write_text("".join(f"{key} = {value}\n" for key, value in (lines | toml).items()))
-    return model
+MODEL, TOML, TABLE = "tiny.onnx", "tiny.toml", "tiny.npz"
+VALUES: list[tuple[str, str, str]] = [  # a key of tiny.toml, its value as TOML, a word of the message
+    ("name", '""', "name"),
+    ("mean", "[nan, 0.5, 0.5]", "three numbers"),
+    ("std", "[0, 0.5, 0.5]", "std"),
+    ("size", "[1000000, 1000000]", "size"),
+    ("size", "[30, 32]", "not a multiple of 4"),
+    ("multiple", "0", "multiple"),
+    ("base", "-5", "base"),
+    ("labels", '".."', "labels"),
+    ("labels", '"a\\u0000b"', "labels"),
+    ("text", '"tiny.npz"', "`text` without `tokenizer`"),
+    ("prompt", '"a photo"', "photo of a {}"),
+    ("labls", '"tiny.npz"', "did you mean labels"),
+]
+NAMES, ROWS = npy(np.array(list(COLORS))), np.eye(3, dtype=np.float32)
+TABLES: list[tuple[str, bytes, str]] = [
+    ("no zip", b"no zip", "not a readable .npz"),
+    ("no names", npz(embeddings=npy(ROWS)), "names"),
+    ("a name twice", npz(names=npy(np.array(["red", "red", "blue"])), embeddings=npy(ROWS)), "twice"),
+    ("objects for names", npz(names=npy(np.zeros(3), descr="|O"), embeddings=npy(ROWS)), "pickled objects"),
+    ("a null byte", npz(names=npy(np.array(["r\0d", "green", "blue"])), embeddings=npy(ROWS)), "names"),
+    ("a row too few", npz(names=NAMES, embeddings=npy(ROWS[:2])), "embeddings"),
+    ("other channels", npz(names=NAMES, embeddings=npy(np.eye(3, 5))), "gives 3 channels, its text embeddings have 5"),
+    ("nan", npz(names=NAMES, embeddings=npy(ROWS * np.float32(np.nan))), "embeddings"),
+]
+LABELS: list[tuple[str, bytes, str]] = [
+    ("nothing", b"", "holds 0 labels"),
+    ("a name twice", b"red\nred\n", "line 2: a name is given twice"),
+    ("no name", b": crimson\n", "line 1: a name is missing"),
+    ("binary", b"\xff\xfe\x00r", "no UTF-8 text"),
+    ("a null byte", b"re\0d\n", "line 1"),
+]
 
 
-def _ask(folder: Path, named: str, *more: str | Path) -> Asked:
-    """Ask for a picture of a room's size; no room is generated for a teacher that cannot be used."""
-    from PIL import Image
+def set_to(key: str, value: str) -> Edit:
+    def edit(folder: Path) -> None:
+        lines = dict(line.split(" = ", 1) for line in (folder / TOML).read_text().splitlines())
+        text = "".join(f"{name} = {said}\n" for name, said in (lines | {key: value}).items() if said)
+        (folder / TOML).write_text(text)
 
-    Image.fromarray(np.zeros((48, 64, 3), np.uint8)).save(folder / "photo.png")
-    return Asked(["check-teacher", folder / "tiny.onnx", "--photo", folder / "photo.png", *more], named)
-
-
-def _npy(array: np.ndarray, **header: Any) -> bytes:
-    held = io.BytesIO()
-    np.lib.format.write_array_header_1_0(
-        held, {"descr": array.dtype.str, "fortran_order": False, "shape": array.shape} | header
-    )
-    return held.getvalue() + array.tobytes()
+    return edit
 
 
-NAMES, ROWS = np.array(["red", "green", "blue"]), np.eye(3, dtype=np.float32)
-TABLES: dict[str, dict[str, bytes]] = {  # members of tiny.npz
-    "no names": {"embeddings": _npy(ROWS)},
-    "one name": {"names": _npy(np.array("red")), "embeddings": _npy(ROWS)},
-    "names twice": {"names": _npy(np.array(["red", "red", "blue"])), "embeddings": _npy(ROWS)},
-    "names are numbers": {"names": _npy(np.arange(3)), "embeddings": _npy(ROWS)},
-    "names are objects": {"names": _npy(np.zeros(3), descr="|O"), "embeddings": _npy(ROWS)},
-    "a null byte": {"names": _npy(np.array(["r\0d", "green", "blue"])), "embeddings": _npy(ROWS)},
-    "a 0-d table": {"names": _npy(NAMES), "embeddings": _npy(np.float32(1).reshape(()))},
-    "a row too few": {"names": _npy(NAMES), "embeddings": _npy(ROWS[:2])},
-    "other channels": {"names": _npy(NAMES), "embeddings": _npy(np.eye(3, 7, dtype=np.float32))},
-    "no channels": {"names": _npy(NAMES), "embeddings": _npy(ROWS[:, :0])},
-    "nan": {"names": _npy(NAMES), "embeddings": _npy(ROWS * np.float32(np.nan))},
-    "beyond float32": {"names": _npy(NAMES), "embeddings": _npy(np.full((3, 3), 1e300))},
-    "complex": {"names": _npy(NAMES), "embeddings": _npy(ROWS.astype(np.complex64))},
-    "terabytes": {"names": _npy(NAMES), "embeddings": _npy(ROWS, shape=(10**7, 10**6))},
-    "a negative shape": {"names": _npy(NAMES), "embeddings": _npy(ROWS, shape=(-3, 3))},
-    "no array": {"names": b"red"},
-}
+def model(*nodes: Any, **more: Any) -> Edit:
+    return lambda folder: write_model(folder / MODEL, list(nodes), **more)
 
 
-def _write_table(folder: Path, members: dict[str, bytes]) -> None:
-    with zipfile.ZipFile(folder / "tiny.npz", "w", zipfile.ZIP_DEFLATED) as archive:
-        for name, content in members.items():
-            archive.writestr(f"{name}.npy", content)
+def node(op: str, *inputs: str, **attributes: Any) -> Any:
+    from onnx import helper
+
+    return helper.make_node(op, list(inputs or ("image",)), ["features"], **attributes)
 
 
-def _bomb(folder: Path) -> None:
-    """20,000 x 20,000 zeros, packed to 1.6 MB without ever being whole in memory."""
-    with zipfile.ZipFile(folder / "tiny.npz", "w", zipfile.ZIP_DEFLATED) as archive:
-        archive.writestr("names.npy", _npy(NAMES))
-        with archive.open("embeddings.npy", "w", force_zip64=True) as handle:
-            handle.write(_npy(np.zeros(0, np.float32), shape=(20_000, 20_000)))
-            for _ in range(200):
-                handle.write(bytes(8_000_000))
-
-
-def _model(folder: Path, nodes: list[Any], outputs: tuple[str, ...] = ("features",), **more: Any) -> None:
-    from tiny_teachers import write_model
-
-    write_model(folder / "tiny.onnx", nodes, outputs, **more)
-
-
-def _endless(folder: Path) -> None:
+def endless() -> Edit:
     """A loop of 2^62 steps over the image."""
     from onnx import TensorProto, helper
 
@@ -125,94 +79,141 @@ def _endless(folder: Path) -> None:
         [value("k", TensorProto.INT64, []), value("on", TensorProto.BOOL, []), value("x", TensorProto.FLOAT, None)],
         [value("more", TensorProto.BOOL, []), value("y", TensorProto.FLOAT, None)],
     )
-    node = helper.make_node("Loop", ["count", "true", "image"], ["features"], body=body)
-    _model(folder, [node], constants={"count": np.array(2**62), "true": np.array(True)})
+    constants = {"count": np.array(2**62), "true": np.array(True)}
+    return model(node("Loop", "count", "true", "image", body=body), constants=constants)
 
 
-def _node(op: str, **attributes: Any) -> Callable[[Path], None]:
+def huge() -> Edit:
+    """An output of 120 GB."""
     from onnx import helper
 
-    return lambda folder: _model(folder, [helper.make_node(op, ["image"], ["features"], **attributes)])
+    zeros = helper.make_node("ConstantOfShape", ["shape"], ["zeros"])
+    return model(zeros, node("Add", "image", "zeros"), constants={"shape": np.array([1, 3, 100_000, 100_000])})
 
 
-def _without(part: str) -> Callable[[Path], None]:
-    def write(folder: Path) -> None:
+def halves() -> Edit:
+    """Two halves that must be alike: a side that is no multiple of 2 fails inside the model."""
+    from onnx import helper
+
+    split = helper.make_node("Split", ["image"], ["a", "b"], axis=3, num_outputs=2)
+    return all_of(set_to("multiple", "13"), model(split, node("Add", "a", "b")))
+
+
+def changed(change: Callable[[Any], Any]) -> Edit:
+    """The model after `change`."""
+
+    def edit(folder: Path) -> None:
         import onnx
 
-        model = onnx.load(folder / "tiny.onnx")
-        del getattr(model.graph, part)[:]
-        (folder / "tiny.onnx").write_bytes(model.SerializeToString())
+        held = onnx.load(folder / MODEL)
+        change(held)
+        (folder / MODEL).write_bytes(held.SerializeToString())
 
-    return write
-
-
-def _huge(folder: Path) -> None:
-    from onnx import helper
-
-    nodes = [
-        helper.make_node("ConstantOfShape", ["shape"], ["zeros"]),
-        helper.make_node("Add", ["image", "zeros"], ["features"]),
-    ]
-    _model(folder, nodes, constants={"shape": np.array([1, 3, 100_000, 100_000])})
+    return edit
 
 
-def _outside(folder: Path) -> None:
+def two_inputs(held: Any) -> None:
+    from onnx import TensorProto, helper
+
+    held.graph.input.append(helper.make_tensor_value_info("text", TensorProto.FLOAT, (1, 3)))
+
+
+def outside(held: Any) -> None:
     """Weights in a file that lies above the model's folder."""
-    import onnx
     from onnx.external_data_helper import set_external_data
 
-    model = onnx.load(folder / "tiny.onnx")
-    (folder.parent / "secret.bin").write_bytes(bytes(4096))
-    for tensor in model.graph.initializer:
+    for tensor in held.graph.initializer:
         set_external_data(tensor, "../secret.bin", 0, len(tensor.raw_data))
         tensor.ClearField("raw_data")
-    (folder / "tiny.onnx").write_bytes(model.SerializeToString())
 
 
-MODELS: dict[str, Callable[[Path], Any]] = {
-    "no ONNX": lambda folder: (folder / "tiny.onnx").write_text("no model"),
-    "empty": lambda folder: (folder / "tiny.onnx").write_bytes(b""),
-    "cut": lambda folder: os.truncate(folder / "tiny.onnx", 60),
-    "no inputs": _without("input"),
-    "no outputs": _without("output"),
-    "no nodes": _without("node"),
-    "a loop of 2^62 steps": _endless,
-    "an output of 120 GB": _huge,
-    "weights outside": _outside,
-    "one feature a view": _node("GlobalAveragePool"),
-    "nan": _node("Log"),
-    "flat": _node("Flatten"),
-    "a shape": _node("Shape"),
-    "a folder": lambda folder: ((folder / "tiny.onnx").unlink(), (folder / "tiny.onnx").mkdir()),
-    "missing": lambda folder: (folder / "tiny.onnx").unlink(),
-    "a pipe": lambda folder: ((folder / "tiny.onnx").unlink(), os.mkfifo(folder / "tiny.onnx")),
-}
+def bomb(folder: Path) -> None:
+    """9,000 x 8,000 zeros, packed to 300 kB without ever being whole in memory."""
+    import zipfile
+
+    with zipfile.ZipFile(folder / TABLE, "w", zipfile.ZIP_DEFLATED) as archive:
+        archive.writestr("names.npy", NAMES)
+        with archive.open("embeddings.npy", "w", force_zip64=True) as handle:
+            handle.write(npy(np.zeros(0, np.float32), shape=(9_000, 8_000)))
+            for _ in range(36):
+                handle.write(bytes(8_000_000))
 
 
-def _case(kind: str, name: str, prepare: Callable[[Path], Any], named: str, more: tuple[str, ...] = ()) -> Case:
-    def build(folder: Path) -> Asked:
-        inner = folder / "teacher"
-        inner.mkdir()
-        _teacher(inner)
-        prepare(inner)
-        return _ask(inner, named, *(str(inner / part) if part.endswith(".txt") else part for part in more))
+def segmenter(names: str) -> Edit:
+    """A closed set of three classes whose file gives these names."""
 
-    return Case(kind, name, build, (3, 4))
+    def edit(folder: Path) -> None:
+        (folder / "classes.txt").write_text(names)
+        color_teacher(folder, weights=5 * np.eye(3), output="logits", labels="classes.txt")
+
+    return edit
 
 
-def cases() -> Iterator[Case]:
-    for key, values in TOML.items():
-        for value in values:
-            yield _case("teacher.toml", f"{key} = {value}", lambda f, k=key, v=value: _teacher(f, **{k: v}), "tiny.")
-    for name, content in DOCUMENTS.items():
-        yield _case("teacher.toml", name, lambda f, c=content: (f / "tiny.toml").write_bytes(c), "tiny.toml")
-    for name, members in TABLES.items():
-        yield _case("teacher's table", name, lambda f, m=members: _write_table(f, m), "tiny.npz")
-    yield _case("teacher's table", "a zip bomb", _bomb, "tiny.npz")
-    yield _case("teacher's table", "no zip", lambda f: (f / "tiny.npz").write_text("no zip"), "tiny.npz")
-    yield _case("teacher's table", "a pipe", lambda f: ((f / "tiny.npz").unlink(), os.mkfifo(f / "tiny.npz")), "tiny.")
-    for name, damage in MODELS.items():
-        yield _case("teacher's model", name, damage, "tiny.onnx")
-    for name, content in LABELS.items():
-        said = "labels.txt"
-        yield _case("labels", name, lambda f, c=content: (f / "labels.txt").write_bytes(c), said, ("--labels", said))
+def models() -> Iterator[tuple[str, str, Edit, str]]:
+    """The file that is named, what is wrong, the edit, a word of the message."""
+    from onnx import TensorProto
+
+    relu = {"shape": (3, "H", "W")}
+    yield MODEL, "no ONNX", put(MODEL, "no model"), "is not a usable ONNX model"
+    yield MODEL, "cut short", lambda folder: os.truncate(folder / MODEL, 60), "is not a usable ONNX model"
+    yield MODEL, "no nodes", changed(lambda held: held.graph.ClearField("node")), "is not a usable ONNX model"
+    yield MODEL, "two inputs", changed(two_inputs), "has 2 inputs"
+    yield MODEL, "an input of rank 3", model(node("Relu"), **relu), "[1, 3, H, W] is needed"
+    byte = model(node("Cast", to=TensorProto.FLOAT), kind=TensorProto.UINT8)
+    yield MODEL, "an input of bytes", byte, "float32 input"
+    yield MODEL, "an output of rank 2", model(node("Flatten")), "[1, C, h, w] is needed"
+    yield MODEL, "one feature a view", model(node("GlobalAveragePool")), "one feature every"
+    yield MODEL, "weights outside", changed(outside), MODEL
+    yield (
+        MODEL,
+        "another size than its graph",
+        all_of(lambda folder: color_teacher(folder, shape=(1, 3, 32, 32)), set_to("size", "[64, 64]")),
+        "says size = [64, 64]",
+    )
+    yield MODEL, "multiple not met", halves(), "correct `size` or `multiple`"
+    yield MODEL, "missing", remove(MODEL), "is missing"
+    yield TOML, "missing", remove(TOML), "is missing"
+    yield TABLE, "missing", remove(TABLE), "is missing; correct `labels`"
+    yield TOML, "cut short", put(TOML, "mean = [0.5"), "does not parse"
+    yield TOML, "nested", put(TOML, f"a = {DEEP}"), "nested too deeply"
+    yield TOML, "no labels", set_to("labels", ""), "neither `labels` nor `text`"
+    logits = all_of(set_to("labels", ""), set_to("output", '"logits"'))
+    yield TOML, "no names of channels", logits, "names of the channels"
+    yield "classes.txt", "too few classes", segmenter("red\ngreen\n"), "names 2 classes"
+    yield "classes.txt", "a class twice", segmenter("red\ngreen\nred\n"), "line 3: a name is given twice"
+
+
+def met(named: str, what: str, edit: Edit, word: str, code: int = 3, alone: bool = False) -> Row:
+    """Asked for a picture of a room's size, and for the labels of a file where the edit has written one."""
+
+    def build(folder: Path) -> Arguments:
+        color_teacher(folder)
+        picture("photo.png", (64, 48))(folder)
+        edit(folder)
+        labels = ["--labels", folder / "labels.txt"] if (folder / "labels.txt").exists() else []
+        return ["check-teacher", folder / MODEL, "--photo", folder / "photo.png", *labels]
+
+    return Row("teacher", f"{named}: {what}", build, (named, word), code, alone)
+
+
+def many_channels(folder: Path) -> Arguments:
+    color_teacher(folder, channels=65)
+    write_table(folder / TABLE, embeddings=np.eye(3, 65))
+    return stage("teacher", folder, {"teacher": {"model": str(folder / MODEL)}}, capture=artifacts() / "ingest")
+
+
+def rows() -> Iterator[Row]:
+    for key, value, word in VALUES:
+        yield met("tiny.", f"{key} = {value}", set_to(key, value), word)
+    for named, what, edit, word in models():
+        yield met(named, what, edit, word)
+    for what, content, word in TABLES:
+        yield met(TABLE, what, put(TABLE, content), word)
+    for what, content, word in LABELS:
+        yield met("labels.txt", what, put("labels.txt", content), word)
+    yield Row("teacher", f"{MODEL}: 65 channels", many_channels, (MODEL, "at most 64 can be rendered"), 2)
+    yield met(MODEL, "nan", model(node("Log")), "non-finite values", 4)
+    yield met(MODEL, "an output of 120 GB", huge(), MODEL, 3, True)
+    yield met(MODEL, "a loop of 2^62 steps", endless(), MODEL, 3, True)
+    yield met(MODEL, "a pipe", no_file(MODEL, "pipe"), "is missing", 3, True)
+    yield met(TABLE, "a zip bomb", bomb, "are read", 3, True)

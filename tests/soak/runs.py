@@ -35,7 +35,7 @@ class Count:
     open_files: int
     temporary: int
     hidden: int
-    support: int  # in .snakemake, .leases and .cache
+    support: int  # in .snakemake, .held and .cache
 
 
 def files(*folders: Path) -> int:
@@ -54,7 +54,7 @@ def measured(number: int, stage: str, seconds: float, work: Path) -> Count:
         open_files=len(os.listdir("/proc/self/fd")),
         temporary=files(Path(tempfile.gettempdir())),
         hidden=len([*work.glob("store/*/.*"), *work.glob(".plans/*")]),
-        support=files(*(work / name for name in (".snakemake", ".leases", ".cache"))),
+        support=files(*(work / name for name in (".snakemake", ".held", ".cache"))),
     )
 
 

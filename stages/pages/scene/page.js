@@ -3,23 +3,10 @@ const about = JSON.parse(get("about").textContent), semantic = !!about.labels;
 const TEMPERATURE = 0.1, DIMMED = 0.06, FRAME = 1000 / 24, SMALLEST = 0.25; // of cosines; of what is not brought out; ms; of the pixels a side
 let splats, drawing, sorter, order = new Uint32Array(0), strength, features, views, lists; // lists: Gaussians by label
 let camera, moving = 0, scale = 1, dirty = true, frames = 0, asked = null, mode = "color", picked = -1;
+let path = []; // cameras that are kept for a file
 const hidden = new Set(), held = new Set(), pointers = new Map();
 
-// -- vectors and cameras: { turn: rows of the rotation from world to camera, eye, view: whose lens it has, pivot: how far ahead }
-const times = (m, v) => [0, 3, 6].map(r => m[r] * v[0] + m[r + 1] * v[1] + m[r + 2] * v[2]);
-const back = (m, v) => [0, 1, 2].map(c => m[c] * v[0] + m[c + 3] * v[1] + m[c + 6] * v[2]);
-const product = (a, b) => [0, 3, 6].flatMap(r => [0, 1, 2].map(c => a[r] * b[c] + a[r + 1] * b[c + 3] + a[r + 2] * b[c + 6]));
-const plus = (a, b, by = 1) => a.map((value, i) => value + by * b[i]);
-function about_axis([x, y, z], angle) {
-  const c = Math.cos(angle), s = Math.sin(angle), t = 1 - c;
-  return [t * x * x + c, t * x * y - s * z, t * x * z + s * y, t * x * y + s * z, t * y * y + c, t * y * z - s * x,
-    t * x * z - s * y, t * y * z + s * x, t * z * z + c];
-}
-function unrounded(m) { // rows unit and square again after many turns
-  const unit = v => v.map(x => x / Math.hypot(...v)), z = unit(m.slice(6)), along = m[0] * z[0] + m[1] * z[1] + m[2] * z[2];
-  const x = unit([m[0] - along * z[0], m[1] - along * z[1], m[2] - along * z[2]]);
-  return [...x, z[1] * x[2] - z[2] * x[1], z[2] * x[0] - z[0] * x[2], z[0] * x[1] - z[1] * x[0], ...z];
-}
+// -- cameras of the page, of the capture's lenses
 function lens(view, width, height) { // the capture's picture as large as it fits, in the middle
   const [fx, fy, cx, cy] = views.subarray(16 * view + 12, 16 * view + 16), by = Math.min(width / about.width, height / about.height);
   return [fx * by, fy * by, width / 2 + (cx - about.width / 2) * by, height / 2 + (cy - about.height / 2) * by];
@@ -256,8 +243,20 @@ function listen() {
   addEventListener("resize", () => { dirty = true; });
   get("before").onclick = () => jump(camera.view - 1); get("after").onclick = () => jump(camera.view + 1);
   get("view").onchange = event => jump(+event.target.value);
-  get("save").onclick = () => { drawing.draw(seen(camera), mode == "color" && !!splats.sh1); canvas.toBlob(blob => {
-    const link = document.createElement("a"); link.href = URL.createObjectURL(blob); link.download = `${about.name}.png`; link.click(); URL.revokeObjectURL(link.href); }); };
+  get("save").onclick = () => {
+    drawing.draw(seen(camera), mode == "color" && !!splats.sh1);
+    canvas.toBlob(blob => offer(blob, `${about.name}.png`));
+  };
+  get("link").onclick = () => {
+    location.hash = link_of(camera, about);
+    get("kept").textContent = "The address of this page now leads here.";
+  };
+  get("keep").onclick = () => keep([...path, { ...camera }]); get("forget").onclick = () => keep([]);
+  get("write").onclick = () => {
+    const text = JSON.stringify(file_of(path, about, views), null, 1);
+    offer(new Blob([text], { type: "application/json" }), `${about.name}.cameras.json`);
+  };
+  addEventListener("hashchange", restore);
   canvas.addEventListener("webglcontextlost", event => { event.preventDefault(); trouble("The graphics context was lost; load the page again."); });
   if (!semantic) return;
   for (const button of document.querySelectorAll("[data-mode]")) button.onclick = () => show(button.dataset.mode);
@@ -274,6 +273,22 @@ function hover(event) { // once a frame at most
     tip.replaceChildren(swatch, `${about.labels[label].name} ${Math.round(100 * share)} %${relevant === null ? "" : `, ${about.words[asked.word]} ${calibrated(asked.word) ? `${Math.round(100 * relevant)} %` : relevant.toFixed(2)}`}`);
     tip.style.left = `${Math.min(clientX, innerWidth - tip.offsetWidth - 20)}px`; tip.style.top = `${Math.min(clientY, innerHeight - 50)}px`;
   });
+}
+// -- a path of cameras, a link to one, files
+function restore() { // the camera of the page's address, where that has one
+  if (!location.hash.startsWith("#camera=")) return;
+  const found = camera_of(location.hash, about);
+  if (!found) { get("kept").textContent = "The address leads to no camera of this scene."; return; }
+  camera = found; get("view").value = found.view; moved();
+}
+function keep(next) {
+  path = next;
+  for (const id of ["forget", "write"]) get(id).disabled = !path.length;
+  get("kept").textContent = path.length == 1 ? "1 camera kept" : `${path.length} cameras kept`;
+}
+function offer(blob, name) { // for download
+  const link = document.createElement("a"); link.href = URL.createObjectURL(blob); link.download = name;
+  link.click(); URL.revokeObjectURL(link.href);
 }
 function trouble(text) { get("trouble").textContent = text; get("trouble").hidden = false; }
 
@@ -303,7 +318,7 @@ async function open() {
   drawing = new Drawing(canvas, splats); camera = at_view(0);
   sorter = new Sorter(splats, found => { order = found; drawing.order(order); dirty = true; });
   order = sorted(splats.means, splats.reach, sortable(seen(camera))); drawing.order(order);
-  furnish(); listen(); retint(); requestAnimationFrame(now => { last = now; frame(now); });
+  furnish(); listen(); retint(); restore(); requestAnimationFrame(now => { last = now; frame(now); });
 }
 /** For scripts and tests: `await scene.ready`, then the capture's views as pictures, words, and what a pixel means. */
 const scene = {

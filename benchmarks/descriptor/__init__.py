@@ -1,1 +1,0 @@
-"""Routes to the descriptor: error against run time, and the growth of sampling."""

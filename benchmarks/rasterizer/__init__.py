@@ -1,1 +1,0 @@
-"""The CPU rasterizer: its stages and whole steps timed, its images and gradients against float64."""

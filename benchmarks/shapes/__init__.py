@@ -1,1 +1,0 @@
-"""How well a simple classifier tells simple shapes from each descriptor."""

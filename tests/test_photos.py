@@ -1,0 +1,246 @@
+"""Exposures that are undone before a training, depth that a capture brings, and disturbances for studies."""
+
+import chebsplat  # noqa: F401  # isort: skip
+import numpy as np
+import pytest
+import torch
+from scipy.spatial.transform import Rotation
+from shared import ROOT
+
+from chebsplat.cameras import centers
+from chebsplat.errors import ConfigError
+from chebsplat.evaluation.metrics import color_fitted
+from chebsplat.formats.capture import Capture
+from chebsplat.formats.points import Points
+from chebsplat.photos import exposures as measuring
+from chebsplat.photos.exposures import measured_exposures, own_part, relit
+from chebsplat.settings import TrainSection
+from chebsplat.stages import config
+from chebsplat.stages.command import Job
+from chebsplat.stages.exposures import exposures
+from chebsplat.stages.measured_depth import WEIGHT, with_depth_loss
+from chebsplat.stages.sources.disturbed import displaced, recolored
+from chebsplat.stages.train_inputs import training_views
+from chebsplat.training.losses import depth_distance
+
+K = torch.tensor([[40.0, 0, 24], [0, 40, 20], [0, 0, 1]])
+
+
+@pytest.fixture
+def tiny_trainer(monkeypatch):
+    monkeypatch.syspath_prepend(str(ROOT))
+    from benchmarks.stability.training import tiny_trainer
+
+    return tiny_trainer
+
+
+def test_measured_exposures_are_those_the_photos_were_taken_with():
+    """In linear light, of a wall of many colours; and none is told where two photos share no points."""
+    g = np.random.default_rng(0)
+    poses = np.tile(np.eye(4), (5, 1, 1))
+    poses[:, 2, 3] = 5
+    points, image = g.normal(size=(2000, 3)), np.repeat(np.repeat(g.integers(90, 200, (5, 6, 3)), 8, 0), 8, 1)
+    stops = np.array([[-0.4, 0.1, 0], [0.2, 0.2, 0.2], [0, 0, 0], [0.1, -0.2, 0], [0.1, -0.1, -0.2]])
+    images = np.stack([relit(image.astype(np.uint8), own) for own in stops])
+    Ks = np.tile(K.double().numpy(), (5, 1, 1))
+    assert measured_exposures(images, Ks, poses, points) == pytest.approx(stops, abs=0.02)
+    assert measured_exposures(images[[2] * 5], Ks, poses, points) == pytest.approx(0, abs=1e-9)
+    assert np.isnan(measured_exposures(images, Ks, poses, points, np.zeros((0, 2), int))).all()
+    tracks = np.stack(np.meshgrid(np.arange(2000), np.arange(4)), -1).reshape(-1, 2)
+    some = measured_exposures(images, Ks, poses, points, tracks)
+    assert np.isnan(some[4]).all() and some[:4] == pytest.approx(stops[:4] - stops[:4].mean(0), abs=0.02)
+
+
+def test_a_photo_relit_and_back_is_the_same_but_for_what_was_cut_off():
+    image = np.random.default_rng(0).integers(60, 150, (8, 8, 3)).astype(np.uint8)
+    back = relit(relit(image, np.array([0.5, 0.3, -0.3])), -np.array([0.5, 0.3, -0.3]))
+    assert np.abs(back.astype(int) - image).max() <= 1
+    assert (relit(np.full((1, 1, 3), 250, np.uint8), np.ones(3)) == 255).all()
+    assert np.array_equal(relit(image, np.zeros(3)), image)
+
+
+def ring(n):
+    """Cameras about the origin that look at it."""
+    poses = np.tile(np.eye(4), (n, 1, 1))
+    for k, angle in enumerate(np.linspace(0, 2 * np.pi, n, endpoint=False)):
+        poses[k, :3, :3] = [[np.cos(angle), 0, np.sin(angle)], [0, 1, 0], [-np.sin(angle), 0, np.cos(angle)]]
+        poses[k, 2, 3] = 3
+    return poses
+
+
+def test_exposures_that_drift_along_the_path_are_shared_and_those_of_single_photos_their_own():
+    g, poses, angle = np.random.default_rng(0), ring(40), np.linspace(0, 2 * np.pi, 40, endpoint=False)[:, None]
+    drift = 0.3 * np.sin(angle) * np.array([1, 0.9, 1.2])
+    assert np.abs(own_part(drift, poses)).max() < 0.01
+    noise = g.normal(size=(40, 1)) * 0.2 + g.normal(size=(40, 3)) * 0.02
+    own = own_part(drift + noise, poses)
+    assert (own - noise + noise.mean(0)).std() < 0.55 * noise.std()
+    alone = np.full((40, 3), np.nan)
+    assert not own_part(alone, poses).any() and not own_part(np.zeros((40, 3)), np.tile(np.eye(4), (40, 1, 1))).any()
+    some = np.where(np.arange(40)[:, None] == 7, np.nan, drift + noise)
+    assert not own_part(some, poses)[7].any() and own_part(some, poses)[8].any()
+
+
+def test_own_exposures_of_many_views_are_told_of_every_second_one_by_itself(monkeypatch):
+    poses, values = ring(40), np.random.default_rng(0).normal(size=(40, 3))
+    own = own_part(values, poses)
+    monkeypatch.setattr(measuring, "MOST_VIEWS", 40)
+    halves = own_part(np.repeat(values, 2, 0), np.repeat(poses, 2, 0))
+    assert np.allclose(halves[::2], own) and np.allclose(halves[1::2], own)
+
+
+def test_an_exposure_that_no_neighbour_shares_is_undone_in_training(tmp_path):
+    """One photo of eight is half as bright, and is trained on as bright as the others."""
+    capture, points = photographed("colmap", [1, 1, 1, 0.5, 1, 1, 1, 1])
+    points.cam_from_world[:, 0, 3] = np.linspace(-0.2, 0.2, 8)
+    job = Job({}, config.build({}, "test"), tmp_path, tmp_path)
+    undone = exposures(job, capture, points)
+    photos = training_views(capture, points, None, exposures=undone).images.float()
+    assert photos.mean((1, 2, 3)).std() < 3 and capture.images[3].max() == 50
+
+
+def test_depth_is_a_channel_that_changes_no_colour(tiny_trainer):
+    made = tiny_trainer()
+    view = made.views.camera(0, 1)
+    with_depth, without = (made.model.render(view, 3, depth=wanted) for wanted in (True, False))
+    torch.testing.assert_close(with_depth.rgb, without.rgb, rtol=0, atol=1e-6)
+    assert without.inverse_depth is None
+    covered = with_depth.alpha[..., 0] > 0.5
+    near = (with_depth.alpha[..., 0] / with_depth.inverse_depth)[covered]
+    assert covered.any() and near.min() > 2.5 and near.max() < 5.5  # a unit sphere four units away
+
+
+def test_depth_distance_counts_what_is_known_alone():
+    truth = torch.full((4, 4), 2.0)
+    truth[0, 0], truth[0, 1] = float("nan"), 0.0
+    inverse = torch.full((4, 4), 0.55, requires_grad=True)
+    distance = depth_distance(inverse, torch.ones(4, 4, 1), truth, None)
+    distance.backward()
+    assert distance.item() == pytest.approx(0.1) and not inverse.grad[0, :2].any() and (inverse.grad[1:] > 0).all()
+    assert depth_distance(inverse, torch.ones(4, 4, 1), truth * float("nan"), None) == 0
+
+
+def test_gaussians_go_where_depth_is_measured(tiny_trainer):
+    """The same training with and without a depth a tenth beyond what the Gaussians show at first."""
+
+    def distance(weight):
+        made = tiny_trainer(steps=60, densify="off", prune=False, depth_every=2, weight_depth=weight)
+        with torch.no_grad():
+            shown = [made.model.render(made.views.camera(v, 1), 0, depth=True) for v in range(len(made.views.names))]
+        truths = [torch.where(r.alpha[..., 0] > 0.5, 1.1 * r.alpha[..., 0] / r.inverse_depth, torch.nan) for r in shown]
+        made.views.depth = lambda index, factor: truths[index][::factor, ::factor]
+        losses = list(made.steps())
+        assert ["loss_depth" in figures for figures in losses] == [step % 2 == 1 for step in range(60)]
+        with torch.no_grad():
+            r = made.model.render(made.views.camera(0, 1), 0, depth=True)
+            return float(depth_distance(r.inverse_depth, r.alpha, truths[0], None))
+
+    without, pulled = distance(0.0), distance(3.0)
+    assert pulled < 0.5 * without
+
+
+def test_the_depth_loss_is_on_where_views_tell_the_same_depth():
+    capture, points = photographed("colmap", [1, 1, 1])
+
+    def decided(**given):
+        train, why = with_depth_loss(TrainSection(**given), capture, points)
+        return train.weight_depth, why
+
+    assert decided() == (0, "the capture has no depth in the unit of its poses")
+    points.depths = np.full((3, 20, 24), 5, np.float32)
+    assert decided() == (WEIGHT, "")
+    points.depths = None
+    capture.cam_from_world[1, 2, 3], capture.cam_from_world[2, 2, 3] = 5.5, 6.0  # each half a unit farther back
+    capture.depth = np.stack([np.full((40, 48), z, np.float32) for z in (5, 5.5, 6)])
+    capture.depth[:, :3] = np.nan
+    assert decided() == (WEIGHT, "")
+    assert decided(weight_depth=0.5) == (0.5, "") and decided(weight_depth=0) == (0, "train.weight_depth is 0")
+    capture.depth[1] *= 1.01
+    weight, why = decided()
+    assert weight == 0 and "differ by 0.9% between views" in why  # as seen from the farther one
+    capture.cam_from_world = None  # of matched photos: another unit
+    assert decided()[0] == 0
+
+
+def test_a_colour_fit_undoes_an_affine_map():
+    g = np.random.default_rng(1)
+    truth = g.integers(60, 200, (20, 30, 3), np.uint8)
+    image = (truth @ np.array([[0.7, 0.1, 0], [0, 0.8, 0.1], [0.1, 0, 0.9]]) + 10).round().astype(np.uint8)
+    assert np.abs(color_fitted(image, truth).astype(int) - truth).max() <= 2  # of rounding to 8 bits, twice
+    assert color_fitted(np.full_like(truth, 7), truth).std() < 60  # one colour fits as a constant
+
+
+def test_disturbances_leave_test_views_and_the_mean_alone():
+    poses = np.tile(np.eye(4), (9, 1, 1))
+    poses[:, :3, 3] = np.random.default_rng(2).normal(size=(9, 3))
+    is_test = np.arange(9) % 3 == 0
+    changed = displaced(poses, is_test, 0.5, 0.01)
+    assert np.array_equal(changed[is_test], poses[is_test])
+    motions = np.linalg.inv(poses[~is_test]) @ changed[~is_test]
+    rotations = Rotation.from_matrix(motions[:, :3, :3])
+    assert np.abs(rotations.as_rotvec().mean(0)).max() < 1e-4 and np.abs(motions[:, :3, 3].mean(0)).max() < 1e-4
+    turns = np.degrees(rotations.magnitude())
+    shifts = np.linalg.norm(centers(changed) - centers(poses), axis=1)[~is_test]
+    assert 0.3 < turns.mean() < 0.7 and 0.005 < shifts.mean() < 0.015
+    images = np.full((9, 4, 4, 3), 128, np.uint8)
+    other = recolored(images, is_test, 0.5)
+    assert np.array_equal(other[is_test], images[is_test]) and other[~is_test].std() > 10
+
+
+def photographed(kind, gains):
+    """A capture of one wall, a view for each gain, and points on it."""
+    g, n = np.random.default_rng(0), len(gains)
+    poses = np.tile(np.eye(4), (n, 1, 1))
+    poses[:, 2, 3] = 5
+    images = np.stack([np.full((40, 48, 3), 100 * gain, np.uint8) for gain in gains])
+    Ks, names = np.tile(K.double().numpy(), (n, 1, 1)), [f"v{k}" for k in range(n)]
+    capture = Capture(names, images, Ks, poses, np.zeros(n, bool), source={"kind": kind})
+    means = g.normal(size=(2000, 3))
+    flat = np.zeros((2000, 3), np.float32)
+    colors, shapes = np.full((2000, 3), 100, np.uint8), np.tile(np.eye(3, dtype=np.float32), (2000, 1, 1))
+    points = Points(names, Ks, poses, means, colors, flat, shapes, np.zeros((0, 2), np.int32))
+    return capture, points
+
+
+@pytest.mark.parametrize(
+    ("kind", "gains", "chosen", "wanted", "why"),
+    [
+        ("generated", [0.5, 1, 1.5, 2], "auto", False, "generated"),
+        ("colmap", [0.8, 1.4, 0.7, 1.2], "auto", True, ""),
+        ("colmap", [1, 1, 1, 1], "auto", False, "differ by 0.00 stops"),
+        ("colmap", [1, 1, 1, 1], "measured", True, ""),
+        ("colmap", [0.8, 1.4, 0.7, 1.2], "off", False, "train.exposure is off"),
+    ],
+)
+def test_exposures_are_undone_where_photos_of_the_same_points_differ(tmp_path, kind, gains, chosen, wanted, why):
+    job = Job({}, config.build({"train": {"exposure": chosen}}, "test"), tmp_path, tmp_path)
+    capture, points = photographed(kind, gains)
+    found = exposures(job, capture, points)
+    assert (found is not None) == wanted and why in job.facts.get("left_out", {}).get("exposure by photo", "")
+    assert ("exposure_stops" in job.facts) == (chosen != "off" and kind != "generated")
+
+
+def test_depth_that_is_asked_for_and_is_not_there_is_an_error():
+    with pytest.raises(ConfigError, match="no depth"):
+        training_views(*photographed("colmap", [1, 1, 1]), None, with_depth=True)
+
+
+def test_depth_of_a_view_is_thinned_like_its_picture():
+    capture, points = photographed("colmap", [1, 1, 1])
+    capture.depth = np.arange(3 * 40 * 48, dtype=np.float32).reshape(3, 40, 48)
+    views = training_views(capture, points, None, with_depth=True)
+    for factor in (1, 2, 3):
+        target, _ = views.target(2, factor)
+        assert views.depth(2, factor).shape == target.shape[:2]
+    assert views.depth(2, 2)[1, 3] == capture.depth[2, 2, 6]
+    assert training_views(capture, points, None).depth is None
+
+
+def test_swept_depth_stands_for_blocks_of_pixels_of_its_view():
+    capture, points = photographed("colmap", [1, 1, 1])
+    capture.is_test[0] = True  # and so the first training view is the second of the points
+    points.depths = np.arange(3 * 13 * 16, dtype=np.float32).reshape(3, 13, 16)
+    depth = training_views(capture, points, None, with_depth=True).depth
+    assert np.array_equal(depth(0, 3)[:13], points.depths[1])
+    assert depth(0, 1).shape == (40, 48) and not depth(0, 1)[39].any()  # a line that no block holds
+    assert depth(1, 1)[4, 5] == points.depths[2, 1, 1]
