@@ -210,5 +210,3 @@ class EvaluateSection(Section):
     lpips_weights: Text | None = setting(
         None, ".safetensors or .pth with VGG-16 and LPIPS' taps; default: LPIPS is not measured"
     )
-
-

@@ -255,8 +255,6 @@ def places() -> Iterator[Row]:
         return stage("ingest", folder, {"source": {"kind": "photos", "path": "nowhere"}})
 
     yield Row("setting", "source.path = 'nowhere'", ingest, ("nowhere", "source.path"))
-    for key in ("", "abc", "../../x", KEY.upper(), KEY + "0", KEY[:-1] + "\n", "0" * 15 + "²"):
-        yield Row("--key", f"{key!r}", lambda folder, key=key: [*ingest(folder), "--key", key], ("--key",), 2)
     for what, (stands, place, code) in PLACES.items():
         for force in (False, True) if place == "mine" else (False,):
             if what == "a link to an artifact" and not force:
@@ -334,7 +332,7 @@ def work() -> Iterator[Row]:
         yield words(f"work, a plan {what}", ["clean-stale", "--yes"], "plan.json", code=3, edit=plan_under_way(text))
     yield words("work, several settings", ["verify", "toy"], "toy@train.steps=5", edit=several)
     yield words("work, unfinished", ["extract", "toy", "--out", "x.ply"], "export", edit=unfinished)
-    yield words("work, unfinished", ["query", "toy", "sofa"], "ingest", code=3, edit=unfinished)
+    yield words("work, unfinished", ["query", "toy", "sofa"], "export", edit=unfinished)
     yield words("work, a file", ["run", "--scene", "toy"], "work", edit=put("work", "a file"))
     photo = put("images/a.jpg", "")
     yield words("work, photos not run yet", ["query", "./images", "sofa"], "make scene=./images", code=3, edit=photo)
