@@ -28,10 +28,10 @@ from torch import Tensor
 from benchmarks import shared
 from chebsplat.cameras import extent, unproject
 from chebsplat.formats import artifact
-from chebsplat.formats.capture import SCHEMA, read_capture, write_capture
-from chebsplat.formats.features import read_features
+from chebsplat.formats.capture import Capture
+from chebsplat.formats.features import Features
 from chebsplat.formats.manifest import Manifest
-from chebsplat.formats.points import Points, read_points
+from chebsplat.formats.points import Points
 from chebsplat.pipelines.plan import merged
 from chebsplat.pipelines.scenes import read_toml
 from chebsplat.settings import MOST_STEPS
@@ -64,8 +64,8 @@ def trainer_from(
     Args: work: folder of the links `ingest`, `sfm` and, if semantics are trained, `teacher`; backend: of the
           rasterizer; basis: earlier knowledge, as `Trainer` takes it; device: `cpu` or `cuda`.
     """
-    capture, points = read_capture(work / "ingest"), read_points(work / "sfm")
-    features = read_features(work / "teacher") if config.train.semantics else None
+    capture, points = Capture.read(work / "ingest"), Points.read(work / "sfm")
+    features = Features.read(work / "teacher") if config.train.semantics else None
     train, _ = with_depth_loss(config.train, capture, points)
     model = model_of(points, features, train, config.describe, device, backend)
     views = training_views(capture, points, features, bool(train.weight_depth)).to(device)
@@ -98,7 +98,7 @@ def by_turns(work: Path, variants: Sequence[str], n_steps: int) -> None:
 
 def enlarged(work: Path, size: tuple[int, int], n_views: int, out: Path) -> Path:
     """A capture of a scene's training views, repeated and enlarged to pixels (width, height)."""
-    given = read_capture(work / "ingest")
+    given = Capture.read(work / "ingest")
     assert given.cam_from_world is not None and given.depth is not None
     used = np.resize(np.flatnonzero(~given.is_test), n_views)
     rows = np.arange(size[1]) * given.size[1] // size[1]
@@ -115,14 +115,14 @@ def enlarged(work: Path, size: tuple[int, int], n_views: int, out: Path) -> Path
         cam_from_world=given.cam_from_world[used], is_test=np.zeros(n_views, bool), **nothing,
     )  # fmt: skip
     folder = out / "capture"
-    with artifact.publish(folder, Manifest(SCHEMA, artifact.digest({"case": str(out)}), "ingest")) as tmp:
-        write_capture(tmp, capture)
+    with artifact.publish(folder, Manifest(Capture.SCHEMA, artifact.digest({"case": str(out)}), "ingest")) as tmp:
+        capture.write(tmp)
     return folder
 
 
 def measured(capture: Path, n_gaussians: int) -> dict[str, float]:
     """What a training of this process takes; nothing else is to be in its memory."""
-    held, rng = read_capture(capture), np.random.default_rng(0)
+    held, rng = Capture.read(capture), np.random.default_rng(0)
     assert held.cam_from_world is not None and held.depth is not None
     views = np.linspace(0, len(held.names) - 1, 60).astype(int)
     means, colors = [], []

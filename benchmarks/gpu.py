@@ -21,7 +21,7 @@ from benchmarks import shared
 from benchmarks.cost import trainer_from
 from chebsplat.errors import ConfigError
 from chebsplat.formats.artifact import read_manifest
-from chebsplat.formats.scene import read_scene
+from chebsplat.formats.scene import Scene
 from chebsplat.pipelines import store
 from chebsplat.pipelines.plan import Plan, Planner
 from chebsplat.pipelines.run import execute
@@ -84,7 +84,7 @@ def measured(plan: Plan) -> dict[str, Any]:
     """A finished training's figures, and frames a second of its scene on the GPU."""
     figures = json.loads((plan.targets["evaluate"] / "figures.json").read_text())
     facts = read_manifest(plan.targets["train"]).facts
-    scene = read_scene(plan.targets["export"])
+    scene = Scene.read(plan.targets["export"])
     renderer, cameras = SceneRenderer(scene.parameters, DEVICE), scene.cameras
     views = [
         View(torch.tensor(K).float().to(DEVICE), torch.tensor(pose).float().to(DEVICE), cameras.width, cameras.height)

@@ -19,8 +19,8 @@ import torch
 
 from benchmarks import shared
 from chebsplat.evaluation.metrics import confusion, segmentation
-from chebsplat.formats.capture import read_capture
-from chebsplat.formats.gaussians import Gaussians, read_gaussians
+from chebsplat.formats.capture import Capture
+from chebsplat.formats.gaussians import Gaussians
 from chebsplat.formats.knowledge import SHIPPED
 from chebsplat.formats.ply import write_ply
 from chebsplat.lifting.cell_maps import to_cells
@@ -34,7 +34,7 @@ SCENES = {"office0": 0.8, "room0": 0.8, "shuffled0": 0.8, "shuffled1": 0.8, "kit
 
 def true_labels(made: Mapping[str, Path], gaussians: Gaussians) -> np.ndarray:
     """The label [N] that most of what shows a Gaussian has, over all views; -1: none. Artifacts by stage."""
-    capture, cameras = read_capture(made["ingest"]), gaussians.cameras
+    capture, cameras = Capture.read(made["ingest"]), gaussians.cameras
     assert capture.labels is not None and capture.class_names
     raw = {name: torch.from_numpy(values) for name, values in gaussians.parameters.items()}
     shapes = tuple(part.numpy() for part in activated(raw))
@@ -51,7 +51,7 @@ def true_labels(made: Mapping[str, Path], gaussians: Gaussians) -> np.ndarray:
 
 def named(made: Mapping[str, Path]) -> dict[str, Any]:
     """Shares of a scene's Gaussians, and of the surer half of them, that bear their true label, and the mIoU."""
-    gaussians, capture = read_gaussians(made["train"]), read_capture(made["ingest"])
+    gaussians, capture = Gaussians.read(made["train"]), Capture.read(made["ingest"])
     assert capture.class_names
     truth, words = true_labels(made, gaussians), list(capture.class_names)
     with TemporaryDirectory() as folder:

@@ -14,9 +14,9 @@ import numpy as np
 import torch
 
 from benchmarks import shared
-from chebsplat.formats.capture import read_capture
-from chebsplat.formats.features import read_features
-from chebsplat.formats.gaussians import read_gaussians
+from chebsplat.formats.capture import Capture
+from chebsplat.formats.features import Features
+from chebsplat.formats.gaussians import Gaussians
 from chebsplat.lifting.cell_maps import to_cells
 from chebsplat.lifting.observations import Observations, estimate, gathered
 from chebsplat.rasterize.lift import lift
@@ -32,8 +32,8 @@ def main(arguments: Sequence[str]) -> int:
     parser.add_argument("--rounds", type=int, default=5)
     options = parser.parse_args(arguments)
     numba.set_num_threads(options.threads)
-    capture, scene = read_capture(options.work / "ingest"), read_gaussians(options.work / "train")
-    features = read_features(options.work / "teacher")
+    capture, scene = Capture.read(options.work / "ingest"), Gaussians.read(options.work / "train")
+    features = Features.read(options.work / "teacher")
     raw = {name: torch.from_numpy(values) for name, values in scene.parameters.items()}
     means, quats, scales, opacities = (part.numpy() for part in activated(raw))
     gaussians = means, quats, scales, opacities

@@ -17,7 +17,7 @@ from scipy.spatial import cKDTree
 
 from benchmarks import shared
 from chebsplat.cameras import unproject
-from chebsplat.formats.capture import Capture, read_capture
+from chebsplat.formats.capture import Capture
 from chebsplat.formats.meshes import Mesh, cleaned, fused
 from chebsplat.pipelines.api import load
 from chebsplat.splats.cubes import first_of_each
@@ -79,7 +79,7 @@ def main(arguments: Sequence[str]) -> int:
     options = parser.parse_args(arguments)
     rows: list[dict[str, Any]] = []
     for work in (options.work, *options.also):
-        scene, capture = load(work), read_capture(work / "ingest")
+        scene, capture = load(work), Capture.read(work / "ingest")
         points, labels = truth(capture)
         began = time.perf_counter()
         seen = list(frames(scene, Progress()))

@@ -17,8 +17,8 @@ from scipy.spatial import cKDTree
 
 from benchmarks import shared
 from chebsplat.cameras import unproject
-from chebsplat.formats.capture import read_capture
-from chebsplat.formats.scene import Scene, read_scene
+from chebsplat.formats.capture import Capture
+from chebsplat.formats.scene import Scene
 from chebsplat.formats.teacher_model import EMBEDDED
 from chebsplat.labels.relevancy import relevancy
 from chebsplat.pipelines import store
@@ -34,7 +34,7 @@ LEAST = 20  # Gaussians of a class, of which a room has it
 
 def classes_of(scene: Scene, capture: Path) -> np.ndarray:
     """True class of each Gaussian, i64 [N], -1 where no surface is near."""
-    held = read_capture(capture)
+    held = Capture.read(capture)
     assert held.depth is not None and held.labels is not None and held.cam_from_world is not None
     points, classes = [], []
     for depth, labels, K, pose in zip(held.depth, held.labels, held.Ks, held.cam_from_world, strict=True):
@@ -75,7 +75,7 @@ def main(arguments: Sequence[str]) -> int:
     pooled: dict[str, list[tuple[int, int, int]]] = {"calibrated": [], "relevancy above 0.5": []}
     refused, found = [], []
     for folder in folders:
-        scene = read_scene(folder / "export")
+        scene = Scene.read(folder / "export")
         features, classes = scene.parameters["features"], classes_of(scene, folder / "ingest")
         here: dict[str, list[tuple[int, int, int]]] = {name: [] for name in pooled}
         for k, word in enumerate(CLASS_NAMES):

@@ -17,11 +17,11 @@ import numpy as np
 from benchmarks import shared
 from benchmarks.teaching import made, taught
 from chebsplat.evaluation.metrics import confusion, segmentation
-from chebsplat.formats.capture import read_capture
-from chebsplat.formats.features import read_features
-from chebsplat.formats.gaussians import read_gaussians
+from chebsplat.formats.capture import Capture
+from chebsplat.formats.features import Features
+from chebsplat.formats.gaussians import Gaussians
 from chebsplat.formats.knowledge import SHIPPED, read_knowledge
-from chebsplat.formats.points import read_points
+from chebsplat.formats.points import Points
 from chebsplat.labels.decode import decode_labels
 from chebsplat.lifting.blend import blend, calibrate, effective, familiar, reliable, trusted
 from chebsplat.lifting.carry import carry
@@ -52,8 +52,8 @@ class Scene:
     """A trained scene with a teacher, its artifacts below `work`."""
 
     def __init__(self, work: Path):
-        self.capture, self.gaussians = read_capture(work / "ingest"), read_gaussians(work / "train")
-        self.points, self.taught = read_points(work / "sfm"), read_features(work / "teacher")
+        self.capture, self.gaussians = Capture.read(work / "ingest"), Gaussians.read(work / "train")
+        self.points, self.taught = Points.read(work / "sfm"), Features.read(work / "teacher")
         parameters = self.gaussians.parameters
         self.means, self.surface = parameters["means"], surface_of(parameters)
         self.features: np.ndarray = parameters.get("fused", parameters["features"])

@@ -18,9 +18,9 @@ from scipy.stats import spearmanr
 from benchmarks import shared
 from chebsplat.evaluation.metrics import confusion, segmentation
 from chebsplat.evaluation.protocols.task import predicted, resized
-from chebsplat.formats.agreement import read_agreement
-from chebsplat.formats.capture import read_capture
-from chebsplat.formats.features import read_features
+from chebsplat.formats.agreement import ViewAgreement
+from chebsplat.formats.capture import Capture
+from chebsplat.formats.features import Features
 from chebsplat.stages.settings import AgreeSection
 
 SCENES = ("office0", "room0", "shuffled0", "kitchen", "living")
@@ -32,7 +32,7 @@ BAR, LEAST = 0.8, 12  # rank correlation, and pairs that it needs
 
 def true_miou(made: Mapping[str, Path]) -> float:
     """mIoU of the labels that a scene's teacher gives all views, at their resolution; artifacts by stage."""
-    capture, features = read_capture(made["ingest"]), read_features(made["teacher"])
+    capture, features = Capture.read(made["ingest"]), Features.read(made["teacher"])
     assert capture.labels is not None and capture.class_names and features.pseudo_labels is not None
     row, n = {name: k for k, name in enumerate(features.names)}, len(capture.class_names)
     counts = np.zeros((n + 1, n + 1), np.int64)
@@ -51,7 +51,7 @@ def main(arguments: Sequence[str]) -> int:
     plans = shared.finished([(scene, TEACHERS[teacher]) for scene, teacher in pairs], "agree")
     rows = []
     for (scene, teacher), plan in zip(pairs, plans, strict=True):
-        found, miou = read_agreement(plan.targets["agree"]), true_miou(plan.targets)
+        found, miou = ViewAgreement.read(plan.targets["agree"]), true_miou(plan.targets)
         value = found.agreement or 0.0
         rows.append({"scene": scene, "teacher": teacher, "agreement": value, "miou": miou, "points": found.n_points})
         print(f"{scene:<10} {teacher:<22} agreement {value:.3f}  true mIoU {miou:.1%}")

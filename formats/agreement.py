@@ -22,11 +22,3 @@ class ViewAgreement(Record):
     n_points: int
     n_views: int
     labels: dict[str, dict[str, float]]
-
-
-SCHEMA = ViewAgreement.SCHEMA
-read_agreement = ViewAgreement.read
-
-
-def write_agreement(out, record):  # temporary, until the branches are merged
-    record.write(out)

@@ -80,11 +80,3 @@ def _check(capture: Capture) -> None:
         return
     if tracks.min() < 0 or (tracks.max(0) >= (len(points), n_views)).any():
         raise InputError(f"{where}: tracks of points or views that are not there; {remedy}")
-
-
-SCHEMA = Capture.SCHEMA
-read_capture = Capture.read
-
-
-def write_capture(out, record):  # temporary, until the branches are merged
-    record.write(out)

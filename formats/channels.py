@@ -46,11 +46,3 @@ class ChannelMap(Record):
         """Mapped features [..., d] -> f32 [..., C]."""
         restored: np.ndarray = np.asarray(features, np.float32) @ self.inverse
         return restored
-
-
-SCHEMA = ChannelMap.SCHEMA
-read_channels = ChannelMap.read
-
-
-def write_channels(out, record):  # temporary, until the branches are merged
-    record.write(out)

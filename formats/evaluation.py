@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Annotated, Any, ClassVar
+from typing import Annotated, Any, ClassVar, Self
 
 from chebsplat.formats import artifact
 from chebsplat.formats.documents import read_document, write_document
@@ -21,41 +21,38 @@ class Evaluation:
     pictures: by name as in `Pictures`, one entry a test view.
     """
 
+    SCHEMA: ClassVar[str] = "chebsplat.evaluation/2"
     figures: dict[str, Any]
     pictures: dict[str, Stack] = field(default_factory=dict)
+
+    def write(self, out: Path) -> None:
+        """Fill the directory that `artifact.publish` yields. Raises ValueError on a figure that is nan or infinite."""
+        write_document(out / FIGURES, self.figures)
+        Pictures(**self.pictures).write(out)
+
+    @classmethod
+    def read(cls, path: Path) -> Self:
+        """Figures at `path`; pictures stay on disk until indexed.
+
+        Raises: InputError naming the damaged file and the remedy.
+        """
+        path = Path(path)
+        stored = Pictures.read(path)
+        pictures = {name: getattr(stored, name) for name in layout_of(Pictures).arrays}
+        figures = read_figures(path, artifact.read_manifest(path))
+        return cls(figures, {name: stack for name, stack in pictures.items() if stack is not None})
 
 
 @dataclass
 class Pictures(Record):
     """Of the test views: `truth`, `renders` u8 [V, H, W, 3]; maps i16 [V, H, W] of labels, -1 none."""
 
-    SCHEMA: ClassVar[str] = "chebsplat.evaluation/2"
+    SCHEMA: ClassVar[str] = Evaluation.SCHEMA
     truth: Annotated[Stack | None, Array("uint8", (*PIXELS, 3), "sRGB", by_view=True)] = None
     renders: Annotated[Stack | None, Array("uint8", (*PIXELS, 3), "sRGB", by_view=True)] = None
     labels: Annotated[Stack | None, Array("int16", PIXELS, "class index", by_view=True)] = None
     predicted: Annotated[Stack | None, Array("int16", PIXELS, "class index", by_view=True)] = None
     teacher: Annotated[Stack | None, Array("int16", PIXELS, "class index", by_view=True)] = None
-
-
-SCHEMA = Pictures.SCHEMA
-
-
-def write_evaluation(out: Path, evaluation: Evaluation) -> None:
-    """Fill the directory that `artifact.publish` yields. Raises ValueError on a figure that is nan or infinite."""
-    write_document(out / FIGURES, evaluation.figures)
-    Pictures(**evaluation.pictures).write(out)
-
-
-def read_evaluation(path: Path) -> Evaluation:
-    """Figures at `path`; pictures stay on disk until indexed.
-
-    Raises: InputError naming the damaged file and the remedy.
-    """
-    path = Path(path)
-    stored = Pictures.read(path)
-    pictures = {name: getattr(stored, name) for name in layout_of(Pictures).arrays}
-    figures = read_figures(path, artifact.read_manifest(path, SCHEMA))
-    return Evaluation(figures, {name: stack for name, stack in pictures.items() if stack is not None})
 
 
 def read_figures(path: Path, manifest: Manifest) -> dict[str, Any]:

@@ -162,11 +162,3 @@ def _link(source: Path, target: Path) -> None:
         os.link(source, target)
     except OSError:  # a file system without hard links
         shutil.copyfile(source, target)
-
-
-SCHEMA = Features.SCHEMA
-read_features = Features.read
-
-
-def write_features(out, record):  # temporary, until the branches are merged
-    record.write(out)

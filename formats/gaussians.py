@@ -6,7 +6,7 @@ import csv
 import math
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Annotated, Any, ClassVar
+from typing import Annotated, Any, ClassVar, Self
 
 import numpy as np
 
@@ -33,6 +33,7 @@ class Gaussians:
     notes:      encoder sizes, label names, and what the scene left out and why.
     """
 
+    SCHEMA: ClassVar[str] = "chebsplat.gaussians/2"
     parameters: dict[str, np.ndarray]
     cameras: Cameras
     modules: dict[str, np.ndarray] = field(default_factory=dict)
@@ -47,6 +48,45 @@ class Gaussians:
         weights = {k.removeprefix(prefix): v for k, v in self.modules.items() if k.startswith(prefix)}
         return self.notes["encoder"], weights
 
+    def write(self, out: Path) -> None:
+        """Fill the directory that `artifact.publish` yields. Raises ValueError on a non-finite parameter.
+
+        Choices: SH bands that no Gaussian keeps are left out of the file; reading gives them back as zeros.
+        """
+        degrees, shN = self.parameters["degrees"], self.parameters["shN"]
+        kept = shN[:, : (int(degrees.max(initial=0)) + 1) ** 2 - 1]
+        weights = [np.zeros(0, np.float32), *map(np.ravel, self.modules.values())]
+        Checkpoint(
+            **self.parameters | {"shN": kept},
+            cameras=self.cameras,
+            modules=np.concatenate(weights),
+            module_shapes={name: list(values.shape) for name, values in self.modules.items()},
+            notes=self.notes,
+        ).write(out)
+        with (out / TRACE).open("w", newline="") as handle:
+            columns = list(self.trace[0]) if self.trace else ["step", "seconds"]
+            writer = csv.DictWriter(handle, columns)
+            writer.writeheader()
+            writer.writerows(self.trace)
+
+    @classmethod
+    def read(cls, path: Path) -> Self:
+        """The checkpoint at `path`; SH bands that it leaves out are zeros.
+
+        Raises: InputError naming the damaged file and the remedy.
+        """
+        stored = Checkpoint.read(path)
+        values = {name: getattr(stored, name) for name in layout_of(Checkpoint).arrays if name != "modules"}
+        parameters = {name: value for name, value in values.items() if value is not None}
+        n, n_kept = stored.shN.shape[:2]
+        parameters["shN"] = np.concatenate([stored.shN, np.zeros((n, 15 - n_kept, 3), np.float32)], 1)
+        ends = np.cumsum([math.prod(shape) for shape in stored.module_shapes.values()])
+        parts = np.split(stored.modules, ends[:-1]) if len(ends) else []
+        shapes = stored.module_shapes.items()
+        modules = {name: part.reshape(shape) for (name, shape), part in zip(shapes, parts, strict=True)}
+        trace = read_trace(path, artifact.read_manifest(path))
+        return cls(parameters, stored.cameras, modules, trace, stored.notes)
+
 
 @dataclass
 class Checkpoint(Record):
@@ -55,7 +95,7 @@ class Checkpoint(Record):
     modules: f32 [W], all weights one after the other, in the order of module_shapes.
     """
 
-    SCHEMA: ClassVar[str] = "chebsplat.gaussians/2"
+    SCHEMA: ClassVar[str] = Gaussians.SCHEMA
     COMPRESSED: ClassVar[bool] = False
     means: Annotated[np.ndarray, Array("float32", ("gaussian", 3), "scene units")]
     log_scales: Annotated[np.ndarray, Array("float32", ("gaussian", 3), "ln of scene units")]
@@ -70,49 +110,6 @@ class Checkpoint(Record):
     notes: dict[str, Any]
     features: Annotated[np.ndarray | None, Array("float32", ("gaussian", "channel"))] = None
     fused: Annotated[np.ndarray | None, Array("float32", ("gaussian", "channel"))] = None
-
-
-SCHEMA = Checkpoint.SCHEMA
-
-
-def write_gaussians(out: Path, gaussians: Gaussians) -> None:
-    """Fill the directory that `artifact.publish` yields. Raises ValueError on a non-finite parameter.
-
-    Choices: SH bands that no Gaussian keeps are left out of the file; reading gives them back as zeros.
-    """
-    degrees, shN = gaussians.parameters["degrees"], gaussians.parameters["shN"]
-    kept = shN[:, : (int(degrees.max(initial=0)) + 1) ** 2 - 1]
-    weights = [np.zeros(0, np.float32), *map(np.ravel, gaussians.modules.values())]
-    Checkpoint(
-        **gaussians.parameters | {"shN": kept},
-        cameras=gaussians.cameras,
-        modules=np.concatenate(weights),
-        module_shapes={name: list(values.shape) for name, values in gaussians.modules.items()},
-        notes=gaussians.notes,
-    ).write(out)
-    with (out / TRACE).open("w", newline="") as handle:
-        columns = list(gaussians.trace[0]) if gaussians.trace else ["step", "seconds"]
-        writer = csv.DictWriter(handle, columns)
-        writer.writeheader()
-        writer.writerows(gaussians.trace)
-
-
-def read_gaussians(path: Path) -> Gaussians:
-    """The checkpoint at `path`; SH bands that it leaves out are zeros.
-
-    Raises: InputError naming the damaged file and the remedy.
-    """
-    stored = Checkpoint.read(path)
-    values = {name: getattr(stored, name) for name in layout_of(Checkpoint).arrays if name != "modules"}
-    parameters = {name: value for name, value in values.items() if value is not None}
-    n, n_kept = stored.shN.shape[:2]
-    parameters["shN"] = np.concatenate([stored.shN, np.zeros((n, 15 - n_kept, 3), np.float32)], 1)
-    ends = np.cumsum([math.prod(shape) for shape in stored.module_shapes.values()])
-    parts = np.split(stored.modules, ends[:-1]) if len(ends) else []
-    shapes = stored.module_shapes.items()
-    modules = {name: part.reshape(shape) for (name, shape), part in zip(shapes, parts, strict=True)}
-    trace = read_trace(path, artifact.read_manifest(path))
-    return Gaussians(parameters, stored.cameras, modules, trace, stored.notes)
 
 
 def read_trace(path: Path, manifest: Manifest) -> list[dict[str, float]]:

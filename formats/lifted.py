@@ -30,11 +30,3 @@ class Lifted(Record):
     halves: Annotated[np.ndarray, Array("float32", (2, "gaussian", "channel"))]
     half_views: Annotated[np.ndarray, Array("int32", (2, "gaussian"), "views")]
     notes: dict[str, Any] = field(default_factory=dict)
-
-
-SCHEMA = Lifted.SCHEMA
-read_lifted = Lifted.read
-
-
-def write_lifted(out, record):  # temporary, until the branches are merged
-    record.write(out)

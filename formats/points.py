@@ -45,11 +45,3 @@ def thinned(points: Points, most: int, seed: int) -> Points:
     kept = np.sort(np.random.default_rng(seed).choice(len(points.means), most, replace=False))
     fewer = {name: getattr(points, name)[kept] for name in ("means", "colors", "normals", "covariances")}
     return replace(points, **fewer, tracks=points.tracks[:0])
-
-
-SCHEMA = Points.SCHEMA
-read_points = Points.read
-
-
-def write_points(out, record):  # temporary, until the branches are merged
-    record.write(out)

@@ -25,11 +25,3 @@ class Refined(Record):
     features: Annotated[np.ndarray, Array("float32", ("gaussian", "channel"))]
     confidence: Annotated[np.ndarray, Array("float32", ("gaussian",))]
     notes: dict[str, Any] = field(default_factory=dict)
-
-
-SCHEMA = Refined.SCHEMA
-read_refined = Refined.read
-
-
-def write_refined(out, record):  # temporary, until the branches are merged
-    record.write(out)

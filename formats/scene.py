@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Annotated, Any, ClassVar
+from typing import Annotated, Any, ClassVar, Self
 
 import numpy as np
 
@@ -33,6 +33,7 @@ class Scene:
     summary:    counts, bytes, and what was left out and why.
     """
 
+    SCHEMA: ClassVar[str] = "chebsplat.scene/3"
     parameters: dict[str, np.ndarray]
     cameras: Cameras
     order: np.ndarray
@@ -40,6 +41,77 @@ class Scene:
     label_names: list[str] | None = None
     label_embeddings: np.ndarray | None = None
     summary: dict[str, Any] = field(default_factory=dict)
+
+    def write(self, out: Path) -> dict[str, int]:
+        """Fill the directory that `artifact.publish` yields; returns bytes by part.
+
+        Choices: `scene.ply` is trimmed to the highest degree in use; `scene_d<k>.ply` hold each degree apart, each
+        valid on its own. Features are 16-bit fixed point: as small as halves, 20 times as exact. Degrees are
+        stored in the checkpoint's order, which they then tell.
+        """
+        p, degrees = self.parameters, self.parameters["degrees"]
+        unsorted = np.empty_like(degrees)
+        unsorted[self.order] = degrees
+        if not np.array_equal(np.argsort(unsorted, kind="stable"), self.order):
+            raise ValueError("Gaussians are not sorted by degree, stably")
+        top = int(degrees.max(initial=0))
+        write_ply(out / "scene.ply", p, top, self.labels, self.label_names)
+        if len(np.unique(degrees)) > 1:
+            for degree in np.unique(degrees):
+                chosen = degrees == degree
+                part = {name: values[chosen] for name, values in p.items()}
+                labels = None if self.labels is None else self.labels[chosen]
+                write_ply(out / f"scene_d{degree}.ply", part, int(degree), labels, self.label_names)
+        bands = {}
+        for band in range(1, top + 1):
+            rows = p["shN"][degrees >= band, REST[band - 1] : REST[band]]
+            bands[f"sh{band}"] = rows.reshape(len(rows), -1)
+        steps = {name: float(np.abs(p[name]).max(initial=0)) / 32767 or 1.0 for name in SEMANTIC if name in p}
+        fixed = {name: np.round(p[name] / step).astype(np.int16) for name, step in steps.items()}
+        stored = RaggedScene(
+            **{name: p[name] for name in ("means", "log_scales", "quats", "logit_opacities")},
+            sh0=p["sh0"][:, 0],
+            degrees=unsorted.astype(np.uint8),
+            cameras=self.cameras,
+            steps=steps,
+            summary=self.summary | {"max_degree": top, "n": len(degrees)},
+            labels=self.labels,
+            label_embeddings=self.label_embeddings,
+            **bands,
+            **fixed,
+        )
+        stored.write(out)
+        write_document(out / LABELS, dict(enumerate(self.label_names or [])))
+        sizes = {
+            "unpruned_ply": 62 * 4 * len(degrees),
+            "ply": (out / "scene.ply").stat().st_size,
+            "split": sum(file.stat().st_size for file in out.glob("scene_d*.ply")),
+            "ragged": _bytes_of(out, RAGGED),
+            "semantic": _bytes_of(out, SEMANTIC),
+        }
+        stored.summary["bytes"] = sizes
+        stored.write_attributes(out)
+        return sizes
+
+    @classmethod
+    def read(cls, path: Path) -> Self:
+        """The exported scene at `path`, all in memory. Raises InputError naming the damaged file and the remedy."""
+        path = Path(path)
+        stored = RaggedScene.read(path)
+        order = np.argsort(stored.degrees, kind="stable")
+        degrees = stored.degrees[order]
+        parameters = {name: getattr(stored, name) for name in ("means", "log_scales", "quats", "logit_opacities")}
+        parameters["sh0"] = stored.sh0[:, None]
+        parameters["shN"] = np.zeros((len(order), 15, 3), np.float32)
+        for band in range(1, int(degrees.max(initial=0)) + 1):
+            width = REST[band] - REST[band - 1]
+            rows = getattr(stored, f"sh{band}").reshape(-1, width, 3)
+            parameters["shN"][degrees >= band, REST[band - 1] : REST[band]] = rows
+        parameters["degrees"] = degrees
+        for name, step in stored.steps.items():
+            parameters[name] = getattr(stored, name) * np.float32(step)
+        names = read_label_names(path, artifact.read_manifest(path)) if stored.labels is not None else None
+        return cls(parameters, stored.cameras, order, stored.labels, names, stored.label_embeddings, stored.summary)
 
 
 @dataclass
@@ -50,7 +122,7 @@ class RaggedScene(Record):
     integer of `features` and of `raw_features` counts.
     """
 
-    SCHEMA: ClassVar[str] = "chebsplat.scene/3"
+    SCHEMA: ClassVar[str] = Scene.SCHEMA
     means: Annotated[np.ndarray, Array("float32", ("gaussian", 3), "scene units")]
     log_scales: Annotated[np.ndarray, Array("float32", ("gaussian", 3), "ln of scene units")]
     quats: Annotated[np.ndarray, Array("float32", ("gaussian", 4), "wxyz")]
@@ -67,81 +139,6 @@ class RaggedScene(Record):
     raw_features: Annotated[np.ndarray | None, Array("int16", ("gaussian", "channel"), "a step")] = None
     labels: Annotated[np.ndarray | None, Array("int32", ("gaussian",), "class index, -1 none")] = None
     label_embeddings: Annotated[np.ndarray | None, Array("float32", ("label", "channel"))] = None
-
-
-SCHEMA = RaggedScene.SCHEMA
-
-
-def write_scene(out: Path, scene: Scene) -> dict[str, int]:
-    """Fill the directory that `artifact.publish` yields; returns bytes by part.
-
-    Choices: `scene.ply` is trimmed to the highest degree in use; `scene_d<k>.ply` hold each degree apart, each valid
-    on its own. Features are 16-bit fixed point: as small as halves, 20 times as exact. Degrees are stored in the
-    checkpoint's order, which they then tell.
-    """
-    p, degrees = scene.parameters, scene.parameters["degrees"]
-    unsorted = np.empty_like(degrees)
-    unsorted[scene.order] = degrees
-    if not np.array_equal(np.argsort(unsorted, kind="stable"), scene.order):
-        raise ValueError("Gaussians are not sorted by degree, stably")
-    top = int(degrees.max(initial=0))
-    write_ply(out / "scene.ply", p, top, scene.labels, scene.label_names)
-    if len(np.unique(degrees)) > 1:
-        for degree in np.unique(degrees):
-            chosen = degrees == degree
-            part = {name: values[chosen] for name, values in p.items()}
-            labels = None if scene.labels is None else scene.labels[chosen]
-            write_ply(out / f"scene_d{degree}.ply", part, int(degree), labels, scene.label_names)
-    bands = {}
-    for band in range(1, top + 1):
-        rows = p["shN"][degrees >= band, REST[band - 1] : REST[band]]
-        bands[f"sh{band}"] = rows.reshape(len(rows), -1)
-    steps = {name: float(np.abs(p[name]).max(initial=0)) / 32767 or 1.0 for name in SEMANTIC if name in p}
-    fixed = {name: np.round(p[name] / step).astype(np.int16) for name, step in steps.items()}
-    stored = RaggedScene(
-        **{name: p[name] for name in ("means", "log_scales", "quats", "logit_opacities")},
-        sh0=p["sh0"][:, 0],
-        degrees=unsorted.astype(np.uint8),
-        cameras=scene.cameras,
-        steps=steps,
-        summary=scene.summary | {"max_degree": top, "n": len(degrees)},
-        labels=scene.labels,
-        label_embeddings=scene.label_embeddings,
-        **bands,
-        **fixed,
-    )
-    stored.write(out)
-    write_document(out / LABELS, dict(enumerate(scene.label_names or [])))
-    sizes = {
-        "unpruned_ply": 62 * 4 * len(degrees),
-        "ply": (out / "scene.ply").stat().st_size,
-        "split": sum(file.stat().st_size for file in out.glob("scene_d*.ply")),
-        "ragged": _bytes_of(out, RAGGED),
-        "semantic": _bytes_of(out, SEMANTIC),
-    }
-    stored.summary["bytes"] = sizes
-    stored.write_attributes(out)
-    return sizes
-
-
-def read_scene(path: Path) -> Scene:
-    """The exported scene at `path`, all in memory. Raises InputError naming the damaged file and the remedy."""
-    path = Path(path)
-    stored = RaggedScene.read(path)
-    order = np.argsort(stored.degrees, kind="stable")
-    degrees = stored.degrees[order]
-    parameters = {name: getattr(stored, name) for name in ("means", "log_scales", "quats", "logit_opacities")}
-    parameters["sh0"] = stored.sh0[:, None]
-    parameters["shN"] = np.zeros((len(order), 15, 3), np.float32)
-    for band in range(1, int(degrees.max(initial=0)) + 1):
-        width = REST[band] - REST[band - 1]
-        rows = getattr(stored, f"sh{band}").reshape(-1, width, 3)
-        parameters["shN"][degrees >= band, REST[band - 1] : REST[band]] = rows
-    parameters["degrees"] = degrees
-    for name, step in stored.steps.items():
-        parameters[name] = getattr(stored, name) * np.float32(step)
-    names = read_label_names(path, artifact.read_manifest(path)) if stored.labels is not None else None
-    return Scene(parameters, stored.cameras, order, stored.labels, names, stored.label_embeddings, stored.summary)
 
 
 def read_label_names(path: Path, manifest: Manifest) -> list[str]:

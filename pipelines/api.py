@@ -21,10 +21,10 @@ def load(scene: str | Path) -> OpenedScene:
     Args: scene: its name, its photo folder, its folder in `work`, or an `export` artifact.
     Raises: ConfigError or InputError, which name what is missing and the remedy.
     """
-    from chebsplat.formats.scene import read_scene
+    from chebsplat.formats.scene import Scene
     from chebsplat.pipelines.finished import artifact_of, teacher_of
 
-    return OpenedScene(read_scene(artifact_of(str(scene), "export")), Path(scene), teacher_of(str(scene)))
+    return OpenedScene(Scene.read(artifact_of(str(scene), "export")), Path(scene), teacher_of(str(scene)))
 
 
 def train(

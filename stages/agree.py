@@ -27,15 +27,15 @@ def run(job: Job) -> None:
     import numpy as np
 
     from chebsplat.cameras import centers
-    from chebsplat.formats.agreement import ViewAgreement, write_agreement
-    from chebsplat.formats.capture import read_capture
-    from chebsplat.formats.features import read_features
-    from chebsplat.formats.points import read_points
+    from chebsplat.formats.agreement import ViewAgreement
+    from chebsplat.formats.capture import Capture
+    from chebsplat.formats.features import Features
+    from chebsplat.formats.points import Points
     from chebsplat.labels.agreement import between, far_pairs
     from chebsplat.stages.thinning import even
 
-    settings, capture = job.config.agree, read_capture(job.inputs["capture"])
-    points, features = read_points(job.inputs["points"]), read_features(job.inputs["features"])
+    settings, capture = job.config.agree, Capture.read(job.inputs["capture"])
+    points, features = Points.read(job.inputs["points"]), Features.read(job.inputs["features"])
     views = training_views(capture, points, features)
     rows = even(points)
     rng = np.random.default_rng(SEED)
@@ -62,7 +62,7 @@ def run(job: Job) -> None:
         log.warning("%s", job.facts["doubt"])
     else:
         log.info("views agree by %.2f on what points are (1: always, 0: by chance)", value)
-    write_agreement(job.out, ViewAgreement(value, len(row), len(views), labels))
+    ViewAgreement(value, len(row), len(views), labels).write(job.out)
 
 
 def training_views(capture: Capture, points: Points, features: Features) -> list[tuple[int, int, int]]:

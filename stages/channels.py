@@ -35,7 +35,7 @@ def run(job: Job) -> None:
     import numpy as np
 
     from chebsplat.formats.artifact import read_manifest
-    from chebsplat.formats.channels import SCHEMA, ChannelMap, read_channels, write_channels
+    from chebsplat.formats.channels import ChannelMap
     from chebsplat.formats.teacher_model import EMBEDDED, read_teacher
     from chebsplat.labels import channels as maths
     from chebsplat.stages.teacher_inference import TeacherInference
@@ -46,8 +46,10 @@ def run(job: Job) -> None:
         raise ConfigError(f"{teacher.settings}: output is {teacher.output}; only channels of features are reduced")
     if (brought := shipped(teacher, settings)) is not None:
         job.left_out("reference images", f"{brought.name} beside the teacher holds what comes of them")
-        job.facts |= {name: value for name, value in read_manifest(brought, SCHEMA).facts.items() if name != "left_out"}
-        write_channels(job.out, read_channels(brought))
+        job.facts |= {
+            name: value for name, value in read_manifest(brought, ChannelMap.SCHEMA).facts.items() if name != "left_out"
+        }
+        ChannelMap.read(brought).write(job.out)
         return
     words = vocabulary(job, teacher)
     network = TeacherInference(teacher, n_threads())
@@ -78,17 +80,17 @@ def run(job: Job) -> None:
     if words is not None:
         job.facts["label_agreement"] = maths.agreement(np.concatenate(sample), words, matrix)
     matrix, energy = matrix.astype(np.float32), energy.astype(np.float32)
-    write_channels(job.out, ChannelMap(matrix, matrix.T.copy(), energy, teacher.name, notes))
+    ChannelMap(matrix, matrix.T.copy(), energy, teacher.name, notes).write(job.out)
 
 
 def shipped(teacher: TeacherModel, settings: ChannelsSection) -> Path | None:
     """The artifact of this stage that lies beside the teacher, if it is of the same files and settings."""
     from chebsplat.formats.artifact import read_manifest
-    from chebsplat.formats.channels import SCHEMA
+    from chebsplat.formats.channels import ChannelMap
 
     if not teacher.channels.is_dir():
         return None
-    manifest, unnamed = read_manifest(teacher.channels, SCHEMA), {"model"}
+    manifest, unnamed = read_manifest(teacher.channels, ChannelMap.SCHEMA), {"model"}
     asked = settings.model_dump(mode="json", exclude=unnamed)
     given = {name: value for name, value in manifest.config["channels"].items() if name not in unnamed}
     return teacher.channels if given == asked and manifest.facts.get("digest") == digest(teacher) else None

@@ -21,12 +21,12 @@ def run(job: Job) -> None:
     """
     from chebsplat.formats.artifact import read_manifest
     from chebsplat.formats.basis import Basis, read_basis, write_basis
-    from chebsplat.formats.gaussians import read_gaussians
+    from chebsplat.formats.gaussians import Gaussians
     from chebsplat.stages.restored import restored_encoder, without_basis
 
     settings = job.config.cks
     old = read_basis(job.inputs["basis"]) if "basis" in job.inputs else Basis({}, {})
-    checkpoint = read_gaussians(job.inputs["gaussians"])
+    checkpoint = Gaussians.read(job.inputs["gaussians"])
     import torch  # once its inputs are known to be usable
 
     from chebsplat.shape.cks import update

@@ -18,13 +18,13 @@ def run(job: Job) -> None:
     import numpy as np
 
     from chebsplat.formats.descriptors import Descriptors, write_descriptors
-    from chebsplat.formats.points import read_points
+    from chebsplat.formats.points import Points
     from chebsplat.shape.descriptor import describe_members
     from chebsplat.shape.regions import regions_of
     from chebsplat.splats.gaussians import activated, initial_gaussians
 
     settings = job.config.describe
-    points = read_points(job.inputs["points"])
+    points = Points.read(job.inputs["points"])
     if len(points.means) == 0:
         raise DataFailure("the points artifact holds no points; nothing can be described")
     raw = initial_gaussians(points.means, points.colors, points.covariances)

@@ -105,12 +105,12 @@ def gaussians(scene: Path, features: Path | None, n_channels: int) -> tuple[dict
     import numpy as np
 
     from chebsplat.formats.ply import read_ply
-    from chebsplat.formats.scene import read_scene
+    from chebsplat.formats.scene import Scene
 
     if scene.is_dir():
         if features is not None:
             raise ConfigError(f"{scene} holds its own features; --features is for a PLY")
-        held = read_scene(scene)
+        held = Scene.read(scene)
         if "raw_features" not in held.parameters:
             raise InputError(f"{scene} was trained without an encoder; train it with train.encoder = transformer")
         back = np.argsort(held.order)

@@ -28,14 +28,14 @@ def run(job: Job) -> None:
 
     from chebsplat.evaluation import protocols
     from chebsplat.evaluation.lpips import NET, NORMALIZE
-    from chebsplat.formats.capture import read_capture
-    from chebsplat.formats.evaluation import Evaluation, write_evaluation
-    from chebsplat.formats.scene import read_scene
+    from chebsplat.formats.capture import Capture
+    from chebsplat.formats.evaluation import Evaluation
+    from chebsplat.formats.scene import Scene
     from chebsplat.render import SceneRenderer
     from chebsplat.stages.fidelity import frame_split, image_figures, perceptual, timing
 
     settings = job.config.evaluate
-    capture, scene = read_capture(job.inputs["capture"]), read_scene(job.inputs["scene"])
+    capture, scene = Capture.read(job.inputs["capture"]), Scene.read(job.inputs["scene"])
     named = str(capture.protocol.get("name"))
     protocol = protocols.ALL.get(named)
     if protocol is None:
@@ -92,7 +92,7 @@ def run(job: Job) -> None:
     job.facts |= {"psnr": figures["image"]["psnr"], "n_test": len(names)}
     if segmentation:
         job.facts["miou"] = segmentation["scene"]["miou"]
-    write_evaluation(job.out, Evaluation(figures, pictures))
+    Evaluation(figures, pictures).write(job.out)
 
 
 def camera(scene: Scene, index: int) -> View:
@@ -144,7 +144,7 @@ def evaluated_views(
     import numpy as np
 
     from chebsplat.evaluation.protocols.task import EvaluatedView, MapsByName, resized, translated
-    from chebsplat.formats.features import read_features
+    from chebsplat.formats.features import Features
     from chebsplat.labels.decode import decode_labels
 
     def as_classes(labels: np.ndarray) -> np.ndarray:
@@ -159,7 +159,7 @@ def evaluated_views(
         depths = MapsByName(capture.names, capture.depth, "depth")
     teachers = pseudo_labels = None
     if "features" in job.inputs and scene.labels is not None:
-        teacher = read_features(job.inputs["features"])
+        teacher = Features.read(job.inputs["features"])
         own = scene.label_embeddings
         if teacher.label_names != scene.label_names or own is None or teacher.label_embeddings.shape != own.shape:
             raise InputError(f"{job.inputs['features']} has other labels than the scene; export the scene again")

@@ -22,12 +22,12 @@ def run(job: Job) -> None:
     """
     import numpy as np
 
-    from chebsplat.formats.features import read_features
-    from chebsplat.formats.gaussians import read_gaussians
-    from chebsplat.formats.scene import Scene, write_scene
+    from chebsplat.formats.features import Features
+    from chebsplat.formats.gaussians import Gaussians
+    from chebsplat.formats.scene import Scene
     from chebsplat.labels.decode import decode_labels
 
-    gaussians = read_gaussians(job.inputs["gaussians"])
+    gaussians = Gaussians.read(job.inputs["gaussians"])
     if len(gaussians.parameters["means"]) == 0:
         raise DataFailure("the checkpoint holds no Gaussians; train the scene again with milder pruning")
     order = np.argsort(gaussians.parameters["degrees"], kind="stable")
@@ -44,7 +44,7 @@ def run(job: Job) -> None:
     elif "features" not in job.inputs:
         job.left_out("labels", "no --in-features: the label embeddings are unknown")
     else:
-        teacher = read_features(job.inputs["features"])
+        teacher = Features.read(job.inputs["features"])
         parameters["features"] = semantic[order]
         if semantic.shape[1] != teacher.label_embeddings.shape[1]:
             raise InputError(f"{job.inputs['features']} has other channels than the checkpoint; pass its own")
@@ -61,20 +61,20 @@ def run(job: Job) -> None:
     left_out = gaussians.notes.get("left_out", {}) | job.facts.get("left_out", {})
     summary = {"left_out": left_out, "by_degree": counts, "n_initial": gaussians.notes.get("n_initial")}
     scene = Scene(parameters, gaussians.cameras, order, **labelled, summary=summary)
-    sizes = write_scene(job.out, scene)
+    sizes = scene.write(job.out)
     job.facts |= {"n_gaussians": len(order), "by_degree": counts, "bytes": sizes}
 
 
 def later_features(job: Job, n: int) -> np.ndarray | None:
     """Features [n, C] made after training, refined before lifted; None where the trained ones are the scene's."""
-    from chebsplat.formats.lifted import read_lifted
-    from chebsplat.formats.refined import read_refined
+    from chebsplat.formats.lifted import Lifted
+    from chebsplat.formats.refined import Refined
 
-    readers: dict[str, Any] = {"refined": read_refined, "lifted": read_lifted}
-    role = next((role for role in readers if role in job.inputs), None)
+    records: dict[str, type[Refined | Lifted]] = {"refined": Refined, "lifted": Lifted}
+    role = next((role for role in records if role in job.inputs), None)
     if role is None:
         return None
-    features: np.ndarray = readers[role](job.inputs[role]).features
+    features: np.ndarray = records[role].read(job.inputs[role]).features
     if len(features) != n:
         raise InputError(f"{job.inputs[role]} is of {len(features)} Gaussians, not these {n}; make it again")
     return features

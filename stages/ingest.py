@@ -156,7 +156,7 @@ def run(job: Job) -> None:
     """
     import numpy as np
 
-    from chebsplat.formats.capture import Capture, write_capture
+    from chebsplat.formats.capture import Capture
 
     name, settings = job.config.scene.name, job.config.ingest
     source = resolve(name, job.config.source)
@@ -190,4 +190,4 @@ def run(job: Job) -> None:
     if len(capture.names) < n_views:
         job.left_out("views", f"{n_views - len(capture.names)} that ingest.max_train_views spares the training")
     job.facts |= {"source": capture.source, "n_views": len(capture.names), "n_test": int(np.sum(capture.is_test))}
-    write_capture(job.out, capture)
+    capture.write(job.out)

@@ -26,13 +26,12 @@ def run(job: Job) -> None:
 
     Reads `capture`, `gaussians` and `features`. Writes `lifted`.
     """
-    from chebsplat.formats.capture import read_capture
-    from chebsplat.formats.features import read_features
-    from chebsplat.formats.gaussians import read_gaussians
-    from chebsplat.formats.lifted import write_lifted
+    from chebsplat.formats.capture import Capture
+    from chebsplat.formats.features import Features
+    from chebsplat.formats.gaussians import Gaussians
 
-    capture, gaussians = read_capture(job.inputs["capture"]), read_gaussians(job.inputs["gaussians"])
-    features = read_features(job.inputs["features"])
+    capture, gaussians = Capture.read(job.inputs["capture"]), Gaussians.read(job.inputs["gaussians"])
+    features = Features.read(job.inputs["features"])
     lifted = lifted_from(capture, gaussians.cameras, gaussians.parameters, features, job.config.lift.gate, job.progress)
     n = len(lifted.features)
     job.facts |= {
@@ -41,7 +40,7 @@ def run(job: Job) -> None:
         "n_observations": lifted.notes["n_observations"],
         "n_views": len(lifted.notes["views"]),
     }
-    write_lifted(job.out, lifted)
+    lifted.write(job.out)
 
 
 def lifted_from(

@@ -30,7 +30,7 @@ def lift_ply(
     Returns: counts.
     Raises:  InputError on what cannot be read, DataFailure if no view sees a Gaussian.
     """
-    from chebsplat.formats.features import read_features
+    from chebsplat.formats.features import Features
     from chebsplat.stages import export, lift
     from chebsplat.stages.page import foreign
 
@@ -48,7 +48,7 @@ def lift_ply(
             (out / name).symlink_to(path.resolve())
     facts = artifact.read_manifest(out / "lift").facts
     return {"gaussians": facts["n_gaussians"], "seen by no view": facts["n_unseen"], "views": facts["n_views"],
-            "labels": len(read_features(features).label_names)}  # fmt: skip
+            "labels": len(Features.read(features).label_names)}  # fmt: skip
 
 
 def import_ply(ply: Path, out: Path) -> dict[str, Any]:
@@ -67,25 +67,25 @@ def import_ply(ply: Path, out: Path) -> dict[str, Any]:
 
 def taken_over(ply: Path, parameters: dict[str, np.ndarray], cameras: Cameras, out: Path) -> None:
     """Make the folder `out`, and in it `gaussians` of what a PLY holds."""
-    from chebsplat.formats.gaussians import SCHEMA, Gaussians, write_gaussians
+    from chebsplat.formats.gaussians import Gaussians
     from chebsplat.formats.manifest import Manifest
 
     out.mkdir(parents=True)
     given = {"path": ply.name, "sha256": artifact.sha256_file(ply)}
-    manifest = Manifest(SCHEMA, artifact.digest(given), "train", facts={"source": given})
+    manifest = Manifest(Gaussians.SCHEMA, artifact.digest(given), "train", facts={"source": given})
     with artifact.publish(out / "gaussians", manifest) as tmp:
-        write_gaussians(tmp, Gaussians(parameters, cameras, notes={"left_out": {"training": "the splat was given"}}))
+        Gaussians(parameters, cameras, notes={"left_out": {"training": "the splat was given"}}).write(tmp)
 
 
 def cameras_of(capture: Path, points: Path | None) -> Cameras:
     """The cameras of a capture, or of the points that were reconstructed from it. Raises InputError without poses."""
     from chebsplat.formats.cameras import Cameras
-    from chebsplat.formats.capture import read_capture
-    from chebsplat.formats.points import read_points
+    from chebsplat.formats.capture import Capture
+    from chebsplat.formats.points import Points
 
-    held = read_capture(capture)
+    held = Capture.read(capture)
     if points is not None:
-        found = read_points(points)
+        found = Points.read(points)
         return Cameras(found.names, found.Ks, found.cam_from_world, *held.size)
     if held.cam_from_world is None:
         raise InputError(f"{capture} has no poses; name the scene, whose sfm has them, or ingest a source with poses")

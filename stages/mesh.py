@@ -14,7 +14,6 @@ from chebsplat.labels.decode import decode_labels
 from chebsplat.stages.opened import OpenedScene
 from chebsplat.stages.progress import Progress
 
-N_TRIANGLES = 200_000  # at most
 N_VOXELS = 250  # along the longest side of the room, where no voxel is asked for
 OPAQUE = 0.6  # least coverage of a pixel whose depth counts
 STEP = 0.05  # of its depth, by which a neighbouring pixel may lie deeper: beyond, a pixel is on an edge

@@ -29,12 +29,12 @@ def run(job: Job) -> None:
     import onnx
 
     from chebsplat.formats.encoder import DYNAMIC, FLOAT, FUSED, write_encoder
-    from chebsplat.formats.gaussians import read_gaussians
+    from chebsplat.formats.gaussians import Gaussians
     from chebsplat.stages.onnx_graphs import encoder_model, fusion_model
     from chebsplat.stages.restored import restored_encoder, trained_with
 
     path = job.inputs["gaussians"]
-    gaussians = read_gaussians(path)
+    gaussians = Gaussians.read(path)
     encoder = restored_encoder(gaussians)
     config = trained_with(path)
     fusion = restored_fusion(gaussians, encoder.n_channels, config["train"])

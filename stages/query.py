@@ -101,9 +101,9 @@ class Relevancy:
 def taught(path: Path) -> tuple[Features, str | None]:
     """A scene's `features` artifact, and the model that it was made with; None: the embedded one."""
     from chebsplat.formats.artifact import read_manifest
-    from chebsplat.formats.features import read_features
+    from chebsplat.formats.features import Features
 
-    return read_features(path), read_manifest(path).config["teacher"]["model"]
+    return Features.read(path), read_manifest(path).config["teacher"]["model"]
 
 
 def is_closed(features: Features) -> bool:

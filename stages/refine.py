@@ -25,17 +25,17 @@ def run(job: Job) -> None:
     Reads `gaussians` and `lifted`, for the scene's unit `capture`, for what knowledge says `knowledge`, `points` and
     `features`, by which the share of labels that change is counted, too. Writes `refined`.
     """
-    from chebsplat.formats.capture import read_capture
-    from chebsplat.formats.features import read_features
-    from chebsplat.formats.gaussians import read_gaussians
-    from chebsplat.formats.lifted import read_lifted
-    from chebsplat.formats.refined import Refined, write_refined
+    from chebsplat.formats.capture import Capture
+    from chebsplat.formats.features import Features
+    from chebsplat.formats.gaussians import Gaussians
+    from chebsplat.formats.lifted import Lifted
+    from chebsplat.formats.refined import Refined
     from chebsplat.lifting.blend import blend, calibrate, confidence, effective, familiar, reliable, start, trusted
     from chebsplat.lifting.smoothing import affinities, smooth
     from chebsplat.splats.gaussians import surface_of
 
     settings = job.config.refine
-    gaussians, lifted = read_gaussians(job.inputs["gaussians"]), read_lifted(job.inputs["lifted"])
+    gaussians, lifted = Gaussians.read(job.inputs["gaussians"]), Lifted.read(job.inputs["lifted"])
     p = gaussians.parameters
     if len(p["means"]) == 0:
         raise DataFailure("the checkpoint holds no Gaussians; train the scene again with milder pruning")
@@ -44,7 +44,7 @@ def run(job: Job) -> None:
             f"{job.inputs['lifted']} is of {len(lifted.features)} Gaussians, not {len(p['means'])}; lift again"
         )
     trained = p.get("fused", p.get("features"))
-    capture = read_capture(job.inputs["capture"]) if "capture" in job.inputs else None
+    capture = Capture.read(job.inputs["capture"]) if "capture" in job.inputs else None
     started = settings.start
     if started == "auto":  # Gaussians that no depth has placed lie where they look right, which lifting asks nothing of
         started = "both" if capture is None or capture.depth is not None else "trained"
@@ -63,14 +63,14 @@ def run(job: Job) -> None:
     made = [features, smooth(features, lifted.n_views, near) if smoothed else features]
     made.append(made[1])
     if knowledge is not None:
-        known_to_teacher = familiar(lifted.features, knowledge, read_features(job.inputs["features"]).label_embeddings)
+        known_to_teacher = familiar(lifted.features, knowledge, Features.read(job.inputs["features"]).label_embeddings)
         evidence = effective(lifted.n_views) * reliable(lifted.halves, lifted.half_views) * known_to_teacher
         blended = blend(made[1], evidence, knowledge, strength)
         made[2] = smooth(blended, evidence + trusted(knowledge, strength), near) if smoothed else blended
     curve = {name: {f"{k:g}": value for k, value in row.items()} for name, row in choice.curve.items()}
     notes = {"start": started, "smooth": smoothed, "strength": strength, "familiar": known_to_teacher, "curve": curve}
     sure = confidence(made[1], lifted.n_views, lifted.agreement, knowledge, strength, known_to_teacher)
-    write_refined(job.out, Refined(made[2], sure, notes))
+    Refined(made[2], sure, notes).write(job.out)
     job.facts |= {"n_gaussians": len(features), "unit": unit, **notes} | shares(job, made)
 
 
@@ -82,8 +82,8 @@ def known(job: Job, gaussians: Gaussians, capture: Capture | None, unit: float) 
       to tell. Without either knowledge is left out by default: Gaussians that ten photos have placed show a surface on
       which shape alone is right for half of them.
     """
-    from chebsplat.formats.features import read_features
-    from chebsplat.formats.points import read_points
+    from chebsplat.formats.features import Features
+    from chebsplat.formats.points import Points
     from chebsplat.lifting.carry import carry
     from chebsplat.splats.gaussians import surface_of
     from chebsplat.stages.known_shapes import known_shapes, measured, shown, swept
@@ -92,7 +92,7 @@ def known(job: Job, gaussians: Gaussians, capture: Capture | None, unit: float) 
         return None
     if absent := [role for role in ("points", "features") if role not in job.inputs]:
         raise ConfigError(f"knowledge is of points and a teacher; pass --in-{absent[0]}, too")
-    points, features = read_points(job.inputs["points"]), read_features(job.inputs["features"])
+    points, features = Points.read(job.inputs["points"]), Features.read(job.inputs["features"])
     p, cameras = gaussians.parameters, gaussians.cameras
     source = "rendered depth" if job.config.refine.surface == "rendered" else "swept depth"
     if capture is None or capture.depth is not None:
@@ -151,12 +151,12 @@ def scene_unit(job: Job, capture: Capture | None, means: np.ndarray) -> float:
 
 def shares(job: Job, made: list[np.ndarray]) -> dict[str, Any]:
     """Share of the Gaussians whose label smoothing changes, and knowledge after it."""
-    from chebsplat.formats.features import read_features
+    from chebsplat.formats.features import Features
     from chebsplat.labels.decode import decode_labels
 
     if "features" not in job.inputs:
         return {}
-    embeddings = read_features(job.inputs["features"]).label_embeddings
+    embeddings = Features.read(job.inputs["features"]).label_embeddings
     if embeddings.shape[1] != made[0].shape[1]:
         raise InputError(f"{job.inputs['features']} has other channels than the checkpoint; pass its own")
     labels = [decode_labels(features, embeddings) for features in made]

@@ -51,14 +51,14 @@ def run(job: Job) -> None:
     import shlex
 
     from chebsplat.formats.artifact import read_manifest
-    from chebsplat.formats.evaluation import read_evaluation
-    from chebsplat.formats.gaussians import read_gaussians
+    from chebsplat.formats.evaluation import Evaluation
+    from chebsplat.formats.gaussians import Gaussians
     from chebsplat.stages.pages import parts
     from chebsplat.stages.pages import pictures as draw
     from chebsplat.stages.pages.template import REPORT, rendered
 
-    evaluation = read_evaluation(job.inputs["evaluation"])
-    gaussians = read_gaussians(job.inputs["gaussians"])
+    evaluation = Evaluation.read(job.inputs["evaluation"])
+    gaussians = Gaussians.read(job.inputs["gaussians"])
     if not gaussians.trace:
         raise DataFailure("the training left no trace of error against run time; train the scene again")
     manifests = {role: read_manifest(job.inputs[role]) for role in STAGE_OF if role in job.inputs}

@@ -34,11 +34,11 @@ def run(job: Job) -> None:
     import numpy as np
 
     from chebsplat.cameras import centers
-    from chebsplat.formats.capture import read_capture
-    from chebsplat.formats.points import Points, write_points
+    from chebsplat.formats.capture import Capture
+    from chebsplat.formats.points import Points
     from chebsplat.splats.gaussians import local_shape
 
-    settings, capture = job.config.sfm, read_capture(job.inputs["capture"])
+    settings, capture = job.config.sfm, Capture.read(job.inputs["capture"])
     spares = capture.points is not None or capture.depth is not None
     given = capture.cam_from_world is not None and settings.matching == "auto" and spares
     adjusted = wants_adjustment(job, capture, settings) if given else None  # otherwise all matches tell
@@ -69,21 +69,18 @@ def run(job: Job) -> None:
     away = np.einsum("ni,ni->n", normals, eye - means) < 0
     normals[away] *= -1
     job.facts |= {"n_points": len(means), "n_views": len(cloud["names"])} | cloud["notes"]
-    write_points(
-        job.out,
-        Points(
-            cloud["names"],
-            cloud["Ks"],
-            cloud["cam_from_world"],
-            means,
-            cloud["colors"],
-            normals,
-            covariances,
-            cloud["tracks"],
-            cloud["notes"],
-            depths,
-        ),
-    )
+    Points(
+        cloud["names"],
+        cloud["Ks"],
+        cloud["cam_from_world"],
+        means,
+        cloud["colors"],
+        normals,
+        covariances,
+        cloud["tracks"],
+        cloud["notes"],
+        depths,
+    ).write(job.out)
 
 
 def filled(cloud: Cloud, more: Cloud, count: int, spacing: str = "even", name: str = "n_from_depth") -> Cloud:

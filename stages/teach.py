@@ -34,7 +34,7 @@ def run(job: Job) -> None:
     """
     import numpy as np
 
-    from chebsplat.formats.channels import read_channels
+    from chebsplat.formats.channels import ChannelMap
     from chebsplat.formats.knowledge import Knowledge, write_knowledge
     from chebsplat.formats.teacher_model import EMBEDDED, read_teacher
     from chebsplat.settings import DescribeSection
@@ -43,7 +43,7 @@ def run(job: Job) -> None:
     from chebsplat.stages.text import found
     from chebsplat.synthetic import CLASS_NAMES
 
-    settings, channels = job.config.knowledge, read_channels(job.inputs["channels"])
+    settings, channels = job.config.knowledge, ChannelMap.read(job.inputs["channels"])
     teacher = read_teacher(Path(settings.model) if settings.model else EMBEDDED)
     if teacher.output != "features":
         raise ConfigError(f"{teacher.settings}: output is {teacher.output}; knowledge is taught in features")

@@ -22,17 +22,16 @@ def run(job: Job) -> None:
 
     Reads `capture` and, where an ONNX teacher's channels are reduced, `channels`. Writes `features`.
     """
-    from chebsplat.formats.capture import read_capture
-    from chebsplat.formats.features import write_features
+    from chebsplat.formats.capture import Capture
 
-    settings, capture = job.config.teacher, read_capture(job.inputs["capture"])
+    settings, capture = job.config.teacher, Capture.read(job.inputs["capture"])
     if settings.kind == "none":
         raise ConfigError("teacher.kind is none: this scene has no teacher; leave the stage out")
     if settings.kind in ("labels", "given"):
         make = from_labels if settings.kind == "labels" else from_pseudo_labels
         features = make(job, capture, settings)
         job.facts |= {"kind": settings.kind, "n_labels": len(features.label_names), "convention": features.convention}
-        write_features(job.out, features)
+        features.write(job.out)
     else:
         from_onnx(job, capture, settings)
 
@@ -44,7 +43,7 @@ def from_onnx(job: Job, capture: Capture, settings: TeacherSection) -> None:
     """
     from pathlib import Path
 
-    from chebsplat.formats.channels import read_channels
+    from chebsplat.formats.channels import ChannelMap
     from chebsplat.formats.features import FeatureWriter
     from chebsplat.formats.teacher_model import EMBEDDED, read_teacher
     from chebsplat.stages.command import n_threads
@@ -63,7 +62,7 @@ def from_onnx(job: Job, capture: Capture, settings: TeacherSection) -> None:
         space = closed_set(teacher, labels, n_channels, settings.n_channels)
     else:
         if "channels" in job.inputs:
-            channels = read_channels(job.inputs["channels"])
+            channels = ChannelMap.read(job.inputs["channels"])
         elif n_channels > MAX_CHANNELS:
             raise ConfigError(
                 f"{teacher.path} has {n_channels} channels, at most {MAX_CHANNELS} can be rendered; use "

@@ -42,16 +42,16 @@ def run(job: Job) -> None:
     """
     from chebsplat.cameras import extent
     from chebsplat.formats.cameras import Cameras
-    from chebsplat.formats.capture import read_capture
-    from chebsplat.formats.features import read_features
-    from chebsplat.formats.gaussians import Gaussians, write_gaussians
-    from chebsplat.formats.points import read_points
+    from chebsplat.formats.capture import Capture
+    from chebsplat.formats.features import Features
+    from chebsplat.formats.gaussians import Gaussians
+    from chebsplat.formats.points import Points
 
     train = job.config.train
-    capture, given = read_capture(job.inputs["capture"]), read_points(job.inputs["points"])
+    capture, given = Capture.read(job.inputs["capture"]), Points.read(job.inputs["points"])
     descriptors, points = described(job, given), within_cap(job, given)
     taught = "features" in job.inputs and train.semantics and train.features == "trained"
-    features = read_features(job.inputs["features"]) if taught else None
+    features = Features.read(job.inputs["features"]) if taught else None
     train, without_depth = with_depth_loss(with_feature_loss(train, features), capture, points)
     if without_depth:
         job.left_out("depth loss", without_depth)
@@ -113,7 +113,7 @@ def run(job: Job) -> None:
     if job.device == "cuda":
         job.facts["peak_device_bytes"] = torch.cuda.max_memory_allocated()
     job.facts["milliseconds"] = {part: 1e3 * seconds / timed for part, seconds in trainer.laps.seconds.items()}
-    write_gaussians(job.out, Gaussians(parameters, cameras, modules, trace, notes))
+    Gaussians(parameters, cameras, modules, trace, notes).write(job.out)
 
 
 def agreement(alone: np.ndarray, features: np.ndarray, embeddings: np.ndarray) -> dict[str, float]:

@@ -7,11 +7,11 @@ from chebsplat.formats import artifact
 from chebsplat.formats.artifact import sha256_file
 from chebsplat.formats.calibration import TeacherCalibration, beside, write_calibration
 from chebsplat.formats.cameras import Cameras
-from chebsplat.formats.features import Features, write_features
+from chebsplat.formats.features import Features
 from chebsplat.formats.manifest import Manifest
 from chebsplat.formats.packed import C0
 from chebsplat.formats.ply import write_ply
-from chebsplat.formats.scene import Scene, read_scene, write_scene
+from chebsplat.formats.scene import Scene
 from chebsplat.labels.calibration import Calibration
 
 LABELS = ["wall", "floor", "ceiling", "sofa", "chair"]
@@ -85,13 +85,13 @@ def made(folder, calibrated=False):
     cameras = Cameras(views, np.stack([K] * 3), poses, *SIZE)
     held = Scene(parameters, cameras, order, labels, LABELS, words()[:5])
     with artifact.publish(folder / "export", Manifest("chebsplat.scene/3", KEY, "export")) as tmp:
-        write_scene(tmp, held)
+        held.write(tmp)
     convention = {"kind": "onnx", "output": "features", "sha256": sha256_file(model)}
     features = Features(views, np.zeros((3, 2, 2, 8), np.float16), LABELS, words()[:5], convention=convention)
     facts = {"config": {"teacher": {"model": str(model)}}}
     with artifact.publish(folder / "teacher", Manifest("chebsplat.features/2", KEY, "teacher", **facts)) as tmp:
-        write_features(tmp, features)
-    return folder, read_scene(folder / "export")
+        features.write(tmp)
+    return folder, Scene.read(folder / "export")
 
 
 def foreign_ply(path, n=300):

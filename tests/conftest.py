@@ -50,26 +50,26 @@ def mixed(toy, tmp_path_factory):
     import numpy as np
 
     from chebsplat.formats import artifact
-    from chebsplat.formats.gaussians import read_gaussians
+    from chebsplat.formats.gaussians import Gaussians
     from chebsplat.formats.manifest import Manifest
-    from chebsplat.formats.scene import SCHEMA, read_scene, write_scene
+    from chebsplat.formats.scene import Scene
 
-    checkpoint = read_gaussians(toy["train"])
+    checkpoint = Gaussians.read(toy["train"])
     p = checkpoint.parameters
     rng = np.random.default_rng(0)
     p["degrees"] = rng.integers(0, 4, len(p["means"])).astype(np.uint8)
     p["shN"] = rng.normal(0, 0.2, p["shN"].shape).astype(np.float32)
     for degree, n_rest in enumerate((0, 3, 8)):
         p["shN"][p["degrees"] == degree, n_rest:] = 0
-    before = read_scene(toy["export"])
+    before = Scene.read(toy["export"])
     order = np.argsort(p["degrees"], kind="stable")
     back = np.argsort(before.order)
     before.parameters = {name: values[back][order] for name, values in before.parameters.items()}
     before.parameters |= {name: p[name][order] for name in ("degrees", "shN")}
     before.labels, before.order = before.labels[back][order], order
     path = tmp_path_factory.mktemp("mixed") / "scene"
-    with artifact.publish(path, Manifest(SCHEMA, KEY, "test")) as tmp:
-        write_scene(tmp, before)
+    with artifact.publish(path, Manifest(Scene.SCHEMA, KEY, "test")) as tmp:
+        before.write(tmp)
     return checkpoint, path
 
 

@@ -87,6 +87,16 @@ def gaussian_parameters(n=6, seed=0):
     return {k: rng.normal(size=s).astype(np.float32) for k, s in shapes.items()} | {"shN": shN, "degrees": degrees}
 
 
+def published(path, record, **facts):
+    """Publish a record as an artifact of its kind; returns its path."""
+    from chebsplat.formats import artifact
+    from chebsplat.formats.manifest import Manifest
+
+    with artifact.publish(path, Manifest(record.SCHEMA, KEY, "test", **facts)) as tmp:
+        record.write(tmp)
+    return path
+
+
 def data(name):
     """A folder of third-party data, or a skip that names it."""
     if not (DATA / name).is_dir():

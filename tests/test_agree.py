@@ -8,7 +8,7 @@ from malformed.artifacts import LABELS, N, artifacts
 from shared import KEY, run_stage
 
 from chebsplat.formats import capture, points
-from chebsplat.formats.agreement import read_agreement
+from chebsplat.formats.agreement import ViewAgreement
 from chebsplat.formats.artifact import publish, read_manifest
 from chebsplat.formats.manifest import Manifest
 from chebsplat.labels.agreement import between, far_pairs, project, unhidden
@@ -90,7 +90,7 @@ def test_the_stage_warns_of_a_teacher_that_says_one_thing_and_records_it(tmp_pat
     """The small features have label 0 everywhere."""
     inputs = {role: artifacts() / name for role, name in INPUTS.items()}
     assert run_stage("agree", tmp_path / "out", inputs, {}) == 0
-    found, facts = read_agreement(tmp_path / "out"), read_manifest(tmp_path / "out").facts
+    found, facts = ViewAgreement.read(tmp_path / "out"), read_manifest(tmp_path / "out").facts
     assert found.agreement == facts["agreement"] == 0
     assert 0 < found.n_points <= N and list(found.labels) == LABELS[:1]
     told = [line for line in capsys.readouterr().err.splitlines() if "does not know this scene" in line]
@@ -102,26 +102,26 @@ def test_the_stage_warns_of_a_teacher_that_says_one_thing_and_records_it(tmp_pat
 def with_points(path, **changes):
     """The small points, changed."""
     with publish(path, Manifest(points.SCHEMA, KEY, "test")) as tmp:
-        points.write_points(tmp, replace(points.read_points(artifacts() / "sfm"), **changes))
+        replace(points.Points.read(artifacts() / "sfm"), **changes).write(tmp)
     return path
 
 
 def test_points_that_no_two_views_see_leave_the_figure_open(tmp_path, capsys):
-    means = points.read_points(artifacts() / "sfm").means + 1000
+    means = points.Points.read(artifacts() / "sfm").means + 1000
     far = with_points(tmp_path / "far", means=means)
     inputs = {role: artifacts() / name for role, name in INPUTS.items()} | {"points": far}
     assert run_stage("agree", tmp_path / "out", inputs, {}) == 0
-    assert read_agreement(tmp_path / "out").agreement is None
+    assert ViewAgreement.read(tmp_path / "out").agreement is None
     assert "not known" in capsys.readouterr().err
 
 
 def test_tracks_tell_who_sees_a_point_where_there_is_no_depth(tmp_path):
-    record = capture.read_capture(artifacts() / "ingest")
+    record = capture.Capture.read(artifacts() / "ingest")
     record.depth = None
     with publish(tmp_path / "capture", Manifest(capture.SCHEMA, KEY, "test")) as tmp:
-        capture.write_capture(tmp, record)
+        record.write(tmp)
     tracks = np.array([[0, 1], [0, 2], [1, 1], [2, 0], [2, 2]], np.int32)  # view 0 is a test view
     tracked = with_points(tmp_path / "tracked", tracks=tracks)
     inputs = {"capture": tmp_path / "capture", "points": tracked, "features": artifacts() / "teacher"}
     assert run_stage("agree", tmp_path / "out", inputs, {}) == 0
-    assert read_agreement(tmp_path / "out").n_points == 1  # of the three, one is in two training views
+    assert ViewAgreement.read(tmp_path / "out").n_points == 1  # of the three, one is in two training views

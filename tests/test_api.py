@@ -6,7 +6,7 @@ import pytest
 import chebsplat
 from chebsplat.errors import ConfigError
 from chebsplat.formats.ply import read_ply
-from chebsplat.formats.scene import read_scene
+from chebsplat.formats.scene import Scene
 from chebsplat.pipelines.api import as_text
 
 
@@ -16,7 +16,7 @@ def scene(toy):
 
 
 def test_what_is_opened_is_the_exported_scene(scene, toy):
-    held = read_scene(toy["export"])
+    held = Scene.read(toy["export"])
     assert len(scene) == len(held.parameters["means"])
     assert scene.features.shape == (len(scene), held.label_embeddings.shape[1])
     assert [camera.name for camera in scene.cameras] == held.cameras.names
@@ -27,7 +27,7 @@ def test_a_render_is_the_one_that_was_evaluated(scene, toy):
     from chebsplat.render import SceneRenderer
     from chebsplat.stages.evaluate import camera
 
-    held, shown = read_scene(toy["export"]), scene.render(scene.cameras[2])
+    held, shown = Scene.read(toy["export"]), scene.render(scene.cameras[2])
     image, features = SceneRenderer(held.parameters).render(camera(held, 2), with_features=True)
     np.testing.assert_array_equal(shown.color, image)
     np.testing.assert_array_equal(shown.features, features)
@@ -37,9 +37,9 @@ def test_a_render_is_the_one_that_was_evaluated(scene, toy):
 
 
 def test_depth_is_that_of_the_room(scene, toy):
-    from chebsplat.formats.capture import read_capture
+    from chebsplat.formats.capture import Capture
 
-    capture = read_capture(toy["ingest"])
+    capture = Capture.read(toy["ingest"])
     errors = []
     for name in scene.cameras[0].name, scene.cameras[3].name:
         view, truth = scene.camera(name), capture.depth[capture.names.index(name)]

@@ -8,7 +8,7 @@ from shared import KEY
 
 from chebsplat.errors import InputError
 from chebsplat.formats import artifact
-from chebsplat.formats.channels import SCHEMA, ChannelMap, read_channels, write_channels
+from chebsplat.formats.channels import ChannelMap
 from chebsplat.formats.manifest import Manifest
 from chebsplat.labels.channels import ROWS, Moments, channel_map
 
@@ -126,13 +126,13 @@ def made(path):
     matrix, energy = channel_map(moments(low_rank(8, 12)), words(12), 5)
     matrix32 = matrix.astype(np.float32)
     record = ChannelMap(matrix32, matrix32.T.copy(), energy.astype(np.float32), "lseg", {"n_pixels": 400})
-    with artifact.publish(path, Manifest(SCHEMA, KEY, "channels")) as tmp:
-        write_channels(tmp, record)
+    with artifact.publish(path, Manifest(ChannelMap.SCHEMA, KEY, "channels")) as tmp:
+        record.write(tmp)
     return record
 
 
 def test_a_channel_map_reads_back_and_restores(tmp_path):
-    record, found = made(tmp_path / "p"), read_channels(tmp_path / "p")
+    record, found = made(tmp_path / "p"), ChannelMap.read(tmp_path / "p")
     assert (found.teacher, found.notes) == ("lseg", {"n_pixels": 400})
     assert all(np.array_equal(getattr(found, k), getattr(record, k)) for k in ("matrix", "inverse", "energy"))
     features = low_rank(8, 12).reshape(20, 20, 12)
@@ -148,4 +148,4 @@ def test_a_damaged_channel_map_is_named_with_its_remedy(tmp_path, name):
     good = file.read_bytes()
     file.write_bytes(good[:-1] + bytes([good[-1] ^ 1]))
     with pytest.raises(InputError, match=rf"{name} does not match its sha256; delete .* run its stage again"):
-        read_channels(tmp_path / "p")
+        ChannelMap.read(tmp_path / "p")

@@ -9,7 +9,7 @@ from shared import ROOT, run_stage
 from tiny_teachers import color_reference, color_teacher, write_settings, write_table
 
 from chebsplat.formats.artifact import read_manifest
-from chebsplat.formats.channels import SCHEMA, read_channels
+from chebsplat.formats.channels import ChannelMap
 from chebsplat.formats.images import SUFFIXES
 from chebsplat.formats.teacher_model import EMBEDDED, read_teacher
 from chebsplat.pipelines.plan import Planner
@@ -34,7 +34,7 @@ def tiny(tmp_path, monkeypatch):
 def reduced(tmp_path, model, reference, **settings):
     values = {"model": str(model), "reference": None if reference is None else str(reference)} | settings
     code = run_stage("channels", tmp_path / "out", {}, {"channels": {k: v for k, v in values.items() if v}})
-    return code, read_channels(tmp_path / "out") if code == 0 else None
+    return code, ChannelMap.read(tmp_path / "out") if code == 0 else None
 
 
 def test_a_teacher_is_reduced_to_the_channels_that_its_features_span(tmp_path, tiny):
@@ -43,14 +43,14 @@ def test_a_teacher_is_reduced_to_the_channels_that_its_features_span(tmp_path, t
     assert found.matrix.shape == (6, 3)
     assert found.energy[2] == pytest.approx(1)
     assert (found.notes["n_pixels"], found.notes["n_words"], found.notes["n_images"]) == (2 * 12 * 16, 3, 2)
-    facts = read_manifest(tmp_path / "out", SCHEMA).facts
+    facts = read_manifest(tmp_path / "out", ChannelMap.SCHEMA).facts
     assert (facts["n_channels"], facts["of"], facts["label_agreement"]) == (3, 6, 1.0)
     assert facts["relative_error"] < 1e-3
 
 
 def test_fewer_channels_lose_what_the_facts_say(tmp_path, tiny):
     _, found = reduced(tmp_path, *tiny, n_channels=2)
-    facts = read_manifest(tmp_path / "out", SCHEMA).facts
+    facts = read_manifest(tmp_path / "out", ChannelMap.SCHEMA).facts
     assert found.matrix.shape == (6, 2)
     assert facts["relative_error"] == pytest.approx((1 - found.energy[1]) ** 0.5, rel=1e-4)
     assert 0.05 < facts["relative_error"] < 1
@@ -64,7 +64,7 @@ def test_a_teacher_without_a_table_is_reduced_by_energy_alone(tmp_path, tiny):
     write_settings(model, multiple=4, labels=None, text=model.name, tokenizer=tokens.name)
     code, _ = reduced(tmp_path, model, reference)
     assert code == 0
-    facts = read_manifest(tmp_path / "out", SCHEMA).facts
+    facts = read_manifest(tmp_path / "out", ChannelMap.SCHEMA).facts
     assert "vocabulary" in facts["left_out"]
     assert facts["n_words"] == 0
 
@@ -78,7 +78,7 @@ def test_a_map_beside_its_teacher_is_taken_as_long_as_it_is_of_the_same_files_an
     for is_taken in (True, False):
         code, found = reduced(tmp_path, model, reference)
         assert code == 0
-        facts = read_manifest(tmp_path / "out", SCHEMA).facts
+        facts = read_manifest(tmp_path / "out", ChannelMap.SCHEMA).facts
         assert ("reference images" in facts.get("left_out", {})) == is_taken
         assert (facts["n_channels"], facts["n_images"]) == (3, 2)
         assert np.array_equal(found.matrix, computed.matrix) and found.notes["digest"] == facts["digest"]
@@ -108,7 +108,7 @@ def test_the_embedded_teacher_brings_its_map():
 def test_the_map_that_ships_is_what_its_stage_computes(tmp_path, monkeypatch):
     monkeypatch.setattr(channels, "shipped", lambda *_: None)
     assert run_stage("channels", tmp_path / "out", {}, {}) == 0
-    computed, brought = read_channels(tmp_path / "out"), read_channels(read_teacher(EMBEDDED).channels)
+    computed, brought = ChannelMap.read(tmp_path / "out"), ChannelMap.read(read_teacher(EMBEDDED).channels)
     assert np.abs(computed.matrix - brought.matrix).max() < 1e-5
     assert computed.notes == brought.notes
 

@@ -10,9 +10,9 @@ from click.testing import CliRunner
 from shared import ROOT
 
 from chebsplat.formats.encoder import DYNAMIC, FLOAT, FUSED, read_encoder
-from chebsplat.formats.gaussians import read_gaussians
+from chebsplat.formats.gaussians import Gaussians
 from chebsplat.formats.ply import read_ply, write_ply
-from chebsplat.formats.scene import read_scene
+from chebsplat.formats.scene import Scene
 from chebsplat.pipelines.cli import main
 
 pytestmark = pytest.mark.xdist_group("toy")
@@ -40,7 +40,7 @@ def restored(toy):
     from chebsplat.stages.onnx import restored_fusion
     from chebsplat.stages.restored import trained_with
 
-    held = read_gaussians(toy["train"])
+    held = Gaussians.read(toy["train"])
     encoder = RegionEncoder.restored(*held.encoder())
     return encoder, restored_fusion(held, encoder.n_channels, trained_with(toy["train"])["train"])
 
@@ -106,7 +106,7 @@ def test_contract_is_what_the_models_take_and_give_and_lies_in_their_metadata(to
 
 def test_encode_gives_the_scene_s_fused_features_without_torch(toy, mixed, tmp_path):
     checkpoint, path = mixed
-    scene = read_scene(path)
+    scene = Scene.read(path)
     assert not np.array_equal(scene.order, np.arange(len(scene.order)))
     program = (
         "import sys; sys.modules['torch'] = None\n"
@@ -136,7 +136,7 @@ def test_the_quantised_model_is_chosen_by_naming_it(toy, tmp_path):
 
 
 def test_a_ply_with_features_encodes_like_its_scene(toy, tmp_path):
-    scene = read_scene(toy["export"])
+    scene = Scene.read(toy["export"])
     p, degree, _ = read_ply(toy["export"] / "scene.ply")
     trained = np.argsort(scene.order)  # the regions depend on the order, of which a PLY says nothing
     write_ply(tmp_path / "scene.ply", {name: values[trained] for name, values in p.items()}, degree)

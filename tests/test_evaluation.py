@@ -4,16 +4,16 @@ import numpy as np
 import pytest
 import torch
 from safetensors.torch import save_file
-from shared import INPUTS, run_stage
-from test_stages import changed, inputs_of, published
+from shared import INPUTS, published, run_stage
+from test_stages import changed, inputs_of
 
 from chebsplat.errors import InputError
 from chebsplat.evaluation.lpips import BLOCKS, SCALE, SHIFT, Lpips
 from chebsplat.formats import artifact
-from chebsplat.formats.capture import read_capture, write_capture
-from chebsplat.formats.evaluation import read_evaluation
-from chebsplat.formats.features import read_features, write_features
-from chebsplat.formats.scene import read_scene
+from chebsplat.formats.capture import Capture
+from chebsplat.formats.evaluation import Evaluation
+from chebsplat.formats.features import Features
+from chebsplat.formats.scene import Scene
 from chebsplat.stages.fidelity import image_figures, perceptual
 
 
@@ -114,7 +114,7 @@ def test_lpips_given_weights_and_the_time_by_part_are_in_the_evaluation(toy, wei
     save_file(weights, tmp_path / "vgg.safetensors")
     config = changed(evaluate={"lpips_weights": str(tmp_path / "vgg.safetensors"), "timing_repeats": 1})
     assert run_stage("evaluate", tmp_path / "out", inputs_of(toy, "evaluate"), config) == 0
-    figures = read_evaluation(tmp_path / "out").figures
+    figures = Evaluation.read(tmp_path / "out").figures
     assert figures["lpips"] > 0 and figures["lpips_net"] == {"net": "vgg", "normalize": False}
     assert "LPIPS" not in figures["left_out"]
     split = figures["milliseconds"]
@@ -122,9 +122,9 @@ def test_lpips_given_weights_and_the_time_by_part_are_in_the_evaluation(toy, wei
     assert (split["width"], split["height"], split["device"]) == (96, 72, "cpu") and split["threads"] >= 1
     config = changed(evaluate={"timing_repeats": 0})
     assert run_stage("evaluate", tmp_path / "untimed", inputs_of(toy, "evaluate"), config) == 0
-    untimed = read_evaluation(tmp_path / "untimed").figures
+    untimed = Evaluation.read(tmp_path / "untimed").figures
     assert untimed["frames_per_second"] == untimed["milliseconds"] == {} and "frames a second" in untimed["left_out"]
-    without = read_evaluation(toy["evaluate"]).figures
+    without = Evaluation.read(toy["evaluate"]).figures
     assert without["lpips"] is None and "not measured" in without["left_out"]["LPIPS"]
 
 
@@ -134,7 +134,7 @@ def test_the_clocked_steps_render_the_same_frame(toy):
     from chebsplat.render import SceneRenderer
     from chebsplat.stages.evaluate import camera
 
-    scene = read_scene(toy["export"])
+    scene = Scene.read(toy["export"])
     renderer = SceneRenderer(scene.parameters)
     for k in range(3):
         view = camera(scene, k)
@@ -144,7 +144,7 @@ def test_the_clocked_steps_render_the_same_frame(toy):
 @pytest.mark.xdist_group("toy")
 def test_views_of_capture_and_teacher_in_another_order_change_no_figure(toy, tmp_path):
     rng = np.random.default_rng(0)
-    capture, features = read_capture(toy["ingest"]), read_features(toy["teacher"])
+    capture, features = Capture.read(toy["ingest"]), Features.read(toy["teacher"])
     for record, parts in ((capture, ("images", "depth", "labels", "Ks", "cam_from_world", "is_test")),
                           (features, ("features", "pseudo_labels", "confidence"))):  # fmt: skip
         order = rng.permutation(len(record.names))
@@ -152,26 +152,26 @@ def test_views_of_capture_and_teacher_in_another_order_change_no_figure(toy, tmp
             setattr(record, part, np.asarray(getattr(record, part)[:])[order])
         record.names = [record.names[k] for k in order]
     inputs = inputs_of(toy, "evaluate") | {
-        "capture": published(tmp_path / "c", "chebsplat.capture/2", write_capture, capture),
-        "features": published(tmp_path / "f", "chebsplat.features/2", write_features, features),
+        "capture": published(tmp_path / "c", capture),
+        "features": published(tmp_path / "f", features),
     }
     assert run_stage("evaluate", tmp_path / "out", inputs) == 0
-    found, wanted = (read_evaluation(path).figures for path in (tmp_path / "out", toy["evaluate"]))
+    found, wanted = (Evaluation.read(path).figures for path in (tmp_path / "out", toy["evaluate"]))
     for part in ("names", "image", "segmentation"):
         assert found[part] == wanted[part]
 
 
 @pytest.mark.xdist_group("toy")
 def test_points_are_measured_where_depth_and_poses_say_where_they_lie(toy, tmp_path):
-    measured = read_evaluation(toy["evaluate"]).figures["segmentation"]
+    measured = Evaluation.read(toy["evaluate"]).figures["segmentation"]
     for side in ("scene", "teacher"):  # other weights of the same surfaces
         assert 0 < abs(measured[side]["point_miou"] - measured[side]["miou"]) < 0.1
-    record = read_capture(toy["ingest"])
+    record = Capture.read(toy["ingest"])
     record.depth = None
     inputs = inputs_of(toy, "evaluate")
-    inputs["capture"] = published(tmp_path / "c", "chebsplat.capture/2", write_capture, record)
+    inputs["capture"] = published(tmp_path / "c", record)
     assert run_stage("evaluate", tmp_path / "out", inputs) == 0
-    figures = read_evaluation(tmp_path / "out").figures
+    figures = Evaluation.read(tmp_path / "out").figures
     assert figures["segmentation"]["scene"]["point_miou"] is None
     assert "depth" in figures["left_out"]["3D point mIoU"]
     assert figures["segmentation"]["scene"]["miou"] == measured["scene"]["miou"]
@@ -202,7 +202,7 @@ def test_a_scannet_scene_runs_from_its_folder_to_the_figures_of_scannet_open(tmp
         made[stage] = tmp_path / stage
         assert run_stage(stage, made[stage], roles, config) == 0, stage
     assert artifact.read_manifest(made["sfm"]).facts["how"] == "source"
-    figures = read_evaluation(made["evaluate"]).figures
+    figures = Evaluation.read(made["evaluate"]).figures
     assert len(figures["names"]) == 16
     matrix = np.array(figures["segmentation"]["scene"]["confusion"])
     assert matrix.shape == (20, 20) and matrix.sum() == 16 * 484 * 648

@@ -6,7 +6,7 @@ from click.testing import CliRunner
 from shared import data
 
 from chebsplat.formats.ply import read_ply, write_ply
-from chebsplat.formats.scene import read_scene
+from chebsplat.formats.scene import Scene
 from chebsplat.pipelines.cli import main
 
 pytestmark = pytest.mark.xdist_group("toy")
@@ -37,7 +37,7 @@ def test_the_exported_scene_renders_as_the_checkpoint_does(mixed):
     for index in range(0, len(checkpoint.cameras.names), 3):
         wanted = rendered(checkpoint.parameters, checkpoint.cameras, index)
         assert wanted.max() > 0.3
-        for found in (read_scene(path).parameters, read_ply(path / "scene.ply")[0], together):
+        for found in (Scene.read(path).parameters, read_ply(path / "scene.ply")[0], together):
             image = rendered(found, checkpoint.cameras, index)
             assert (image - wanted).abs().max() < 1e-4  # only the order of equal depths may differ
 
@@ -49,7 +49,7 @@ def test_the_renderer_that_evaluates_by_degree_agrees(mixed):
     from chebsplat.views import View
 
     checkpoint, path = mixed
-    scene = read_scene(path)
+    scene = Scene.read(path)
     cameras = scene.cameras
     view = View(
         torch.from_numpy(cameras.Ks[0]).float(), torch.from_numpy(cameras.cam_from_world[0]).float(), cameras.width,
@@ -61,7 +61,7 @@ def test_the_renderer_that_evaluates_by_degree_agrees(mixed):
 
 
 def test_a_quarter_of_each_degree_costs_at_most_what_the_bar_allows(mixed):
-    scene = read_scene(mixed[1])
+    scene = Scene.read(mixed[1])
     n, counts = len(scene.order), np.bincount(scene.parameters["degrees"])
     split = sum(file.stat().st_size for file in mixed[1].glob("scene_d*.ply"))
     floats = sum(count * (17 + 3 * ((degree + 1) ** 2 - 1) + 2) for degree, count in enumerate(counts))
@@ -75,7 +75,7 @@ def run(*arguments):
 
 
 def test_filters_keep_what_they_name_and_nothing_else(mixed, tmp_path):
-    scene = read_scene(mixed[1])
+    scene = Scene.read(mixed[1])
     p, names = scene.parameters, scene.label_names
     wanted = names[np.bincount(scene.labels[scene.labels >= 0]).argmax()]
     low, high = np.quantile(p["means"], [0.1, 0.9], axis=0).round(3)
@@ -95,7 +95,7 @@ def test_filters_keep_what_they_name_and_nothing_else(mixed, tmp_path):
 
 
 def test_an_extract_is_trimmed_to_the_degrees_it_holds(mixed, tmp_path):
-    scene = read_scene(mixed[1])
+    scene = Scene.read(mixed[1])
     keep = scene.parameters["degrees"] == 1
     corner = scene.parameters["means"][keep][0]
     box = ",".join(map(str, [*(corner - 1e-4), *(corner + 1e-4)]))
@@ -150,6 +150,6 @@ def test_files_of_others_come_back_unchanged(tmp_path, name):
 
 
 def test_what_was_left_out_is_listed(toy):
-    summary = read_scene(toy["export"]).summary
+    summary = Scene.read(toy["export"]).summary
     assert summary["left_out"]["knowledge basis"].startswith("no sequence")
     assert set(summary["bytes"]) == {"unpruned_ply", "ply", "split", "ragged", "semantic"}

@@ -157,7 +157,7 @@ def test_every_bit_of_a_view_is_guarded(tmp_path):
         Features(["a"], stack, ["x"], np.eye(1, 1, dtype=np.float32)).write(tmp)
     chunk = path / "features/c/0/0/0/0"
     good = chunk.read_bytes()
-    found = features.read_features(path).features
+    found = features.Features.read(path).features
     for place in range(len(good)):
         chunk.write_bytes(good[:place] + bytes([good[place] ^ (1 << place % 8)]) + good[place + 1 :])
         with pytest.raises(InputError, match="does not match its sha256"):

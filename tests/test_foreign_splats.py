@@ -12,7 +12,7 @@ from scipy.special import expit
 from shared import INPUTS, TOY, data, run_stage
 from test_page import decibels, held_in, picture
 
-from chebsplat.formats.gaussians import read_gaussians
+from chebsplat.formats.gaussians import Gaussians
 from chebsplat.formats.packed import Packed, unpack
 from chebsplat.formats.ply import read_ply
 from chebsplat.pipelines.cli import main
@@ -98,7 +98,7 @@ def test_training_goes_on_from_a_splat_that_others_made(toy, tmp_path):
     def trained(name, **train):
         settings = TOY["train"] | {"steps": 4, "report_every": 1, "densify": "off", "prune": False} | train
         assert run_stage("train", tmp_path / name, inputs, TOY | {"train": settings}) == 0
-        found = read_gaussians(tmp_path / name)
+        found = Gaussians.read(tmp_path / name)
         return found.notes["n_initial"], found.trace[0]["psnr"]
 
     count, on = trained("on", start=str(ply))

@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import zarr
-from shared import KEY, gaussian_parameters
+from shared import KEY, gaussian_parameters, published
 
 from chebsplat.errors import InputError
 from chebsplat.formats import (
@@ -159,23 +159,29 @@ def make_knowledge():
 
 
 CASES = {
-    "capture": (make_capture, capture.write_capture, capture.read_capture, capture.SCHEMA),
-    "points": (make_points, points.write_points, points.read_points, points.SCHEMA),
-    "features": (make_features, features.write_features, features.read_features, features.SCHEMA),
-    "descriptors": (make_descriptors, descriptors.write_descriptors, descriptors.read_descriptors, descriptors.SCHEMA),
-    "scene": (make_scene, scene.write_scene, scene.read_scene, scene.SCHEMA),
-    "knowledge": (make_knowledge, knowledge.write_knowledge, knowledge.read_knowledge, knowledge.SCHEMA),
-    "agreement": (make_agreement, agreement.write_agreement, agreement.read_agreement, agreement.SCHEMA),
-    "lifted": (make_lifted, lifted.write_lifted, lifted.read_lifted, lifted.SCHEMA),
-    "refined": (make_refined, refined.write_refined, refined.read_refined, refined.SCHEMA),
-    "evaluation": (make_evaluation, evaluation.write_evaluation, evaluation.read_evaluation, evaluation.SCHEMA),
+    "capture": make_capture,
+    "points": make_points,
+    "features": make_features,
+    "scene": make_scene,
+    "agreement": make_agreement,
+    "lifted": make_lifted,
+    "refined": make_refined,
+    "evaluation": make_evaluation,
+    "descriptors": make_descriptors,
+    "knowledge": make_knowledge,
+}
+OTHERS = {  # no record of zarr's yet
+    "descriptors": (descriptors.write_descriptors, descriptors.read_descriptors, descriptors.SCHEMA),
+    "knowledge": (knowledge.write_knowledge, knowledge.read_knowledge, knowledge.SCHEMA),
 }
 
 
 @pytest.fixture(params=CASES)
 def case(request, tmp_path):
-    make, write, read, schema = CASES[request.param]
-    record, path = make(), tmp_path / request.param
+    record, path = CASES[request.param](), tmp_path / request.param
+    if request.param not in OTHERS:
+        return record, type(record).read, published(path, record)
+    write, read, schema = OTHERS[request.param]
     with artifact.publish(path, Manifest(schema, KEY, "s")) as tmp:
         write(tmp, record)
     return record, read, path
@@ -258,7 +264,7 @@ def test_non_finite_values_are_never_published(tmp_path):
     record = make_points()
     record.means[2, 1] = np.nan
     with pytest.raises(ValueError, match="non-finite"), artifact.publish(tmp_path / "p", Manifest("s", KEY, "s")) as t:
-        points.write_points(t, record)
+        record.write(t)
     assert not (tmp_path / "p").exists()
 
 
@@ -266,7 +272,7 @@ def test_a_capture_with_a_repeated_name_is_refused(tmp_path):
     record = make_capture()
     record.names = ["a", "b", "a"]
     with pytest.raises(InputError, match="'a' occurs 2 times"):
-        capture.write_capture(tmp_path, record)
+        record.write(tmp_path)
 
 
 @pytest.mark.parametrize("degree", range(4))
@@ -329,16 +335,15 @@ def test_tags_follow_the_62_floats_as_floats_and_names_are_comments(tmp_path):
 def test_fixed_point_features_are_within_half_a_step(tmp_path):
     record = make_scene()
     record.parameters["features"] = np.random.default_rng(0).normal(size=(6, 4)).astype(np.float32)
-    with artifact.publish(tmp_path / "s", Manifest(scene.SCHEMA, KEY, "s")) as tmp:
-        scene.write_scene(tmp, record)
+    published(tmp_path / "s", record)
     wanted = record.parameters["features"]
-    found = scene.read_scene(tmp_path / "s").parameters["features"]
+    found = scene.Scene.read(tmp_path / "s").parameters["features"]
     assert np.abs(found - wanted).max() <= 0.51 * np.abs(wanted).max() / 32767  # half a step, and float32's own
 
 
 def test_split_ply_files_hold_the_same_gaussians(tmp_path):
     record = make_scene()
-    scene.write_scene(tmp_path, record)
+    record.write(tmp_path)
     parts = [ply.read_ply(file)[0]["means"] for file in sorted(tmp_path.glob("scene_d*.ply"))]
     assert len(parts) > 1
     assert np.array_equal(np.concatenate(parts), record.parameters["means"])
@@ -389,8 +394,7 @@ def test_a_compressed_ply_is_refused_with_advice():
 
 @pytest.mark.parametrize("damage", ["truncate", "flip", "remove"])
 def test_verify_names_a_damaged_ply_of_a_scene(tmp_path, damage):
-    with artifact.publish(tmp_path / "scene", Manifest(scene.SCHEMA, KEY, "s")) as tmp:
-        scene.write_scene(tmp, make_scene())
+    published(tmp_path / "scene", make_scene())
     file = tmp_path / "scene/scene.ply"
     good = file.read_bytes()
     if damage == "remove":

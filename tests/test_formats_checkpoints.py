@@ -7,7 +7,7 @@ from shared import KEY
 
 from chebsplat.formats import artifact
 from chebsplat.formats.cameras import Cameras
-from chebsplat.formats.gaussians import SCHEMA, Gaussians, read_gaussians, write_gaussians
+from chebsplat.formats.gaussians import Gaussians
 from chebsplat.formats.manifest import Manifest
 
 CAMERAS = Cameras(["a"], np.eye(3)[None], np.eye(4)[None], 5, 4)
@@ -24,8 +24,8 @@ def example(n=5, seed=0, top=3):
 
 
 def publish(path, gaussians):
-    with artifact.publish(path, Manifest(SCHEMA, KEY, "train")) as tmp:
-        write_gaussians(tmp, gaussians)
+    with artifact.publish(path, Manifest(Gaussians.SCHEMA, KEY, "train")) as tmp:
+        gaussians.write(tmp)
     return path
 
 
@@ -34,7 +34,7 @@ def test_checkpoint_round_trip_is_exact(tmp_path, n):
     modules = {"encoder.w": np.arange(6, dtype=np.float32).reshape(2, 3), "gate.b": np.float32([7])}
     trace = [{"step": 1.0, "seconds": 0.5, "psnr": 20.25}]
     given = Gaussians(example(n), CAMERAS, modules, trace, {"label_names": ["wall"]})
-    found = read_gaussians(publish(tmp_path / "g", given))
+    found = Gaussians.read(publish(tmp_path / "g", given))
     for mine, theirs in ((given.parameters, found.parameters), (modules, found.modules)):
         assert mine.keys() == theirs.keys()
         assert all(np.array_equal(theirs[name], array) for name, array in mine.items())
@@ -46,7 +46,7 @@ def test_bands_that_nobody_keeps_are_not_in_the_file(tmp_path):
     given = Gaussians(example(50, top=1), CAMERAS)
     path = publish(tmp_path / "g", given)
     assert zarr.open_group(str(path), mode="r")["shN"].shape == (50, 3, 3)
-    assert np.array_equal(read_gaussians(path).parameters["shN"], given.parameters["shN"])
+    assert np.array_equal(Gaussians.read(path).parameters["shN"], given.parameters["shN"])
 
 
 BAD = {

@@ -11,11 +11,10 @@ from test_page import held_in
 from test_readers import CONVERSIONS, GRID, packages, transform  # noqa: F401  # a fixture among them
 
 from chebsplat.formats import artifact
-from chebsplat.formats.gaussians import write_gaussians
 from chebsplat.formats.manifest import Manifest
 from chebsplat.formats.packed import Packed, unpack
 from chebsplat.formats.ply import read_ply
-from chebsplat.formats.scene import read_scene
+from chebsplat.formats.scene import Scene
 from chebsplat.pipelines.cli import main
 
 SCALE, SHIFT = 3.7, np.array([120.0, -45.0, 18.0])
@@ -41,7 +40,7 @@ def moved(mixed, tmp_path_factory):
     poses[:, :3, 3] = SCALE * poses[:, :3, 3] - poses[:, :3, :3] @ TURN.T @ SHIFT
     poses[:, :3, :3] = poses[:, :3, :3] @ TURN.T
     with artifact.publish(root / "gaussians", Manifest("chebsplat.gaussians/2", KEY, "train")) as tmp:
-        write_gaussians(tmp, checkpoint)
+        checkpoint.write(tmp)
     return checkpoint, run_stage("export", root / "scene/export", {"gaussians": root / "gaussians"})
 
 
@@ -57,7 +56,7 @@ def close(found, wanted, within):
 def test_layouts_lie_where_the_checkpoint_does(moved):
     checkpoint, export = moved
     wanted = checkpoint.parameters["means"]
-    scene = read_scene(export)
+    scene = Scene.read(export)
     close(scene.parameters["means"], wanted, 0)  # ragged arrays
     close(read_ply(export / "scene.ply")[0]["means"], wanted, 0)
     split = [read_ply(path)[0]["means"] for path in sorted(export.glob("scene_d*.ply"))]

@@ -15,7 +15,7 @@ from chebsplat.errors import ConfigError, InputError
 from chebsplat.formats import artifact, heads
 from chebsplat.formats.basis import Basis, read_basis, read_lineage, write_basis
 from chebsplat.formats.cameras import Cameras
-from chebsplat.formats.gaussians import SCHEMA, Gaussians, write_gaussians
+from chebsplat.formats.gaussians import Gaussians
 from chebsplat.formats.manifest import Manifest
 
 COUNTING = """
@@ -130,8 +130,8 @@ def trained(path, key, seed):
     notes = {"encoder": {"n_inputs": 4, "n_channels": 3} | encoder.settings}
     cameras = Cameras(["a"], np.eye(3)[None], np.eye(4)[None], 5, 4)
     config = {"describe": {}, "train": {}}
-    with artifact.publish(path, Manifest(SCHEMA, key, "train", config=config)) as tmp:
-        write_gaussians(tmp, Gaussians(gaussian_parameters(), cameras, modules, notes=notes))
+    with artifact.publish(path, Manifest(Gaussians.SCHEMA, key, "train", config=config)) as tmp:
+        Gaussians(gaussian_parameters(), cameras, modules, notes=notes).write(tmp)
     return path
 
 

@@ -8,7 +8,7 @@ from shared import INPUTS, TOY, run_stage
 
 from chebsplat.formats.artifact import read_manifest
 from chebsplat.formats.basis import read_basis
-from chebsplat.formats.gaussians import read_gaussians
+from chebsplat.formats.gaussians import Gaussians
 
 pytestmark = pytest.mark.xdist_group("toy")
 
@@ -20,7 +20,7 @@ def train(toy, out, basis, **settings):
     assert run_stage("train", out, inputs, config) == 0
     with (out / "trace.csv").open() as handle:
         columns = next(csv.reader(handle))
-    return read_gaussians(out), read_manifest(out).facts, columns
+    return Gaussians.read(out), read_manifest(out).facts, columns
 
 
 VARIANTS = {

@@ -7,14 +7,14 @@ from shared import KEY, run_stage
 
 from chebsplat.errors import DataFailure, InputError
 from chebsplat.formats import artifact, gaussians
-from chebsplat.formats.capture import SCHEMA, read_capture, write_capture
-from chebsplat.formats.features import read_features
-from chebsplat.formats.gaussians import read_gaussians
-from chebsplat.formats.lifted import read_lifted
+from chebsplat.formats.capture import Capture
+from chebsplat.formats.features import Features
+from chebsplat.formats.gaussians import Gaussians
+from chebsplat.formats.lifted import Lifted
 from chebsplat.formats.manifest import Manifest
 from chebsplat.formats.ply import write_ply
-from chebsplat.formats.points import read_points
-from chebsplat.formats.scene import read_scene
+from chebsplat.formats.points import Points
+from chebsplat.formats.scene import Scene
 from chebsplat.labels.decode import decode_labels
 from chebsplat.stages.config import build
 from chebsplat.stages.lift_ply import lift_ply
@@ -31,50 +31,50 @@ def lifted(tmp_path):
 
 
 def test_only_training_views_are_lifted_and_the_export_has_what_was(lifted, tmp_path):
-    held = read_lifted(lifted)
+    held = Lifted.read(lifted)
     assert held.notes["views"] == VIEWS[1:]  # the first is a test view
     assert held.n_views.max() <= 2
     assert held.features.shape == (N, 5)
     np.testing.assert_array_equal(held.half_views.sum(0), held.n_views)
     inputs = {"gaussians": artifacts() / "train", "features": artifacts() / "teacher", "lifted": lifted}
     assert run_stage("export", tmp_path / "export", inputs, {}) == 0
-    scene, unseen = read_scene(tmp_path / "export"), ~held.features.any(1)
+    scene, unseen = Scene.read(tmp_path / "export"), ~held.features.any(1)
     assert unseen.any() and not unseen.all()
     np.testing.assert_array_equal(scene.labels[np.argsort(scene.order)] == -1, unseen)
     np.testing.assert_allclose(scene.parameters["features"], held.features[scene.order], atol=1e-4)
-    raw = read_gaussians(artifacts() / "train").parameters["features"][scene.order]  # what the encoder sees stays
+    raw = Gaussians.read(artifacts() / "train").parameters["features"][scene.order]  # what the encoder sees stays
     np.testing.assert_allclose(scene.parameters["raw_features"], raw, atol=1e-3)
 
 
 def test_a_ply_gets_what_its_checkpoint_gets_and_becomes_a_folder_of_artifacts(lifted, tmp_path):
-    parameters = read_gaussians(artifacts() / "train").parameters
+    parameters = Gaussians.read(artifacts() / "train").parameters
     write_ply(tmp_path / "a.ply", parameters, 0)
     out = tmp_path / "out"
     figures = lift_ply(tmp_path / "a.ply", artifacts() / "ingest", None, artifacts() / "teacher", None, out)
     assert figures["gaussians"] == N
-    np.testing.assert_array_equal(read_lifted(out / "lift").features, read_lifted(lifted).features)
-    assert read_scene(out / "export").labels is not None
+    np.testing.assert_array_equal(Lifted.read(out / "lift").features, Lifted.read(lifted).features)
+    assert Scene.read(out / "export").labels is not None
 
 
 def test_a_splat_in_another_frame_and_a_capture_without_poses_are_refused(tmp_path):
-    parameters = read_gaussians(artifacts() / "train").parameters
+    parameters = Gaussians.read(artifacts() / "train").parameters
     write_ply(tmp_path / "far.ply", parameters | {"means": parameters["means"] + np.float32(1000)}, 0)
     with pytest.raises(DataFailure, match="same frame"):
         lift_ply(tmp_path / "far.ply", artifacts() / "ingest", None, artifacts() / "teacher", None, tmp_path / "far")
-    record = read_capture(artifacts() / "ingest")
+    record = Capture.read(artifacts() / "ingest")
     record.cam_from_world = None
-    with artifact.publish(tmp_path / "capture", Manifest(SCHEMA, KEY, "test")) as tmp:
-        write_capture(tmp, record)
+    with artifact.publish(tmp_path / "capture", Manifest(Capture.SCHEMA, KEY, "test")) as tmp:
+        record.write(tmp)
     with pytest.raises(InputError, match="has no poses"):
         lift_ply(tmp_path / "far.ply", tmp_path / "capture", None, artifacts() / "teacher", None, tmp_path / "out")
     assert not (tmp_path / "out").exists()
 
 
 def test_features_of_another_number_of_gaussians_are_refused(lifted, tmp_path, capsys):
-    fewer = read_gaussians(artifacts() / "train")
+    fewer = Gaussians.read(artifacts() / "train")
     fewer.parameters = {name: values[:-1] for name, values in fewer.parameters.items()}
     with artifact.publish(tmp_path / "train", Manifest(gaussians.SCHEMA, KEY, "test")) as tmp:
-        gaussians.write_gaussians(tmp, fewer)
+        fewer.write(tmp)
     inputs = {"gaussians": tmp_path / "train", "features": artifacts() / "teacher", "lifted": lifted}
     assert run_stage("export", tmp_path / "export", inputs, {}) == 3
     assert "make it again" in capsys.readouterr().err
@@ -95,8 +95,8 @@ def test_the_command_is_a_stage_without_a_file_and_a_use_with_one():
 
 
 def test_features_of_a_training_start_as_what_the_views_say_of_its_gaussians(up_to_teacher):
-    capture, points = read_capture(up_to_teacher / "ingest"), read_points(up_to_teacher / "sfm")
-    features, config = read_features(up_to_teacher / "teacher"), build({}, "toy")
+    capture, points = Capture.read(up_to_teacher / "ingest"), Points.read(up_to_teacher / "sfm")
+    features, config = Features.read(up_to_teacher / "teacher"), build({}, "toy")
     model = model_of(points, features, config.train, config.describe)
     views = training_views(capture, points, features)
     start_features(model, capture, points, features, Progress(False))
@@ -113,8 +113,8 @@ def test_features_of_a_training_start_as_what_the_views_say_of_its_gaussians(up_
 
 
 def test_features_start_at_nothing_where_no_view_says_anything(up_to_teacher):
-    capture, points = read_capture(up_to_teacher / "ingest"), read_points(up_to_teacher / "sfm")
-    features, config = read_features(up_to_teacher / "teacher"), build({}, "toy")
+    capture, points = Capture.read(up_to_teacher / "ingest"), Points.read(up_to_teacher / "sfm")
+    features, config = Features.read(up_to_teacher / "teacher"), build({}, "toy")
     features.pseudo_labels = np.full_like(features.pseudo_labels, -1)
     model = model_of(points, features, config.train, config.describe)
     assert start_features(model, capture, points, features, Progress(False)) == 0

@@ -10,7 +10,7 @@ from chebsplat.formats.cameras import Cameras
 from chebsplat.formats.manifest import Manifest
 from chebsplat.formats.names import check_names, suggest
 from chebsplat.formats.ply import read_ply
-from chebsplat.formats.scene import SCHEMA, Scene, read_scene, write_scene
+from chebsplat.formats.scene import Scene
 from chebsplat.stages.extract import extract
 from chebsplat.stages.frames import file_names
 from chebsplat.stages.opened import OpenedScene
@@ -25,15 +25,15 @@ def scene(tmp_path):
     cameras = Cameras(["a"], np.eye(3)[None], np.eye(4)[None], 5, 4)
     labels = np.arange(len(LABELS), dtype=np.int32)
     held = Scene(p, cameras, labels.astype(np.int64), labels, LABELS, p["features"], {"left_out": {}})
-    with artifact.publish(tmp_path / "scene", Manifest(SCHEMA, "0" * 16, "export")) as tmp:
-        write_scene(tmp, held)
+    with artifact.publish(tmp_path / "scene", Manifest(Scene.SCHEMA, "0" * 16, "export")) as tmp:
+        held.write(tmp)
     return tmp_path / "scene"
 
 
 def test_labels_in_any_language_survive_export(scene):
     from plyfile import PlyData
 
-    assert read_scene(scene).label_names == LABELS
+    assert Scene.read(scene).label_names == LABELS
     assert "沙发" in (scene / "labels.json").read_text(encoding="utf-8")
     for file in scene.glob("*.ply"):
         assert read_ply(file)[2] is not None
@@ -44,7 +44,7 @@ def test_labels_in_any_language_survive_export(scene):
 
 @pytest.mark.parametrize("label", LABELS)
 def test_a_label_in_any_language_can_be_extracted(scene, tmp_path, label):
-    extract(OpenedScene(read_scene(scene), scene), tmp_path / "part.ply", (label,), 0.0, None)
+    extract(OpenedScene(Scene.read(scene), scene), tmp_path / "part.ply", (label,), 0.0, None)
     parameters, _, labels = read_ply(tmp_path / "part.ply")
     assert labels.tolist() == [LABELS.index(label)] and len(parameters["means"]) == 1
 

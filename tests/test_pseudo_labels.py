@@ -8,8 +8,8 @@ from chebsplat.errors import ConfigError
 from chebsplat.evaluation.protocols import labels, scannet_closed
 from chebsplat.evaluation.protocols.task import EvaluatedView, Task
 from chebsplat.formats.artifact import publish
-from chebsplat.formats.capture import read_capture, write_capture
-from chebsplat.formats.features import read_features
+from chebsplat.formats.capture import Capture
+from chebsplat.formats.features import Features
 from chebsplat.formats.manifest import Manifest
 from chebsplat.labels.pseudo_labels import voted
 
@@ -48,15 +48,15 @@ def test_where_a_teacher_has_no_label_it_is_wrong():
 
 @pytest.mark.xdist_group("toy")
 def test_a_scene_learns_from_its_source_s_pseudo_labels(toy, tmp_path, capsys):
-    record = read_capture(toy["ingest"])
+    record = Capture.read(toy["ingest"])
     truth = np.asarray(record.labels[:])
     record.pseudo_labels, record.confidence = truth.copy(), np.ones(truth.shape, np.float16)
     record.pseudo_labels[:, :8] = -1
     with publish(tmp_path / "capture", Manifest("chebsplat.capture/2", KEY, "ingest")) as tmp:
-        write_capture(tmp, record)
+        record.write(tmp)
     config = TOY | {"teacher": {"kind": "given", "downscale": 4}}
     assert run_stage("teacher", tmp_path / "teacher", {"capture": tmp_path / "capture"}, config) == 0
-    features = read_features(tmp_path / "teacher")
+    features = Features.read(tmp_path / "teacher")
     told = np.asarray(features.pseudo_labels[:])
     assert features.label_names == record.class_names
     assert (told[:, :2] == -1).all()

@@ -6,16 +6,14 @@ import numpy as np
 import pytest
 from click.testing import CliRunner
 from PIL import Image
-from shared import KEY
+from shared import published
 
-from chebsplat.formats import artifact
 from chebsplat.formats.artifact import sha256_file
 from chebsplat.formats.cameras import Cameras
-from chebsplat.formats.capture import Capture, write_capture
+from chebsplat.formats.capture import Capture
 from chebsplat.formats.channels import ChannelMap
-from chebsplat.formats.features import Features, write_features
-from chebsplat.formats.manifest import Manifest
-from chebsplat.formats.scene import Scene, write_scene
+from chebsplat.formats.features import Features
+from chebsplat.formats.scene import Scene
 from chebsplat.labels.relevancy import relevancy
 from chebsplat.pipelines.api import load
 from chebsplat.pipelines.cli import main
@@ -36,11 +34,6 @@ def vectors(names):
     return rows / np.linalg.norm(rows, axis=1, keepdims=True)
 
 
-def published(path, schema, write, record, **facts):
-    with artifact.publish(path, Manifest(f"chebsplat.{schema}", KEY, "test", **facts)) as tmp:
-        write(tmp, record)
-
-
 def write_toy(folder, teacher=None):
     """A chair left, a sofa in the middle, a wall right; four of the teacher's six channels, or codes of labels."""
     rng = np.random.default_rng(0)
@@ -58,9 +51,9 @@ def write_toy(folder, teacher=None):
     K = np.array([[40, 0, SIZE[1] / 2], [0, 40, SIZE[0] / 2], [0, 0, 1]], float)
     views, Ks, poses = ["a.png", "b.png"], np.stack([K, K]), np.stack([np.eye(4)] * 2)
     scene = Scene(parameters, Cameras(views, Ks, poses, SIZE[1], SIZE[0]), np.arange(n), labels, LABELS, known)
-    published(folder / "export", "scene/3", write_scene, scene)
+    published(folder / "export", scene)
     capture = Capture(views, np.zeros((2, *SIZE, 3), np.uint8), Ks, poses, np.array([False, True]))
-    published(folder / "ingest", "capture/2", write_capture, capture)
+    published(folder / "ingest", capture)
     convention, model = {"kind": "labels"}, None
     if teacher is not None:
         convention, model = {"kind": "onnx", "output": "features", "sha256": sha256_file(teacher)}, str(teacher)
@@ -68,7 +61,7 @@ def write_toy(folder, teacher=None):
         views, np.zeros((2, 2, 2, known.shape[1]), np.float16), LABELS, known, convention=convention,
         channels=None if teacher is None else channels,
     )  # fmt: skip
-    published(folder / "teacher", "features/2", write_features, features, config={"teacher": {"model": model}})
+    published(folder / "teacher", features, config={"teacher": {"model": model}})
 
 
 @pytest.fixture(scope="module")

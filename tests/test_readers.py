@@ -14,7 +14,7 @@ from shared import ROOT, gaussian_parameters
 
 import chebsplat.kernels.jit  # noqa: F401  # gsply runs on numba too: the threading layer is chosen first
 from chebsplat.formats.cameras import Cameras
-from chebsplat.formats.scene import Scene, write_scene
+from chebsplat.formats.scene import Scene
 
 pytestmark = [pytest.mark.slow, pytest.mark.xdist_group("readers")]
 
@@ -49,7 +49,7 @@ def exported(tmp_path_factory):
     p["features"] = rng.normal(size=(n, 4)).astype(np.float32)
     labels = rng.integers(-1, 3, n).astype(np.int32)
     cameras = Cameras(["a"], np.eye(3)[None], np.eye(4)[None], 5, 4)
-    write_scene(path, Scene(p, cameras, np.arange(n), labels, NAMES, np.eye(3, 4, dtype=np.float32)))
+    Scene(p, cameras, np.arange(n), labels, NAMES, np.eye(3, 4, dtype=np.float32)).write(path)
     return path, p, labels
 
 

@@ -6,7 +6,7 @@ from shared import data, run_stage
 
 from chebsplat.cameras import centers
 from chebsplat.formats import artifact
-from chebsplat.formats.points import read_points
+from chebsplat.formats.points import Points
 
 pytestmark = [pytest.mark.data, pytest.mark.xdist_group("sfm")]
 
@@ -20,7 +20,7 @@ def points_of(tmp_path, kind, folder, views, ingest=(), **sfm):
     }
     assert run_stage("ingest", tmp_path / kind, config=config) == 0
     assert run_stage("sfm", tmp_path / f"{kind}-points", {"capture": tmp_path / kind}, config) == 0
-    return read_points(tmp_path / f"{kind}-points")
+    return Points.read(tmp_path / f"{kind}-points")
 
 
 @pytest.fixture(scope="module")

@@ -15,7 +15,7 @@ from PIL import Image
 
 import chebsplat
 from chebsplat.errors import ConfigError, InputError
-from chebsplat.formats.evaluation import read_evaluation
+from chebsplat.formats.evaluation import Evaluation
 from chebsplat.pipelines.cli import main
 from chebsplat.stages import camera_files, camera_paths, video
 from chebsplat.stages.frames import kinds_of
@@ -53,7 +53,7 @@ def picture(path):
 def test_frames_are_what_is_evaluated_and_what_python_renders(scene, folder, toy, tmp_path):
     word = scene.label_names[0]
     run("render", folder, "--what", "color,labels,depth,relevancy", "--query", word, "--out", tmp_path / "frames")
-    figures = read_evaluation(toy["evaluate"])
+    figures = Evaluation.read(toy["evaluate"])
     for name, render in zip(figures.figures["names"], figures.pictures["renders"], strict=True):
         np.testing.assert_array_equal(picture(tmp_path / f"frames/color/{name}.png"), render)
     camera = scene.cameras[1]

@@ -14,7 +14,7 @@ from shared import INPUTS, KEY, run_stage
 
 from chebsplat.errors import InputError
 from chebsplat.formats.artifact import publish, read_manifest
-from chebsplat.formats.evaluation import read_evaluation
+from chebsplat.formats.evaluation import Evaluation
 from chebsplat.formats.manifest import Manifest
 from chebsplat.stages.pages import pictures as draw
 from chebsplat.stages.pages.parts import class_rows, label_names, legend, picture_rows
@@ -61,12 +61,12 @@ def test_the_report_is_one_page_that_fetches_nothing(toy):
 
 def test_the_page_s_pictures_are_those_of_the_evaluation(toy):
     pictures = Fetches((toy["report"] / "report.html").read_text()).pictures
-    truth = read_evaluation(toy["evaluate"]).pictures["truth"]
+    truth = Evaluation.read(toy["evaluate"]).pictures["truth"]
     assert set(pictures) == {"truth", "renders", "error", "labels", "teacher", "predicted", "wrong"}
     assert {len(of_kind) for of_kind in pictures.values()} == {min(4, len(truth))}
     difference = image(pictures["truth"][0]).astype(float) - truth[0]
     assert np.abs(difference).mean() < 4  # WebP at quality 90; another view lies 30 away
-    classes = read_evaluation(toy["evaluate"]).figures["segmentation"]["classes"]
+    classes = Evaluation.read(toy["evaluate"]).figures["segmentation"]["classes"]
     colors = {tuple(color) for color in draw.palette(len(classes)).tolist()} | {(0, 0, 0)}
     assert {tuple(color) for color in image(pictures["labels"][0]).reshape(-1, 3).tolist()} <= colors
 
@@ -78,13 +78,13 @@ def test_labels_are_named_by_the_capture_and_otherwise_by_the_scene(toy, tmp_pat
     inputs = {"scene": tmp_path / "scene"}
     assert label_names(inputs, {}) == ["sofa", "lamp"]
     inputs["capture"] = toy["ingest"]
-    classes = read_evaluation(toy["evaluate"]).figures["segmentation"]["classes"]
+    classes = Evaluation.read(toy["evaluate"]).figures["segmentation"]["classes"]
     assert label_names(inputs, {}) == classes
 
 
 def test_a_label_without_a_name_is_an_error_not_a_colour(toy, tmp_path):
     with pytest.raises(InputError, match="has no name"):
-        picture_rows(read_evaluation(toy["evaluate"]), ["wall"], 1, tmp_path)
+        picture_rows(Evaluation.read(toy["evaluate"]), ["wall"], 1, tmp_path)
 
 
 def test_a_legend_names_the_labels_that_cover_most_and_how_many_more_there_are():

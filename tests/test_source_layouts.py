@@ -13,9 +13,9 @@ from chebsplat.cameras import centers, unproject
 from chebsplat.errors import InputError
 from chebsplat.evaluation.protocols import scannet_closed, scannet_open
 from chebsplat.formats import artifact
-from chebsplat.formats.capture import Capture, write_capture
+from chebsplat.formats.capture import Capture
 from chebsplat.formats.manifest import Manifest
-from chebsplat.formats.points import read_points
+from chebsplat.formats.points import Points
 from chebsplat.stages.settings import IngestSection
 from chebsplat.stages.sources import colmap, common, generated, replica, scannet, scannet_labels, seven_scenes
 
@@ -271,10 +271,10 @@ def test_a_sources_own_points_become_the_scenes(scene, tmp_path, colored):
     fields = {key: scene[key] for key in ("names", "images", "Ks", "cam_from_world")}
     record = Capture(**fields, is_test=np.arange(16) % 8 == 0, points=points, point_colors=colors)
     with artifact.publish(tmp_path / "c", Manifest("chebsplat.capture/2", KEY, "test")) as tmp:
-        write_capture(tmp, record)
+        record.write(tmp)
     config = {"sfm": {"max_points": 100_000, "dense": "off"}}
     assert run_stage("sfm", tmp_path / "out", {"capture": tmp_path / "c"}, config) == 0
-    found = read_points(tmp_path / "out")
+    found = Points.read(tmp_path / "out")
     facts = artifact.read_manifest(tmp_path / "out").facts
     assert facts["how"] == "source" and facts["n_candidates"] == len(points)
     assert facts["n_unseen"] >= 5 and len(found.means) == len(points) - facts["n_unseen"]

@@ -236,14 +236,14 @@ def test_images_are_reduced_but_never_enlarged(tmp_path):
 
 def test_depth_that_is_not_wanted_is_left_out_and_nothing_else(tmp_path):
     from chebsplat.formats.artifact import read_manifest
-    from chebsplat.formats.capture import read_capture
+    from chebsplat.formats.capture import Capture
 
     write_colmap(tmp_path / "source")
     made = []
     for depth in ("auto", "off"):
         config = {"source": {"kind": "colmap", "path": str(tmp_path / "source")}, "ingest": {"depth": depth}}
         assert run_stage("ingest", tmp_path / depth, config=config) == 0
-        made.append(read_capture(tmp_path / depth))
+        made.append(Capture.read(tmp_path / depth))
     assert made[0].depth is not None and made[1].depth is None
     np.testing.assert_array_equal(made[0].images[:], made[1].images[:])
     assert read_manifest(tmp_path / "off").facts["left_out"]["depth"] == "ingest.depth is off"

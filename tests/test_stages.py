@@ -7,14 +7,13 @@ import re
 
 import numpy as np
 import pytest
-from shared import INPUTS, KEY, TOY, run_stage
+from shared import INPUTS, TOY, published, run_stage
 
 from chebsplat.formats import artifact
-from chebsplat.formats.capture import read_capture, write_capture
-from chebsplat.formats.evaluation import read_evaluation
-from chebsplat.formats.gaussians import read_gaussians, write_gaussians
-from chebsplat.formats.manifest import Manifest
-from chebsplat.formats.points import read_points, write_points
+from chebsplat.formats.capture import Capture
+from chebsplat.formats.evaluation import Evaluation
+from chebsplat.formats.gaussians import Gaussians
+from chebsplat.formats.points import Points
 from chebsplat.stages.registry import STAGES
 
 pytestmark = pytest.mark.xdist_group("toy")
@@ -29,12 +28,6 @@ def changed(**sections):
 
 def inputs_of(toy, stage):
     return {role: toy[of] for role, of in INPUTS[stage].items()}
-
-
-def published(path, schema, write, record, *arguments):
-    with artifact.publish(path, Manifest(schema, KEY, "test")) as tmp:
-        write(tmp, record, *arguments)
-    return path
 
 
 @pytest.mark.parametrize("stage", STAGES)
@@ -68,9 +61,9 @@ def one_photo(toy, tmp):
 
 
 def without_depth(toy, tmp):
-    record = read_capture(toy["ingest"])
+    record = Capture.read(toy["ingest"])
     record.depth = np.full(record.depth.shape, np.nan, np.float32)
-    return {"capture": published(tmp / "c", "chebsplat.capture/2", write_capture, record)}, TOY
+    return {"capture": published(tmp / "c", record)}, TOY
 
 
 def teacher_of_nothing(toy, tmp):
@@ -88,23 +81,23 @@ def photos_apart(toy, tmp):
 
 
 def without_labels(toy, tmp):
-    record = read_capture(toy["ingest"])
+    record = Capture.read(toy["ingest"])
     record.labels = None
-    path = published(tmp / "c", "chebsplat.capture/2", write_capture, record)
+    path = published(tmp / "c", record)
     return {"capture": path}, TOY
 
 
 def without_points(toy, tmp):
-    record = read_points(toy["sfm"])
+    record = Points.read(toy["sfm"])
     for name in ("means", "colors", "normals", "covariances"):
         setattr(record, name, getattr(record, name)[:0])
-    return {"points": published(tmp / "p", "chebsplat.points/2", write_points, record)}, TOY
+    return {"points": published(tmp / "p", record)}, TOY
 
 
 def only_test_views(toy, tmp):
-    record = read_capture(toy["ingest"])
+    record = Capture.read(toy["ingest"])
     record.is_test[:] = True
-    path = published(tmp / "c", "chebsplat.capture/2", write_capture, record)
+    path = published(tmp / "c", record)
     return inputs_of(toy, "train") | {"capture": path}, TOY
 
 
@@ -119,9 +112,9 @@ def only_test_views_to_agree(toy, tmp):
 
 
 def without_gaussians(toy, tmp):
-    record = read_gaussians(toy["train"])
+    record = Gaussians.read(toy["train"])
     record.parameters = {name: values[:0] for name, values in record.parameters.items()}
-    return {"gaussians": published(tmp / "g", "chebsplat.gaussians/2", write_gaussians, record)}, TOY
+    return {"gaussians": published(tmp / "g", record)}, TOY
 
 
 def nothing_to_refine(toy, tmp):
@@ -141,16 +134,16 @@ def encoder_without_attention(toy, tmp):
 
 
 def no_test_view(toy, tmp):
-    record = read_capture(toy["ingest"])
+    record = Capture.read(toy["ingest"])
     record.is_test[:] = False
-    path = published(tmp / "c", "chebsplat.capture/2", write_capture, record)
+    path = published(tmp / "c", record)
     return inputs_of(toy, "evaluate") | {"capture": path}, TOY
 
 
 def without_trace(toy, tmp):
-    record = read_gaussians(toy["train"])
+    record = Gaussians.read(toy["train"])
     record.trace = []
-    path = published(tmp / "g", "chebsplat.gaussians/2", write_gaussians, record)
+    path = published(tmp / "g", record)
     return inputs_of(toy, "report") | {"gaussians": path}, TOY
 
 
@@ -189,8 +182,8 @@ def test_rendering_only_scenes_leave_the_semantic_branch_out(toy, tmp_path):
     exported = made("export", {"gaussians": gaussians})
     evaluation = made("evaluate", {"capture": toy["ingest"], "scene": exported})
     page = made("report", {"evaluation": evaluation, "gaussians": gaussians}) / "report.html"
-    assert "features" not in read_gaussians(gaussians).parameters
-    assert "segmentation" not in read_evaluation(evaluation).figures
+    assert "features" not in Gaussians.read(gaussians).parameters
+    assert "segmentation" not in Evaluation.read(evaluation).figures
     text = page.read_text()
     for what in ("semantic branch", "stage teacher", "stage describe", "stage onnx", "stage cks"):
         assert what in text

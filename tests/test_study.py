@@ -13,8 +13,8 @@ from shared import ROOT
 
 from chebsplat.errors import ConfigError
 from chebsplat.formats.artifact import publish
-from chebsplat.formats.capture import Capture, write_capture
-from chebsplat.formats.evaluation import Evaluation, write_evaluation
+from chebsplat.formats.capture import Capture
+from chebsplat.formats.evaluation import Evaluation
 from chebsplat.formats.manifest import Manifest
 from chebsplat.pipelines.scenes import data_of, names
 from chebsplat.pipelines.sequences import scenes_of
@@ -69,7 +69,7 @@ def finish(run, miou=0.5, psnr=30.0, n=100, seconds=10.0, steps=10, segmentation
         blank, K = np.zeros((1, 4, 6, 3), np.uint8), np.eye(3)[None]
         truth = np.zeros((1, 4, 6), np.int16)
         capture = Capture(["a"], blank, K, np.eye(4)[None], np.array([True]), labels=truth, class_names=labels[0])
-        publish_stage(run, "ingest", lambda tmp: write_capture(tmp, capture))
+        publish_stage(run, "ingest", lambda tmp: capture.write(tmp))
     for step in run.steps:
         if step.stage not in ("train", "export", "evaluate"):
             publish_stage(run, step.stage, {"empty.json": "{}"})
@@ -83,7 +83,7 @@ def finish(run, miou=0.5, psnr=30.0, n=100, seconds=10.0, steps=10, segmentation
     pictures = {name: np.zeros((1, 4, 6, 3), np.uint8) for name in ("truth", "renders")}
     if labels is not None:
         pictures |= {"labels": truth, "predicted": labels[1]}
-    publish_stage(run, "evaluate", lambda tmp: write_evaluation(tmp, Evaluation(figures, pictures)))
+    publish_stage(run, "evaluate", lambda tmp: Evaluation(figures, pictures).write(tmp))
 
 
 def test_a_study_is_every_combination_and_each_step_once():

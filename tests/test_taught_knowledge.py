@@ -10,7 +10,7 @@ from tiny_teachers import color_teacher, knowing_rooms
 
 from chebsplat.errors import ConfigError, InputError
 from chebsplat.formats import artifact
-from chebsplat.formats.features import read_features
+from chebsplat.formats.features import Features
 from chebsplat.formats.knowledge import ENCODER, SHIPPED, read_knowledge
 from chebsplat.formats.manifest import Manifest
 from chebsplat.pipelines.knowledge import teaching
@@ -117,7 +117,7 @@ def test_what_ships_is_whole_small_and_says_what_it_was_taught():
 
 @pytest.mark.xdist_group("toy")
 def test_scenes_of_codes_meet_knowledge_through_words(toy):
-    knowledge, features = read_knowledge(toy["teach"]), read_features(toy["teacher"])
+    knowledge, features = read_knowledge(toy["teach"]), Features.read(toy["teacher"])
     words = [knowledge.words.index(name) for name in features.label_names]
     translated = into_channels(toy["teach"], knowledge, features)
     answers = knowledge.embeddings[words].astype(np.float32)
@@ -157,21 +157,21 @@ def refined(toy, out, config=None, **changes):
 @pytest.mark.xdist_group("toy")
 def test_shape_is_told_of_depth_s_points_or_of_what_the_gaussians_show(toy, tmp_path):
     from chebsplat.formats import gaussians as gaussians_format
-    from chebsplat.formats.capture import SCHEMA, read_capture, write_capture
-    from chebsplat.formats.gaussians import read_gaussians, write_gaussians
+    from chebsplat.formats.capture import Capture
+    from chebsplat.formats.gaussians import Gaussians
 
     assert refined(toy, tmp_path / "a")["knowledge"]["of"] == "points"
-    capture = read_capture(toy["ingest"])
+    capture = Capture.read(toy["ingest"])
     capture.depth = None
-    with artifact.publish(tmp_path / "flat", Manifest(SCHEMA, KEY, "test")) as tmp:
-        write_capture(tmp, capture)
+    with artifact.publish(tmp_path / "flat", Manifest(Capture.SCHEMA, KEY, "test")) as tmp:
+        capture.write(tmp)
     without = refined(toy, tmp_path / "b", capture=tmp_path / "flat")
     assert "no depth" in without["left_out"]["knowledge of shape"]
     assert without["strength"] == without["changed_by_knowledge"] == 0
-    gaussians = read_gaussians(toy["train"])
+    gaussians = Gaussians.read(toy["train"])
     gaussians.parameters["logit_opacities"] = gaussians.parameters["logit_opacities"] + 5  # 24 steps leave them faint
     with artifact.publish(tmp_path / "opaque", Manifest(gaussians_format.SCHEMA, KEY, "test")) as tmp:
-        write_gaussians(tmp, gaussians)
+        gaussians.write(tmp)
     rendered = TOY | {"refine": {"surface": "rendered"}}
     facts = refined(toy, tmp_path / "d", rendered, capture=tmp_path / "flat", gaussians=tmp_path / "opaque")
     assert facts["knowledge"]["of"] == "rendered depth"
@@ -181,12 +181,12 @@ def test_shape_is_told_of_depth_s_points_or_of_what_the_gaussians_show(toy, tmp_
 
 @pytest.mark.xdist_group("toy")
 def test_labels_without_a_word_leave_knowledge_out_and_say_so(toy, tmp_path):
-    from chebsplat.formats.features import SCHEMA, write_features
+    from chebsplat.formats.features import Features
 
-    features = read_features(toy["teacher"])
+    features = Features.read(toy["teacher"])
     features.label_names = ["thingamajig", *features.label_names[1:]]
-    with artifact.publish(tmp_path / "f", Manifest(SCHEMA, KEY, "test")) as tmp:
-        write_features(tmp, features)
+    with artifact.publish(tmp_path / "f", Manifest(Features.SCHEMA, KEY, "test")) as tmp:
+        features.write(tmp)
     facts = refined(toy, tmp_path / "out", features=tmp_path / "f")
     assert "thingamajig" in facts["left_out"]["knowledge of shape"]
     assert facts["changed_by_knowledge"] == 0
@@ -194,7 +194,7 @@ def test_labels_without_a_word_leave_knowledge_out_and_say_so(toy, tmp_path):
 
 @pytest.mark.xdist_group("toy")
 def test_knowledge_of_another_teacher_is_refused(toy):
-    features = read_features(toy["teacher"])
+    features = Features.read(toy["teacher"])
     features.convention |= {"kind": "onnx", "output": "features", "teacher": "another"}
     with pytest.raises(InputError, match="the scene has another; teach knowledge for it"):
         into_channels(toy["teach"], read_knowledge(toy["teach"]), features)
@@ -225,7 +225,7 @@ def test_a_swept_room_is_what_its_photos_tell_of_depth(tmp_path, monkeypatch):
 
 @pytest.mark.xdist_group("toy")
 def test_without_measured_depth_knowledge_is_asked_of_swept_depth_or_left_out(toy, tmp_path, monkeypatch):
-    from chebsplat.formats.refined import read_refined
+    from chebsplat.formats.refined import Refined
     from chebsplat.stages import refine
 
     withheld = TOY | {"ingest": {"depth": "off"}}
@@ -239,7 +239,7 @@ def test_without_measured_depth_knowledge_is_asked_of_swept_depth_or_left_out(to
         inputs |= {"capture": tmp_path / "ingest", "points": tmp_path / name / "sfm"}
         assert run_stage("refine", tmp_path / name / "refine", inputs, withheld) == 0
         made[name] = artifact.read_manifest(tmp_path / name / "refine").facts
-    assert read_refined(tmp_path / "enough/refine").notes["start"] == made["enough"]["start"] == "trained"
+    assert Refined.read(tmp_path / "enough/refine").notes["start"] == made["enough"]["start"] == "trained"
     assert made["enough"]["knowledge"]["of"] == "swept depth"
     left_out = {name: facts.get("left_out", {}).get("knowledge of shape", "") for name, facts in made.items()}
     assert left_out["enough"] == ""

@@ -7,9 +7,9 @@ from shared import KEY, run_stage
 from tiny_teachers import COLORS, color_teacher, write_model, write_settings, write_table
 
 from chebsplat.formats import artifact
-from chebsplat.formats.capture import Capture, write_capture
-from chebsplat.formats.channels import ChannelMap, write_channels
-from chebsplat.formats.features import read_features
+from chebsplat.formats.capture import Capture
+from chebsplat.formats.channels import ChannelMap
+from chebsplat.formats.features import Features
 from chebsplat.formats.manifest import Manifest
 from chebsplat.formats.teacher_model import read_label_set, read_teacher
 from chebsplat.stages import config as configs
@@ -42,7 +42,7 @@ def published_capture(path, images, labels=None, class_names=tuple(COLORS)):
         labels=None if labels is None else labels.astype(np.int16), class_names=list(class_names) or None,
     )  # fmt: skip
     with artifact.publish(path, Manifest("chebsplat.capture/2", KEY, "ingest")) as tmp:
-        write_capture(tmp, record)
+        record.write(tmp)
     return path
 
 
@@ -50,26 +50,26 @@ def encoded(tmp_path, capture, model, inputs=None, **settings):
     """(exit code, features or None) of the teacher stage."""
     config = {"teacher": {"model": str(model)} | settings}
     code = run_stage("teacher", tmp_path / "out", {"capture": capture} | (inputs or {}), config)
-    return code, read_features(tmp_path / "out") if code == 0 else None
+    return code, Features.read(tmp_path / "out") if code == 0 else None
 
 
 def image_of(capture, view=0):
-    from chebsplat.formats.capture import read_capture
+    from chebsplat.formats.capture import Capture
 
-    return read_capture(capture).images[view]
+    return Capture.read(capture).images[view]
 
 
 # what a teacher says
 
 
 def test_every_pixel_of_a_view_is_told_by_its_colour(tmp_path, capture):
-    from chebsplat.formats.capture import read_capture
+    from chebsplat.formats.capture import Capture
 
     code, found = encoded(tmp_path, capture, color_teacher(tmp_path))
     assert code == 0
     assert found.features.shape == (4, 12, 16, 3)
     assert found.label_names == list(COLORS)
-    assert np.array_equal(found.pseudo_labels[:], read_capture(capture).labels[:, ::4, ::4])
+    assert np.array_equal(found.pseudo_labels[:], Capture.read(capture).labels[:, ::4, ::4])
     assert np.allclose(np.linalg.norm(found.features[:].astype(np.float32), axis=-1), 1, atol=1e-3)
     known = {"teacher": "tiny", "output": "features", "normalized": True, "n_scales": 1, "flips": False}
     assert known.items() <= found.convention.items()
@@ -93,14 +93,14 @@ def test_every_pixel_of_a_view_is_told_by_its_colour(tmp_path, capture):
     ],
 )
 def test_windows_scales_and_flips_leave_things_where_they_are(tmp_path, capture, model, settings):
-    from chebsplat.formats.capture import read_capture
+    from chebsplat.formats.capture import Capture
 
     code, found = encoded(tmp_path, capture, color_teacher(tmp_path, **model), **settings)
     assert code == 0
     h, w = found.features.shape[1:3]
     rows, columns = (((np.arange(n) + 0.5) * side / n).astype(int) for n, side in zip((h, w), SIZE, strict=True))
     inner = np.outer(np.abs(rows % 16 - 7.5) < 5, np.abs(columns % 16 - 7.5) < 5)  # blocks without their edges
-    truth = read_capture(capture).labels[:][:, rows][:, :, columns]
+    truth = Capture.read(capture).labels[:][:, rows][:, :, columns]
     assert (found.pseudo_labels[:] == truth)[:, inner].all()
 
 
@@ -134,7 +134,7 @@ def test_channels_are_reduced_in_every_view_and_the_labels_are_the_teacher_s(tmp
     matrix = np.linalg.qr(np.concatenate([wide, rng.normal(size=(100, 5))], 1))[0].astype(np.float32)
     record = ChannelMap(matrix, matrix.T.copy(), np.ones(100, np.float32), "tiny", {})
     with artifact.publish(tmp_path / "channels", Manifest("chebsplat.channels/2", KEY, "channels")) as tmp:
-        write_channels(tmp, record)
+        record.write(tmp)
     code, found = encoded(tmp_path, capture, tmp_path / "tiny.onnx", {"channels": tmp_path / "channels"})
     assert code == 0
     assert found.features.shape[3] == 8
@@ -177,12 +177,12 @@ def segmenter(folder, names="red\ngreen\nblue\n"):
 
 
 def test_a_closed_set_segmenter_gives_its_likeliest_classes_and_their_probabilities(tmp_path, capture):
-    from chebsplat.formats.capture import read_capture
+    from chebsplat.formats.capture import Capture
     from chebsplat.labels.class_codes import class_codes
 
     code, found = encoded(tmp_path, capture, segmenter(tmp_path))
     assert code == 0
-    assert np.array_equal(found.pseudo_labels[:], read_capture(capture).labels[:, ::4, ::4])
+    assert np.array_equal(found.pseudo_labels[:], Capture.read(capture).labels[:, ::4, ::4])
     likely = 1 / (1 + 2 * np.exp(-10))
     assert np.allclose(found.confidence[:], likely, atol=1e-3)
     assert np.array_equal(found.label_embeddings, class_codes(list(COLORS), 13))

@@ -137,7 +137,7 @@ def _name(scene: str) -> str:
 
 def _write_page(scene: str, out: Path, sh: int, words: Path | None, against: list[str]) -> None:
     """Write the page and say where it is."""
-    from chebsplat.formats.scene import read_scene
+    from chebsplat.formats.scene import Scene
     from chebsplat.formats.teacher_model import read_label_set
     from chebsplat.pipelines.finished import artifact_of, teacher_of
     from chebsplat.stages.page import foreign, write_page
@@ -146,7 +146,7 @@ def _write_page(scene: str, out: Path, sh: int, words: Path | None, against: lis
     if theirs:
         opened, teacher = foreign(Path(scene).expanduser()), None
     else:
-        opened, teacher = read_scene(artifact_of(scene, "export")), teacher_of(scene)
+        opened, teacher = Scene.read(artifact_of(scene, "export")), teacher_of(scene)
     more = list(read_label_set(words)) if words else []
     counts = write_page(opened, _name(scene), teacher, out, sh, against, more)
     print(", ".join(f"{name} {number:,}" for name, number in counts.items()), file=sys.stderr)

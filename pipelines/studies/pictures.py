@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from chebsplat.formats.evaluation import Evaluation, read_evaluation
+from chebsplat.formats.evaluation import Evaluation
 from chebsplat.pipelines.studies.results import Row
 from chebsplat.pipelines.studies.study import Run, Study
 from chebsplat.stages.pages import pictures as draw
@@ -38,7 +38,7 @@ def gallery(study: Study, runs: list[Run], rows: list[Row]) -> dict[str, Any]:
     pixels: Counter[int] = Counter()
     for where, some in scenes.items():
         table = np.array([*(union.index(name) for name in names[where]), -1])
-        evaluations = {variant: read_evaluation(run.plan.targets["evaluate"]) for variant, run in some.items()}
+        evaluations = {variant: Evaluation.read(run.plan.targets["evaluate"]) for variant, run in some.items()}
         images, counts = _images(evaluations, table, len(union))
         pictures.append({"name": " ".join(part for part in where if part), "images": images})
         pixels.update(counts)
@@ -60,7 +60,7 @@ def gallery(study: Study, runs: list[Run], rows: list[Row]) -> dict[str, Any]:
 def _names(runs: dict[str, Run]) -> list[str]:
     """Names of the labels in a scene's pictures; none where a variant has no labels."""
     for run in runs.values():
-        evaluation = read_evaluation(run.plan.targets["evaluate"])
+        evaluation = Evaluation.read(run.plan.targets["evaluate"])
         if "predicted" in evaluation.pictures:
             inputs = {role: run.plan.targets[stage] for role, stage in (("capture", "ingest"), ("scene", "export"))}
             return label_names(inputs, evaluation.figures)

@@ -54,10 +54,10 @@ def modes(pictures: list[dict[str, Any]]) -> list[list[Any]]:
 def label_names(inputs: dict[str, Path], figures: dict[str, Any]) -> list[str]:
     """Names of the labels in the pictures: the capture's classes, or the scene's own labels where it has none."""
     from chebsplat.formats.artifact import read_manifest
-    from chebsplat.formats.capture import read_capture
+    from chebsplat.formats.capture import Capture
     from chebsplat.formats.scene import read_label_names
 
-    classes = read_capture(inputs["capture"]).class_names if "capture" in inputs else None
+    classes = Capture.read(inputs["capture"]).class_names if "capture" in inputs else None
     classes = classes or (figures.get("segmentation") or {}).get("classes")
     if classes is None and "scene" in inputs:
         path = inputs["scene"]

@@ -204,7 +204,7 @@ def _cameras() -> Any:
 
 
 def _capture(out: Path) -> None:
-    from chebsplat.formats.capture import Capture, write_capture
+    from chebsplat.formats.capture import Capture
 
     rng, (width, height) = np.random.default_rng(1), SIZE
     Ks, poses = _poses()
@@ -213,17 +213,17 @@ def _capture(out: Path) -> None:
     labels = rng.integers(-1, len(LABELS), (V, height, width)).astype(np.int16)
     is_test = np.arange(V) == 0
     source, protocol = {"name": "toy", "kind": "generated"}, {"name": "labels", "split": "every third"}
-    write_capture(out, Capture(VIEWS, images, Ks, poses, is_test, depth, labels, None, LABELS, source, protocol))
+    Capture(VIEWS, images, Ks, poses, is_test, depth, labels, None, LABELS, source, protocol).write(out)
 
 
 def _points(out: Path) -> None:
-    from chebsplat.formats.points import Points, write_points
+    from chebsplat.formats.points import Points
 
     normals = np.tile(np.array([0, 0, 1], np.float32), (N, 1))
     shape = np.tile(np.eye(3, dtype=np.float32), (N, 1, 1))
     means = _parameters()["means"].astype(np.float64)
     tracks = np.zeros((0, 2), np.int32)
-    write_points(out, Points(VIEWS, *_poses(), means, np.zeros((N, 3), np.uint8), normals, shape, tracks, {}))
+    Points(VIEWS, *_poses(), means, np.zeros((N, 3), np.uint8), normals, shape, tracks, {}).write(out)
 
 
 def _embeddings() -> np.ndarray:
@@ -231,12 +231,12 @@ def _embeddings() -> np.ndarray:
 
 
 def _features(out: Path) -> None:
-    from chebsplat.formats.features import Features, write_features
+    from chebsplat.formats.features import Features
 
     maps = np.random.default_rng(2).normal(0, 0.3, (V, 4, 6, C)).astype(np.float16)
     pseudo, sure = np.zeros((V, 4, 6), np.int16), np.ones((V, 4, 6), np.float16)
     convention = {"kind": "labels", "normalized": True}
-    write_features(out, Features(VIEWS, maps, LABELS, _embeddings(), pseudo, sure, convention))
+    Features(VIEWS, maps, LABELS, _embeddings(), pseudo, sure, convention).write(out)
 
 
 def _descriptors(out: Path) -> None:
@@ -248,39 +248,37 @@ def _descriptors(out: Path) -> None:
 
 
 def _gaussians(out: Path) -> None:
-    from chebsplat.formats.gaussians import Gaussians, write_gaussians
+    from chebsplat.formats.gaussians import Gaussians
 
     encoder = {"n_inputs": 9, "n_channels": C, "width": 8, "n_layers": 1, "n_heads": 2}
     trace = [{"step": 10.0, "seconds": 1.0, "n": float(N), "psnr": 20.0}]
     notes = NOTES | {"encoder": encoder, "label_names": LABELS}
     modules = {"shape.gate.weight": np.ones((2, 2), np.float32)}
-    write_gaussians(out, Gaussians(_parameters(), _cameras(), modules, {}, trace, notes))
+    Gaussians(_parameters(), _cameras(), modules, {}, trace, notes).write(out)
 
 
 def _agreement(out: Path) -> None:
-    from chebsplat.formats.agreement import ViewAgreement, write_agreement
+    from chebsplat.formats.agreement import ViewAgreement
 
     labels = {"wall": {"share": 0.75, "agreement": 0.5}, "floor": {"share": 0.25, "agreement": 0.25}}
-    write_agreement(out, ViewAgreement(0.375, N, V - 1, labels))
+    ViewAgreement(0.375, N, V - 1, labels).write(out)
 
 
 def _lifted(out: Path) -> None:
-    from chebsplat.formats.lifted import Lifted, write_lifted
+    from chebsplat.formats.lifted import Lifted
 
     ones, views = np.ones(N, np.float32), np.full((2, N), 2, np.int32)
     features = np.random.default_rng(3).normal(size=(N, C)).astype(np.float32)
     notes = {"views": VIEWS[1:], "n_observations": 4 * N}
-    write_lifted(
-        out, Lifted(features, ones, views.sum(0, dtype=np.int32), ones, np.stack([features] * 2), views, notes)
-    )
+    Lifted(features, ones, views.sum(0, dtype=np.int32), ones, np.stack([features] * 2), views, notes).write(out)
 
 
 def _refined(out: Path) -> None:
-    from chebsplat.formats.refined import Refined, write_refined
+    from chebsplat.formats.refined import Refined
 
     features = np.random.default_rng(4).normal(size=(N, C)).astype(np.float32)
     notes = {"start": "trained", "smooth": True, "strength": 0.0, "curve": {"off": {"0": 0.8}, "on": {"0": 0.9}}}
-    write_refined(out, Refined(features, np.ones(N, np.float32), notes))
+    Refined(features, np.ones(N, np.float32), notes).write(out)
 
 
 def _knowledge(out: Path) -> None:
@@ -296,12 +294,12 @@ def _knowledge(out: Path) -> None:
 
 
 def _scene(out: Path) -> None:
-    from chebsplat.formats.scene import Scene, write_scene
+    from chebsplat.formats.scene import Scene
 
     p = _parameters()
     p["raw_features"] = p.pop("fused")
     labels = np.arange(N, dtype=np.int32) % len(LABELS)
-    write_scene(out, Scene(p, _cameras(), np.arange(N), labels, LABELS, _embeddings(), NOTES))
+    Scene(p, _cameras(), np.arange(N), labels, LABELS, _embeddings(), NOTES).write(out)
 
 
 def _encoder(out: Path) -> None:
@@ -332,7 +330,7 @@ def _basis(out: Path) -> None:
 
 
 def _evaluation(out: Path) -> None:
-    from chebsplat.formats.evaluation import Evaluation, write_evaluation
+    from chebsplat.formats.evaluation import Evaluation
 
     (width, height), blank = SIZE, np.zeros((1, SIZE[1], SIZE[0], 3), np.uint8)
     sizes = dict.fromkeys(("unpruned_ply", "ply", "split", "ragged", "semantic"), 100)
@@ -346,7 +344,7 @@ def _evaluation(out: Path) -> None:
     figures |= {"left_out": {}, "segmentation": {"classes": LABELS, "scene": whole, "teacher": whole}}
     labels = np.zeros((1, height, width), np.int16)
     pictures = {"truth": blank, "renders": blank, "labels": labels, "predicted": labels, "teacher": labels}
-    write_evaluation(out, Evaluation(figures, pictures))
+    Evaluation(figures, pictures).write(out)
 
 
 WRITERS: dict[str, tuple[str, Callable[[Path], None]]] = {
