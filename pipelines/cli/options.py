@@ -12,14 +12,14 @@ from chebsplat.errors import ConfigError
 
 
 class NewPath(click.ParamType):
-    """A file, of one of these suffixes where there are any, or a folder, that is to be made: never written over."""
+    """A file, of one of these suffixes where there are any, or a folder: made, never written over."""
 
     name = "path"
 
     def __init__(self, *suffixes: str):
         self.suffixes = suffixes
 
-    def convert(self, value: Any, param: click.Parameter | None, context: click.Context | None) -> Path:
+    def convert(self, value: Any, param: Any, context: click.Context | None) -> Path:
         path = Path(value)
         if self.suffixes and path.suffix.lower() not in self.suffixes:
             raise ConfigError(f"{path}: the result is a {' or '.join(self.suffixes)}; name it so")
@@ -33,9 +33,13 @@ class Phrases(click.ParamType):
 
     name = "phrases"
 
-    def convert(self, value: Any, param: click.Parameter | None, context: click.Context | None) -> list[str]:
+    def convert(self, value: Any, param: Any, context: click.Context | None) -> list[str]:
         return [word.strip() for word in value.split(",") if word.strip()]
 
 
-AGAINST = click.option("--against", type=Phrases(), default="",
-                       help="phrases it is weighed against; default: object,things,stuff,texture")  # fmt: skip
+AGAINST = click.option(
+    "--against",
+    type=Phrases(),
+    default="",
+    help="phrases it is weighed against; default: object,things,stuff,texture",
+)

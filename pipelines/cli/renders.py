@@ -64,12 +64,10 @@ def render(
     from chebsplat.stages.camera_paths import fitted, path_of, size_of
     from chebsplat.stages.frames import Shot, kinds_of, render_frames
     from chebsplat.stages.progress import Progress
-    from chebsplat.stages.video import library, render_video
+    from chebsplat.stages.video import render_video
 
     opened, wanted = load(scene), size_of(size)
     kinds = kinds_of(what, opened, query is not None)
-    if out.suffix == ".mp4":
-        library()
     asked = None if query is None else opened.understood(query, against)
     shot = Shot(kinds, read_manifest(artifact_of(scene, "export")).key, asked)
     cameras = [fitted(camera, wanted) for camera in path_of(opened, path, frames)]
