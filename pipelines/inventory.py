@@ -5,7 +5,6 @@ from __future__ import annotations
 import os
 import time
 from collections import Counter
-from dataclasses import dataclass
 from itertools import chain
 from pathlib import Path
 
@@ -19,29 +18,14 @@ from chebsplat.stages.registry import STAGES
 PAGE = "view.html"  # of `chebsplat view`, in a scene's folder
 
 
-@dataclass(frozen=True)
-class Scene:
-    """One folder of links, of a scene or a study. size: bytes of what it names and of all that this was made of; alone:
-    of these, what nothing else was made of; when: the newest of what it names, seconds since 1970.
+COLUMNS = ("scene", "source", "done", "MB", "alone", "when", "PSNR", "mIoU")
+
+
+def scenes() -> list[tuple[str, ...]]:
+    """A row of COLUMNS for each folder of links in work, of a scene or a study, as far as it can be
+    read: MB of what it names and of all that this was made of, and of what nothing else was made of;
+    when the newest of what it names was finished. What is damaged counts nothing.
     """
-
-    title: str
-    source: str
-    done: str
-    size: int
-    alone: int
-    when: float
-    psnr: str
-    miou: str
-
-    def row(self) -> tuple[str, ...]:
-        day = time.strftime("%Y-%m-%d %H:%M", time.localtime(self.when))
-        sizes = (f"{size / 1e6:.1f}" for size in (self.size, self.alone))
-        return self.title, self.source, self.done, *sizes, day, self.psnr, self.miou
-
-
-def scenes() -> list[Scene]:
-    """Those in work, each as far as it can be read; what is damaged counts nothing."""
     store_paths = store.work().glob("store/*/*")
     held = {path.name: _manifest(path) for path in store_paths if not path.name.startswith(".")}
     reached = {title: _made_of(title, held) for title in titles()}
@@ -49,14 +33,15 @@ def scenes() -> list[Scene]:
     rows = []
     for title, keys in reached.items():
         named = links(store.work() / title)
-        when = max((path / "artifact.json").stat().st_mtime for path in named.values())
+        newest = max((path / "artifact.json").stat().st_mtime for path in named.values())
+        when = time.strftime("%Y-%m-%d %H:%M", time.localtime(newest))
         stages = [stage for stage in named if stage in STAGES]
-        done = " ".join(stages) or f"{len(named)} artifacts"
+        done = "all" if "report" in named else " ".join(stages) or f"{len(named)} artifacts"
         source = _source(title, _manifest(named["ingest"]) if "ingest" in named else None) if stages else ""
         psnr, miou, _ = summary.quality(summary.figures(named["evaluate"]) if "evaluate" in named else None)
         size = sum(sizes[key] for key in keys)
         alone = sum(sizes[key] for key in keys if times[key] == 1)
-        rows.append(Scene(title, source, "all" if "report" in named else done, size, alone, when, psnr, miou))
+        rows.append((title, source, done, f"{size / 1e6:.1f}", f"{alone / 1e6:.1f}", when, psnr, miou))
     return rows
 
 

@@ -73,8 +73,6 @@ def command(name: str, run: Callable[[Job], None]) -> click.Command:
         click.Option(["--out"], type=click.Path(path_type=Path), required=True, help="the artifact's directory"),
         click.Option(["--device"], type=click.Choice(DEVICES), default="auto", show_default=True),
         click.Option(["--force"], is_flag=True, help="run even if the artifact exists, and replace it; nothing else"),
-        click.Option(["--log-level"], default="info",
-                     type=click.Choice(["debug", "info", "warning", "error"])),
     ]  # fmt: skip
     return click.Command(name, params=params, callback=invoke, help=stage.help)
 
@@ -90,7 +88,6 @@ def publish(
     code: dict[str, Any] | None = None,
     device: str = "auto",
     force: bool = False,
-    log_level: str = "info",
     within: AbstractContextManager[Any] | None = None,
 ) -> None:
     """Run one stage in this process and publish its artifact; nothing if it is there, unless by `force`.
@@ -102,7 +99,7 @@ def publish(
     """
     line = f"%(asctime)s {name}: %(message)s"
     logging.basicConfig(stream=sys.stderr, format=line, datefmt="%H:%M:%S", level="WARNING", force=True)
-    log.setLevel(log_level.upper())
+    log.setLevel("INFO")
     out, stage = out.absolute(), STAGES[name]
     if not force and artifact.is_whole(out, stage.schema):
         log.info("already there")

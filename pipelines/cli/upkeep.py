@@ -37,8 +37,7 @@ def list_scenes() -> None:
     if not scenes:
         print(f"no scene in {store.work()}", file=sys.stderr)
         return
-    heading = ("scene", "source", "done", "MB", "alone", "when", "PSNR", "mIoU")
-    show_rows([heading, *(scene.row() for scene in scenes)])
+    show_rows([inventory.COLUMNS, *scenes])
     print(f"{store.work()}: what several share counts in each, and in none alone", file=sys.stderr)
 
 
