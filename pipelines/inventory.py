@@ -30,7 +30,7 @@ def scenes() -> list[tuple[str, ...]]:
     held = {path.name: _manifest(path) for path in store_paths if not path.name.startswith(".")}
     reached = {title: _made_of(title, held) for title in titles()}
     sizes, times = {key: _size(manifest) for key, manifest in held.items()}, Counter(chain(*reached.values()))
-    rows = []
+    rows: list[tuple[str, ...]] = []
     for title, keys in reached.items():
         named = links(store.work() / title)
         newest = max((path / "artifact.json").stat().st_mtime for path in named.values())
