@@ -42,14 +42,13 @@ def test_a_setting_has_a_lower_and_an_upper_bound():
 
 def settings_of(values):
     """Every `section.key` of nested tables, whatever they lie in."""
-    if not isinstance(values, dict):
-        return set()
-    own = {f"{name}.{key}" for name, table in values.items() if isinstance(table, dict) for key in table}
-    return own.union(*map(settings_of, values.values()))
+    tables = {name: table for name, table in values.items() if isinstance(table, dict)}
+    own = {f"{name}.{key}" for name, table in tables.items() for key in table}
+    return own.union(*map(settings_of, tables.values()))
 
 
 def names_in(source):
-    """What Python code sets: every `section.key` of a table in a table, and the names of keys and keywords alone."""
+    """Every `section.key` of tables in tables of Python code; names of keys and keywords alone."""
     whole, alone = set(), set()
     for node in ast.walk(ast.parse(source)):
         if isinstance(node, ast.Call):
@@ -59,19 +58,21 @@ def names_in(source):
                 if isinstance(name, ast.Constant):
                     alone.add(name.value)
                     tables = [inner for inner in ast.walk(value) if isinstance(inner, ast.Dict)]
-                    keys = [key for table in tables for key in table.keys if isinstance(key, ast.Constant)]
-                    whole |= {f"{name.value}.{key.value}" for key in keys}
+                    keys = [key for table in tables for key in table.keys]
+                    keys = [key.value for key in keys if isinstance(key, ast.Constant)]
+                    whole |= {f"{name.value}.{key}" for key in keys}
     return whole, alone
 
 
 def test_there_are_at_most_150_settings_and_something_names_each():
-    """A setting that no config, study, doc, test or benchmark names has no use that anyone knows of.
+    """One that no config, study, doc, test or benchmark names has no use that anyone knows of.
 
-    It is named with its section; by its key alone, as a keyword of code, too, if no other section has that key.
+    It is named with its section; by its key alone in code, too, if no other section has that key.
     """
     settings = config.known_keys()
     assert len(settings) <= 150
-    pages, configs = [*ROOT.glob("docs/*.md"), ROOT / "README.md"], [*ROOT.glob("pipelines/configs/*/*.toml")]
+    pages = [*ROOT.glob("docs/*.md"), ROOT / "README.md"]
+    configs = list(ROOT.glob("pipelines/configs/*/*.toml"))
     code = [path for folder in ("tests", "benchmarks") for path in ROOT.glob(f"{folder}/**/*.py")]
     named, alone = set(), set()
     for path in (*pages, *configs, *code):
@@ -81,9 +82,10 @@ def test_there_are_at_most_150_settings_and_something_names_each():
     for path in code:
         whole, keys = names_in(path.read_text())
         named, alone = named | whole, alone | keys
-    times = Counter(key.split(".")[1] for key in settings)
-    named |= {setting for setting in settings if (key := setting.split(".")[1]) in alone and times[key] == 1}
-    assert sorted(set(settings) - named) == []
+    times = Counter(setting.split(".")[1] for setting in settings)
+    alone = {key for key in alone if times[key] == 1}
+    unknown = [name for name in settings if name not in named]
+    assert [name for name in unknown if name.split(".")[1] not in alone] == []
 
 
 @pytest.mark.parametrize("value", [True, 1.0, "5", float("nan"), float("inf"), 10**400, [5]])
