@@ -6,6 +6,7 @@ A key becomes a folder's name and a member's name a path: neither may lead anywh
 from __future__ import annotations
 
 import re
+from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path, PurePosixPath
 from typing import Any
@@ -62,11 +63,18 @@ def parse_manifest(path: Path) -> Manifest:
     document = parse_json(file, remedy_of(path))
     try:
         manifest = Manifest(**document)
-        sound = is_key(manifest.key) and all(is_member(name) for name in manifest.files)
-        sound &= all(is_key(entry["key"]) for entry in manifest.inputs.values())
-        sound &= all({"sha256", "bytes"} <= entry.keys() for entry in manifest.files.values())
-    except (TypeError, AttributeError, KeyError):
-        sound = False
-    if not sound:
-        raise InputError(f"{file} is damaged: it is not what `publish` writes; {remedy_of(path)}")
+        bad = [name for name, sound in _RULES.items() if not sound(getattr(manifest, name))]
+    except (TypeError, AttributeError, KeyError) as error:
+        bad = [str(error)]
+    if bad:
+        raise InputError(f"{file} is damaged: {bad[0]} is not what `publish` writes; {remedy_of(path)}")
     return manifest
+
+
+_RULES: dict[str, Callable[[Any], bool]] = {
+    "key": is_key,
+    "inputs": lambda inputs: all(is_key(entry["key"]) for entry in inputs.values()),
+    "files": lambda files: all(
+        is_member(name) and {"sha256", "bytes"} <= entry.keys() for name, entry in files.items()
+    ),
+}

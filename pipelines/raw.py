@@ -66,7 +66,7 @@ def _of_channels(settings: dict[str, Any]) -> list[Path]:
 
     images = reference_files(Path(settings["reference"])) if settings["reference"] else []
     teacher = read_teacher(Path(settings["model"]))
-    brought = sorted(teacher.channels.iterdir()) if teacher.channels.is_dir() else []
+    brought = sorted(path for path in teacher.channels.rglob("*") if path.is_file())
     return [*teacher.files(), *brought, *images]
 
 

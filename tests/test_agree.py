@@ -118,7 +118,7 @@ def test_points_that_no_two_views_see_leave_the_figure_open(tmp_path, capsys):
 def test_tracks_tell_who_sees_a_point_where_there_is_no_depth(tmp_path):
     record = capture.Capture.read(artifacts() / "ingest")
     record.depth = None
-    with publish(tmp_path / "capture", Manifest(capture.SCHEMA, KEY, "test")) as tmp:
+    with publish(tmp_path / "capture", Manifest(capture.Capture.SCHEMA, KEY, "test")) as tmp:
         record.write(tmp)
     tracks = np.array([[0, 1], [0, 2], [1, 1], [2, 0], [2, 2]], np.int32)  # view 0 is a test view
     tracked = with_points(tmp_path / "tracked", tracks=tracks)

@@ -141,7 +141,7 @@ def test_a_channel_map_reads_back_and_restores(tmp_path):
     assert found.embed(words(12)).shape == (40, 5)
 
 
-@pytest.mark.parametrize("name", ["channels.safetensors", "channels.json"])
+@pytest.mark.parametrize("name", ["matrix/c/0/0", "zarr.json"])
 def test_a_damaged_channel_map_is_named_with_its_remedy(tmp_path, name):
     made(tmp_path / "p")
     file = tmp_path / "p" / name

@@ -153,7 +153,7 @@ def test_a_store_that_lacks_a_view_or_its_labels_is_not_finished(tmp_path):
 def test_every_bit_of_a_view_is_guarded(tmp_path):
     path = tmp_path / "f"
     stack = np.zeros((1, 65, 65, 1), np.float16)  # compresses well: few bytes to try
-    with artifact.publish(path, Manifest(features.SCHEMA, KEY, "s")) as tmp:
+    with artifact.publish(path, Manifest(Features.SCHEMA, KEY, "s")) as tmp:
         Features(["a"], stack, ["x"], np.eye(1, 1, dtype=np.float32)).write(tmp)
     chunk = path / "features/c/0/0/0/0"
     good = chunk.read_bytes()

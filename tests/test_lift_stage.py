@@ -73,7 +73,7 @@ def test_a_splat_in_another_frame_and_a_capture_without_poses_are_refused(tmp_pa
 def test_features_of_another_number_of_gaussians_are_refused(lifted, tmp_path, capsys):
     fewer = Gaussians.read(artifacts() / "train")
     fewer.parameters = {name: values[:-1] for name, values in fewer.parameters.items()}
-    with artifact.publish(tmp_path / "train", Manifest(gaussians.SCHEMA, KEY, "test")) as tmp:
+    with artifact.publish(tmp_path / "train", Manifest(gaussians.Gaussians.SCHEMA, KEY, "test")) as tmp:
         fewer.write(tmp)
     inputs = {"gaussians": tmp_path / "train", "features": artifacts() / "teacher", "lifted": lifted}
     assert run_stage("export", tmp_path / "export", inputs, {}) == 3

@@ -92,7 +92,7 @@ def test_a_folder_s_manifest_cannot_say_where_its_copy_goes(work, tmp_path, key)
     file = folder / "artifact.json"
     file.write_text(json.dumps(json.loads(file.read_text()) | {"key": key}))
     before = sorted(tmp_path.rglob("*"))
-    with pytest.raises(InputError, match="key is not 16 hexadecimal digits"):
+    with pytest.raises(InputError, match="damaged: key"):
         store.taken_in(folder, "cks", "chebsplat.basis/3", running=True)
     assert sorted(tmp_path.rglob("*")) == before
     assert not os.path.lexists("/tmp/elsewhere")

@@ -1,7 +1,6 @@
 """Studies: what they expand to, what they compute again (nothing), and the tables they make."""
 
 import csv
-import json
 import os
 import subprocess
 import sys
@@ -40,13 +39,13 @@ def study(**changes):
     return checked_study(values | changes, "study")
 
 
-def publish_stage(run, stage, fill):
+def publish_stage(run, stage, fill, **facts):
     """An artifact of a run, without running it. fill: documents by name, or what writes them into a folder."""
     step = next(step for step in run.steps if step.stage == stage)
     if step.fresh:
         return
     code = {"commit": "c" * 40, "dirty": False}
-    manifest = Manifest(STAGES[stage].schema, step.key, stage, {}, step.sections, 0, threads=2, code=code)
+    manifest = Manifest(STAGES[stage].schema, step.key, stage, {}, step.sections, 0, facts, threads=2, code=code)
     step.path.parent.mkdir(parents=True, exist_ok=True)
     with publish(step.path, manifest) as tmp:
         if callable(fill):
@@ -77,7 +76,7 @@ def finish(run, miou=0.5, psnr=30.0, n=100, seconds=10.0, steps=10, segmentation
         run, "train", {"trace.csv": f"step,seconds,psnr\n{steps // 2},{seconds / 2},20\n{steps},{seconds},25\n"}
     )
     # 10 Gaussians keep degree 3 (16 coefficients) and 30 degree 0 (1): 190 of 640.
-    publish_stage(run, "export", {"summary.json": json.dumps({"by_degree": [30, 0, 0, 10]})})
+    publish_stage(run, "export", {}, by_degree=[30, 0, 0, 10])
     figures |= {"names": ["a"], "left_out": {"LPIPS": "not measured"}}
     figures["image"]["per_view"] = {"psnr": [psnr]}
     pictures = {name: np.zeros((1, 4, 6, 3), np.uint8) for name in ("truth", "renders")}

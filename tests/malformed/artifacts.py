@@ -254,7 +254,7 @@ def _gaussians(out: Path) -> None:
     trace = [{"step": 10.0, "seconds": 1.0, "n": float(N), "psnr": 20.0}]
     notes = NOTES | {"encoder": encoder, "label_names": LABELS}
     modules = {"shape.gate.weight": np.ones((2, 2), np.float32)}
-    Gaussians(_parameters(), _cameras(), modules, {}, trace, notes).write(out)
+    Gaussians(_parameters(), _cameras(), modules, trace, notes).write(out)
 
 
 def _agreement(out: Path) -> None:
