@@ -85,7 +85,7 @@ def test_what_cannot_be_is_said(scene):
         scene.select(np.ones(3, bool))
     with pytest.raises(ConfigError, match="is left"):
         scene.select(np.zeros(len(scene), bool))
-    with pytest.raises(ConfigError, match="open the scene.s folder"):
+    with pytest.raises(ConfigError, match="open the scene"):
         scene.query("wall")
     with pytest.raises(AttributeError):
         chebsplat.nothing  # noqa: B018
