@@ -103,16 +103,27 @@ def errors(poses, truth):
     return np.array([apart / size, np.degrees(Rotation.from_matrix(turns).magnitude().mean())])
 
 
-def test_disturbed_poses_and_a_wrong_focal_length_are_found_again(synthetic):
-    job, database, names, truth = synthetic
+def disturbed(truth):
+    """Poses half a degree and a hundredth of the scene's size off the true ones; that size."""
     rng = np.random.default_rng(0)
     turns = Rotation.from_rotvec(np.radians(0.5) * rng.normal(size=(len(truth), 3))).as_matrix()
     size = np.linalg.norm(centers(truth) - centers(truth).mean(0), axis=1).mean()
-    given = poses_of(turns @ truth[:, :3, :3], centers(truth) + 0.01 * size * rng.normal(size=(len(truth), 3)))
-    model, notes = adjust(job, model_of(database, names, given, 927.0), database, names, given)
+    places = centers(truth) + 0.01 * size * rng.normal(size=(len(truth), 3))
+    return poses_of(turns @ truth[:, :3, :3], places), size
+
+
+def held_by(model, names):
     held = {image.name: image for image in model.images.values()}
-    found = given.copy()
-    found[:, :3] = [held[name].cam_from_world().matrix() for name in names]
+    poses = np.tile(np.eye(4), (len(names), 1, 1))
+    poses[:, :3] = [held[name].cam_from_world().matrix() for name in names]
+    return poses
+
+
+def test_disturbed_poses_and_a_wrong_focal_length_are_found_again(synthetic):
+    job, database, names, truth = synthetic
+    given, size = disturbed(truth)
+    model, notes = adjust(job, model_of(database, names, given, 927.0), database, names, given)
+    found = held_by(model, names)
     assert errors(given, truth).min() > 0.005
     assert (errors(found, truth) < errors(given, truth) / 5).all()
     assert notes["focal_px"][1] == pytest.approx(900, rel=0.003)
@@ -159,10 +170,7 @@ def test_a_view_is_found_among_the_points_of_others_or_stays_where_it_was_given(
 @pytest.mark.parametrize("weak", [1, 3])
 def test_views_with_few_matches_stay_near_where_they_were_given(synthetic, weak):
     job, database, names, truth = synthetic
-    rng = np.random.default_rng(0)
-    turns = Rotation.from_rotvec(np.radians(0.5) * rng.normal(size=(len(truth), 3))).as_matrix()
-    size = np.linalg.norm(centers(truth) - centers(truth).mean(0), axis=1).mean()
-    given = poses_of(turns @ truth[:, :3, :3], centers(truth) + 0.01 * size * rng.normal(size=(len(truth), 3)))
+    given, size = disturbed(truth)
     with pycolmap.Database.open(database) as opened:
         images = {image.name: image.image_id for image in opened.read_all_images()}
         for name in names[:weak]:
@@ -172,9 +180,7 @@ def test_views_with_few_matches_stay_near_where_they_were_given(synthetic, weak)
                     geometry.inlier_matches = geometry.inlier_matches[:2]
                     opened.update_two_view_geometry(images[name], images[other], geometry)
     model, notes = adjust(job, model_of(database, names, given, 900.0), database, names, given)
-    held = {image.name: image for image in model.images.values()}
-    found = given.copy()
-    found[:, :3] = [held[name].cam_from_world().matrix() for name in names]
+    found = held_by(model, names)
     assert notes["poses_kept"] == weak
     moved, turned = differences(found[:weak], given[:weak])
     assert (moved < 0.1 * size).all() and (np.degrees(turned) < 4).all()

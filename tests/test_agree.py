@@ -5,12 +5,12 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from malformed.artifacts import LABELS, N, artifacts
-from shared import KEY, run_stage
+from shared import published, run_stage
 
-from chebsplat.formats import capture, points
 from chebsplat.formats.agreement import ViewAgreement
-from chebsplat.formats.artifact import publish, read_manifest
-from chebsplat.formats.manifest import Manifest
+from chebsplat.formats.artifact import read_manifest
+from chebsplat.formats.capture import Capture
+from chebsplat.formats.points import Points
 from chebsplat.labels.agreement import between, far_pairs, project, unhidden
 
 K, SIZE = np.array([[50.0, 0, 32], [0, 50, 24], [0, 0, 1]]), (64, 48)
@@ -99,16 +99,9 @@ def test_the_stage_warns_of_a_teacher_that_says_one_thing_and_records_it(tmp_pat
     assert "doubt" not in read_manifest(tmp_path / "calm").facts
 
 
-def with_points(path, **changes):
-    """The small points, changed."""
-    with publish(path, Manifest(points.SCHEMA, KEY, "test")) as tmp:
-        replace(points.Points.read(artifacts() / "sfm"), **changes).write(tmp)
-    return path
-
-
 def test_points_that_no_two_views_see_leave_the_figure_open(tmp_path, capsys):
-    means = points.Points.read(artifacts() / "sfm").means + 1000
-    far = with_points(tmp_path / "far", means=means)
+    small = Points.read(artifacts() / "sfm")
+    far = published(tmp_path / "far", replace(small, means=small.means + 1000))
     inputs = {role: artifacts() / name for role, name in INPUTS.items()} | {"points": far}
     assert run_stage("agree", tmp_path / "out", inputs, {}) == 0
     assert ViewAgreement.read(tmp_path / "out").agreement is None
@@ -116,12 +109,9 @@ def test_points_that_no_two_views_see_leave_the_figure_open(tmp_path, capsys):
 
 
 def test_tracks_tell_who_sees_a_point_where_there_is_no_depth(tmp_path):
-    record = capture.Capture.read(artifacts() / "ingest")
-    record.depth = None
-    with publish(tmp_path / "capture", Manifest(capture.Capture.SCHEMA, KEY, "test")) as tmp:
-        record.write(tmp)
+    blind = published(tmp_path / "capture", replace(Capture.read(artifacts() / "ingest"), depth=None))
     tracks = np.array([[0, 1], [0, 2], [1, 1], [2, 0], [2, 2]], np.int32)  # view 0 is a test view
-    tracked = with_points(tmp_path / "tracked", tracks=tracks)
-    inputs = {"capture": tmp_path / "capture", "points": tracked, "features": artifacts() / "teacher"}
+    tracked = published(tmp_path / "tracked", replace(Points.read(artifacts() / "sfm"), tracks=tracks))
+    inputs = {"capture": blind, "points": tracked, "features": artifacts() / "teacher"}
     assert run_stage("agree", tmp_path / "out", inputs, {}) == 0
     assert ViewAgreement.read(tmp_path / "out").n_points == 1  # of the three, one is in two training views

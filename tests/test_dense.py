@@ -13,6 +13,7 @@ from chebsplat.stages.config import Config
 from chebsplat.stages.settings import SfmSection
 
 FOCAL, SIZE = 160.0, (160, 120)
+OTHERS = np.array([[k for k in range(5) if k != view] for view in range(5)])
 
 
 @pytest.fixture(scope="module")
@@ -37,6 +38,11 @@ def wall():
         poses.append(pose)
     pixels = (255 * np.stack(images)[..., None].repeat(3, -1)).astype(np.uint8)
     return pixels, np.tile(K, (5, 1, 1)), np.stack(poses), np.stack(depths)
+
+
+@pytest.fixture
+def job(tmp_path):
+    return Job({}, Config(), tmp_path / "out", tmp_path)
 
 
 def cloud_of(wall):
@@ -75,26 +81,25 @@ def test_a_sweep_finds_depth_between_its_steps(wall):
 
 def test_views_confirm_true_depth_and_deny_another(wall):
     _, Ks, poses, depths = wall
-    true, others = depths.astype(np.float32), np.array([[k for k in range(5) if k != view] for view in range(5)])
-    agree = consistency.agreed(true, Ks, poses, others, 2)
+    true = depths.astype(np.float32)
+    agree = consistency.agreed(true, Ks, poses, OTHERS, 2)
     np.testing.assert_allclose(agree[2][agree[2] > 0], true[2][agree[2] > 0], rtol=1e-6)
     assert (agree[2] > 0).mean() > 0.95
     wrong = true.copy()
     wrong[2] *= 1.2
-    assert (consistency.agreed(wrong, Ks, poses, others, 2)[2] > 0).mean() < 0.05
+    assert (consistency.agreed(wrong, Ks, poses, OTHERS, 2)[2] > 0).mean() < 0.05
     noisy = true.copy()
     noisy[2] *= 1.01
-    mean = consistency.agreed(noisy, Ks, poses, others, 2)[2]
+    mean = consistency.agreed(noisy, Ks, poses, OTHERS, 2)[2]
     assert (np.abs(mean / true[2] - 1) < 0.004).mean() > 0.8  # four right ones, and its own
 
 
 def test_what_other_views_see_through_goes_however_many_share_it(wall):
     _, Ks, poses, depths = wall
-    others = np.array([[k for k in range(5) if k != view] for view in range(5)])
     floating = depths.astype(np.float32)
     corner = np.s_[5:20, 60:90]  # of the wall
     floating[:2][:, *corner] = 1.6  # two views share a thing in the air; three see the wall behind it
-    kept = consistency.agreed(floating, Ks, poses, others, 1)
+    kept = consistency.agreed(floating, Ks, poses, OTHERS, 1)
     assert (kept[0][corner] > 0).mean() < 0.3
     assert (kept[4][corner] > 0).mean() > 0.9  # which hides nothing from these, and denies nothing
 
@@ -103,25 +108,22 @@ def test_unknown_depth_and_views_that_compare_with_none_stay_unknown(wall):
     _, Ks, poses, depths = wall
     nobody = np.full((5, 1), -1)
     assert not consistency.agreed(depths.astype(np.float32), Ks, poses, nobody, 1).any()
-    others = np.array([[k for k in range(5) if k != view] for view in range(5)])
     holes = depths.astype(np.float32)
     holes[:, :60] = 0
-    assert not consistency.agreed(holes, Ks, poses, others, 1)[:, :60].any()
+    assert not consistency.agreed(holes, Ks, poses, OTHERS, 1)[:, :60].any()
 
 
-def test_points_beside_the_cameras_leave_a_sweep_where_it_looks(wall, tmp_path):
+def test_points_beside_the_cameras_leave_a_sweep_where_it_looks(wall, job):
     """Views from within a room have points behind the edges of every photo, nearer than anything in it."""
     cloud = cloud_of(wall)
     beside = np.random.default_rng(2).uniform([1, -1, 0.01], [3, 1, 0.1], (20, 3))
     both = cloud | {"means": np.concatenate([cloud["means"], beside])}
-    job = Job({}, Config(), tmp_path / "out", tmp_path)
     assert len(dense.swept(job, capture_of(wall), both)["means"]) == len(
         dense.swept(job, capture_of(wall), cloud)["means"]
     )
 
 
-def test_swept_points_lie_on_the_surfaces_and_come_from_training_views(wall, tmp_path):
-    job = Job({}, Config(), tmp_path / "out", tmp_path)
+def test_swept_points_lie_on_the_surfaces_and_come_from_training_views(wall, job):
     found = dense.swept(job, capture_of(wall), cloud_of(wall))
     z = found["means"][:, 2]
     off = np.minimum(np.abs(z / 2.5 - 1), np.abs(z / 4 - 1))
@@ -137,8 +139,7 @@ def test_swept_points_lie_on_the_surfaces_and_come_from_training_views(wall, tmp
     assert found["colors"].shape == found["means"].shape
 
 
-def test_masked_pixels_give_no_points(wall, tmp_path):
-    job = Job({}, Config(), tmp_path / "out", tmp_path)
+def test_masked_pixels_give_no_points(wall, job):
     mask = np.ones(wall[0].shape[:3], bool)
     mask[:, :, :80] = False
     found = dense.swept(job, capture_of(wall, loss_mask=mask), cloud_of(wall))

@@ -1,9 +1,9 @@
 """Depth of the surface equals its transcription, and lies where most of a pixel's light comes from."""
 
-import numba
 import numpy as np
 import pytest
 from raster import camera, scene
+from thread_counts import assert_same_bits
 
 from chebsplat.rasterize import lift_reference
 from chebsplat.rasterize.depths import depths
@@ -43,14 +43,7 @@ def test_the_depth_of_a_view_equals_the_transcription(part):
 
 
 def test_the_depth_is_the_same_bits_for_any_number_of_threads():
-    before, results = numba.get_num_threads(), []
-    try:
-        for threads in (1, min(2, before)):
-            numba.set_num_threads(threads)
-            results.append(depths(*arguments()))
-    finally:
-        numba.set_num_threads(before)
-    np.testing.assert_array_equal(*(np.stack(images) for images in results))
+    assert_same_bits(lambda: depths(*arguments()))
 
 
 def test_a_wall_of_faint_gaussians_is_met_where_they_are_densest():

@@ -1,5 +1,6 @@
 """What evaluate measures: joined by name, LPIPS from weights, the time of a frame by part."""
 
+import layouts
 import numpy as np
 import pytest
 import torch
@@ -7,14 +8,21 @@ from safetensors.torch import save_file
 from shared import INPUTS, published, run_stage
 from test_stages import changed, inputs_of
 
+from chebsplat.cameras import unproject
 from chebsplat.errors import InputError
+from chebsplat.evaluation.frame_parts import frame_parts
 from chebsplat.evaluation.lpips import BLOCKS, SCALE, SHIFT, Lpips
+from chebsplat.evaluation.protocols import scannet_closed, scannet_open
 from chebsplat.formats import artifact
 from chebsplat.formats.capture import Capture
 from chebsplat.formats.evaluation import Evaluation
 from chebsplat.formats.features import Features
 from chebsplat.formats.scene import Scene
+from chebsplat.pipelines.plan import Planner
+from chebsplat.render import SceneRenderer
+from chebsplat.stages.evaluate import camera
 from chebsplat.stages.fidelity import image_figures, perceptual
+from chebsplat.stages.sources import generated
 
 
 def widths():
@@ -130,10 +138,6 @@ def test_lpips_given_weights_and_the_time_by_part_are_in_the_evaluation(toy, wei
 
 @pytest.mark.xdist_group("toy")
 def test_the_clocked_steps_render_the_same_frame(toy):
-    from chebsplat.evaluation.frame_parts import frame_parts
-    from chebsplat.render import SceneRenderer
-    from chebsplat.stages.evaluate import camera
-
     scene = Scene.read(toy["export"])
     renderer = SceneRenderer(scene.parameters)
     for k in range(3):
@@ -180,12 +184,6 @@ def test_points_are_measured_where_depth_and_poses_say_where_they_lie(toy, tmp_p
 @pytest.mark.slow
 def test_a_scannet_scene_runs_from_its_folder_to_the_figures_of_scannet_open(tmp_path):
     """All 16 views are trained on and evaluated; points come from the scene's own file."""
-    import layouts
-
-    from chebsplat.cameras import unproject
-    from chebsplat.evaluation.protocols import scannet_open
-    from chebsplat.stages.sources import generated
-
     fields = generated.capture("toy", 1, "toy")
     fields["labels"], fields["class_names"] = (fields["labels"] + 7) % 20, list(scannet_open.CLASSES)
     pixels = np.argwhere(np.ones((72, 96), bool))[::17]
@@ -210,11 +208,7 @@ def test_a_scannet_scene_runs_from_its_folder_to_the_figures_of_scannet_open(tmp
     assert figures["segmentation"]["scene"] == scannet_open.summed([matrix])
 
 
-def test_the_content_of_the_weights_is_part_of_what_an_evaluation_is(tmp_path, monkeypatch):
-    from chebsplat.pipelines.plan import Planner
-
-    monkeypatch.chdir(tmp_path)
-    monkeypatch.setenv("CHEBSPLAT_WORK", str(tmp_path / "work"))
+def test_the_content_of_the_weights_is_part_of_what_an_evaluation_is(quick_plans, tmp_path):
     plans = []
     for content in (b"one", b"other"):
         (tmp_path / "vgg.pth").write_bytes(content)
@@ -225,14 +219,7 @@ def test_the_content_of_the_weights_is_part_of_what_an_evaluation_is(tmp_path, m
         Planner().plan("toy", "evaluate.lpips_weights=gone.pth")
 
 
-def test_a_scannet_folder_is_planned_without_the_stages_it_does_not_need(tmp_path, monkeypatch):
-    import layouts
-
-    from chebsplat.evaluation.protocols import scannet_closed
-    from chebsplat.pipelines.plan import Planner
-
-    monkeypatch.chdir(tmp_path)
-    monkeypatch.setenv("CHEBSPLAT_WORK", str(tmp_path / "work"))
+def test_a_scannet_folder_is_planned_without_the_stages_it_does_not_need(quick_plans, tmp_path):
     fields = {"images": np.zeros((5, 6, 8, 3), np.uint8), "depth": np.ones((5, 6, 8), np.float32),
               "labels": np.zeros((5, 6, 8), np.int16), "class_names": list(scannet_closed.CLASSES),
               "Ks": np.tile([[8.0, 0, 4], [0, 8, 3], [0, 0, 1]], (5, 1, 1)),

@@ -1,9 +1,9 @@
 """Fused features in view equal the plain-torch oracle, in value and gradient, and are the same bits for any threads."""
 
 import chebsplat  # noqa: F401  # isort: skip
-import numba
 import pytest
 import torch
+from thread_counts import assert_same_bits
 
 from chebsplat.shape.fusion import Gate, fuse_in_view, propagate
 
@@ -50,15 +50,7 @@ def test_fused_features_equal_the_oracle(channels):
 
 def test_threads_do_not_change_a_bit():
     case = scene(13, n=3000)
-    before, results = numba.get_num_threads(), []
-    try:
-        for threads in (1, min(2, before), before):
-            numba.set_num_threads(threads)
-            results.append([value.clone() for value in fused(*case)])
-    finally:
-        numba.set_num_threads(before)
-    for other in results[1:]:
-        assert all(torch.equal(a, b) for a, b in zip(results[0], other, strict=True))
+    assert_same_bits(lambda: [value.clone() for value in fused(*case)])
 
 
 def test_nothing_in_view_and_no_fresh_region():

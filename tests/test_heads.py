@@ -9,14 +9,18 @@ import time
 
 import numpy as np
 import pytest
+import torch
 from shared import ROOT, gaussian_parameters, key_of
 
-from chebsplat.errors import ConfigError, InputError
+from chebsplat.errors import ConfigError, DataFailure, InputError
 from chebsplat.formats import artifact, heads
 from chebsplat.formats.basis import Basis, read_basis, read_lineage, write_basis
 from chebsplat.formats.cameras import Cameras
 from chebsplat.formats.gaussians import Gaussians
 from chebsplat.formats.manifest import Manifest
+from chebsplat.pipelines import bases, store
+from chebsplat.shape.encoder import RegionEncoder
+from chebsplat.stages import cks
 
 COUNTING = """
 import sys
@@ -117,10 +121,6 @@ def test_eight_hundred_updates_without_locks_of_the_file_system_by_killed_proces
 
 def trained(path, key, seed):
     """A checkpoint whose encoder is random and its linear maps of rank 1, so that many scenes have news."""
-    import torch
-
-    from chebsplat.shape.encoder import RegionEncoder
-
     torch.manual_seed(seed)
     encoder = RegionEncoder(4, 3, width=32, n_layers=1)
     with torch.no_grad():
@@ -144,8 +144,6 @@ def work(tmp_path, monkeypatch):
 
 
 def test_a_head_grows_by_scenes_and_a_scene_it_knows_adds_nothing(work):
-    from chebsplat.pipelines import bases, store
-
     for seed in range(3):
         found = bases.extend("shared", trained(work / f"trained/{seed}", key_of(seed), seed), f"room{seed}")
         assert len(found) == seed + 1
@@ -166,10 +164,6 @@ def test_a_head_grows_by_scenes_and_a_scene_it_knows_adds_nothing(work):
 
 
 def test_a_head_whose_stage_fails_raises_its_error_and_stays_as_it_is(work, monkeypatch):
-    from chebsplat.errors import DataFailure
-    from chebsplat.pipelines import bases
-    from chebsplat.stages import cks
-
     def fail(job):
         raise DataFailure("no column is left")
 

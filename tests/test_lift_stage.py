@@ -3,15 +3,13 @@
 import numpy as np
 import pytest
 from malformed.artifacts import VIEWS, N, artifacts
-from shared import KEY, run_stage
+from shared import published, run_stage
 
 from chebsplat.errors import DataFailure, InputError
-from chebsplat.formats import artifact, gaussians
 from chebsplat.formats.capture import Capture
 from chebsplat.formats.features import Features
 from chebsplat.formats.gaussians import Gaussians
 from chebsplat.formats.lifted import Lifted
-from chebsplat.formats.manifest import Manifest
 from chebsplat.formats.ply import write_ply
 from chebsplat.formats.points import Points
 from chebsplat.formats.scene import Scene
@@ -63,19 +61,17 @@ def test_a_splat_in_another_frame_and_a_capture_without_poses_are_refused(tmp_pa
         lift_ply(tmp_path / "far.ply", artifacts() / "ingest", None, artifacts() / "teacher", None, tmp_path / "far")
     record = Capture.read(artifacts() / "ingest")
     record.cam_from_world = None
-    with artifact.publish(tmp_path / "capture", Manifest(Capture.SCHEMA, KEY, "test")) as tmp:
-        record.write(tmp)
+    posed, features = published(tmp_path / "capture", record), artifacts() / "teacher"
     with pytest.raises(InputError, match="has no poses"):
-        lift_ply(tmp_path / "far.ply", tmp_path / "capture", None, artifacts() / "teacher", None, tmp_path / "out")
+        lift_ply(tmp_path / "far.ply", posed, None, features, None, tmp_path / "out")
     assert not (tmp_path / "out").exists()
 
 
 def test_features_of_another_number_of_gaussians_are_refused(lifted, tmp_path, capsys):
     fewer = Gaussians.read(artifacts() / "train")
     fewer.parameters = {name: values[:-1] for name, values in fewer.parameters.items()}
-    with artifact.publish(tmp_path / "train", Manifest(gaussians.Gaussians.SCHEMA, KEY, "test")) as tmp:
-        fewer.write(tmp)
-    inputs = {"gaussians": tmp_path / "train", "features": artifacts() / "teacher", "lifted": lifted}
+    inputs = {"features": artifacts() / "teacher", "lifted": lifted}
+    inputs["gaussians"] = published(tmp_path / "train", fewer)
     assert run_stage("export", tmp_path / "export", inputs, {}) == 3
     assert "make it again" in capsys.readouterr().err
 

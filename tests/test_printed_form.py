@@ -6,13 +6,11 @@ import numpy as np
 import pytest
 import torch
 
-from chebsplat.settings import DescribeSection, TrainSection
-from chebsplat.shape.albo import canonicalize
-from chebsplat.shape.descriptor import describe, describe_members, n_degrees
+from chebsplat.settings import TrainSection
+from chebsplat.shape.descriptor import describe, n_degrees
 from chebsplat.shape.fusion import Fusion, Gate
 from chebsplat.shape.regions import build_regions
 from chebsplat.splats.rotations import rotation_matrices
-from chebsplat.training.densify import densify
 
 SIZES = {"n_angles": 3, "max_degree": 5, "backend": "reference", "dtype": torch.float64}
 
@@ -72,13 +70,6 @@ def test_the_printed_metric_axis_and_spectrum_are_the_printed_formula(n_eigs):
         assert (found[..., :2].abs() < 1e-12).all()  # degrees 0 and 1 are identically constant
 
 
-def test_the_printed_metric_depends_on_the_unit_and_ours_does_not():
-    near, far = regions(), regions(unit=0.01)
-    for metric, same in (("relative", True), ("printed", False)):
-        a, b = (describe(*given, **SIZES, metric=metric).values for given in (near, far))
-        assert torch.allclose(a, b, atol=1e-9) == same
-
-
 def test_the_printed_metric_has_a_finite_gradient_that_finite_differences_confirm():
     *given, mask = regions(1, 5)
 
@@ -102,23 +93,6 @@ def test_the_first_degree_is_chosen_and_what_is_added_vanishes(spectrum):
     compiled = describe(*(v.float() for v in given[:3]), given[3], n_angles=3, max_degree=5, from_degree=0)
     assert compiled.values.shape[-1] == 6
     assert (compiled.values[..., :2] == 0).all()
-
-
-def test_members_are_described_as_the_settings_say():
-    rng = np.random.default_rng(0)
-    means, quats, scales = (rng.random((20, k)).astype(np.float32) for k in (3, 4, 3))
-    members = np.stack([np.arange(8), np.arange(8, 16)])
-    settings = DescribeSection(metric="printed", axis="world", from_degree=0, n_angles=3, max_degree=4)
-    found = describe_members(means, quats, scales, members, settings)
-    given = (torch.from_numpy(v[members]) for v in (means, scales))
-    rotmats = rotation_matrices(torch.from_numpy(quats)[members.ravel()]).reshape(2, 8, 3, 3)
-    options = {"metric": "printed", "axis": "world", "from_degree": 0, "n_angles": 3, "max_degree": 4}
-    wanted = describe(*given, rotmats, torch.ones(2, 8, dtype=torch.bool), **options, dtype=torch.float64).values
-    assert np.array_equal(found.values, wanted.float().numpy())
-    plain = describe_members(means, quats, scales, members, DescribeSection(from_degree=0, n_angles=3, max_degree=4))
-    native = describe_members(means, quats, scales, members, DescribeSection(n_angles=3, max_degree=4))
-    assert np.array_equal(plain.values[..., 2:], native.values)
-    assert (plain.values[..., :2] == 0).all()
 
 
 def test_a_spectrum_of_zeros_is_guarded_and_counted():
@@ -171,34 +145,3 @@ def test_the_gate_starts_where_the_setting_says():
     fused, gate = Gate(3, TrainSection(gate_start=0.0).gate_start)(features, shape, covered)
     assert torch.allclose(fused[0], torch.full((3,), 0.5))
     assert (gate[1] == 1).all()
-
-
-def growing(n=200, unit=1.0):
-    g = torch.Generator().manual_seed(0)
-    raw = {"means": unit * torch.rand(n, 3, generator=g), "quats": torch.randn(n, 4, generator=g)}
-    raw |= {"log_scales": torch.full((n, 3), math.log(0.05 * unit)), "logit_opacities": torch.zeros(n)}
-    return raw, torch.arange(n).reshape(2, -1)
-
-
-def grown(raw, members, **options):
-    options = {"nearest": 1e-3, "farthest": 1e3, "max_candidates": 1000} | options
-    gradient = torch.tensor([2.5, 0.5])
-    return len(densify(raw, members, gradient, 1.0, 10_000, torch.Generator().manual_seed(1), **options).parents)
-
-
-def test_the_printed_count_depends_on_the_unit_and_ours_does_not():
-    raw, members = growing()
-    far, _ = growing(unit=100)
-    assert grown(far, members, density=0.05) == grown(raw, members, density=0.05)
-    assert grown(far, members, density=1e-5, printed=True) > grown(raw, members, density=1e-5, printed=True) == 1
-
-
-def test_growth_bounds_out_of_order_are_refused():
-    with pytest.raises(ValueError, match=r"nearest 2\.0 < farthest 1\.5"):
-        densify(*growing(), torch.ones(2), 1.0, 10, torch.Generator(), nearest=2.0)
-
-
-def test_canonical_regions_know_their_unit():
-    means, scales, rotmats, mask = regions(unit=7.0)
-    region = canonicalize(means, scales, rotmats, mask)
-    assert torch.allclose(region.scales * region.unit, scales)

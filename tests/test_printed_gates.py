@@ -33,7 +33,7 @@ def weights(module):
 def scene():
     rng = np.random.default_rng(3)
     members = rng.permuted(np.tile(np.arange(N), (M, 1)), axis=1)[:, :7]
-    members[2, 4:] = -1
+    members[2, 4:] = members[4] = -1
     return {
         "features": torch.from_numpy(rng.normal(size=(N, C))),
         "logits": torch.from_numpy(rng.normal(size=N)),
@@ -71,7 +71,7 @@ def test_band_masks_are_their_formula(scene):
     wanted = np.zeros((M, 4, 4))
     for region, members in enumerate(scene["members"].numpy()):
         members = members[members >= 0]
-        for band in range(4):
+        for band in range(4 if len(members) else 0):
             rows = slice(band**2, (band + 1) ** 2)
             colors = np.einsum("nk,nkc->nc", values[members, rows], c[members, rows])
             wanted[region, band] = histogram(colors, 4)
@@ -117,19 +117,6 @@ def test_both_start_alike_for_all_and_as_the_logits_alone_would():
     assert (delta[:, 0] > 0.9).all()
 
 
-def test_semantics_of_some_gaussians_change_their_masks_and_no_others(scene):
-    gate, network = randomized(prune.PrintedGate(C)), randomized(BandMaskNetwork(C))
-    found = region_histograms(scene["coefficients"], scene["directions"], scene["members"], 8)
-    half = torch.arange(N) < N // 2
-    other = torch.where(half[:, None], scene["features"].flip(1), scene["features"])
-    for masks in (
-        lambda f: gate(f, scene["logits"])[:, None],
-        lambda f: network(scene["band_logits"], f, found, scene["nearest"]),
-    ):
-        changed = (masks(other) - masks(scene["features"])).abs().amax(1) > 1e-9
-        assert torch.equal(changed, half)
-
-
 def test_penalties_reach_gate_and_histogram_weights_only_where_guidance_is_on(scene):
     coefficients = scene["coefficients"].clone().requires_grad_()
     found = region_histograms(coefficients, scene["directions"], scene["members"], 8)
@@ -152,19 +139,6 @@ def test_masks_are_nested_binary_and_pass_the_gradient_of_what_they_threshold():
     assert masks.detach().tolist() == [[1, 0, 0, 0], [0, 1, 1, 0], [1, 1, 1, 1]]
     masks.sum().backward()
     assert (delta.grad > 0).all()
-
-
-def test_regions_without_members_or_of_one_colour_have_finite_histograms(scene):
-    members = torch.full((2, 4), -1)
-    members[1] = 7
-    coefficients = scene["coefficients"].clone().requires_grad_()
-    found = region_histograms(coefficients, scene["directions"], members, 8)
-    assert found[0].abs().max() == 0
-    assert torch.allclose(found[1].sum(-1), torch.ones(4, dtype=torch.float64))
-    found.square().sum().backward()
-    assert coefficients.grad.isfinite().all()
-    one_bin = region_histograms(scene["coefficients"], scene["directions"], scene["members"], 1)
-    assert torch.allclose(one_bin, torch.ones_like(one_bin))
 
 
 def test_what_guidance_changed_is_read_off_a_finished_training():

@@ -6,6 +6,8 @@ import numpy as np
 import pytest
 import torch
 from scipy.special import erf
+from test_printed_gates import randomized
+from test_printed_gates import weights as arrays
 
 from chebsplat.shape.cks import update
 from chebsplat.shape.encoder import N_FREQUENCIES, RegionEncoder, positional_encoding
@@ -18,18 +20,6 @@ from chebsplat.training.losses import feature_distance, feature_distance_referen
 N, M, C = 50, 6, 5
 RADIUS = 0.4
 DIFFERENCES = {"rtol": 1e-5, "atol": 1e-7}
-
-
-def randomized(module, seed=0):
-    torch.manual_seed(seed)
-    module = module.double()
-    for value in module.parameters():
-        torch.nn.init.normal_(value, std=0.5)
-    return module
-
-
-def arrays(module):
-    return {name: value.detach().numpy() for name, value in module.named_parameters()}
 
 
 @pytest.fixture

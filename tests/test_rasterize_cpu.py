@@ -1,9 +1,9 @@
 """The numba backend equals the plain-torch oracle, in value and gradient, and never depends on thread count."""
 
-import numba
 import pytest
 import torch
 from raster import camera, gradients, scene
+from thread_counts import assert_same_bits
 
 from chebsplat.rasterize import rasterize
 
@@ -12,17 +12,13 @@ from chebsplat.rasterize import rasterize
 @pytest.mark.parametrize(("channels", "n"), [(4, 150), (19, 3000)])
 def test_any_number_of_threads_gives_the_same_bits(channels, n, mode):
     weights = torch.randn(2, 61, 83, channels, generator=torch.Generator().manual_seed(2))
-    before, results = numba.get_num_threads(), []
-    try:
-        for threads in sorted({1, min(2, before), min(4, before)}):
-            numba.set_num_threads(threads)
-            options = {"backend": "cpu", "rasterize_mode": mode, "absgrad": True}
-            render, alpha, grads, meta = gradients(scene(n, channels), torch.float32, weights=weights, **options)
-            results.append([render, alpha, *grads, meta["means2d"].absgrad])
-    finally:
-        numba.set_num_threads(before)
-    for other in results[1:]:
-        assert all(torch.equal(x, y) for x, y in zip(results[0], other, strict=True))
+
+    def rendered():
+        options = {"rasterize_mode": mode, "absgrad": True}
+        found = gradients(scene(n, channels), torch.float32, "cpu", weights, **options)
+        return [*found[:2], *found[2], found[3]["means2d"].absgrad]
+
+    assert_same_bits(rendered)
 
 
 def test_float64_is_refused_by_the_cpu_backend_and_taken_by_auto():

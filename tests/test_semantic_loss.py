@@ -65,13 +65,6 @@ def test_a_cell_without_a_label_pulls_nothing_whatever_the_loss(kind):
     assert (gradient(loss, render) == 0).all()
 
 
-def test_confidence_scales_the_gradient():
-    render, labels = view()
-    half = labels._replace(confidence=0.5 * labels.confidence)
-    whole, less = (gradient(label_entropy(render, given, None, 1.0), render) for given in (labels, half))
-    assert torch.allclose(less, 0.5 * whole, rtol=1e-12)
-
-
 def test_masked_pixels_do_not_count_and_nothing_left_is_no_loss():
     render, labels = view()
     mask = torch.ones(H, W, dtype=torch.bool)

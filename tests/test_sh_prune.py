@@ -19,7 +19,11 @@ def normal(*shape, seed=0):
 
 
 def test_masks_are_binary_nested_and_degree_is_the_highest_band_kept():
-    mask = sh_prune.band_mask(normal(500, 3) * 6)
+    logits = torch.cat([normal(500, 3) * 6, torch.tensor([[-1e30, 1e30, -1e30]])])
+    logits.requires_grad_(True)
+    mask = sh_prune.band_mask(logits)
+    sh_prune.sh_loss(mask).backward()
+    assert torch.isfinite(logits.grad).all()
     assert set(mask.unique().tolist()) == {0.0, 1.0}
     assert (mask.diff(dim=1) <= 0).all()
     assert torch.equal(sh_prune.degrees(mask).float(), mask.sum(1))
@@ -31,13 +35,6 @@ def test_a_higher_band_teaches_the_lower_bands_that_carry_it():
     logits = torch.zeros(1, 3, requires_grad=True)
     sh_prune.band_mask(logits)[0, 2].backward()
     assert torch.allclose(logits.grad, torch.full((1, 3), 0.5**4))
-
-
-@pytest.mark.parametrize("size", [0.0, 9.9, 1e30])
-def test_mask_gradients_are_finite_at_any_logit(size):
-    logits = torch.tensor([[-size, size, -size]], requires_grad=True)
-    sh_prune.sh_loss(sh_prune.band_mask(logits)).backward()
-    assert torch.isfinite(logits.grad).all()
 
 
 def test_masked_bands_vanish_and_band_zero_is_untouched():
@@ -74,38 +71,12 @@ def test_ragged_of_nothing_and_of_a_degree_that_does_not_exist():
 # histograms
 
 
-@settings(deadline=None, derandomize=True, max_examples=60)
-@given(
-    n=st.integers(0, 40),
-    n_bins=st.integers(2, 20),
-    log_size=st.integers(-30, 30),
-    offset=st.sampled_from([0.0, 1.0, -1e3, 1e6]),
-    seed=st.integers(0, 10**6),
-)
-def test_histogram_has_mass_one_no_negative_bin_and_finite_gradients(n, n_bins, log_size, offset, seed):
-    values = (normal(n, seed=seed) * 10.0**log_size + offset).requires_grad_(True)
-    valid = torch.ones(n, dtype=torch.bool)
-    low, high = (values.detach().aminmax()) if n else (torch.tensor(0.0), torch.tensor(1.0))
-    found = sh_prune.soft_histogram(values, valid, n_bins, low, high)
-    assert found.shape == (n_bins,)
-    assert abs(found.sum().item() - (n > 0)) < 1e-5
-    assert (found >= 0).all()
-    (found**2).sum().backward()
-    assert torch.isfinite(values.grad).all()
-
-
 def test_histogram_of_well_placed_values_is_the_plain_one():
     values = torch.tensor([0.05, 0.15, 0.15, 0.35, 0.95])
     found = sh_prune.soft_histogram(values, torch.ones(5, dtype=torch.bool), 10, torch.tensor(0.0), torch.tensor(1.0))
     plain = torch.histc(values, 10, 0, 1) / 5
+    assert (found >= 0).all()
     assert torch.allclose(found, plain, atol=1e-4)  # half a bin from an edge: sigmoid(-10) = 5e-5
-
-
-def test_a_histogram_can_be_taught():
-    values = torch.tensor([0.19, 0.5], requires_grad=True)
-    valid = torch.ones(2, dtype=torch.bool)
-    sh_prune.soft_histogram(values, valid, 5, torch.tensor(0.0), torch.tensor(1.0))[1].backward()
-    assert values.grad[0] > 0
 
 
 # guidance
@@ -170,15 +141,11 @@ def test_guidance_is_one_outside_regions_and_without_regions():
     assert sh_prune.region_guidance(shN[:0], torch.zeros(0, 3, dtype=torch.int64), 0).shape == (0, 3)
 
 
-def test_loss_weights_bands_by_their_number_of_coefficients():
+def test_loss_weights_bands_by_their_number_of_coefficients_and_by_the_guidance():
     mask = torch.eye(3, requires_grad=True)
     assert sh_prune.sh_loss(mask).item() == pytest.approx(5.0)
+    guided = sh_prune.sh_loss(mask, torch.tensor([0.5, 1.0, 0.1]))
+    assert guided.item() == pytest.approx((1.5 + 5.0 + 0.7) / 3)
     sh_prune.sh_loss(mask).backward()
     assert torch.allclose(mask.grad * 3, torch.tensor([3.0, 5.0, 7.0]).expand(3, 3))
     assert sh_prune.sh_loss(torch.zeros(0, 3)).item() == 0
-
-
-def test_guidance_scales_the_loss_and_learns_nothing_from_it():
-    logits, guide = torch.zeros(4, 3, requires_grad=True), torch.full((4, 3), 0.5)
-    halved, full = sh_prune.sh_loss(sh_prune.band_mask(logits), guide), sh_prune.sh_loss(sh_prune.band_mask(logits))
-    assert halved.item() == pytest.approx(full.item() / 2)

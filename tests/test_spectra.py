@@ -4,9 +4,8 @@ import pytest
 import torch
 from shared_regions import REGIONS, extreme, region
 
-from chebsplat.settings import DescribeSection
 from chebsplat.shape.albo import canonicalize, metric_factors, similarity
-from chebsplat.shape.descriptor import describe, describe_members, n_degrees
+from chebsplat.shape.descriptor import describe
 from chebsplat.shape.spectra import cut_spectrum
 
 
@@ -48,14 +47,3 @@ def test_extreme_region_is_finite_and_repeatable(name, spectrum):
         found, again = (described(extreme(name), spectrum, bandwidth=bandwidth, n_eigs=8).values for _ in range(2))
         assert torch.isfinite(found).all()
         assert torch.equal(found, again)
-
-
-@pytest.mark.parametrize("spectrum", ["full", "taper", "hard"])
-def test_members_are_described_with_the_spectrum_that_was_chosen(spectrum):
-    g = torch.Generator().manual_seed(0)
-    means, quats, scales = (torch.randn(40, k, generator=g) for k in (3, 4, 3))
-    members = torch.randint(0, 40, (5, 12), generator=g)
-    settings = DescribeSection(n_angles=4, max_degree=8, spectrum=spectrum, n_eigs=4)
-    found = describe_members(*(v.numpy() for v in (means, quats, scales.exp(), members)), settings)
-    assert found.values.shape == (5, 12, 4, n_degrees(spectrum, 8))
-    assert found.n_cuts == (20 if spectrum == "hard" else 0)

@@ -4,20 +4,37 @@ import json
 import shutil
 
 import numpy as np
+import onnxruntime
 import pytest
-from shared import INPUTS, KEY, TOY, run_stage
+from scipy.spatial import cKDTree
+from shared import INPUTS, TOY, published, run_stage
 from tiny_teachers import color_teacher, knowing_rooms
 
 from chebsplat.errors import ConfigError, InputError
 from chebsplat.formats import artifact
+from chebsplat.formats.capture import Capture
 from chebsplat.formats.features import Features
+from chebsplat.formats.gaussians import Gaussians
 from chebsplat.formats.knowledge import ENCODER, SHIPPED, read_knowledge
-from chebsplat.formats.manifest import Manifest
+from chebsplat.formats.refined import Refined
+from chebsplat.formats.teacher_model import read_teacher
+from chebsplat.lifting.surface import Surface
 from chebsplat.pipelines.knowledge import teaching
 from chebsplat.pipelines.plan import Planner
+from chebsplat.shape.point_encoder import PointEncoder
+from chebsplat.shape.point_inputs import point_inputs
+from chebsplat.splats.gaussians import local_shape
+from chebsplat.stages import refine, teaching_rooms
 from chebsplat.stages.known_shapes import into_channels
+from chebsplat.stages.settings import KnowledgeSection
+from chebsplat.stages.teacher_inference import TeacherInference
 from chebsplat.synthetic import CLASS_NAMES
 from chebsplat.synthetic.seeds import HELD_OUT, KNOWLEDGE, REFERENCE, SCENES, TRAINING
+
+
+@pytest.fixture
+def network(tmp_path):
+    return TeacherInference(read_teacher(color_teacher(tmp_path)), 1)
 
 
 def refine_of(settings="", scene="office0"):
@@ -71,25 +88,14 @@ def test_no_room_of_knowledge_is_one_of_a_scene_a_test_or_the_teacher():
     ranges = (SCENES, REFERENCE, HELD_OUT, TRAINING, KNOWLEDGE)
     assert sum(map(len, ranges)) == len(set().union(*ranges))
     with pytest.raises(ValueError, match="not one for knowledge"):
-        from chebsplat.stages.settings import KnowledgeSection
-        from chebsplat.stages.teaching_rooms import rooms_of
-
-        rooms_of(101, KnowledgeSection(), None, np.eye(3))
+        teaching_rooms.rooms_of(101, KnowledgeSection(), None, np.eye(3))
 
 
 @pytest.mark.parametrize("stretch", [1.0, 1.2])
-def test_a_half_seen_room_is_what_few_photos_show_and_is_taught_what_all_say(tmp_path, monkeypatch, stretch):
-    from scipy.spatial import cKDTree
-
-    from chebsplat.formats.teacher_model import read_teacher
-    from chebsplat.stages import teaching_rooms
-    from chebsplat.stages.settings import KnowledgeSection
-    from chebsplat.stages.teacher_inference import TeacherInference
-
+def test_a_half_seen_room_is_what_few_photos_show_and_is_taught_all(network, monkeypatch, stretch):
     monkeypatch.setattr(teaching_rooms, "FEW_VIEWS", (2, 2.5))
     monkeypatch.setattr(teaching_rooms, "STRETCH", (stretch, stretch))
     monkeypatch.setattr(teaching_rooms, "KINDS", ("shuffled",))
-    network = TeacherInference(read_teacher(color_teacher(tmp_path)), 1)
     settings = KnowledgeSection(n_views=12, n_points=3000)
     sizes = []
     for seed in KNOWLEDGE[:2]:
@@ -130,12 +136,6 @@ def test_scenes_of_codes_meet_knowledge_through_words(toy):
 
 @pytest.mark.xdist_group("toy")
 def test_onnx_of_a_taught_encoder_says_what_torch_says(toy):
-    import onnxruntime
-
-    from chebsplat.shape.point_encoder import PointEncoder
-    from chebsplat.shape.point_inputs import point_inputs
-    from chebsplat.splats.gaussians import local_shape
-
     knowledge = read_knowledge(toy["teach"])
     means = np.random.default_rng(0).uniform(0, 3, (400, 3))
     covariances, normals = local_shape(means, 16)
@@ -156,24 +156,18 @@ def refined(toy, out, config=None, **changes):
 
 @pytest.mark.xdist_group("toy")
 def test_shape_is_told_of_depth_s_points_or_of_what_the_gaussians_show(toy, tmp_path):
-    from chebsplat.formats import gaussians as gaussians_format
-    from chebsplat.formats.capture import Capture
-    from chebsplat.formats.gaussians import Gaussians
-
     assert refined(toy, tmp_path / "a")["knowledge"]["of"] == "points"
     capture = Capture.read(toy["ingest"])
     capture.depth = None
-    with artifact.publish(tmp_path / "flat", Manifest(Capture.SCHEMA, KEY, "test")) as tmp:
-        capture.write(tmp)
-    without = refined(toy, tmp_path / "b", capture=tmp_path / "flat")
+    flat = published(tmp_path / "flat", capture)
+    without = refined(toy, tmp_path / "b", capture=flat)
     assert "no depth" in without["left_out"]["knowledge of shape"]
     assert without["strength"] == without["changed_by_knowledge"] == 0
     gaussians = Gaussians.read(toy["train"])
     gaussians.parameters["logit_opacities"] = gaussians.parameters["logit_opacities"] + 5  # 24 steps leave them faint
-    with artifact.publish(tmp_path / "opaque", Manifest(gaussians_format.SCHEMA, KEY, "test")) as tmp:
-        gaussians.write(tmp)
+    opaque = published(tmp_path / "opaque", gaussians)
     rendered = TOY | {"refine": {"surface": "rendered"}}
-    facts = refined(toy, tmp_path / "d", rendered, capture=tmp_path / "flat", gaussians=tmp_path / "opaque")
+    facts = refined(toy, tmp_path / "d", rendered, capture=flat, gaussians=opaque)
     assert facts["knowledge"]["of"] == "rendered depth"
     assert facts["unit_from"] == "source"  # generated: metric without depth, too
     assert "knowledge" not in refined(toy, tmp_path / "c", knowledge=None)
@@ -181,13 +175,9 @@ def test_shape_is_told_of_depth_s_points_or_of_what_the_gaussians_show(toy, tmp_
 
 @pytest.mark.xdist_group("toy")
 def test_labels_without_a_word_leave_knowledge_out_and_say_so(toy, tmp_path):
-    from chebsplat.formats.features import Features
-
     features = Features.read(toy["teacher"])
     features.label_names = ["thingamajig", *features.label_names[1:]]
-    with artifact.publish(tmp_path / "f", Manifest(Features.SCHEMA, KEY, "test")) as tmp:
-        features.write(tmp)
-    facts = refined(toy, tmp_path / "out", features=tmp_path / "f")
+    facts = refined(toy, tmp_path / "out", features=published(tmp_path / "f", features))
     assert "thingamajig" in facts["left_out"]["knowledge of shape"]
     assert facts["changed_by_knowledge"] == 0
 
@@ -200,17 +190,8 @@ def test_knowledge_of_another_teacher_is_refused(toy):
         into_channels(toy["teach"], read_knowledge(toy["teach"]), features)
 
 
-def test_a_swept_room_is_what_its_photos_tell_of_depth(tmp_path, monkeypatch):
-    from scipy.spatial import cKDTree
-
-    from chebsplat.formats.teacher_model import read_teacher
-    from chebsplat.lifting.surface import Surface
-    from chebsplat.stages import teaching_rooms
-    from chebsplat.stages.settings import KnowledgeSection
-    from chebsplat.stages.teacher_inference import TeacherInference
-
+def test_a_swept_room_is_what_its_photos_tell_of_depth(network, monkeypatch):
     monkeypatch.setattr(teaching_rooms, "LEAST_SWEPT", 16)
-    network = TeacherInference(read_teacher(color_teacher(tmp_path)), 1)
     settings = KnowledgeSection(n_views=16, n_points=3000)
     whole, _, _, swept = teaching_rooms.rooms_of(KNOWLEDGE[1], settings, network, np.eye(3))
     assert len(swept.n_views) > 1000
@@ -225,9 +206,6 @@ def test_a_swept_room_is_what_its_photos_tell_of_depth(tmp_path, monkeypatch):
 
 @pytest.mark.xdist_group("toy")
 def test_without_measured_depth_knowledge_is_asked_of_swept_depth_or_left_out(toy, tmp_path, monkeypatch):
-    from chebsplat.formats.refined import Refined
-    from chebsplat.stages import refine
-
     withheld = TOY | {"ingest": {"depth": "off"}}
     assert run_stage("ingest", tmp_path / "ingest", {}, withheld) == 0
     made = {}

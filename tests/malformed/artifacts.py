@@ -35,8 +35,8 @@ def artifacts() -> Path:
     """A folder with an artifact of each schema, by the name of its stage; made once a process."""
     root = Path(tempfile.mkdtemp(prefix="malformed-artifacts-"))
     atexit.register(shutil.rmtree, root, ignore_errors=True)
-    for name, (schema, write) in WRITERS.items():
-        _publish(root / name, schema, name, write)
+    for name, write in WRITERS.items():
+        _publish(root / name, name, write)
     return root
 
 
@@ -166,11 +166,11 @@ def encoded(named: str, what: str, edit: Edit, word: str, alone: bool = False) -
 # small artifacts of every schema
 
 
-def _publish(path: Path, schema: str, stage: str, write: Callable[[Path], Any]) -> None:
+def _publish(path: Path, stage: str, write: Callable[[Path], Any]) -> None:
     from chebsplat.stages.config import Config
 
     config = Config.model_validate({"describe": DESCRIBED | {"n_regions": 4, "region_size": 8}, "sfm": {}})
-    manifest = Manifest(schema, KEY, stage, config=config.sections(("describe", "train")))
+    manifest = Manifest(STAGES[stage].schema, KEY, stage, config=config.sections(("describe", "train")))
     manifest.facts = {
         "teacher": {"kind": "labels", "n_labels": len(LABELS), "convention": {"confusion": 0.1}},
         "agree": {"agreement": 0.375, "n_points": N},
@@ -347,18 +347,18 @@ def _evaluation(out: Path) -> None:
     Evaluation(figures, pictures).write(out)
 
 
-WRITERS: dict[str, tuple[str, Callable[[Path], None]]] = {
-    "ingest": ("chebsplat.capture/1", _capture),
-    "sfm": ("chebsplat.points/1", _points),
-    "teacher": ("chebsplat.features/1", _features),
-    "agree": ("chebsplat.agreement/1", _agreement),
-    "describe": ("chebsplat.descriptors/1", _descriptors),
-    "teach": ("chebsplat.knowledge/1", _knowledge),
-    "train": ("chebsplat.gaussians/1", _gaussians),
-    "lift": ("chebsplat.lifted/1", _lifted),
-    "refine": ("chebsplat.refined/1", _refined),
-    "export": ("chebsplat.scene/2", _scene),
-    "onnx": ("chebsplat.encoder/2", _encoder),
-    "cks": ("chebsplat.basis/3", _basis),
-    "evaluate": ("chebsplat.evaluation/1", _evaluation),
+WRITERS: dict[str, Callable[[Path], None]] = {
+    "ingest": _capture,
+    "sfm": _points,
+    "teacher": _features,
+    "agree": _agreement,
+    "describe": _descriptors,
+    "teach": _knowledge,
+    "train": _gaussians,
+    "lift": _lifted,
+    "refine": _refined,
+    "export": _scene,
+    "onnx": _encoder,
+    "cks": _basis,
+    "evaluate": _evaluation,
 }
