@@ -68,7 +68,7 @@ def publish(out: Path, manifest: Manifest, force: bool = False) -> Iterator[Path
     out = Path(out)
     tmp = out.parent / f".tmp-{out.name}-{os.getpid()}"
     try:
-        with disk.explained(tmp):
+        with disk.explained(tmp, scratch=True):
             _make(tmp, out)
             yield tmp
             if force or not is_whole(out, manifest.schema):

@@ -42,7 +42,7 @@ def write_basis(out: Path, basis: Basis) -> None:
 
 
 def read_basis(path: Path) -> Basis:
-    """Raises: InputError naming the damaged file and the remedy."""
+    """The basis at `path`. Raises InputError naming the damaged file and the remedy."""
     manifest = artifact.read_manifest(path, SCHEMA)
     bases = read_tensors(path, manifest, "bases.safetensors")
     weights = read_tensors(path, manifest, "weights.safetensors")

@@ -16,9 +16,10 @@ REFUSALS = {errno.ENOSPC, errno.EDQUOT} | CLOSED
 
 
 @contextmanager
-def explained(folder: Path) -> Iterator[None]:
-    """What fails within because `folder`, or a file that the error names, cannot be written is a DiskFailure.
+def explained(folder: Path, scratch: bool = False) -> Iterator[None]:
+    """Turn refusals of the disk within into a DiskFailure that names the error's file, or `folder`.
 
+    Args: scratch: `folder` holds what is being written and nothing else; the message has its bytes.
     Raises: DiskFailure; InputError naming a file that may not be read.
     """
     try:
@@ -31,19 +32,19 @@ def explained(folder: Path) -> Iterator[None]:
             fault = fault.__cause__
         if fault is None:
             raise
-        raise _failure(fault, folder) from error
+        raise _failure(fault, folder, scratch) from error
 
 
-def _failure(fault: OSError, folder: Path) -> ChebsplatError:
+def _failure(fault: OSError, folder: Path, scratch: bool) -> ChebsplatError:
     file = Path(os.fsdecode(fault.filename)) if isinstance(fault.filename, str | bytes) else folder
     if fault.errno in CLOSED:
         if file.exists() and not os.access(file, os.R_OK):
             return InputError(f"{file} cannot be read ({fault.strerror}); allow it, or name another")
         return DiskFailure(f"{file} cannot be written ({fault.strerror}); make it writable, or choose another folder")
     there = next(parent for parent in (folder, *folder.parents) if parent.is_dir())
-    written = sum(path.stat().st_size for path in folder.rglob("*") if path.is_file()) if folder == there else 0
-    free = shutil.disk_usage(there).free
+    written = sum(path.stat().st_size for path in folder.rglob("*") if path.is_file()) if scratch else 0
+    needed = f"more than {written:,} bytes are needed in {folder.parent}, " if scratch else ""
+    free = f"{shutil.disk_usage(there).free:,} are free{' beside those' if scratch else ''}"
     return DiskFailure(
-        f"{file} cannot be written ({fault.strerror}): more than {written:,} bytes are needed in {folder.parent}, "
-        f"{free:,} are free beside those; make room and give the same command again"
+        f"{file} cannot be written ({fault.strerror}): {needed}{free}; make room and give the same command again"
     )

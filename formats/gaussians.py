@@ -54,10 +54,10 @@ class Gaussians:
         Choices: SH bands that no Gaussian keeps are left out of the file; reading gives them back as zeros.
         """
         degrees, shN = self.parameters["degrees"], self.parameters["shN"]
-        kept = shN[:, : (int(degrees.max(initial=0)) + 1) ** 2 - 1]
+        used_bands = shN[:, : (int(degrees.max(initial=0)) + 1) ** 2 - 1]
         weights = [np.zeros(0, np.float32), *map(np.ravel, self.modules.values())]
         Checkpoint(
-            **self.parameters | {"shN": kept},
+            **self.parameters | {"shN": used_bands},
             cameras=self.cameras,
             modules=np.concatenate(weights),
             module_shapes={name: list(values.shape) for name, values in self.modules.items()},

@@ -55,7 +55,7 @@ def read_card(path: Path) -> dict[str, Any]:
 
 
 def read_knowledge(path: Path) -> Knowledge:
-    """Raises InputError naming the damaged file and the remedy."""
+    """The knowledge at `path`. Raises InputError naming the damaged file and the remedy."""
     path = Path(path)
     manifest = artifact.read_manifest(path, SCHEMA)
     document = read_document(path, manifest, "knowledge.json")

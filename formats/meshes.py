@@ -73,18 +73,8 @@ def fused(frames: Iterable[Frame], voxel: float, farthest: float) -> Mesh:
     return Mesh(found.vertex.positions.numpy(), found.triangle.indices.numpy().astype(np.int32), colors)
 
 
-def cleaned(mesh: Mesh, n_triangles: int, least_diagonal: float, longest_hole: int, voxel: float) -> Mesh:
-    """The mesh without what floats, its small holes closed, in at most so many triangles. Labels are dropped.
-
-    Args: least_diagonal: of a connected part that stays, scene units; longest_hole: edges of a hole that is closed;
-      voxel: edge of those that it was fused from, scene units.
-    Raises: ConfigError where pymeshlab, or a library of the system that it needs, is missing.
-    Choices: a vertex takes the colour of the nearest one before. Vertices are first clustered in cubic cells, of a size
-      that leaves what is wanted or EASY, and edges collapsed by quadrics from there on: the collapse alone takes four
-      times as long, for 0.002 of the F-score at 5 cm.
-    """
-    from scipy.spatial import cKDTree
-
+def meshlab() -> Any:
+    """The module that cleans meshes. Raises ConfigError where it, or a library that it is linked to, is missing."""
     try:
         import pymeshlab
     except ImportError as error:  # of the package, or of a library that it is linked to
@@ -92,6 +82,22 @@ def cleaned(mesh: Mesh, n_triangles: int, least_diagonal: float, longest_hole: i
             f"cleaning a mesh needs pymeshlab ({error}); install the extra: pip install 'chebsplat[mesh]', and where a "
             "library of the system is named, that one; or ask for the mesh as it is: --raw"
         ) from None
+    return pymeshlab
+
+
+def cleaned(mesh: Mesh, n_triangles: int, least_diagonal: float, longest_hole: int, voxel: float) -> Mesh:
+    """The mesh without what floats, its small holes closed, in at most so many triangles. Labels are dropped.
+
+    Args: least_diagonal: of a connected part that stays, scene units; longest_hole: edges of a hole that is closed;
+      voxel: edge of those that it was fused from, scene units.
+    Raises: ConfigError as `meshlab`.
+    Choices: a vertex takes the colour of the nearest one before. Vertices are first clustered in cubic cells, of a size
+      that leaves what is wanted or EASY, and edges collapsed by quadrics from there on: the collapse alone takes four
+      times as long, for 0.002 of the F-score at 5 cm.
+    """
+    from scipy.spatial import cKDTree
+
+    pymeshlab = meshlab()
     meshes = pymeshlab.MeshSet(verbose=False)
     meshes.add_mesh(pymeshlab.Mesh(mesh.vertices.astype(np.float64), mesh.triangles))
     meshes.meshing_remove_connected_component_by_diameter(mincomponentdiag=pymeshlab.PureValue(least_diagonal))

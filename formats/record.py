@@ -33,7 +33,7 @@ METADATA = "zarr.json"
 
 @dataclass(frozen=True)
 class Array:
-    """How a field of a `Record` is stored.
+    """Storage of a field of a `Record`.
 
     Args:
       axes:     a name an axis, or its length where that is fixed; an axis has one length throughout a record.
@@ -74,7 +74,7 @@ class Record:
     def write_attributes(self, out: Path) -> None:
         """Write the group's own metadata, anew where they are there already.
 
-        Raises: ValueError on a value that JSON or UTF-8 does not have, nan among them.
+        Raises: ValueError or TypeError on a value that JSON or UTF-8 does not have, nan among them.
         """
         import zarr
 
@@ -85,7 +85,10 @@ class Record:
             "units": {name: spec.units for name, spec in specs.items() if spec.units},
         } | _attributes_of(self)
         json.dumps(attributes, allow_nan=False, ensure_ascii=False).encode()
-        zarr.open_group(str(out), mode="a").update_attributes(attributes)
+        group = zarr.open_group(str(out), mode="a")
+        group.update_attributes(attributes)
+        for name in {place.rpartition("/")[0] for place in specs} - {""}:
+            group.require_group(name)
 
     @classmethod
     def read(cls, path: Path) -> Self:
@@ -111,7 +114,7 @@ def read_attributes(path: Path, manifest: Manifest) -> dict[str, Any]:
 
 @contextmanager
 def reading(path: Path) -> Iterator[None]:
-    """What fails within because the artifact at `path` is damaged is an InputError with the remedy."""
+    """Turn errors within, of a damaged artifact at `path`, into an InputError with the remedy."""
     try:
         yield
     except (ValueError, KeyError, TypeError, AttributeError, RuntimeError, OSError) as error:
@@ -132,7 +135,7 @@ class StoredArray:
 
         self.root, self.name, self.manifest = root, name, manifest
         artifact.checked(root, manifest, f"{name}/{METADATA}")
-        with reading(root / name):
+        with reading(root):
             self._array: Any = zarr.open_array(str(root / name), mode="r")
         self.shape: tuple[int, ...] = self._array.shape
         self.dtype: np.dtype = self._array.dtype
@@ -146,8 +149,6 @@ class StoredArray:
     def __getitem__(self, index: Any) -> np.ndarray:
         try:
             return np.asarray(self._array[index])
-        except IndexError:
-            raise
         except (ValueError, RuntimeError, OSError) as error:
             for chunk in chunk_names(self._array):
                 artifact.checked(self.root, self.manifest, f"{self.name}/{chunk}")
@@ -200,13 +201,12 @@ def check_lengths(arrays: dict[str, tuple[tuple[str | int, ...], tuple[int, ...]
     """
     lengths: dict[str | int, int] = {}
     for name, (axes, shape) in arrays.items():
-        wanted = tuple(axis if isinstance(axis, int) else lengths.get(axis, axis) for axis in axes)
-        fits = len(shape) == len(axes) and all(
-            n == (lengths.setdefault(axis, n) if isinstance(axis, str) else axis)
-            for n, axis in zip(shape, axes, strict=True)
-        )
-        if not fits:
-            raise ValueError(f"{name} has shape {shape}, expected {wanted}")
+        for axis, n in zip(axes, shape, strict=False):
+            if isinstance(axis, str):
+                lengths.setdefault(axis, n)
+        expected = tuple(lengths.get(axis, axis) if isinstance(axis, str) else axis for axis in axes)
+        if shape != expected:
+            raise ValueError(f"{name} has shape {shape}, expected {expected}")
 
 
 @dataclass(frozen=True)
@@ -220,7 +220,7 @@ class Layout:
 
 
 def layout_of(cls: type[Record]) -> Layout:
-    """How the fields of a record are stored."""
+    """Sort the fields of a record by how they are stored."""
     layout = Layout({}, set(), {}, [])
     hints = get_type_hints(cls, include_extras=True)
     for name in (field.name for field in fields(cls)):  # type: ignore[arg-type]  # all are dataclasses
@@ -261,6 +261,7 @@ def _built(cls: type[Any], path: Path, manifest: Manifest, attributes: dict[str,
     layout, values = layout_of(cls), dict(attributes)
     for name, within in layout.records.items():
         if values[name] is not None:
+            artifact.checked(path, manifest, f"{prefix}{name}/{METADATA}")
             values[name] = _built(within, path, manifest, values[name], f"{prefix}{name}/")
     for name, spec in layout.arrays.items():
         if f"{prefix}{name}/{METADATA}" in manifest.files:
@@ -276,13 +277,17 @@ def _built(cls: type[Any], path: Path, manifest: Manifest, attributes: dict[str,
 
 
 def _converted(name: str, value: Any, spec: Array) -> Any:
-    """A value in the dtype that it is stored in; an array of zarr's, which lies in its place already, as it is."""
+    """A value in the dtype that it is stored in; a zarr array is in its place already and returned unchanged."""
     if not isinstance(value, np.ndarray | StoredArray):
         return value
     values = np.asarray(value)
     if values.dtype != spec.dtype and not np.can_cast(values.dtype, spec.dtype, "same_kind"):
         raise ValueError(f"{name} is {values.dtype}, expected {spec.dtype}")
-    values = values.astype(spec.dtype, copy=False)
+    with np.errstate(over="ignore"):  # what is infinite then is refused below
+        converted = values.astype(spec.dtype, copy=False)
+    if converted.dtype.kind in "iu" and not np.array_equal(converted, values):
+        raise ValueError(f"{name} holds values that {spec.dtype} does not have")
+    values = converted
     if values.dtype.kind == "f" and not spec.any_value and not np.isfinite(values).all():
         raise ValueError(f"{name} holds {np.sum(~np.isfinite(values))} non-finite values")
     return values

@@ -58,9 +58,9 @@ class Scene:
         write_ply(out / "scene.ply", p, top, self.labels, self.label_names)
         if len(np.unique(degrees)) > 1:
             for degree in np.unique(degrees):
-                chosen = degrees == degree
-                part = {name: values[chosen] for name, values in p.items()}
-                labels = None if self.labels is None else self.labels[chosen]
+                of_degree = degrees == degree
+                part = {name: values[of_degree] for name, values in p.items()}
+                labels = None if self.labels is None else self.labels[of_degree]
                 write_ply(out / f"scene_d{degree}.ply", part, int(degree), labels, self.label_names)
         bands = {}
         for band in range(1, top + 1):

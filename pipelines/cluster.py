@@ -202,7 +202,7 @@ def watch_run(plan: Path) -> None:
         while goes_on:
             time.sleep(leases.EVERY)
             with suppress(OSError):  # a file system that does not answer for a while is asked again
-                goes_on = store.is_held(store.run_lease(plan.parent))
+                goes_on = store.holder(store.run_lease(plan.parent)) is not None
         end_itself()
 
     threading.Thread(target=watch, daemon=True).start()

@@ -108,7 +108,10 @@ def snakemake(
     entries = [entry(step, state, device) for step in steps]
     for item in entries:
         timed = item["stage"] == "evaluate" and item["config"]["evaluate"]["timing_repeats"] > 0 and on == cluster.LOCAL
-        item["threads"] = (1 if on == cluster.LOCAL else cores) if threads is None else cores if timed else threads
+        if threads is not None:
+            item["threads"] = cores if timed else threads
+        else:
+            item["threads"] = 1 if on == cluster.LOCAL else cores
     with plan_of(entries, on) as plan:
         folder, words = plan.parent, plan.parent / "snakemake.log"
         arguments = ["--workflow-profile", "none", "--profile", str(cluster.profile(on))]

@@ -3,14 +3,13 @@
 from __future__ import annotations
 
 import json
-import time
 from collections import Counter
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from chebsplat.pipelines import leases, store
+from chebsplat.pipelines import store
 
 RUNS, FAILED, WAITS, LEFT, DONE = "runs", "failed", "waits", "not begun", "done"
 LINES = 5  # of a failed step's log
@@ -32,9 +31,9 @@ def state_of(folder: Path, step: dict[str, Any]) -> State:
     stage, key, file = step["stage"], step["key"], folder / f"{step['stage']}-{step['key']}"
     if store.is_fresh(Path(step["path"])):
         return State(stage, key, DONE)
-    if machine := leases.holder(store.lease(folder.parents[1], file.name)):
+    if machine := store.holder(store.lease(folder.parents[1], file.name)):
         return State(stage, key, RUNS, f"{seconds(file.with_suffix('.exit'))} s on {machine}")
-    log, is_over = file.with_suffix(".log"), leases.holder(store.run_lease(folder)) is None
+    log, is_over = file.with_suffix(".log"), store.holder(store.run_lease(folder)) is None
     if code := int(file.with_suffix(".exit").read_text()):
         return State(stage, key, FAILED, f"exit code {code}", last_lines(log))
     if log.is_file() and is_over:
@@ -44,7 +43,7 @@ def state_of(folder: Path, step: dict[str, Any]) -> State:
 
 def seconds(file: Path) -> int:
     """Since a file was written, which what it belongs to does as it begins."""
-    return max(int(time.time() - file.stat().st_mtime), 0)
+    return max(int(store.age(file)), 0)
 
 
 def last_lines(log: Path) -> tuple[str, ...]:
@@ -67,7 +66,7 @@ def runs() -> Iterator[tuple[str, list[State]]]:
         except (OSError, ValueError, TypeError, KeyError, AttributeError, RecursionError):
             yield f"{plan} is damaged; remove {plan.parent} if no run is under way", []
             continue
-        machine = leases.holder(store.run_lease(plan.parent))
+        machine = store.holder(store.run_lease(plan.parent))
         since = f" on {machine}, {seconds(plan)} s" if machine else ", over"
         yield f"run {plan.parent.name}{since}", states
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import os
 import shutil
+import socket
 import sys
 import tempfile
 import time
@@ -150,7 +151,7 @@ def sweep() -> None:
     """Remove leases of the dead, and where no run is under way what Snakemake remembers."""
     for path in work().glob(".held/*"):
         with suppress(FileNotFoundError):
-            if age(path) > leases.EXPIRES:
+            if age(path) > leases.EXPIRES and holder(path) is None:
                 path.unlink()
     if not any(map(is_under_way, work().glob(".plans/*"))):
         for name in (".snakemake", ".leases", ".names"):  # earlier versions had the last two
@@ -180,14 +181,16 @@ def _running(base: Path) -> set[Path]:
 
 def is_under_way(plans: Path) -> bool:
     """Whether the run that a folder of `.plans` belongs to goes on, here or on another machine."""
-    return _owner_lives(plans) or is_held(run_lease(plans))
+    return _owner_lives(plans) or holder(run_lease(plans)) is not None
 
 
-def is_held(path: Path) -> bool:
-    """Whether someone holds a lease and gives signs of life, by the clock of the file system."""
+def holder(path: Path) -> str | None:
+    """The machine of whoever holds a lease; None: nobody, or one elsewhere, silent by the file system's clock."""
+    machine = leases.holder(path)
     with suppress(FileNotFoundError):  # it has just been let go
-        return leases.holder(path) is not None and age(path) < leases.EXPIRES
-    return False
+        if machine == socket.gethostname() or (machine and age(path) < leases.EXPIRES):
+            return machine
+    return None
 
 
 def _in_use(path: Path, running: set[Path]) -> bool:
@@ -211,7 +214,7 @@ def remove_half(path: Path) -> None:
 def remove_halves(paths: Iterable[Path]) -> None:
     """Remove what killed jobs have left of artifacts, but for those that another run makes."""
     for path in paths:
-        if leases.holder(lease(path.parents[2], f"{path.parent.name}-{path.name}")) is None:
+        if holder(lease(path.parents[2], f"{path.parent.name}-{path.name}")) is None:
             remove_half(path)
 
 

@@ -161,8 +161,8 @@ def fused(means: np.ndarray, colors: np.ndarray, seen_from: np.ndarray) -> dict[
         return {"means": means, "colors": colors, "seen_from": seen_from}
     numbers = cubes_of(means, edge_of(means, 2 * MOST))
     _, first, cube = np.unique(numbers, return_index=True, return_inverse=True)
-    kept, middle, color = means_of_each(cube, LEAST, means, colors)
-    return {"means": middle, "colors": color.round().astype(np.uint8), "seen_from": seen_from[first[kept]]}
+    is_dense, middle, color = means_of_each(cube, LEAST, means, colors)
+    return {"means": middle, "colors": color.round().astype(np.uint8), "seen_from": seen_from[first[is_dense]]}
 
 
 def reduced(image: np.ndarray, factor: int) -> np.ndarray:

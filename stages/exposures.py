@@ -18,7 +18,7 @@ LEAST_SPREAD = 0.05  # stops between the photos' own exposures, from which on th
 
 
 def exposures(job: Job, capture: Capture, points: Points) -> np.ndarray | None:
-    """What each training photo's exposure [V, 3] differs from its neighbours', to be undone; None where they are left.
+    """Difference of each training photo's exposure [V, 3] from its neighbours', to be undone; None where it is left.
 
     Choices: generated views are alike by construction; elsewhere the photos are measured at the points, at the cost of
       a second or two.

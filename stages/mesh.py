@@ -9,7 +9,7 @@ import numpy as np
 
 from chebsplat.errors import ConfigError, DataFailure
 from chebsplat.evaluation.surface import features_at
-from chebsplat.formats.meshes import Frame, Mesh, cleaned, fused
+from chebsplat.formats.meshes import Frame, Mesh, cleaned, fused, meshlab
 from chebsplat.labels.decode import decode_labels
 from chebsplat.stages.opened import OpenedScene
 from chebsplat.stages.progress import Progress
@@ -33,6 +33,8 @@ def mesh_of(
     """
     if not scene.cameras:
         raise ConfigError(f"{scene.source} has no cameras to see its surface from; open a scene that was trained")
+    if not raw:
+        meshlab()  # a missing extra is said before minutes are spent
     extent = room_extent(scene)
     edge = extent / N_VOXELS if voxel is None else voxel
     made = fused(frames(scene, progress), edge, 2 * extent)

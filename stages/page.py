@@ -50,7 +50,7 @@ def write_page(
     """Write the page, in the place of what is there.
 
     Args:
-      scene:     from `formats.scene.read_scene`, or `foreign`; name: the page's title.
+      scene:     from `Scene.read`, or `foreign`; name: the page's title.
       teacher:   the scene's `features` artifact, whose teacher's words are embedded; None: the labels alone.
       sh_degree: 0 or 1; phrases: what words are weighed against, as of `query`; more: words beside the teacher's own.
     Returns: counts: Gaussians, views, labels, words, bytes.

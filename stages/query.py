@@ -179,7 +179,8 @@ def among_labels(features: Features, text: str, phrases: list[str]) -> Query:
     from chebsplat.stages.text import folded, found
 
     names = features.label_names
-    asked, *others = rows = found([text, *phrases], names)
+    rows = found([text, *phrases], names)
+    target, others = rows[0], rows[1:]
     for word, row in zip((text, *phrases), rows, strict=True):
         if row < 0:
             near = suggest(folded(word), map(folded, names))
@@ -188,10 +189,10 @@ def among_labels(features: Features, text: str, phrases: list[str]) -> Query:
                 f"other words{'; near: ' + ', '.join(near) if near else ''}. Labels: {', '.join(names)}. For free text "
                 "run the scene with teacher.kind=auto"
             )
-    others = others or [k for k in range(len(names)) if k != asked]
+    others = others or [k for k in range(len(names)) if k != target]
     if not others:
         raise ConfigError(f"{text!r} is the scene's only label: there is nothing to weigh it against")
-    return Query(text, features.label_embeddings[asked], [names[k] for k in others], features.label_embeddings[others],
+    return Query(text, features.label_embeddings[target], [names[k] for k in others], features.label_embeddings[others],
                  closed=not phrases)  # fmt: skip
 
 

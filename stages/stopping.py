@@ -1,4 +1,4 @@
-"""How our processes end: well, with a typed error, a crash, or by SIGINT, SIGTERM or SIGHUP.
+"""Ends of our processes: well, with a typed error, a crash, or by SIGINT, SIGTERM or SIGHUP.
 
 A signal raises `Stopped` in the main thread, so that nothing half made is left; a loop that can reach
 a better place within a moment defers it. Whoever cannot listen (a kernel is being compiled) is killed
@@ -41,7 +41,7 @@ def exit_code(action: Callable[[], int | None], folder: Path, tell: Callable[[st
     except (ChebsplatError, Stopped) as error:
         tell(str(error))
         return error.exit_code
-    except (click.ClickException, click.Abort, click.exceptions.Exit):
+    except (click.ClickException, click.Abort, click.exceptions.Exit, BrokenPipeError):  # click knows what to do
         raise
     except Exception:
         log.exception("crashed; nothing was published")
@@ -56,10 +56,11 @@ class Asked:
         self.deferred = False
 
     def heed(self, number: int, _frame: FrameType | None) -> None:
-        """The signals' handler."""
-        self.stop = Stopped(number, f"stopped by {signal.Signals(number).name}; {KEPT}")
-        if not self.deferred:
-            raise self.stop
+        """Handle a signal; a second one does not break into the cleaning up after the first."""
+        if self.stop is None:
+            self.stop = Stopped(number, f"stopped by {signal.Signals(number).name}; {KEPT}")
+            if not self.deferred:
+                raise self.stop
 
 
 _asked: Asked | None = None

@@ -33,19 +33,16 @@ def text_embeddings(names: list[str], teacher: TeacherModel) -> np.ndarray:
 
     from chebsplat.formats.teacher_model import read_label_table
 
-    known: list[str] = []
-    embeddings = None
-    if teacher.labels is not None:
-        known, embeddings = read_label_table(teacher.labels)
+    known, embeddings = ([], None) if teacher.labels is None else read_label_table(teacher.labels)
     if embeddings is None:
         known, embeddings = [], np.zeros((0, 0))
-    asked = list(dict.fromkeys(names))
-    row = dict(zip(asked, found(asked, known), strict=True))
+    unique_names = list(dict.fromkeys(names))
+    row = dict(zip(unique_names, found(unique_names, known), strict=True))
     vectors = {name: embeddings[k] for name, k in row.items() if k >= 0}
     for name in vectors:
         if folded(known[row[name]]) != folded(name):
             log.info("%s is not in %s; its %s is taken", name, teacher.labels, known[row[name]])
-    if unknown := [name for name in asked if name not in vectors]:
+    if unknown := [name for name in unique_names if name not in vectors]:
         vectors |= zip(unknown, _encoded(unknown, teacher, known), strict=True)
     rows = np.stack([vectors[name] for name in names]).astype(np.float32)
     return rows / np.linalg.norm(rows, axis=1, keepdims=True).clip(1e-12)

@@ -50,11 +50,11 @@ def elsewhere(path):
 def test_a_holder_elsewhere_lives_as_long_as_it_gives_signs_of_life(tmp_path, monkeypatch):
     monkeypatch.setenv("CHEBSPLAT_WORK", str(tmp_path))
     path = elsewhere(tmp_path / ".held/run")
-    assert leases.holder(path) == "node7" and store.is_held(path)
+    assert leases.holder(path) == store.holder(path) == "node7"
     store.sweep()
     assert path.exists()
     os.utime(path, (time.time() - 61, time.time() - 61))
-    assert not store.is_held(path)
+    assert not store.holder(path)
     store.sweep()
     assert not path.exists()
 

@@ -117,4 +117,4 @@ def test_a_run_under_way_on_another_machine_keeps_what_it_makes_from_clean_stale
         assert store.unnamed() == []
         os.rename(store.run_lease(elsewhere), store.run_lease(file.parent))
         assert len(store.unnamed()) == len(plan.steps) + 1
-    assert not store.is_held(store.run_lease(file.parent))
+    assert not store.holder(store.run_lease(file.parent))

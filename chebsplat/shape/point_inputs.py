@@ -101,10 +101,10 @@ def _scale(
     near = np.full((n, MEMBERS), -1, np.int64)
     distance = np.full((n, MEMBERS), np.inf)
     if n:
-        kept = first_of_each(means, SPACING * radius)
-        count = min(MEMBERS, len(kept))
-        found, index = cKDTree(means[kept]).query(means, count, workers=-1)
-        near[:, :count] = kept[index.reshape(n, count)]
+        sample = first_of_each(means, SPACING * radius)
+        count = min(MEMBERS, len(sample))
+        found, index = cKDTree(means[sample]).query(means, count, workers=-1)
+        near[:, :count] = sample[index.reshape(n, count)]
         distance[:, :count] = found.reshape(n, count)
     neighbors = np.where(distance <= REACH * radius, near, -1)[:, :n_neighbors]
     others = np.where((near == own) | (distance > 2 * radius), -1, near)

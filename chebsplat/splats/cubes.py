@@ -30,14 +30,14 @@ def first_of_each(points: np.ndarray, edge: float, origin: Corner = None) -> np.
 
 
 def means_of_each(cube: np.ndarray, least: float, *values: np.ndarray) -> tuple[np.ndarray, ...]:
-    """Which cubes hold enough points, bool [M], and of these the means of values [N, 3].
+    """Cubes that hold enough points, bool [M], and of these the means of values [N, 3].
 
-    Args: cube [N]: of each point, from 0; least: points, of as many as the median point's cube holds;
-      three at least.
+    Args: cube [N]: of each point, from 0; least: share of the number of points in the median point's cube that a
+      cube must hold, and three at least.
     """
     count = np.bincount(cube)
-    kept = count >= max(3, least * np.median(count[cube]))
+    is_dense = count >= max(3, least * np.median(count[cube]))
     sums = np.zeros((len(values), len(count), 3))
     for total, each in zip(sums, values, strict=True):
         np.add.at(total, cube, each)
-    return kept, *(sums[:, kept] / count[kept, None])
+    return is_dense, *(sums[:, is_dense] / count[is_dense, None])

@@ -61,7 +61,7 @@ def settings(section: str | None) -> None:
 
 
 def range_of(field: dict[str, Any]) -> str:
-    """What values a field takes, of its JSON schema: its choices, or its type and bounds."""
+    """Values that a field takes, by its JSON schema: its choices, or its type and bounds."""
     kind = field.get("anyOf", [field])[0]
     if "enum" in kind:
         return " | ".join(kind["enum"])

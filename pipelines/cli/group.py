@@ -1,5 +1,5 @@
-"""How a command speaks and leaves: its log goes to stderr; its return is the exit code; a typed error or a stop becomes
-a line on stderr and a code.
+"""Logging and exit codes of commands: the log goes to stderr; what a command returns is its exit code; a typed
+error or a stop becomes a line on stderr and a code.
 """
 
 from __future__ import annotations
@@ -36,15 +36,15 @@ class _Lines(logging.Formatter):
 
 @contextmanager
 def logged(context: click.Context) -> Iterator[None]:
-    """The log goes to stderr within; a stage that is run there says it in its own way from then on."""
-    shown = logging.StreamHandler(sys.stderr)
-    shown.setFormatter(_Lines(context))
+    """Send the log to stderr within; a stage that is run there says it in its own way from then on."""
+    handler = logging.StreamHandler(sys.stderr)
+    handler.setFormatter(_Lines(context))
     logging.getLogger("chebsplat").setLevel("INFO")
-    logging.getLogger().addHandler(shown)
+    logging.getLogger().addHandler(handler)
     try:
         yield
     finally:
-        logging.getLogger().removeHandler(shown)
+        logging.getLogger().removeHandler(handler)
 
 
 class Guarded(click.Group):

@@ -1,4 +1,4 @@
-"""What is seen of a finished scene: render, cameras, page, view."""
+"""Commands that show a finished scene: render, cameras, page, view."""
 
 from __future__ import annotations
 
@@ -66,11 +66,11 @@ def render(
     from chebsplat.stages.progress import Progress
     from chebsplat.stages.video import render_video
 
-    opened, wanted = load(scene), size_of(size)
+    opened, pixels = load(scene), size_of(size)
     kinds = kinds_of(what, opened, query is not None)
-    asked = None if query is None else opened.understood(query, against)
-    shot = Shot(kinds, read_manifest(artifact_of(scene, "export")).key, asked)
-    cameras = [fitted(camera, wanted) for camera in path_of(opened, path, frames)]
+    query_vectors = None if query is None else opened.understood(query, against)
+    shot = Shot(kinds, read_manifest(artifact_of(scene, "export")).key, query_vectors)
+    cameras = [fitted(camera, pixels) for camera in path_of(opened, path, frames)]
     if out.suffix == ".mp4":
         render_video(opened, cameras, shot, out, fps, Progress())
     else:
@@ -90,8 +90,8 @@ def cameras(scene: str, path: str, frames: int | None, size: str | None, out: Pa
     from chebsplat.stages.camera_files import write_cameras
     from chebsplat.stages.camera_paths import fitted, path_of, size_of
 
-    wanted = size_of(size)
-    for file in write_cameras(out, [fitted(camera, wanted) for camera in path_of(load(scene), path, frames)]):
+    pixels = size_of(size)
+    for file in write_cameras(out, [fitted(camera, pixels) for camera in path_of(load(scene), path, frames)]):
         print(file.absolute())
 
 

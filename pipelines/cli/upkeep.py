@@ -29,7 +29,7 @@ class Age(click.ParamType):
 
 @click.command("ls")
 def list_scenes() -> None:
-    """List the scenes and studies in work: source, stages done, what they take, when, and what was measured."""
+    """List scenes, studies and sequences in work: source, stages done, bytes, when, and what was measured."""
     from chebsplat.pipelines import inventory, store
     from chebsplat.pipelines.tables import show_rows
 
@@ -51,8 +51,8 @@ def rm(scenes: tuple[str, ...], yes: bool) -> None:
     chosen = list(dict.fromkeys(inventory.in_work(scene) for scene in scenes))
     artifacts = inventory.only_of(chosen)
     for folder in chosen:
-        kept = inventory.others(folder)
-        print(f"           {folder}" + (f" (stays, for what is not ours: {', '.join(kept)})" if kept else ""))
+        foreign = inventory.others(folder)
+        print(f"           {folder}" + (f" (stays, for what is not ours: {', '.join(foreign)})" if foreign else ""))
     show_sizes(artifacts, yes, "--yes removes them")
     if yes:
         remove(chosen, artifacts)

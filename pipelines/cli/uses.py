@@ -1,4 +1,4 @@
-"""What is done with a finished scene, or before one: query, mesh, extract, encode, lift, label,
+"""Commands on a finished scene, or before one: query, mesh, extract, encode, lift, label,
 check-teacher, get-teacher, knowledge, calibrate.
 """
 
@@ -90,8 +90,8 @@ def extract(
     if against and text is None:
         raise ConfigError("--against is of a query; add --query TEXT")
     opened = load(scene)
-    asked = None if text is None else opened.understood(text, against)
-    told(write(opened, out, labels, min_opacity, corners(box), asked), out)
+    query_vectors = None if text is None else opened.understood(text, against)
+    told(write(opened, out, labels, min_opacity, corners(box), query_vectors), out)
 
 
 @click.command()

@@ -1,4 +1,4 @@
-"""How far a study is: which of its runs are measured."""
+"""Progress of a study: its measured runs."""
 
 from __future__ import annotations
 
@@ -35,15 +35,15 @@ def reported(
         return bool(finished)
 
     def watch() -> None:
-        shown, is_new = time.monotonic(), False
+        written_at, is_new = time.monotonic(), False
         while not over.wait(EVERY):
             is_new |= look()
-            if is_new and time.monotonic() - shown >= REFRESH:
+            if is_new and time.monotonic() - written_at >= REFRESH:
                 try:
                     refresh()
                 except (ChebsplatError, OSError) as error:
                     say(f"  the page could not be written: {error}")
-                shown, is_new = time.monotonic(), False
+                written_at, is_new = time.monotonic(), False
 
     thread = threading.Thread(target=watch, daemon=True)
     thread.start()

@@ -135,12 +135,12 @@ def extended(values: dict[str, Any], origin: str) -> dict[str, Any]:
         raise ConfigError(f"{origin}: {name} itself extends {other['extends']}; extend that")
     values = {key: value for key, value in values.items() if key != "extends"}
     for key in ("variants", "conditions"):
-        if isinstance(chosen := values.get(key), list):
-            there = other.get(key, {})
-            if wrong := [name for name in chosen if name not in list(there)]:
-                known = ", ".join(there)
+        if isinstance(names := values.get(key), list):
+            of_other = other.get(key, {})
+            if wrong := [name for name in names if name not in list(of_other)]:
+                known = ", ".join(of_other)
                 raise ConfigError(f"{origin}: {key}: {wrong[0]!r:.60} is none of {known}")
-            values[key] = {name: there[name] for name in chosen}
+            values[key] = {name: of_other[name] for name in names}
     return other | values
 
 

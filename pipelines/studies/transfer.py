@@ -13,28 +13,28 @@ SHOWN = {figure.key: figure for figure in FIGURES}
 
 
 def sections(study: Study, rows: list[Row]) -> list[Section]:
-    """Those that have at least one row."""
+    """Sections of the page, without those that have no row."""
     parts = [
-        (
+        Section(
             f"What is gained over {study.baseline}",
             "Paired differences with the last budget. Worst scene: the lowest mean difference of "
             "mIoU of any scene, in points.",
             end_table(study, rows),
         ),
-        (
+        Section(
             "The first scenes again, with the last basis",
             "mIoU with the last budget of scenes that come again at the end of their sequence, and so "
             "start from knowledge of all scenes, themselves among them: against "
             f"{study.baseline}, and against their first visit.",
             return_table(study, rows),
         ),
-        (
+        Section(
             "Variants against each other",
             "Paired differences, the first from the second variant.",
             pair_table(study, rows),
         ),
     ]
-    return [Section(*part) for part in parts if len(part[-1]) > 1]
+    return [section for section in parts if len(section.table) > 1]
 
 
 def end_table(study: Study, rows: list[Row]) -> list[list[str]]:
