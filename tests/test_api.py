@@ -4,10 +4,15 @@ import numpy as np
 import pytest
 
 import chebsplat
-from chebsplat.errors import ConfigError
+from chebsplat.errors import ChebsplatError, ConfigError
+from chebsplat.formats.capture import Capture
 from chebsplat.formats.ply import read_ply
 from chebsplat.formats.scene import Scene
+from chebsplat.pipelines import run
 from chebsplat.pipelines.api import as_text
+from chebsplat.pipelines.plan import overrides
+from chebsplat.render import SceneRenderer
+from chebsplat.stages.evaluate import camera
 
 
 @pytest.fixture(scope="module")
@@ -24,9 +29,6 @@ def test_what_is_opened_is_the_exported_scene(scene, toy):
 
 
 def test_a_render_is_the_one_that_was_evaluated(scene, toy):
-    from chebsplat.render import SceneRenderer
-    from chebsplat.stages.evaluate import camera
-
     held, shown = Scene.read(toy["export"]), scene.render(scene.cameras[2])
     image, features = SceneRenderer(held.parameters).render(camera(held, 2), with_features=True)
     np.testing.assert_array_equal(shown.color, image)
@@ -37,8 +39,6 @@ def test_a_render_is_the_one_that_was_evaluated(scene, toy):
 
 
 def test_depth_is_that_of_the_room(scene, toy):
-    from chebsplat.formats.capture import Capture
-
     capture = Capture.read(toy["ingest"])
     errors = []
     for name in scene.cameras[0].name, scene.cameras[3].name:
@@ -92,8 +92,6 @@ def test_what_cannot_be_is_said(scene):
 
 
 def test_settings_as_the_command_takes_them():
-    from chebsplat.pipelines.plan import overrides
-
     given = {"train": {"steps": 10, "prune": False, "lr_means": 1e-4}, "source": {"path": "a, b"}}
     assert overrides(as_text(given)) == given
     with pytest.raises(ConfigError, match="is a section"):
@@ -110,9 +108,6 @@ def test_one_stage_runs_alone(toy, tmp_path):
 
 
 def test_a_scene_is_brought_up_to_date_and_opened(quick_plans, monkeypatch):
-    from chebsplat.errors import ChebsplatError
-    from chebsplat.pipelines import run
-
     asked = []
     monkeypatch.setattr(run, "execute", lambda plans, stage, cores, device: asked.append(plans[0].title) or 4)
     with pytest.raises(ChebsplatError, match="could not be finished"):

@@ -13,6 +13,7 @@ from chebsplat.formats.basis import SCHEMA, Basis, read_basis, write_basis
 from chebsplat.formats.manifest import Manifest
 from chebsplat.pipelines import bases, store
 from chebsplat.pipelines.cli.basis import basis as command
+from chebsplat.pipelines.cli.runs import plans
 from chebsplat.shape.cks import update
 
 NAMES = ("blocks.0.query", "blocks.0.key")
@@ -132,8 +133,6 @@ def test_what_is_exported_starts_scenes_elsewhere(chain, tmp_path, monkeypatch):
     assert (code, out.strip()) == (0, str(tmp_path / "knowledge"))
     assert call("export", "shared", "--out", tmp_path / "knowledge")[0] == 2  # never overwritten
     monkeypatch.setenv("CHEBSPLAT_WORK", str(tmp_path / "elsewhere"))
-    from chebsplat.pipelines.cli.runs import plans
-
     asked = {"scene": "toy", "sequence": None, "settings": "", "ablation": "", "basis": f"{tmp_path}/knowledge/"}
     assert plans(**asked)[0].title == f"toy@basis={key_of(2)}"
     assert not (tmp_path / "elsewhere").exists()  # planning copies nothing
@@ -146,8 +145,6 @@ def test_what_is_exported_starts_scenes_elsewhere(chain, tmp_path, monkeypatch):
 
 @pytest.mark.parametrize(("asked", "number"), [("shared@2", 2), ("shared", 3)])
 def test_a_scene_starts_from_the_revision_of_a_head_that_is_named_or_the_newest(chain, asked, number):
-    from chebsplat.pipelines.cli.runs import plans
-
     (plan,) = plans(scene="toy", sequence=None, settings="", ablation="", basis=asked)
     assert plan.title == f"toy@basis=shared@{number}"
     assert {step.stage for step in plan.steps if "basis" in step.inputs} == {"train"}

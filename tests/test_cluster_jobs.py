@@ -2,6 +2,7 @@
 
 import os
 import sys
+import threading
 from graphlib import TopologicalSorter
 
 import pytest
@@ -123,8 +124,6 @@ def test_without_the_plugin_or_slurm_a_run_there_says_what_is_missing(monkeypatc
 
 
 def test_a_job_on_a_node_stops_when_its_run_lets_go(monkeypatch, tmp_path):
-    import threading
-
     plan, told = store.work() / ".plans/abc-1/plan.json", threading.Event()
     monkeypatch.setattr(leases, "EVERY", 0.05)
     monkeypatch.setattr(cluster, "end_itself", told.set)

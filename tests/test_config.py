@@ -5,13 +5,21 @@ import json
 import re
 import tomllib
 from collections import Counter
+from typing import get_args
 
 import pytest
 from shared import ROOT
 
 from chebsplat.errors import ConfigError
+from chebsplat.pipelines.plan import OFF_IS_CHOICE
 from chebsplat.stages import config
 from chebsplat.stages.registry import STAGES
+
+SETTINGS = {
+    f"{section}.{key}": setting
+    for section, field in config.Config.model_fields.items()
+    for key, setting in field.annotation.model_fields.items()
+}
 
 
 def test_json_and_toml_give_the_same_config(tmp_path):
@@ -27,17 +35,13 @@ def test_every_stage_reads_known_sections_and_known_stages():
 
 
 def test_every_setting_says_what_it_means():
-    sections = {name: field.annotation.model_fields for name, field in config.Config.model_fields.items()}
-    silent = [f"{name}.{key}" for name, fields in sections.items() for key in fields if not fields[key].description]
-    assert not silent
+    assert [name for name, setting in SETTINGS.items() if not setting.description] == []
 
 
 def test_a_setting_has_a_lower_and_an_upper_bound():
-    for name, field in config.Config.model_fields.items():
-        for key, setting in field.annotation.model_fields.items():
-            if setting.annotation in (int, float, int | None, float | None):
-                bounds = {type(rule).__name__ for rule in setting.metadata}
-                assert {"Ge", "Le"} <= bounds, f"{name}.{key}"
+    for name, setting in SETTINGS.items():
+        if setting.annotation in (int, float, int | None, float | None):
+            assert {"Ge", "Le"} <= {type(rule).__name__ for rule in setting.metadata}, name
 
 
 def settings_of(values):
@@ -102,15 +106,5 @@ def test_a_message_is_one_short_line():
 
 
 def test_off_is_text_wherever_it_is_a_choice():
-    from typing import get_args
-
-    from chebsplat.pipelines.plan import OFF_IS_CHOICE
-
-    sections = {name: part.annotation.model_fields for name, part in config.Config.model_fields.items()}
-    choices = {
-        f"{section}.{name}"
-        for section, fields in sections.items()
-        for name, setting in fields.items()
-        if "off" in get_args(setting.annotation)
-    }
+    choices = {name for name, setting in SETTINGS.items() if "off" in get_args(setting.annotation)}
     assert choices == set(OFF_IS_CHOICE)

@@ -8,12 +8,10 @@ import time
 
 import numpy as np
 import pytest
-from shared import KEY
+from shared import published
 
 from chebsplat.errors import InputError
-from chebsplat.formats import artifact, features
 from chebsplat.formats.features import Features, FeatureWriter
-from chebsplat.formats.manifest import Manifest
 
 NAMES = ["a", "b", "c", "d"]
 SHAPE = (70, 130, 3)
@@ -151,13 +149,11 @@ def test_a_store_that_lacks_a_view_or_its_labels_is_not_finished(tmp_path):
 
 
 def test_every_bit_of_a_view_is_guarded(tmp_path):
-    path = tmp_path / "f"
     stack = np.zeros((1, 65, 65, 1), np.float16)  # compresses well: few bytes to try
-    with artifact.publish(path, Manifest(Features.SCHEMA, KEY, "s")) as tmp:
-        Features(["a"], stack, ["x"], np.eye(1, 1, dtype=np.float32)).write(tmp)
+    path = published(tmp_path / "f", Features(["a"], stack, ["x"], np.eye(1, 1, dtype=np.float32)))
     chunk = path / "features/c/0/0/0/0"
     good = chunk.read_bytes()
-    found = features.Features.read(path).features
+    found = Features.read(path).features
     for place in range(len(good)):
         chunk.write_bytes(good[:place] + bytes([good[place] ^ (1 << place % 8)]) + good[place + 1 :])
         with pytest.raises(InputError, match="does not match its sha256"):

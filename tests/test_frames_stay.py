@@ -5,13 +5,14 @@ from copy import deepcopy
 import numpy as np
 import pytest
 from click.testing import CliRunner
+from plyfile import PlyData
+from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
-from shared import KEY
+from shared import published
 from test_page import held_in
 from test_readers import CONVERSIONS, GRID, packages, transform  # noqa: F401  # a fixture among them
 
-from chebsplat.formats import artifact
-from chebsplat.formats.manifest import Manifest
+import chebsplat
 from chebsplat.formats.packed import Packed, unpack
 from chebsplat.formats.ply import read_ply
 from chebsplat.formats.scene import Scene
@@ -25,8 +26,6 @@ TURN *= np.linalg.det(TURN)  # a rotation
 @pytest.fixture(scope="module")
 def moved(mixed, tmp_path_factory):
     """A checkpoint with every SH degree whose poses are of another model of COLMAP's; means [N, 3]; its export."""
-    from chebsplat.pipelines.api import run_stage
-
     root, checkpoint = tmp_path_factory.mktemp("frames"), deepcopy(mixed[0])
     for values in ("fused", "features"):
         checkpoint.parameters.pop(values, None)
@@ -39,15 +38,23 @@ def moved(mixed, tmp_path_factory):
     poses = checkpoint.cameras.cam_from_world
     poses[:, :3, 3] = SCALE * poses[:, :3, 3] - poses[:, :3, :3] @ TURN.T @ SHIFT
     poses[:, :3, :3] = poses[:, :3, :3] @ TURN.T
-    with artifact.publish(root / "gaussians", Manifest("chebsplat.gaussians/2", KEY, "train")) as tmp:
-        checkpoint.write(tmp)
-    return checkpoint, run_stage("export", root / "scene/export", {"gaussians": root / "gaussians"})
+    gaussians = published(root / "gaussians", checkpoint)
+    return checkpoint, chebsplat.run_stage("export", root / "scene/export", {"gaussians": gaussians})
+
+
+def run(*arguments):
+    """A command that succeeds."""
+    done = CliRunner().invoke(main, list(map(str, arguments)))
+    assert done.exit_code == 0, done.output
+
+
+def refused(code, said, *arguments):
+    done = CliRunner().invoke(main, list(map(str, arguments)))
+    assert (done.exit_code, said in done.output) == (code, True)
 
 
 def close(found, wanted, within):
     """Whether two sets of points are one, by nearest neighbours both ways."""
-    from scipy.spatial import cKDTree
-
     assert len(found) == len(wanted)
     for a, b in ((found, wanted), (wanted, found)):
         assert cKDTree(b).query(a)[0].max() <= within
@@ -68,17 +75,12 @@ def test_layouts_lie_where_the_checkpoint_does(moved):
 
 
 def test_parts_pages_and_cameras_lie_there_too(moved, tmp_path):
-    import chebsplat
-
     checkpoint, export = moved
     wanted = checkpoint.parameters["means"]
     scene = chebsplat.load(export)
     close(read_ply(scene.to_ply(tmp_path / "python.ply"))[0]["means"], wanted, 0)
-    for arguments in (["extract", export, "--out", tmp_path / "part.ply"],
-                      ["page", export, "--out", tmp_path / "page.html"],
-                      ["cameras", export, "--out", tmp_path / "cameras"]):  # fmt: skip
-        done = CliRunner().invoke(main, list(map(str, arguments)))
-        assert done.exit_code == 0, done.output
+    for command, out in (("extract", "part.ply"), ("page", "page.html"), ("cameras", "cameras")):
+        run(command, export, "--out", tmp_path / out)
     close(read_ply(tmp_path / "part.ply")[0]["means"], wanted, 0)
     about, arrays = held_in(tmp_path / "page.html")
     held = unpack(Packed({name: arrays[name] for name in arrays if name != "views"}, about["ranges"]))
@@ -89,44 +91,33 @@ def test_parts_pages_and_cameras_lie_there_too(moved, tmp_path):
 
 
 def test_an_imported_splat_stays_where_it_was(moved, tmp_path):
-    import chebsplat
-
     checkpoint, export = moved
-    done = CliRunner().invoke(main, ["lift", str(export / "scene.ply"), "--out", str(tmp_path / "theirs")])
-    assert done.exit_code == 0, done.output
-    scene = chebsplat.load(tmp_path / "theirs")
+    theirs = tmp_path / "theirs"
+    run("lift", export / "scene.ply", "--out", theirs)
+    scene = chebsplat.load(theirs)
     close(scene.parameters["means"], checkpoint.parameters["means"], 0)
     assert scene.features is None
     shown = scene.render(scene.cameras[0])
     assert (shown.alpha > 0.5).mean() > 0.05
-    for arguments in (["verify", tmp_path / "theirs"], ["extract", tmp_path / "theirs", "--min-opacity", "0.1",
-                      "--out", tmp_path / "part.ply"], ["page", tmp_path / "theirs", "--out", tmp_path / "page.html"],
-                      ["lift", export / "scene.ply", "--out", tmp_path / "again"]):  # fmt: skip
-        done = CliRunner().invoke(main, list(map(str, arguments)))
-        assert done.exit_code == 0, done.output
-    for arguments, said in ((["--out", tmp_path / "theirs"], "exists"),
-                            (["--teacher", "x.onnx", "--out", tmp_path / "x"], "add --capture")):  # fmt: skip
-        done = CliRunner().invoke(main, ["lift", str(export / "scene.ply"), *map(str, arguments)])
-        assert (done.exit_code, said in done.output) == (2, True)
+    run("verify", theirs)
+    run("extract", theirs, "--min-opacity", "0.1", "--out", tmp_path / "part.ply")
+    run("page", theirs, "--out", tmp_path / "page.html")
+    run("lift", export / "scene.ply", "--out", tmp_path / "again")
+    refused(2, "exists", "lift", export / "scene.ply", "--out", theirs)
+    refused(2, "add --capture", "lift", export / "scene.ply", "--teacher", "x.onnx", "--out", tmp_path / "x")
 
 
 def test_a_mesh_lies_there_too(mixed, moved, tmp_path):
     """That of the moved scene, moved back, is that of the scene: voxels lie elsewhere, surfaces where they were."""
-    from plyfile import PlyData
-    from scipy.spatial import cKDTree
-
     voxel, found = 0.04, []
     for scene, edge in ((mixed[1], voxel), (moved[1], SCALE * voxel)):
         out = tmp_path / f"{len(found)}.ply"
-        arguments = ["mesh", scene, "--out", out, "--voxel", edge, "--raw"]
-        done = CliRunner().invoke(main, list(map(str, arguments)))
-        assert done.exit_code == 0, done.output
+        run("mesh", scene, "--out", out, "--voxel", edge, "--raw")
         vertex = PlyData.read(out)["vertex"]
         found.append(np.stack([vertex[axis] for axis in "xyz"], 1).astype(np.float64))
-    for arguments, code, said in (([tmp_path / "a.glb", "--voxel", 1e6, "--raw"], 4, "shows no surface"),
-                                  ([tmp_path / "a.obj"], 2, ".ply or .glb"), ([out], 2, "exists")):  # fmt: skip
-        done = CliRunner().invoke(main, ["mesh", str(mixed[1]), "--out", *map(str, arguments)])
-        assert (done.exit_code, said in done.output) == (code, True)
+    refused(4, "shows no surface", "mesh", mixed[1], "--out", tmp_path / "a.glb", "--voxel", 1e6, "--raw")
+    refused(2, ".ply or .glb", "mesh", mixed[1], "--out", tmp_path / "a.obj")
+    refused(2, "exists", "mesh", mixed[1], "--out", out)
     back = (found[1] - SHIFT) @ TURN / SCALE
     for a, b in ((found[0], back), (back, found[0])):
         assert len(a) > 500

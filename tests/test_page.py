@@ -1,6 +1,7 @@
 """`chebsplat page`: a scene in one file. Slow tests open it in a real browser, from file://, and drive it."""
 
 import base64
+import gzip
 import json
 import re
 import shutil
@@ -32,12 +33,16 @@ def scene(tmp_path_factory):
     return made(tmp_path_factory.mktemp("page") / "box room")
 
 
-@pytest.fixture(scope="module")
-def page(scene, tmp_path_factory):
-    out = tmp_path_factory.mktemp("pages") / "room.html"
-    done = CliRunner().invoke(main, ["page", str(scene[0]), "--out", str(out)])
+def page_of(scene, out, *options):
+    """The page that the command writes of a scene's folder or of a PLY."""
+    done = CliRunner().invoke(main, ["page", str(scene), "--out", str(out), *options])
     assert (done.exit_code, done.stdout) == (0, f"{out}\n"), done.output
     return out
+
+
+@pytest.fixture(scope="module")
+def page(scene, tmp_path_factory):
+    return page_of(scene[0], tmp_path_factory.mktemp("pages") / "room.html")
 
 
 @pytest.fixture(scope="module")
@@ -45,16 +50,11 @@ def calibrated(tmp_path_factory):
     """(scene as read, opened, page) of a scene whose teacher's relevancy is calibrated."""
     root = tmp_path_factory.mktemp("calibrated")
     folder, held = made(root / "box room", calibrated=True)
-    out = root / "room.html"
-    done = CliRunner().invoke(main, ["page", str(folder), "--out", str(out)])
-    assert (done.exit_code, done.stdout) == (0, f"{out}\n"), done.output
-    return held, load(folder), out
+    return held, load(folder), page_of(folder, root / "room.html")
 
 
 def held_in(page):
     """(about, arrays) of a page."""
-    import gzip
-
     text = page.read_text()
     about = json.loads(re.search(r'id="about">(.*?)</script>', text, re.DOTALL)[1])
     blob = gzip.decompress(base64.b64decode(re.search(r'id="data">(.*?)</script>', text, re.DOTALL)[1]))
@@ -179,13 +179,11 @@ def test_a_page_of_an_artifact_alone_asks_for_labels(scene, tmp_path):
 
 
 def test_a_page_of_a_foreign_ply_has_no_semantic_controls(tmp_path):
-    ply = foreign_ply(tmp_path / "theirs.ply")
-    done = CliRunner().invoke(main, ["page", str(ply), "--out", str(tmp_path / "theirs.html"), "--sh", "1"])
-    assert done.exit_code == 0, done.output
-    about, arrays = held_in(tmp_path / "theirs.html")
+    out = page_of(foreign_ply(tmp_path / "theirs.ply"), tmp_path / "theirs.html", "--sh", "1")
+    about, arrays = held_in(out)
     assert "labels" not in about
     assert arrays["sh1"].shape == (9, 300)
-    assert not re.search(r'id="(ask|legend|words)"', (tmp_path / "theirs.html").read_text())
+    assert not re.search(r'id="(ask|legend|words)"', out.read_text())
 
 
 def test_an_existing_file_stays(scene, tmp_path):
@@ -430,8 +428,7 @@ def test_in_a_browser_moving_among_20000_gaussians_and_asking_stay_cheap(page, t
 @in_a_browser
 @pytest.mark.parametrize("dark", [False, True])
 def test_in_a_browser_a_foreign_splat_is_shown_on_a_narrow_screen(tmp_path, dark):
-    ply, out = foreign_ply(tmp_path / "theirs.ply", 3000), tmp_path / "theirs.html"
-    assert CliRunner().invoke(main, ["page", str(ply), "--out", str(out), "--sh", "1"]).exit_code == 0
+    out = page_of(foreign_ply(tmp_path / "theirs.ply", 3000), tmp_path / "theirs.html", "--sh", "1")
     with driven(tmp_path) as browser:
         browser.open(out, 390, 800, dark=dark)
         browser.run("scene.ready")

@@ -5,6 +5,7 @@ import shutil
 import numpy as np
 import pytest
 from click.testing import CliRunner
+from malformed.edits import put, remove
 from PIL import Image
 from shared import published
 
@@ -137,38 +138,27 @@ def test_a_scene_of_labels_is_asked_for_a_label_against_the_others(folder):
     assert np.all((scores > 0.5) == (np.arange(3 * N) // N == 1))
 
 
-def remove_teacher(folder):
-    shutil.rmtree(folder / "words/teacher")
-
-
-def other_model(folder):
-    (folder / "toy.onnx").write_bytes(b"another")
-
-
 def small_table(folder):
     np.savez(folder / "toy.npz", names=np.array(LABELS), embeddings=vectors(LABELS))
-
-
-def nothing(folder):
-    pass
 
 
 @pytest.mark.parametrize(
     ("damage", "arguments", "code", "said"),
     [
-        (nothing, ["labels", "something to sit on"], 2, "no label of this scene"),
-        (nothing, ["labels", "something to sit on"], 2, "teacher.kind=auto"),
-        (nothing, ["words", "seatz"], 3, "near: seat"),
-        (nothing, ["word", "seat"], 2, "there is words"),
-        (nothing, ["store", "seat"], 2, "no finished scene"),
-        (nothing, ["words", " "], 2, "empty"),
-        (remove_teacher, ["words", "seat"], 2, "no teacher's artifact"),
-        (other_model, ["words", "seat"], 3, "toy.onnx is not the model"),
+        (None, ["labels", "something to sit on"], 2, "no label of this scene"),
+        (None, ["labels", "something to sit on"], 2, "teacher.kind=auto"),
+        (None, ["words", "seatz"], 3, "near: seat"),
+        (None, ["word", "seat"], 2, "there is words"),
+        (None, ["store", "seat"], 2, "no finished scene"),
+        (None, ["words", " "], 2, "empty"),
+        (remove("words/teacher"), ["words", "seat"], 2, "no teacher's artifact"),
+        (put("toy.onnx", "another"), ["words", "seat"], 3, "toy.onnx is not the model"),
         (small_table, ["words", "sofa"], 3, "choose with --against"),
     ],
 )
 def test_what_cannot_be_answered_is_told_with_the_remedy(folder, damage, arguments, code, said):
-    damage(folder)
+    if damage is not None:
+        damage(folder)
     done = asked(*arguments)
     assert done.exit_code == code
     assert said in done.stderr

@@ -10,12 +10,16 @@ from html.parser import HTMLParser
 import numpy as np
 import pytest
 from browser import BROWSER, browsed
+from malformed.artifacts import artifacts, copied
+from malformed.edits import changed
+from PIL import Image
 from shared import INPUTS, KEY, run_stage
 
 from chebsplat.errors import InputError
 from chebsplat.formats.artifact import publish, read_manifest
 from chebsplat.formats.evaluation import Evaluation
 from chebsplat.formats.manifest import Manifest
+from chebsplat.stages import report
 from chebsplat.stages.pages import pictures as draw
 from chebsplat.stages.pages.parts import class_rows, label_names, legend, picture_rows
 
@@ -40,8 +44,6 @@ class Fetches(HTMLParser):
 
 
 def image(uri):
-    from PIL import Image
-
     return np.asarray(Image.open(io.BytesIO(base64.b64decode(uri.split(",", 1)[1]))).convert("RGB"))
 
 
@@ -125,8 +127,6 @@ def test_the_total_counts_every_stage_with_the_channels_and_no_size_exceeds_plai
 
 
 def test_a_page_that_would_be_too_large_is_refused(toy, tmp_path, monkeypatch):
-    from chebsplat.stages import report
-
     monkeypatch.setattr(report, "LARGEST", 1000)
     inputs = {"evaluation": toy["evaluate"], "gaussians": toy["train"]}
     assert run_stage("report", tmp_path / "report", inputs) == 4
@@ -165,9 +165,6 @@ def test_a_browser_would_notice_an_error_a_request_and_a_page_too_wide(tmp_path)
 
 @pytest.mark.filterwarnings("ignore:No artists with labels")  # the small trace has one row
 def test_the_page_tells_how_far_views_agree_and_doubts_labels_where_they_do_not(tmp_path):
-    from malformed.artifacts import artifacts, copied
-    from malformed.edits import changed
-
     inputs = {"evaluation": artifacts() / "evaluate", "gaussians": artifacts() / "train"}
     agreed = copied("agree", tmp_path)
     assert run_stage("report", tmp_path / "sure", inputs | {"agreement": agreed}, {}) == 0

@@ -8,6 +8,8 @@ import sys
 import numpy as np
 import pytest
 from browser import BROWSER, browsed
+from malformed.edits import put
+from matplotlib.figure import Figure
 from shared import ROOT
 
 from chebsplat.errors import ConfigError
@@ -15,13 +17,14 @@ from chebsplat.formats.artifact import publish
 from chebsplat.formats.capture import Capture
 from chebsplat.formats.evaluation import Evaluation
 from chebsplat.formats.manifest import Manifest
+from chebsplat.pipelines import plan
 from chebsplat.pipelines.scenes import data_of, names
 from chebsplat.pipelines.sequences import scenes_of
 from chebsplat.pipelines.studies import figures
 from chebsplat.pipelines.studies.page import write
 from chebsplat.pipelines.studies.pictures import gallery
 from chebsplat.pipelines.studies.results import compare, row_of, traces
-from chebsplat.pipelines.studies.study import Study, checked_study, execute, expand, outstanding, read_study
+from chebsplat.pipelines.studies.study import checked_study, execute, expand, outstanding, read_study
 from chebsplat.pipelines.studies.tables import Section
 from chebsplat.stages.registry import STAGES
 
@@ -39,20 +42,20 @@ def study(**changes):
     return checked_study(values | changes, "study")
 
 
+def step_of(run, stage):
+    return next(step for step in run.plan.steps if step.stage == stage)
+
+
 def publish_stage(run, stage, fill, **facts):
-    """An artifact of a run, without running it. fill: documents by name, or what writes them into a folder."""
-    step = next(step for step in run.steps if step.stage == stage)
+    """An artifact of a run, without running it. fill: what writes its files into a folder."""
+    step = step_of(run, stage)
     if step.fresh:
         return
     code = {"commit": "c" * 40, "dirty": False}
     manifest = Manifest(STAGES[stage].schema, step.key, stage, {}, step.sections, 0, facts, threads=2, code=code)
     step.path.parent.mkdir(parents=True, exist_ok=True)
     with publish(step.path, manifest) as tmp:
-        if callable(fill):
-            fill(tmp)
-        else:
-            for name, text in fill.items():
-                (tmp / name).write_text(text)
+        fill(tmp)
 
 
 ONE_LABEL = np.zeros((1, 4, 6), np.int16)
@@ -68,21 +71,28 @@ def finish(run, miou=0.5, psnr=30.0, n=100, seconds=10.0, steps=10, segmentation
         blank, K = np.zeros((1, 4, 6, 3), np.uint8), np.eye(3)[None]
         truth = np.zeros((1, 4, 6), np.int16)
         capture = Capture(["a"], blank, K, np.eye(4)[None], np.array([True]), labels=truth, class_names=labels[0])
-        publish_stage(run, "ingest", lambda tmp: capture.write(tmp))
+        publish_stage(run, "ingest", capture.write)
     for step in run.steps:
         if step.stage not in ("train", "export", "evaluate"):
-            publish_stage(run, step.stage, {"empty.json": "{}"})
-    publish_stage(
-        run, "train", {"trace.csv": f"step,seconds,psnr\n{steps // 2},{seconds / 2},20\n{steps},{seconds},25\n"}
-    )
+            publish_stage(run, step.stage, put("empty.json", "{}"))
+    trace = f"step,seconds,psnr\n{steps // 2},{seconds / 2},20\n{steps},{seconds},25\n"
+    publish_stage(run, "train", put("trace.csv", trace))
     # 10 Gaussians keep degree 3 (16 coefficients) and 30 degree 0 (1): 190 of 640.
-    publish_stage(run, "export", {}, by_degree=[30, 0, 0, 10])
+    publish_stage(run, "export", put("empty.json", "{}"), by_degree=[30, 0, 0, 10])
     figures |= {"names": ["a"], "left_out": {"LPIPS": "not measured"}}
     figures["image"]["per_view"] = {"psnr": [psnr]}
     pictures = {name: np.zeros((1, 4, 6, 3), np.uint8) for name in ("truth", "renders")}
     if labels is not None:
         pictures |= {"labels": truth, "predicted": labels[1]}
-    publish_stage(run, "evaluate", lambda tmp: Evaluation(figures, pictures).write(tmp))
+    publish_stage(run, "evaluate", Evaluation(figures, pictures).write)
+
+
+def finished(asked, **figures):
+    """Runs of a study as if they had been made and had found these figures, and a row of results of each."""
+    runs = expand(asked)
+    for run in runs:
+        finish(run, **figures)
+    return runs, [row_of(run, {}) for run in runs]
 
 
 def test_a_study_is_every_combination_and_each_step_once():
@@ -103,11 +113,9 @@ def test_a_study_is_every_combination_and_each_step_once():
 
 def test_a_budget_of_seconds_is_a_training_by_the_clock_beside_one_of_steps():
     runs = expand(study(seeds=[0], budgets={"steps": [10], "seconds": [2.5, 60]}))
-    found = {
-        (run.budget, step.sections["train"]["steps"], step.sections["train"]["seconds"])
-        for run in runs for step in run.steps if step.stage == "train"
-    }  # fmt: skip
-    own = next(step.sections["train"]["steps"] for step in expand(study())[0].steps if step.stage == "train")
+    trained = [(run.budget, step_of(run, "train").sections["train"]) for run in runs]
+    found = {(budget, settings["steps"], settings["seconds"]) for budget, settings in trained}
+    own = step_of(expand(study())[0], "train").sections["train"]["steps"]
     assert found == {("10 steps", 10, None), ("2.5 s", own, 2.5), ("60 s", own, 60)}
     assert len({run.plan.targets["train"] for run in runs}) == 6
 
@@ -119,9 +127,7 @@ def test_only_a_teacher_that_draws_is_computed_for_every_seed():
 
 
 def test_what_is_there_is_not_computed_again_and_is_kept(work):
-    first = expand(study(seeds=[0]))
-    for run in first:
-        finish(run)
+    first, _ = finished(study(seeds=[0]))
     assert outstanding(first) == []
     assert execute("s", first, 1, 1).code == 0
     assert len(list((work / "study-s").iterdir())) == 2
@@ -131,9 +137,8 @@ def test_what_is_there_is_not_computed_again_and_is_kept(work):
 
 
 def test_figures_are_read_from_the_artifacts():
-    (run,) = expand(study(seeds=[3], variants={"less": {}}))
-    finish(run, miou=0.75, psnr=31.5, n=40, seconds=8.0)
-    row = row_of(run, {})
+    asked = study(seeds=[3], variants={"less": {}})
+    _, (row,) = finished(asked, miou=0.75, psnr=31.5, n=40, seconds=8.0)
     expected = {"state": "done", "seed": 3, "miou": 0.75, "miou_gain": 0.5, "psnr": 31.5, "n_gaussians": 40}
     expected |= {"sh_kept": 190 / 640, "bytes_ply": 400, "bytes_ragged": 200, "frames_per_second": 50.0}
     expected |= {"train_seconds": 8.0, "held_in_psnr": 25.0, "steps": 10, "threads": 2}
@@ -192,8 +197,6 @@ def test_scannet_opens_scenes_are_summed_and_those_of_scannet_closed_averaged_be
 
 
 def test_scenes_measured_in_two_ways_are_not_compared(tmp_path, monkeypatch):
-    from chebsplat.pipelines import plan
-
     known = plan.scene_values
     office = {"ingest": {"protocol": "replica-f3"}}
 
@@ -222,10 +225,8 @@ def test_the_page_shows_a_view_of_each_scene_in_one_set_of_colours(tmp_path):
     assert toy["labels of less"] == toy["labels of full"] == office["labels of less"] != toy["labels"]
     assert "render of full" not in office  # that run has failed; the slider says so by a button that is off
     assert [name for name, _ in shown["legend"]] == ["wall", "sofa"]
-    assert [(name, mean, other) for name, _, mean, other in shown["classes"]] == [
-        ("sofa", 0.75, 0.5),
-        ("wall", 0.25, None),
-    ]
+    classes = [(name, mean, other) for name, _, mean, other in shown["classes"]]
+    assert classes == [("sofa", 0.75, 0.5), ("wall", 0.25, None)]
     assert shown["shown"] == "20 steps, seed 0"
     names = ["photo | full", "true labels | full", "photo | less", "less | full", "less | full, labels"]
     assert [mode[0] for mode in shown["modes"]] == names
@@ -288,23 +289,14 @@ def test_without_a_single_result_the_page_says_so(tmp_path):
 def test_a_figure_may_be_drawn_against_a_setting(tmp_path):
     conditions = {f"p{p}": {"teacher": {"kind": "labels", "confusion": p}} for p in (0.0, 0.5)}
     noise = study(seeds=[0], conditions=conditions, against="teacher.confusion")
-    runs = expand(noise)
-    for run in runs:
-        finish(run)
-    write(tmp_path, noise, runs, [row_of(run, {}) for run in runs], "c")
+    write(tmp_path, noise, *finished(noise), "c")
     assert (tmp_path / "error-against-time.png").stat().st_size > 10_000
 
 
 def test_a_figure_of_colour_alone_has_a_panel_for_each_scene(tmp_path, monkeypatch):
-    import matplotlib.figure
-
     panels = []
-    monkeypatch.setattr(matplotlib.figure.Figure, "savefig", lambda figure, *args, **kw: panels.extend(figure.axes))
-    scenes = study(scenes=["toy", "office0"], seeds=[0])
-    runs = expand(scenes)
-    for run in runs:
-        finish(run)
-    rows = [row_of(run, {}) for run in runs]
+    monkeypatch.setattr(Figure, "savefig", lambda figure, *args, **kw: panels.extend(figure.axes))
+    runs, rows = finished(study(scenes=["toy", "office0"], seeds=[0]))
     figures.draw(tmp_path / "figure.png", rows, traces(runs, rows), None, "")
     assert [panel.get_title()[:9] for panel in panels] == ["test PSNR", "test mIoU", "PSNR on w"]
     panels.clear()
@@ -315,20 +307,16 @@ def test_a_figure_of_colour_alone_has_a_panel_for_each_scene(tmp_path, monkeypat
 
 @pytest.fixture
 def there_and_back(tmp_path):
-    """A sequence whose first scene comes again at its end."""
+    """What a study says of a sequence whose first scene comes again at its end."""
     (tmp_path / "back.toml").write_text('scenes = ["toy", "office0", "toy"]')
-    return str(tmp_path / "back.toml")
+    return {"scenes": [], "sequences": [str(tmp_path / "back.toml")], "seeds": [0], "baseline": "scratch"}
 
 
 VARIANTS = {"scratch": {"knowledge": False}, "both": {}, "warm": {"train": {"weight_basis": 0.0}}}
 
 
-def step_of(run, stage):
-    return next(step for step in run.plan.steps if step.stage == stage)
-
-
 def test_a_sequence_carries_knowledge_and_scratch_does_not(there_and_back):
-    runs = expand(study(scenes=[], sequences=[there_and_back], seeds=[0], baseline="scratch", variants=VARIANTS))
+    runs = expand(study(**there_and_back, variants=VARIANTS))
     assert [(run.place, run.visit) for run in runs if run.variant == "both"] == [(1, 1), (2, 1), (3, 2)]
     for run in runs:
         assert ("basis" in step_of(run, "train").inputs) == (run.place > 1 and run.variant != "scratch")
@@ -342,9 +330,7 @@ def test_a_sequence_carries_knowledge_and_scratch_does_not(there_and_back):
 def test_every_budget_starts_from_what_the_last_one_taught(there_and_back):
     budgets = {"steps": [10, 20]}
     variants = {name: VARIANTS[name] for name in ("scratch", "both")}
-    runs = expand(
-        study(scenes=[], sequences=[there_and_back], seeds=[0], baseline="scratch", variants=variants, budgets=budgets)
-    )
+    runs = expand(study(**there_and_back, variants=variants, budgets=budgets))
     both = {(run.budget, run.place): run for run in runs if run.variant == "both"}
     for place in (2, 3):
         basis = step_of(both["20 steps", place - 1], "cks").path
@@ -388,13 +374,6 @@ def test_a_study_that_extends_another_has_its_values_but_for_its_own_and_names_w
 def test_an_extension_of_what_is_not_there_is_an_error_that_names_it(changes, message):
     with pytest.raises(ConfigError, match=message):
         checked_study({"extends": "parts"} | changes, "mine")
-
-
-def test_a_study_may_be_a_file_of_the_user_s(tmp_path):
-    (tmp_path / "mine.toml").write_text(
-        'title = "M"\nabout = ""\nscenes = ["toy"]\nbaseline = "a"\n[variants.a]\n[variants.b.train]\nsteps = 5\n'
-    )
-    assert isinstance(read_study(str(tmp_path / "mine.toml")), Study)
 
 
 @pytest.mark.slow
