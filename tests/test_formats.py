@@ -1,5 +1,8 @@
 """Every artifact reads back what was written; every kind of damage to every file is named with its remedy."""
 
+from dataclasses import replace
+from functools import reduce
+
 import numpy as np
 import pytest
 import zarr
@@ -241,7 +244,7 @@ def test_every_numeric_artifact_of_a_scene_opens_as_a_zarr_group(toy):
             group = zarr.open_group(str(path), mode="r")
             lengths = {}
             for name, axes in group.attrs["axes"].items():
-                values = group[name][:]
+                values = reduce(lambda within, part: within[part], name.split("/"), group)[:]
                 assert len(axes) == values.ndim, (path, name)
                 named = zip(axes, values.shape, strict=True)
                 assert all(n == (lengths.setdefault(a, n) if isinstance(a, str) else a) for a, n in named)
@@ -257,11 +260,17 @@ def test_an_artifact_of_an_older_schema_is_never_misread(case):
         read(path)
 
 
-def test_non_finite_values_are_never_published(tmp_path):
-    record = make_points()
-    record.means[2, 1] = np.nan
-    with pytest.raises(ValueError, match="non-finite"):
-        published(tmp_path / "p", record)
+@pytest.mark.parametrize(
+    ("name", "values", "said"),
+    [
+        ("means", np.full((5, 3), np.nan), "non-finite"),
+        ("covariances", np.full((5, 3, 3), 1e39), "non-finite"),  # in float32
+        ("tracks", np.full((1, 2), 2**40), "int32 does not have"),
+    ],
+)
+def test_values_that_an_array_cannot_hold_are_never_published(tmp_path, name, values, said):
+    with pytest.raises(ValueError, match=said):
+        published(tmp_path / "p", replace(make_points(), **{name: values}))
     assert not (tmp_path / "p").exists()
 
 

@@ -102,7 +102,7 @@ def test_an_imported_splat_stays_where_it_was(moved, tmp_path):
     run("verify", theirs)
     run("extract", theirs, "--min-opacity", "0.1", "--out", tmp_path / "part.ply")
     run("page", theirs, "--out", tmp_path / "page.html")
-    run("lift", export / "scene.ply", "--out", tmp_path / "again")
+    run("lift", "--out", tmp_path / "again", export / "scene.ply")
     refused(2, "exists", "lift", export / "scene.ply", "--out", theirs)
     refused(2, "add --capture", "lift", export / "scene.ply", "--teacher", "x.onnx", "--out", tmp_path / "x")
 

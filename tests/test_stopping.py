@@ -123,6 +123,22 @@ def test_what_breaks_because_of_a_stop_is_the_stop(capsys):
     assert "Traceback" not in result.stderr + capsys.readouterr().err
 
 
+def test_a_second_signal_does_not_break_into_the_cleaning_up_after_the_first():
+    cleaned = []
+    with pytest.raises(Stopped, match="SIGTERM"), stopping.heeded():
+        try:
+            os.kill(os.getpid(), signal.SIGTERM)
+        finally:
+            os.kill(os.getpid(), signal.SIGINT)
+            cleaned.append("up")
+    assert cleaned
+
+
+def test_a_reader_that_has_gone_is_no_crash():
+    command = f"{sys.executable} -P -m chebsplat.pipelines.cli settings | true"
+    assert subprocess.run(command, shell=True, stderr=subprocess.PIPE, text=True).stderr == ""
+
+
 def test_an_ignored_signal_stays_ignored():
     before = signal.signal(signal.SIGHUP, signal.SIG_IGN)
     try:
