@@ -3,6 +3,8 @@
 import json
 
 import numpy as np
+from plyfile import PlyData, PlyElement
+from scipy.spatial.transform import Rotation
 from source_folders import save
 
 from chebsplat.evaluation.protocols import scannet_closed, scannet_open
@@ -63,7 +65,7 @@ def write_colmap(folder, fields):
     write_text(folder / "sparse/0/cameras.txt", f"1 PINHOLE {width} {height} {values}\n")
     rows = []
     for k, (name, pose) in enumerate(zip(fields["names"], fields["cam_from_world"], strict=True), 1):
-        quaternion = quaternion_of(pose[:3, :3])
+        quaternion = Rotation.from_matrix(pose[:3, :3]).as_quat(scalar_first=True)
         rows.append(f"{k} {' '.join(repr(float(v)) for v in (*quaternion, *pose[:3, 3]))} 1 {name}.png\n\n")
         save(folder / f"images/{name}.png", fields["images"][k - 1])
         save(folder / f"depth/{name}.png", stored_depth(fields["depth"][k - 1]))
@@ -71,14 +73,6 @@ def write_colmap(folder, fields):
     write_text(folder / "sparse/0/images.txt", "".join(rows))
     write_text(folder / "sparse/0/points3D.txt", "")
     write_text(folder / "labels.json", json.dumps(dict(zip(map(str, ids), fields["class_names"], strict=True))))
-
-
-def quaternion_of(rotation):
-    """(w, x, y, z)."""
-    from scipy.spatial.transform import Rotation
-
-    x, y, z, w = Rotation.from_matrix(rotation).as_quat()
-    return w, x, y, z
 
 
 def write_seven_scenes(folder, fields, suffix="png", unknown=65_535):
@@ -122,18 +116,14 @@ def write_scannet(folder, fields, suffix="png"):
 
 
 def write_scannet_sg(folder, fields, suffix="png"):
-    from plyfile import PlyData, PlyElement
-
     write_scannet(folder, fields, suffix)
     ids = [SCANNET_IDS[name] for name in scannet_open.CLASSES]
     for k, labels in enumerate(fields["labels"]):
         save(folder / f"label-filt/{10 * k}.png", raw_labels(labels, ids))
     write_table(folder / "scannetv2-labels.modified.tsv", "cocomapid", COCO_IDS)
-    rows = np.zeros(len(fields["points"]), [(a, "f4") for a in "xyz"] + [(c, "u1") for c in ("red", "green", "blue")])
-    for axis, name in enumerate("xyz"):
-        rows[name] = fields["points"][:, axis]
-    for channel, name in enumerate(("red", "green", "blue")):
-        rows[name] = fields["point_colors"][:, channel]
+    kinds = [(axis, "f4") for axis in "xyz"] + [(color, "u1") for color in ("red", "green", "blue")]
+    points = zip(fields["points"], fields["point_colors"], strict=True)
+    rows = np.array([(*xyz, *rgb) for xyz, rgb in points], kinds)
     PlyData([PlyElement.describe(rows, "vertex")]).write(str(folder / "points3d.ply"))
 
 
@@ -143,9 +133,9 @@ def write_scannet_pl(folder, fields, folded=True, objects=None):
     Pseudo labels of half the size where the fields have them, with the confidence of each pixel.
     """
     write_scannet(folder, fields)
+    own, reduced = ([ids[n] for n in scannet_closed.CLASSES] for ids in (SCANNET_IDS, REDUCED_IDS))
     for k, labels in enumerate(fields.get("pseudo_labels", ())):
-        ids = [REDUCED_IDS[name] for name in scannet_closed.CLASSES]
-        save(folder / f"m2f_semantics/{10 * k}.png", raw_labels(labels[::2, ::2], ids))
+        save(folder / f"m2f_semantics/{10 * k}.png", raw_labels(labels[::2, ::2], reduced))
         place = folder / f"m2f_probabilities/{10 * k}.npz"
         place.parent.mkdir(exist_ok=True)
         confidence = fields["confidence"][k, ::2, ::2].astype(np.float32)
@@ -154,12 +144,9 @@ def write_scannet_pl(folder, fields, folded=True, objects=None):
     for k, labels in enumerate(fields["labels"]):
         save(folder / f"depth/{10 * k}.png", stored_depth(fields["depth"][k]))
         if folded:
-            ids = [REDUCED_IDS[name] for name in scannet_closed.CLASSES]
-            save(folder / f"rs_semantics/{10 * k}.png", raw_labels(labels, ids).astype(np.uint8))
+            save(folder / f"rs_semantics/{10 * k}.png", raw_labels(labels, reduced).astype(np.uint8))
         else:
-            save(
-                folder / f"semantics/{10 * k}.png", raw_labels(labels, [SCANNET_IDS[n] for n in scannet_closed.CLASSES])
-            )
+            save(folder / f"semantics/{10 * k}.png", raw_labels(labels, own))
             save(folder / f"instance/{10 * k}.png", objects[k].astype(np.uint8))
     if not folded:
         write_table(folder.parent / "scannet-labels.combined.tsv", "nyu40id", NYU_IDS)

@@ -4,12 +4,9 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from shared import KEY
+from shared import published
 
-from chebsplat.errors import InputError
-from chebsplat.formats import artifact
 from chebsplat.formats.channels import ChannelMap
-from chebsplat.formats.manifest import Manifest
 from chebsplat.labels.channels import ROWS, Moments, channel_map
 
 
@@ -122,30 +119,14 @@ def test_features_that_give_no_channels_are_refused(bad, message):
         make()
 
 
-def made(path):
-    matrix, energy = channel_map(moments(low_rank(8, 12)), words(12), 5)
-    matrix32 = matrix.astype(np.float32)
-    record = ChannelMap(matrix32, matrix32.T.copy(), energy.astype(np.float32), "lseg", {"n_pixels": 400})
-    with artifact.publish(path, Manifest(ChannelMap.SCHEMA, KEY, "channels")) as tmp:
-        record.write(tmp)
-    return record
-
-
 def test_a_channel_map_reads_back_and_restores(tmp_path):
-    record, found = made(tmp_path / "p"), ChannelMap.read(tmp_path / "p")
+    exact = channel_map(moments(low_rank(8, 12)), words(12), 5)
+    matrix, energy = (part.astype(np.float32) for part in exact)
+    record = ChannelMap(matrix, matrix.T.copy(), energy, "lseg", {"n_pixels": 400})
+    found = ChannelMap.read(published(tmp_path / "p", record))
     assert (found.teacher, found.notes) == ("lseg", {"n_pixels": 400})
     assert all(np.array_equal(getattr(found, k), getattr(record, k)) for k in ("matrix", "inverse", "energy"))
     features = low_rank(8, 12).reshape(20, 20, 12)
     once = found.restore(found.apply(features))
     assert np.allclose(found.restore(found.apply(once)), once, atol=1e-4)
     assert found.embed(words(12)).shape == (40, 5)
-
-
-@pytest.mark.parametrize("name", ["matrix/c/0/0", "zarr.json"])
-def test_a_damaged_channel_map_is_named_with_its_remedy(tmp_path, name):
-    made(tmp_path / "p")
-    file = tmp_path / "p" / name
-    good = file.read_bytes()
-    file.write_bytes(good[:-1] + bytes([good[-1] ^ 1]))
-    with pytest.raises(InputError, match=rf"{name} does not match its sha256; delete .* run its stage again"):
-        ChannelMap.read(tmp_path / "p")

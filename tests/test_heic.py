@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from PIL import Image
 from scipy.ndimage import uniform_filter1d, zoom
-from shared import DATA
+from shared import data
 from source_folders import SETTINGS, image
 
 from chebsplat.errors import InputError
@@ -90,8 +90,6 @@ def test_blurred_photos_are_counted_and_named():
 @pytest.mark.parametrize(("name", "kind", "least", "most"), [("redkitchen", "seven_scenes", 8, 16),
                                                              ("house_kitchen", "colmap", 0, 0)])  # fmt: skip
 def test_a_hand_held_sensor_has_blurred_frames_and_a_rendered_house_none(name, kind, least, most):
-    if not (DATA / name).is_dir():
-        pytest.skip(f"{DATA / name} is absent")
-    fields = ingest.read(name, SourceSection(kind=kind, path=str(DATA / name)), IngestSection())
+    fields = ingest.read(name, SourceSection(kind=kind, path=str(data(name))), IngestSection())
     n = int((ingest.blur_note(fields) or "0").split()[0])
     assert least <= n <= most

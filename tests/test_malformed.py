@@ -9,6 +9,10 @@ from malformed.edits import cut, flipped, remove
 from malformed.row import BYTES, called, fault_of, run_alone, stage, state_of
 from PIL import Image
 
+from chebsplat.stages import ingest
+from chebsplat.stages.settings import IngestSection, SourceSection
+from chebsplat.stages.sources import common
+
 ROWS = [*commands.rows(), *artifacts.rows(), *sources.rows(), *teachers.rows()]
 
 
@@ -40,10 +44,6 @@ def test_whatever_file_of_an_artifact_is_damaged_it_is_named(of, tmp_path):
 
 @pytest.mark.parametrize("what", sources.WHOLE)
 def test_a_source_is_whole_before_it_is_spoiled(tmp_path, what):
-    from chebsplat.stages import ingest
-    from chebsplat.stages.settings import IngestSection, SourceSection
-    from chebsplat.stages.sources import common
-
     write, layout, n_views = sources.WHOLE[what]
     folder = tmp_path / "shared/scene"
     folder.mkdir(parents=True)

@@ -5,8 +5,8 @@ import numpy as np
 import pytest
 import torch
 from scipy.spatial.transform import Rotation
-from shared import ROOT
 
+from benchmarks.stability.training import tiny_trainer
 from chebsplat.cameras import centers
 from chebsplat.errors import ConfigError
 from chebsplat.evaluation.metrics import color_fitted
@@ -24,14 +24,6 @@ from chebsplat.stages.train_inputs import training_views
 from chebsplat.training.losses import depth_distance
 
 K = torch.tensor([[40.0, 0, 24], [0, 40, 20], [0, 0, 1]])
-
-
-@pytest.fixture
-def tiny_trainer(monkeypatch):
-    monkeypatch.syspath_prepend(str(ROOT))
-    from benchmarks.stability.training import tiny_trainer
-
-    return tiny_trainer
 
 
 def test_measured_exposures_are_those_the_photos_were_taken_with():
@@ -99,7 +91,7 @@ def test_an_exposure_that_no_neighbour_shares_is_undone_in_training(tmp_path):
     assert photos.mean((1, 2, 3)).std() < 3 and capture.images[3].max() == 50
 
 
-def test_depth_is_a_channel_that_changes_no_colour(tiny_trainer):
+def test_depth_is_a_channel_that_changes_no_colour():
     made = tiny_trainer()
     view = made.views.camera(0, 1)
     with_depth, without = (made.model.render(view, 3, depth=wanted) for wanted in (True, False))
@@ -120,7 +112,7 @@ def test_depth_distance_counts_what_is_known_alone():
     assert depth_distance(inverse, torch.ones(4, 4, 1), truth * float("nan"), None) == 0
 
 
-def test_gaussians_go_where_depth_is_measured(tiny_trainer):
+def test_gaussians_go_where_depth_is_measured():
     """The same training with and without a depth a tenth beyond what the Gaussians show at first."""
 
     def distance(weight):

@@ -6,6 +6,7 @@ from typing import get_args
 import numpy as np
 import pytest
 import torch
+from PIL import Image
 
 from chebsplat.errors import ConfigError, DataFailure
 from chebsplat.evaluation import protocols
@@ -296,8 +297,6 @@ def test_views_are_joined_on_names():
 
 @pytest.mark.parametrize("size", [(119, 159), (7, 31), (360, 480)])
 def test_nearest_pixels_are_those_of_torch_and_pil(size):
-    from PIL import Image
-
     ids = np.random.default_rng(0).integers(0, 150, (97, 211)).astype(np.uint8)
     theirs = torch.nn.functional.interpolate(torch.from_numpy(ids)[None, None], size, mode="nearest")[0, 0]
     assert (resized(ids, size) == theirs.numpy()).mean() > 0.999  # torch counts in float32

@@ -3,8 +3,10 @@
 import json
 import os
 import shutil
+from pathlib import Path
 
 import pytest
+from shared import photo_folder
 from tiny_teachers import color_reference, color_teacher
 
 from chebsplat.errors import InputError
@@ -19,12 +21,7 @@ pytestmark = pytest.mark.usefixtures("own_work")
 
 @pytest.fixture
 def photos(tmp_path):
-    from PIL import Image
-
-    (tmp_path / "photos").mkdir()
-    for k in range(4):
-        Image.new("RGB", (32, 24), (60 * k, 0, 0)).save(tmp_path / f"photos/{k}.png")
-    return tmp_path / "photos"
+    return Path(photo_folder(tmp_path / "photos"))
 
 
 def planned(stage, *arguments):
@@ -43,24 +40,24 @@ def same_size_and_time(path, data):
 
 
 def edited(photos):
-    same_size_and_time(photos / "2.png", (photos / "1.png").read_bytes())
-    return "2.png"
+    same_size_and_time(photos / "2.jpg", (photos / "1.jpg").read_bytes())
+    return "2.jpg"
 
 
 def added(photos):
-    shutil.copy(photos / "1.png", photos / "7.png")
-    return "7.png"
+    shutil.copy(photos / "1.jpg", photos / "7.jpg")
+    return "7.jpg"
 
 
 def removed(photos):
-    (photos / "2.png").unlink()
-    return "2.png"
+    (photos / "2.jpg").unlink()
+    return "2.jpg"
 
 
 def replaced(photos):
-    shutil.copystat(photos / "2.png", photos / "1.png")
-    os.replace(photos / "1.png", photos / "2.png")
-    return ".png"
+    shutil.copystat(photos / "2.jpg", photos / "1.jpg")
+    os.replace(photos / "1.jpg", photos / "2.jpg")
+    return ".jpg"
 
 
 CHANGES = [edited, added, removed, replaced]
@@ -123,16 +120,16 @@ def test_files_that_were_not_touched_for_long_are_not_read_again(photos, monkeyp
 
 def test_a_file_that_has_changed_just_now_is_read_again(photos):
     memo = {}
-    found = hashes([photos / "1.png"], memo)
+    found = hashes([photos / "1.jpg"], memo)
     assert memo == {}
-    assert not found[str(photos / "1.png")][2]
+    assert not found[str(photos / "1.jpg")][2]
 
 
 @pytest.mark.parametrize("damage", ["[]", "{", '{"PATH": 5}', '{"PATH": [1]}', '{"PATH": [[1, 2], 7]}', "[" * 10**5])
 def test_a_damaged_memory_of_hashes_costs_time_only(photos, own_work, damage):
     step, _ = planned("ingest", photos)
     code = next(path for path in Planner().code.memo)
-    for name, path in (("files", photos / "1.png"), ("code", code)):
+    for name, path in (("files", photos / "1.jpg"), ("code", code)):
         (own_work / ".cache").mkdir(exist_ok=True)
         (own_work / f".cache/{name}.json").write_text(damage.replace("PATH", str(path)))
     again, _ = planned("ingest", photos)

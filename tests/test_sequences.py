@@ -5,7 +5,7 @@ from shared import ROOT
 
 from chebsplat.errors import ConfigError
 from chebsplat.pipelines.cli.runs import checked_stage, plans
-from chebsplat.pipelines.plan import Planner
+from chebsplat.pipelines.plan import Planner, overrides
 from chebsplat.pipelines.run import wanted_steps
 from chebsplat.pipelines.sequences import chain, scenes_of
 
@@ -111,8 +111,6 @@ def test_a_sequence_of_scenes_without_encoder_carries_nothing(sequence):
 
 
 def test_settings_may_have_spaces_about_their_commas_and_are_given_once():
-    from chebsplat.pipelines.plan import overrides
-
     wanted = {"train": {"steps": 5, "albo": False}, "teacher": {"scales": [0.5, 1.0]}}
     assert overrides("train.steps=5, train.albo = off ,teacher.scales=[0.5, 1.0]") == wanted
     with pytest.raises(ConfigError, match=r"train\.steps is given twice"):

@@ -196,12 +196,8 @@ def test_a_ceiling_that_gsplat_cannot_keep_is_refused(gpu):
 def test_a_finished_scene_renders_there_as_on_the_cpu(gpu):
     rng = np.random.default_rng(0)
     means, quats, scales, opacities, _ = (value.numpy() for value in scene())
-    parameters = {
-        "means": means,
-        "quats": quats,
-        "log_scales": np.log(scales),
-        "logit_opacities": np.zeros_like(opacities),
-    }
+    parameters = {"means": means, "quats": quats, "log_scales": np.log(scales)}
+    parameters["logit_opacities"] = np.zeros_like(opacities)
     parameters |= {"sh0": rng.normal(size=(150, 1, 3)).astype(np.float32), "features": np.ones((150, 4), np.float32)}
     parameters |= {"shN": rng.normal(size=(150, 15, 3)).astype(np.float32), "degrees": np.sort(rng.integers(0, 4, 150))}
     viewmats, Ks, width, height = camera()

@@ -6,15 +6,15 @@ import shutil
 import layouts
 import numpy as np
 import pytest
-from shared import KEY, data, run_stage
-from source_folders import SETTINGS, image, save
+from shared import data, published, run_stage
+from source_folders import SETTINGS, image, save, tiny
+from test_sources import agreement
 
 from chebsplat.cameras import centers, unproject
 from chebsplat.errors import InputError
 from chebsplat.evaluation.protocols import scannet_closed, scannet_open
 from chebsplat.formats import artifact
 from chebsplat.formats.capture import Capture
-from chebsplat.formats.manifest import Manifest
 from chebsplat.formats.points import Points
 from chebsplat.stages.settings import IngestSection
 from chebsplat.stages.sources import colmap, common, generated, replica, scannet, scannet_labels, seven_scenes
@@ -107,16 +107,6 @@ def test_scannet_as_semantic_gaussians_lays_it_out(scene, tmp_path):
     assert "is_test" not in found
 
 
-def test_scannet_as_panoptic_lifting_lays_it_out(scene, tmp_path):
-    scene = with_classes(scene, scannet_closed.CLASSES)
-    layouts.write_scannet_pl(tmp_path / "scene0000_00", scene)
-    found = read(tmp_path / "scene0000_00", "scannet")
-    compare(found, scene)
-    assert np.flatnonzero(found["is_test"]).tolist() == [0, 5, 10, 15]
-    assert "segmentation_data.pkl" in found["source"]["notes"][1]
-    assert "points" not in found
-
-
 def with_pseudo_labels(scene):
     """Blocks of 2 x 2 pixels share a label and a confidence; some have none."""
     rng = np.random.default_rng(0)
@@ -127,12 +117,13 @@ def with_pseudo_labels(scene):
     return scene | {"pseudo_labels": pseudo, "confidence": confidence}
 
 
-def test_panoptic_liftings_pseudo_labels_come_with_their_confidence(scene, tmp_path):
+def test_scannet_as_panoptic_lifting_lays_it_out_with_its_pseudo_labels(scene, tmp_path):
     scene = with_pseudo_labels(with_classes(scene, scannet_closed.CLASSES))
     folder = tmp_path / "scene0000_00"
     layouts.write_scannet_pl(folder, scene)
     found = read(folder, "scannet")
     compare(found, scene)
+    assert np.flatnonzero(found["is_test"]).tolist() == [0, 5, 10, 15] and "points" not in found
     assert np.array_equal(found["pseudo_labels"], scene["pseudo_labels"])
     assert np.array_equal(found["confidence"], scene["confidence"])
     assert found["pseudo_labels"].dtype == np.int16 and (found["pseudo_labels"] == -1).any()
@@ -204,29 +195,20 @@ def test_frames_without_a_pose_are_left_out_and_counted(scene, tmp_path):
 
 
 def test_intrinsics_of_the_whole_sensor_and_labels_of_its_size_fit_reduced_images(tmp_path):
+    layouts.write_scannet_sg(tmp_path, tiny(2, (648, 484)))
+    ids = np.full((968, 1296), 2, np.uint16)
+    ids[:, 649:] = 8  # left of it, what lies under 324.5 of the reduced pixels
     for k in range(2):
-        image(tmp_path / f"color/{k}.jpg", (648, 484))
-        (tmp_path / "pose").mkdir(exist_ok=True)
-        (tmp_path / f"pose/{k}.txt").write_text(layouts.matrix_text(np.eye(4)))
-        ids = np.full((968, 1296), 2, np.uint16)
-        ids[:, 649:] = 8  # left of it, what lies under 324.5 of the reduced pixels
-        save(tmp_path / f"label-filt/{k}.png", ids)
+        save(tmp_path / f"label-filt/{10 * k}.png", ids)
     K = np.array([[1170.0, 0, 647.5, 0], [0, 1170, 483.5, 0], [0, 0, 1, 0], [0, 0, 0, 1]])
     layouts.write_text(tmp_path / "intrinsic/intrinsic_color.txt", layouts.matrix_text(K))
-    layouts.write_table(tmp_path / "scannetv2-labels.modified.tsv", "cocomapid", layouts.COCO_IDS)
-    write_points(tmp_path)
     found = scannet.read(tmp_path, IngestSection(max_side=648, min_views=2))
     assert np.allclose(found["Ks"][0], [[585, 0, 324], [0, 585, 242], [0, 0, 1]])
     row = [found["class_names"][k] for k in found["labels"][0, 100]]
     assert row == ["chair"] * 324 + ["shelves"] * 324
-    image(tmp_path / "label-filt/1.png", (640, 640), mode="L")
-    with pytest.raises(InputError, match=r"label-filt/1\.png is 640x640"):
+    image(tmp_path / "label-filt/10.png", (640, 640), mode="L")
+    with pytest.raises(InputError, match=r"label-filt/10\.png is 640x640"):
         scannet.read(tmp_path, IngestSection(max_side=648, min_views=2))
-
-
-def write_points(folder, text="0 0 1\n1 0 1\n"):
-    head = f"ply\nformat ascii 1.0\nelement vertex {text.count(chr(10))}\n"
-    (folder / "points3d.ply").write_text(head + "".join(f"property float {a}\n" for a in "xyz") + "end_header\n" + text)
 
 
 def test_depth_of_another_camera_is_looked_up_through_both_cameras(scene, tmp_path):
@@ -270,10 +252,9 @@ def test_a_sources_own_points_become_the_scenes(scene, tmp_path, colored):
     colors = np.full((len(points), 3), 7, np.uint8) if colored else None
     fields = {key: scene[key] for key in ("names", "images", "Ks", "cam_from_world")}
     record = Capture(**fields, is_test=np.arange(16) % 8 == 0, points=points, point_colors=colors)
-    with artifact.publish(tmp_path / "c", Manifest("chebsplat.capture/2", KEY, "test")) as tmp:
-        record.write(tmp)
+    capture = published(tmp_path / "c", record)
     config = {"sfm": {"max_points": 100_000, "dense": "off"}}
-    assert run_stage("sfm", tmp_path / "out", {"capture": tmp_path / "c"}, config) == 0
+    assert run_stage("sfm", tmp_path / "out", {"capture": capture}, config) == 0
     found = Points.read(tmp_path / "out")
     facts = artifact.read_manifest(tmp_path / "out").facts
     assert facts["how"] == "source" and facts["n_candidates"] == len(points)
@@ -287,8 +268,6 @@ def test_a_sources_own_points_become_the_scenes(scene, tmp_path, colored):
 
 @pytest.mark.data
 def test_the_red_kitchens_depth_agrees_between_views():
-    from test_sources import agreement
-
     folder = data("redkitchen")
     assert common.detect(folder) == "seven_scenes"
     assert len(seven_scenes.files(folder)) == 3 * 120 + 1

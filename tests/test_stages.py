@@ -1,13 +1,16 @@
 """Every stage does its job on a toy scene and fails with the documented exit code."""
 
 import copy
+import dataclasses
 import importlib
 import inspect
 import re
 
 import numpy as np
 import pytest
+from PIL import Image
 from shared import INPUTS, TOY, published, run_stage
+from tiny_teachers import color_reference, color_teacher, knowing_rooms
 
 from chebsplat.formats import artifact
 from chebsplat.formats.capture import Capture
@@ -52,124 +55,78 @@ def test_a_stage_says_what_it_computes_reads_and_writes(stage):
     assert writes.startswith(f"`{kinds[stage]}`.")
 
 
-def one_photo(toy, tmp):
-    from PIL import Image
+RECORDS = {"capture": (Capture, "ingest"), "points": (Points, "sfm"), "gaussians": (Gaussians, "train")}
 
+
+def but_for(role, change):
+    """The toy scene's input of that role but for the fields that `change` makes of its record."""
+
+    def made(toy, tmp):
+        kind, of = RECORDS[role]
+        record = kind.read(toy[of])
+        return {role: published(tmp / of, dataclasses.replace(record, **change(record)))}, TOY
+
+    return made
+
+
+def one_photo(toy, tmp):
     (tmp / "photos").mkdir()
     Image.new("RGB", (32, 24)).save(tmp / "photos/a.jpg")
     return {}, {"source": {"kind": "photos", "path": str(tmp / "photos")}}
 
 
-def without_depth(toy, tmp):
-    record = Capture.read(toy["ingest"])
-    record.depth = np.full(record.depth.shape, np.nan, np.float32)
-    return {"capture": published(tmp / "c", record)}, TOY
-
-
 def teacher_of_nothing(toy, tmp):
-    from tiny_teachers import color_reference, color_teacher
-
     model = color_teacher(tmp, weights=np.zeros((3, 3)))
     return {}, {"channels": {"model": str(model), "reference": str(color_reference(tmp / "reference"))}}
 
 
 def photos_apart(toy, tmp):
-    from tiny_teachers import color_teacher, knowing_rooms
-
     model = knowing_rooms(color_teacher(tmp))
-    return inputs_of(toy, "teach"), changed(knowledge={"model": str(model), "n_views": 2, "n_points": 100})
+    return {}, changed(knowledge={"model": str(model), "n_views": 2, "n_points": 100})
 
 
-def without_labels(toy, tmp):
-    record = Capture.read(toy["ingest"])
-    record.labels = None
-    path = published(tmp / "c", record)
-    return {"capture": path}, TOY
+def without_depth(capture):
+    return {"depth": np.full(capture.depth.shape, np.nan, np.float32)}
 
 
-def without_points(toy, tmp):
-    record = Points.read(toy["sfm"])
-    for name in ("means", "colors", "normals", "covariances"):
-        setattr(record, name, getattr(record, name)[:0])
-    return {"points": published(tmp / "p", record)}, TOY
+def without_points(points):
+    return {name: getattr(points, name)[:0] for name in ("means", "colors", "normals", "covariances")}
 
 
-def only_test_views(toy, tmp):
-    record = Capture.read(toy["ingest"])
-    record.is_test[:] = True
-    path = published(tmp / "c", record)
-    return inputs_of(toy, "train") | {"capture": path}, TOY
-
-
-def only_test_views_to_lift(toy, tmp):
-    inputs, config = only_test_views(toy, tmp)
-    return inputs_of(toy, "lift") | {"capture": inputs["capture"]}, config
-
-
-def only_test_views_to_agree(toy, tmp):
-    inputs, config = only_test_views(toy, tmp)
-    return inputs_of(toy, "agree") | {"capture": inputs["capture"]}, config
-
-
-def without_gaussians(toy, tmp):
-    record = Gaussians.read(toy["train"])
-    record.parameters = {name: values[:0] for name, values in record.parameters.items()}
-    return {"gaussians": published(tmp / "g", record)}, TOY
-
-
-def nothing_to_refine(toy, tmp):
-    inputs, config = without_gaussians(toy, tmp)
-    return inputs_of(toy, "refine") | inputs, config
-
-
-def strict_tolerance(toy, tmp):
-    return inputs_of(toy, "onnx"), changed(onnx={"tolerance": 1e-12})
+def without_gaussians(checkpoint):
+    return {"parameters": {name: values[:0] for name, values in checkpoint.parameters.items()}}
 
 
 def encoder_without_attention(toy, tmp):
-    inputs = {role: toy[of] for role, of in INPUTS["train"].items()}
     config = changed(train={"encoder": "mlp", "steps": 8})
-    assert run_stage("train", tmp / "mlp", inputs, config) == 0
+    assert run_stage("train", tmp / "mlp", inputs_of(toy, "train"), config) == 0
     return {"gaussians": tmp / "mlp"}, TOY
 
 
-def no_test_view(toy, tmp):
-    record = Capture.read(toy["ingest"])
-    record.is_test[:] = False
-    path = published(tmp / "c", record)
-    return inputs_of(toy, "evaluate") | {"capture": path}, TOY
-
-
-def without_trace(toy, tmp):
-    record = Gaussians.read(toy["train"])
-    record.trace = []
-    path = published(tmp / "g", record)
-    return inputs_of(toy, "report") | {"gaussians": path}, TOY
-
-
-FAILURES = {
+only_test_views = but_for("capture", lambda capture: {"is_test": capture.is_test | True})
+FAILURES = {  # the inputs of a stage that are others than the toy scene's, and its config
     "ingest": one_photo,
-    "sfm": without_depth,
+    "sfm": but_for("capture", without_depth),
     "channels": teacher_of_nothing,
-    "teacher": without_labels,
-    "agree": only_test_views_to_agree,
+    "teacher": but_for("capture", lambda capture: {"labels": None}),
+    "agree": only_test_views,
     "teach": photos_apart,
-    "describe": without_points,
+    "describe": but_for("points", without_points),
     "train": only_test_views,
-    "lift": only_test_views_to_lift,
-    "refine": nothing_to_refine,
-    "export": without_gaussians,
-    "onnx": strict_tolerance,
+    "lift": only_test_views,
+    "refine": but_for("gaussians", without_gaussians),
+    "export": but_for("gaussians", without_gaussians),
+    "onnx": lambda toy, tmp: ({}, changed(onnx={"tolerance": 1e-12})),
     "cks": encoder_without_attention,
-    "evaluate": no_test_view,
-    "report": without_trace,
+    "evaluate": but_for("capture", lambda capture: {"is_test": capture.is_test & False}),
+    "report": but_for("gaussians", lambda checkpoint: {"trace": []}),
 }
 
 
 @pytest.mark.parametrize("stage", STAGES)
 def test_data_that_cannot_be_worked_with_is_exit_4(toy, stage, tmp_path):
-    inputs, config = FAILURES[stage](toy, tmp_path)
-    assert run_stage(stage, tmp_path / "out", inputs, config) == 4
+    changes, config = FAILURES[stage](toy, tmp_path)
+    assert run_stage(stage, tmp_path / "out", inputs_of(toy, stage) | changes, config) == 4
     assert not (tmp_path / "out").exists()
 
 
@@ -197,12 +154,10 @@ def test_a_cut_spectrum_is_described_trained_on_and_recorded(toy, spectrum, tmp_
     facts = artifact.read_manifest(described, STAGES["describe"].schema).facts
     assert facts["spectrum"] == spectrum
     assert (facts.get("n_cuts", 0) > 0) == (spectrum == "hard")
-    inputs = {"capture": toy["ingest"], "points": toy["sfm"], "features": toy["teacher"], "descriptors": described}
-    assert run_stage("train", trained, inputs, config) == 0
+    assert run_stage("train", trained, inputs_of(toy, "train") | {"descriptors": described}, config) == 0
 
 
 def test_descriptors_of_another_setting_are_exit_3(toy, tmp_path, capsys):
     config = changed(describe={"bandwidth": 0.9})
-    inputs = {role: toy[of] for role, of in INPUTS["train"].items()}
-    assert run_stage("train", tmp_path / "out", inputs, config) == 3
+    assert run_stage("train", tmp_path / "out", inputs_of(toy, "train"), config) == 3
     assert "describe.bandwidth" in capsys.readouterr().err

@@ -6,6 +6,7 @@ import pytest
 from chebsplat.cameras import centers, unproject
 from chebsplat.stages.sources import generated
 from chebsplat.synthetic import CLASS_NAMES
+from chebsplat.synthetic.light import shade
 from chebsplat.synthetic.path import intrinsics, walk
 from chebsplat.synthetic.rays import RayCaster
 from chebsplat.synthetic.rooms import build
@@ -192,8 +193,6 @@ def is_seen(points, depth, K, pose):
 
 
 def test_glossy_surfaces_change_with_the_eye():
-    from chebsplat.synthetic.light import shade
-
     lights = np.array([[[0.0, 0.0, 2.5], [0.3, 0.3, 0.0]]])
     one, up = np.ones(1, np.float32), np.float32([[0, 0, 1]])
     eyes = [np.float32([[0, 0, 1]]), np.float32([[0.8, 0, 0.6]])]

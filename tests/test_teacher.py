@@ -2,16 +2,19 @@
 
 import numpy as np
 import pytest
+from click.testing import CliRunner
 from onnx import helper
-from shared import KEY, run_stage
+from PIL import Image
+from shared import published, run_stage
 from tiny_teachers import COLORS, color_teacher, write_model, write_settings, write_table
 
 from chebsplat.formats import artifact
 from chebsplat.formats.capture import Capture
 from chebsplat.formats.channels import ChannelMap
 from chebsplat.formats.features import Features
-from chebsplat.formats.manifest import Manifest
 from chebsplat.formats.teacher_model import read_label_set, read_teacher
+from chebsplat.labels.class_codes import class_codes
+from chebsplat.pipelines.cli import main
 from chebsplat.stages import config as configs
 from chebsplat.stages import inference, teacher
 from chebsplat.stages.command import Job
@@ -41,9 +44,7 @@ def published_capture(path, images, labels=None, class_names=tuple(COLORS)):
         [f"view_{k:03d}" for k in range(n)], images, np.tile(np.eye(3), (n, 1, 1)), None, np.arange(n) % 4 == 0,
         labels=None if labels is None else labels.astype(np.int16), class_names=list(class_names) or None,
     )  # fmt: skip
-    with artifact.publish(path, Manifest("chebsplat.capture/2", KEY, "ingest")) as tmp:
-        record.write(tmp)
-    return path
+    return published(path, record)
 
 
 def encoded(tmp_path, capture, model, inputs=None, **settings):
@@ -54,8 +55,6 @@ def encoded(tmp_path, capture, model, inputs=None, **settings):
 
 
 def image_of(capture, view=0):
-    from chebsplat.formats.capture import Capture
-
     return Capture.read(capture).images[view]
 
 
@@ -63,8 +62,6 @@ def image_of(capture, view=0):
 
 
 def test_every_pixel_of_a_view_is_told_by_its_colour(tmp_path, capture):
-    from chebsplat.formats.capture import Capture
-
     code, found = encoded(tmp_path, capture, color_teacher(tmp_path))
     assert code == 0
     assert found.features.shape == (4, 12, 16, 3)
@@ -93,8 +90,6 @@ def test_every_pixel_of_a_view_is_told_by_its_colour(tmp_path, capture):
     ],
 )
 def test_windows_scales_and_flips_leave_things_where_they_are(tmp_path, capture, model, settings):
-    from chebsplat.formats.capture import Capture
-
     code, found = encoded(tmp_path, capture, color_teacher(tmp_path, **model), **settings)
     assert code == 0
     h, w = found.features.shape[1:3]
@@ -133,9 +128,8 @@ def test_channels_are_reduced_in_every_view_and_the_labels_are_the_teacher_s(tmp
     write_table(tmp_path / "tiny.npz", embeddings=np.array(list(COLORS.values())) @ wide.T)
     matrix = np.linalg.qr(np.concatenate([wide, rng.normal(size=(100, 5))], 1))[0].astype(np.float32)
     record = ChannelMap(matrix, matrix.T.copy(), np.ones(100, np.float32), "tiny", {})
-    with artifact.publish(tmp_path / "channels", Manifest("chebsplat.channels/2", KEY, "channels")) as tmp:
-        record.write(tmp)
-    code, found = encoded(tmp_path, capture, tmp_path / "tiny.onnx", {"channels": tmp_path / "channels"})
+    channels = published(tmp_path / "channels", record)
+    code, found = encoded(tmp_path, capture, tmp_path / "tiny.onnx", {"channels": channels})
     assert code == 0
     assert found.features.shape[3] == 8
     assert found.channels is not None
@@ -177,9 +171,6 @@ def segmenter(folder, names="red\ngreen\nblue\n"):
 
 
 def test_a_closed_set_segmenter_gives_its_likeliest_classes_and_their_probabilities(tmp_path, capture):
-    from chebsplat.formats.capture import Capture
-    from chebsplat.labels.class_codes import class_codes
-
     code, found = encoded(tmp_path, capture, segmenter(tmp_path))
     assert code == 0
     assert np.array_equal(found.pseudo_labels[:], Capture.read(capture).labels[:, ::4, ::4])
@@ -202,11 +193,6 @@ def test_classes_of_a_segmenter_that_mean_one_label_become_it(tmp_path, capture)
 
 
 def test_check_teacher_tells_what_a_teacher_is_and_sees(tmp_path):
-    from click.testing import CliRunner
-    from PIL import Image
-
-    from chebsplat.pipelines.cli import main
-
     Image.new("RGB", (64, 48), (0, 0, 255)).save(tmp_path / "photo.png")
     model, photo = color_teacher(tmp_path, size=[32, 32]), ["--photo", str(tmp_path / "photo.png")]
     told = CliRunner().invoke(main, ["check-teacher", str(model), *photo])

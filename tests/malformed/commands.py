@@ -9,11 +9,10 @@ from pathlib import Path
 from chebsplat.formats import artifact
 from chebsplat.formats.manifest import Manifest
 from chebsplat.stages.registry import STAGES
-from malformed.artifacts import fake
+from malformed.artifacts import KEY, fake
 from malformed.edits import DEEP, Edit, no_file, put, swollen
 from malformed.row import Arguments, Row, stage
 
-KEY = "0123456789abcdef"
 LONG = "x" * 300
 SETTINGS: list[tuple[str, object, str]] = [  # a setting of a config, its value, a word of the message beside its name
     ("scene.name", "a\nb", "scene.name"),

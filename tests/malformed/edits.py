@@ -7,12 +7,14 @@ import json
 import os
 import shutil
 import struct
+import zipfile
 import zlib
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+from PIL import Image
 
 Edit = Callable[[Path], Any]
 DEEP = "[" * 50_000
@@ -95,8 +97,6 @@ def picture(place: str, size: tuple[int, int] = (8, 6), mode: str = "RGB", form:
     """An image of any format, whatever its name."""
 
     def edit(source: Path) -> None:
-        from PIL import Image
-
         held = io.BytesIO()
         Image.new(mode, size).save(held, form)
         put(place, held.getvalue())(source)
@@ -125,8 +125,6 @@ def npy(array: np.ndarray, **header: Any) -> bytes:
 
 def npz(**members: bytes) -> bytes:
     """An .npz of such files."""
-    import zipfile
-
     held = io.BytesIO()
     with zipfile.ZipFile(held, "w", zipfile.ZIP_DEFLATED) as archive:
         for name, content in members.items():

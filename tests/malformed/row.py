@@ -19,6 +19,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from chebsplat.pipelines.cli import main
+
 SECONDS = 20.0  # of a process of its own
 BYTES = 2**30  # of its memory
 Arguments = Sequence[str | Path]
@@ -66,8 +68,6 @@ def stage(name: str, folder: Path, config: Mapping[str, Any], **inputs: Path) ->
 
 def called(arguments: Arguments) -> Answer:
     """The command's real entry in this process."""
-    from chebsplat.pipelines.cli import main
-
     stderr = io.StringIO()
     code: int | None = 0
     with redirect_stderr(stderr), redirect_stdout(io.StringIO()):

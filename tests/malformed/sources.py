@@ -6,6 +6,7 @@ import json
 import os
 import struct
 from collections.abc import Callable, Iterable, Iterator
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -350,12 +351,8 @@ POSE = "1 0 0 {} 0 1 0 0 0 0 1 0 0 0 0 1\n"
 TRAJECTORY, CAMERA, CLASSES = "traj.txt", "cam_params.json", "info_semantic.json"
 
 
-def write_slam(source: Path) -> None:
-    layouts.write_nice_slam(source, tiny())
-
-
-def write_nerf(source: Path) -> None:
-    layouts.write_semantic_nerf(source, tiny())
+write_slam = partial(layouts.write_nice_slam, fields=tiny())
+write_nerf = partial(layouts.write_semantic_nerf, fields=tiny())
 
 
 def replica() -> Iterator[Row]:
@@ -422,17 +419,11 @@ def coordinates(last: float = 0.0, n: int = 20) -> bytes:
     return rows.tobytes()
 
 
-def write_sg(source: Path) -> None:
-    layouts.write_scannet_sg(source, tiny(4, (20, 16)))
-
-
-def write_pl(source: Path) -> None:
-    fields = tiny(4, (20, 16))
-    layouts.write_scannet_pl(source, fields | {"pseudo_labels": fields["labels"], "confidence": np.ones((4, 16, 20))})
-
-
-def write_seven_scenes(source: Path) -> None:
-    layouts.write_seven_scenes(source, tiny())
+ROOM = tiny(4, (20, 16))
+write_sg = partial(layouts.write_scannet_sg, fields=ROOM)
+TAUGHT = ROOM | {"pseudo_labels": ROOM["labels"], "confidence": np.ones((4, 16, 20))}
+write_pl = partial(layouts.write_scannet_pl, fields=TAUGHT)
+write_seven_scenes = partial(layouts.write_seven_scenes, fields=tiny())
 
 
 def scannet() -> Iterator[Row]:

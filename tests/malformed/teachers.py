@@ -3,11 +3,16 @@
 from __future__ import annotations
 
 import os
+import zipfile
 from collections.abc import Callable, Iterator
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+import onnx
+from onnx import TensorProto, helper
+from onnx.external_data_helper import set_external_data
 from tiny_teachers import COLORS, color_teacher, write_model, write_table
 
 from malformed.artifacts import artifacts
@@ -63,15 +68,11 @@ def model(*nodes: Any, **more: Any) -> Edit:
 
 
 def node(op: str, *inputs: str, **attributes: Any) -> Any:
-    from onnx import helper
-
     return helper.make_node(op, list(inputs or ("image",)), ["features"], **attributes)
 
 
 def endless() -> Edit:
     """A loop of 2^62 steps over the image."""
-    from onnx import TensorProto, helper
-
     value = helper.make_tensor_value_info
     body = helper.make_graph(
         [helper.make_node("Identity", ["on"], ["more"]), helper.make_node("Neg", ["x"], ["y"])],
@@ -85,16 +86,12 @@ def endless() -> Edit:
 
 def huge() -> Edit:
     """An output of 120 GB."""
-    from onnx import helper
-
     zeros = helper.make_node("ConstantOfShape", ["shape"], ["zeros"])
     return model(zeros, node("Add", "image", "zeros"), constants={"shape": np.array([1, 3, 100_000, 100_000])})
 
 
 def halves() -> Edit:
     """Two halves that must be alike: a side that is no multiple of 2 fails inside the model."""
-    from onnx import helper
-
     split = helper.make_node("Split", ["image"], ["a", "b"], axis=3, num_outputs=2)
     return all_of(set_to("multiple", "13"), model(split, node("Add", "a", "b")))
 
@@ -103,8 +100,6 @@ def changed(change: Callable[[Any], Any]) -> Edit:
     """The model after `change`."""
 
     def edit(folder: Path) -> None:
-        import onnx
-
         held = onnx.load(folder / MODEL)
         change(held)
         (folder / MODEL).write_bytes(held.SerializeToString())
@@ -113,15 +108,11 @@ def changed(change: Callable[[Any], Any]) -> Edit:
 
 
 def two_inputs(held: Any) -> None:
-    from onnx import TensorProto, helper
-
     held.graph.input.append(helper.make_tensor_value_info("text", TensorProto.FLOAT, (1, 3)))
 
 
 def outside(held: Any) -> None:
     """Weights in a file that lies above the model's folder."""
-    from onnx.external_data_helper import set_external_data
-
     for tensor in held.graph.initializer:
         set_external_data(tensor, "../secret.bin", 0, len(tensor.raw_data))
         tensor.ClearField("raw_data")
@@ -129,8 +120,6 @@ def outside(held: Any) -> None:
 
 def bomb(folder: Path) -> None:
     """9,000 x 8,000 zeros, packed to 300 kB without ever being whole in memory."""
-    import zipfile
-
     with zipfile.ZipFile(folder / TABLE, "w", zipfile.ZIP_DEFLATED) as archive:
         archive.writestr("names.npy", NAMES)
         with archive.open("embeddings.npy", "w", force_zip64=True) as handle:
@@ -141,18 +130,12 @@ def bomb(folder: Path) -> None:
 
 def segmenter(names: str) -> Edit:
     """A closed set of three classes whose file gives these names."""
-
-    def edit(folder: Path) -> None:
-        (folder / "classes.txt").write_text(names)
-        color_teacher(folder, weights=5 * np.eye(3), output="logits", labels="classes.txt")
-
-    return edit
+    of_three = partial(color_teacher, weights=5 * np.eye(3), output="logits", labels="classes.txt")
+    return all_of(put("classes.txt", names), of_three)
 
 
 def models() -> Iterator[tuple[str, str, Edit, str]]:
     """The file that is named, what is wrong, the edit, a word of the message."""
-    from onnx import TensorProto
-
     relu = {"shape": (3, "H", "W")}
     yield MODEL, "no ONNX", put(MODEL, "no model"), "is not a usable ONNX model"
     yield MODEL, "cut short", lambda folder: os.truncate(folder / MODEL, 60), "is not a usable ONNX model"
@@ -164,12 +147,8 @@ def models() -> Iterator[tuple[str, str, Edit, str]]:
     yield MODEL, "an output of rank 2", model(node("Flatten")), "[1, C, h, w] is needed"
     yield MODEL, "one feature a view", model(node("GlobalAveragePool")), "one feature every"
     yield MODEL, "weights outside", changed(outside), MODEL
-    yield (
-        MODEL,
-        "another size than its graph",
-        all_of(lambda folder: color_teacher(folder, shape=(1, 3, 32, 32)), set_to("size", "[64, 64]")),
-        "says size = [64, 64]",
-    )
+    of_32 = all_of(partial(color_teacher, shape=(1, 3, 32, 32)), set_to("size", "[64, 64]"))
+    yield MODEL, "another size than its graph", of_32, "says size = [64, 64]"
     yield MODEL, "multiple not met", halves(), "correct `size` or `multiple`"
     yield MODEL, "missing", remove(MODEL), "is missing"
     yield TOML, "missing", remove(TOML), "is missing"
