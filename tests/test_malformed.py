@@ -9,6 +9,7 @@ from malformed.edits import cut, flipped, remove
 from malformed.row import BYTES, called, fault_of, run_alone, stage, state_of
 from PIL import Image
 
+from chebsplat.formats.capture import Capture
 from chebsplat.stages import ingest
 from chebsplat.stages.settings import IngestSection, SourceSection
 from chebsplat.stages.sources import common
@@ -63,5 +64,5 @@ def test_photos_of_64_megapixels_are_read_within_a_gibibyte(tmp_path):
     answer = run_alone(stage("ingest", tmp_path, config), tmp_path, 120)
     assert answer.code == 0, answer.stderr
     assert answer.peak < BYTES
-    notes = json.loads((tmp_path / "out/capture.json").read_text())["source"]["notes"]
+    notes = Capture.read(tmp_path / "out").source["notes"]
     assert "Images are reduced by 0.080 (ingest.max_side)." in notes
