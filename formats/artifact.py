@@ -42,7 +42,7 @@ def copy(path: Path, out: Path, manifest: Manifest) -> None:
         for name in expected:
             (tmp / name).parent.mkdir(parents=True, exist_ok=True)
             shutil.copyfile(path / name, tmp / name)
-        changed = [name for name, entry in _file_table(tmp).items() if entry != expected[name]]
+        changed = [name for name, file in _members(tmp).items() if _entry(file) != expected[name]]
         if changed:
             raise InputError(f"{path / changed[0]} has changed while it was copied; run again")
 
@@ -72,9 +72,10 @@ def publish(out: Path, manifest: Manifest, force: bool = False) -> Iterator[Path
             _make(tmp, out)
             yield tmp
             if force or not is_whole(out, manifest.schema):
-                manifest.files = _file_table(tmp)
+                manifest.files = _settled(tmp)
                 (tmp / MANIFEST).write_text(json.dumps(asdict(manifest), indent=1, sort_keys=True) + "\n")
-                _settle_tree(tmp)
+                sync(tmp / MANIFEST)
+                sync(tmp)
                 _put(tmp, out, manifest, force)
                 sync(out.parent)
     finally:
@@ -191,25 +192,25 @@ def _unlisted(path: Path, manifest: Manifest) -> list[str]:
     return sorted(_members(path).keys() - manifest.files.keys() - {MANIFEST})
 
 
-def _file_table(root: Path) -> dict[str, dict[str, Any]]:
-    return {name: {"sha256": sha256_file(p), "bytes": p.stat().st_size} for name, p in _members(root).items()}
+def _entry(path: Path) -> dict[str, Any]:
+    return {"sha256": sha256_file(path), "bytes": path.stat().st_size}
 
 
-def _settle_tree(root: Path) -> None:
-    """Make files outlive a power cut, and as readable as the user's umask has made their folder: some writers give a
-    file to its owner alone.
+def _settled(root: Path) -> dict[str, dict[str, Any]]:
+    """The file table of what outlives a power cut now, and is as readable as the user's umask has made its folder: some
+    writers give a file to its owner alone.
 
     Choices: eight at a time, since a disk writes many files in little more time than one.
     """
-    mode = root.stat().st_mode & 0o666
+    mode, members = root.stat().st_mode & 0o666, _members(root)
 
-    def settle(path: Path) -> None:
+    def settle(path: Path) -> dict[str, Any]:
         path.chmod(mode)
         sync(path)
+        return _entry(path)
 
     with ThreadPoolExecutor(8) as threads:
-        list(threads.map(settle, _members(root).values()))
-    sync(root)
+        return dict(zip(members, threads.map(settle, members.values()), strict=True))
 
 
 def digest(value: Mapping[str, Any]) -> str:

@@ -104,7 +104,6 @@ class FeatureWriter:
             if stored.dtype.kind == "f" and not np.isfinite(stored).all():
                 bad = np.sum(~np.isfinite(stored))
                 raise ValueError(f"view {self.names[view]}: {name} hold {bad} non-finite values in float16")
-            shutil.rmtree(self.folder / name / "c" / str(view), ignore_errors=True)  # what a kill left of it
             array[view] = stored
             sync(self._file(name, view))
         atomic_write(self.folder / "done" / str(view), " ".join(values))
@@ -151,8 +150,8 @@ class FeatureWriter:
 
     def _file(self, name: str, view: int) -> Path:
         """The chunk that holds a view's values."""
-        zeros = ["0"] * (len(layout_of(Features).arrays[name].axes) - 1)
-        return self.folder.joinpath(name, "c", str(view), *zeros)
+        zeros = ".0" * (len(layout_of(Features).arrays[name].axes) - 1)
+        return self.folder / name / f"c.{view}{zeros}"
 
 
 def _link(source: Path, target: Path) -> None:

@@ -93,9 +93,9 @@ def test_a_damaged_map_beside_its_teacher_is_named(tmp_path, tiny, capsys):
     reduced(tmp_path, model, reference)
     brought = model.with_suffix(".channels")
     (tmp_path / "out").rename(brought)
-    (brought / "matrix/c/0/0").write_bytes(b"?")
+    (brought / "matrix/c.0.0").write_bytes(b"?")
     assert reduced(tmp_path, model, reference)[0] == 3
-    assert str(brought / "matrix/c/0/0") in capsys.readouterr().err
+    assert str(brought / "matrix/c.0.0") in capsys.readouterr().err
 
 
 def test_the_embedded_teacher_brings_its_map():

@@ -62,7 +62,7 @@ def test_a_stack_written_at_once_has_the_bytes_of_its_views(tmp_path, whole):
 def test_whatever_a_kill_leaves_is_written_anew(tmp_path, whole, left):
     folder = tmp_path / "w"
     written(folder, [3, 1])
-    chunk, mark = folder / "features/c/1/0/0/0", folder / "done/1"
+    chunk, mark = folder / "features/c.1.0.0.0", folder / "done/1"
     if left == "half a view":
         mark.unlink()
         chunk.write_bytes(chunk.read_bytes()[:50])
@@ -151,7 +151,7 @@ def test_a_store_that_lacks_a_view_or_its_labels_is_not_finished(tmp_path):
 def test_every_bit_of_a_view_is_guarded(tmp_path):
     stack = np.zeros((1, 65, 65, 1), np.float16)  # compresses well: few bytes to try
     path = published(tmp_path / "f", Features(["a"], stack, ["x"], np.eye(1, 1, dtype=np.float32)))
-    chunk = path / "features/c/0/0/0/0"
+    chunk = path / "features/c.0.0.0.0"
     good = chunk.read_bytes()
     found = Features.read(path).features
     for place in range(len(good)):
