@@ -197,8 +197,8 @@ def _entry(path: Path) -> dict[str, Any]:
 
 
 def _settled(root: Path) -> dict[str, dict[str, Any]]:
-    """The file table of what outlives a power cut now, and is as readable as the user's umask has made its folder: some
-    writers give a file to its owner alone.
+    """Make files outlive a power cut, and as readable as the user's umask has made their folder (some writers give a
+    file to its owner alone); returns their sizes and digests by name.
 
     Choices: eight at a time, since a disk writes many files in little more time than one.
     """

@@ -311,9 +311,8 @@ def _converted(name: str, value: Any, spec: Array) -> Any:
         raise ValueError(f"{name} is {values.dtype}, expected {spec.dtype}")
     with np.errstate(over="ignore"):  # what is infinite then is refused below
         converted = values.astype(spec.dtype, copy=False)
-    if converted.dtype.kind in "iu" and not np.array_equal(converted, values):
+    if converted is not values and converted.dtype.kind in "iu" and not np.array_equal(converted, values):
         raise ValueError(f"{name} holds values that {spec.dtype} does not have")
-    values = converted
-    if values.dtype.kind == "f" and not spec.any_value and not np.isfinite(values).all():
-        raise ValueError(f"{name} holds {np.sum(~np.isfinite(values))} non-finite values")
-    return values
+    if converted.dtype.kind == "f" and not spec.any_value and not np.isfinite(converted).all():
+        raise ValueError(f"{name} holds {np.sum(~np.isfinite(converted))} non-finite values")
+    return converted

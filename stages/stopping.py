@@ -30,10 +30,16 @@ PATIENCE = 2.5  # seconds from being asked to being killed
 KEPT = "what was finished is kept, and the same command goes on from there"
 
 
-def exit_code(action: Callable[[], int | None], folder: Path, tell: Callable[[str], object] = log.error) -> int:
+def exit_code(
+    action: Callable[[], int | None],
+    folder: Path,
+    tell: Callable[[str], object] = log.error,
+    raised: tuple[type[Exception], ...] = (),
+) -> int:
     """The door that all commands leave by: the action's code (None: 0), or that of what ends it.
 
-    Args: folder: of a disk's error that names no file; tell: says a typed error or a stop.
+    Args: folder: of a disk's error that names no file; tell: says a typed error or a stop; raised: errors that are left
+      to the caller, beside click's own.
     """
     try:
         with heeded(), disk.explained(folder):
@@ -41,7 +47,9 @@ def exit_code(action: Callable[[], int | None], folder: Path, tell: Callable[[st
     except (ChebsplatError, Stopped) as error:
         tell(str(error))
         return error.exit_code
-    except (click.ClickException, click.Abort, click.exceptions.Exit, BrokenPipeError):  # click knows what to do
+    except (click.ClickException, click.Abort, click.exceptions.Exit):
+        raise
+    except raised:
         raise
     except Exception:
         log.exception("crashed; nothing was published")
@@ -49,16 +57,20 @@ def exit_code(action: Callable[[], int | None], folder: Path, tell: Callable[[st
 
 
 class Asked:
-    """What this process has been asked. `stop`: not at all, or what is raised."""
+    """What this process has been asked. `stop`: not at all, or what is raised; `since`: by the monotonic clock."""
 
     def __init__(self) -> None:
         self.stop: Stopped | None = None
+        self.since = 0.0
         self.deferred = False
 
     def heed(self, number: int, _frame: FrameType | None) -> None:
-        """Handle a signal; a second one does not break into the cleaning up after the first."""
-        if self.stop is None:
-            self.stop = Stopped(number, f"stopped by {signal.Signals(number).name}; {KEPT}")
+        """Handle a signal. Within PATIENCE of one a second does not break into the cleaning up after it; later it
+        does, since a destructor may have lost the first.
+        """
+        now = time.monotonic()
+        if self.stop is None or now - self.since > PATIENCE:
+            self.stop, self.since = Stopped(number, f"stopped by {signal.Signals(number).name}; {KEPT}"), now
             if not self.deferred:
                 raise self.stop
 

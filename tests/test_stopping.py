@@ -134,6 +134,18 @@ def test_a_second_signal_does_not_break_into_the_cleaning_up_after_the_first():
     assert cleaned
 
 
+def test_a_later_signal_is_heeded_where_a_destructor_lost_the_first(monkeypatch):
+    monkeypatch.setattr(stopping, "PATIENCE", 0.0)
+
+    class Deaf:
+        def __del__(self):
+            os.kill(os.getpid(), signal.SIGTERM)
+
+    with pytest.raises(Stopped, match="SIGINT"), stopping.heeded():
+        Deaf()
+        os.kill(os.getpid(), signal.SIGINT)
+
+
 def test_a_reader_that_has_gone_is_no_crash():
     command = f"{sys.executable} -P -m chebsplat.pipelines.cli settings | true"
     assert subprocess.run(command, shell=True, stderr=subprocess.PIPE, text=True).stderr == ""

@@ -28,7 +28,9 @@ class Commands(Guarded):
         return super().get_command(context, name)
 
     def resolve_command(self, context: click.Context, args: list[str]) -> Any:
-        of_a_file = any(word.startswith("--capture") or word.endswith(".ply") for word in args[1:])
+        of_a_file = any(word.startswith("--capture") or word.endswith(".ply") for word in args[1:]) or (
+            len(args) > 1 and not args[1].startswith("-")
+        )
         if args[0] in STAGES and not (of_a_file and args[0] in self.commands):  # `lift` is of a file, too
             from importlib import import_module
 

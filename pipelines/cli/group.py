@@ -51,7 +51,8 @@ class Guarded(click.Group):
     """A group whose commands return an exit code (nothing: 0) and may raise typed errors."""
 
     def invoke(self, context: click.Context) -> NoReturn:
-        context.exit(exit_code(partial(super().invoke, context), store.work(), say))
+        gone = (BrokenPipeError,)  # whoever read stdout: click ends without a word
+        context.exit(exit_code(partial(super().invoke, context), store.work(), say, gone))
 
     def list_commands(self, context: click.Context) -> list[str]:
         """In the order in which they were added."""
