@@ -134,6 +134,7 @@ def test_a_second_signal_does_not_break_into_the_cleaning_up_after_the_first():
     assert cleaned
 
 
+@pytest.mark.usefixtures("unmuted")
 def test_a_later_signal_is_heeded_where_a_destructor_lost_the_first(monkeypatch):
     monkeypatch.setattr(stopping, "PATIENCE", 0.0)
 
