@@ -107,9 +107,7 @@ teacher-quality: text-model  ## measure the shipped embedded teacher on held-out
 
 lint: $(READY)  ## ruff (lint, format) and mypy, strict about the maths and the formats
 	@$(PY) -m ruff check . && $(PY) -m ruff format --check .
-	@rm -rf build/types/chebsplat && mkdir -p build/types/chebsplat && ln -sfn $(CURDIR)/chebsplat/* build/types/chebsplat/
-	@for layer in formats stages pipelines teachers; do ln -sfn $(CURDIR)/$$layer build/types/chebsplat/$$layer; done
-	@cd build/types && ../../$(PY) -m mypy --config-file ../../pyproject.toml -p chebsplat
+	@$(PY) -m mypy -p chebsplat
 
 lock: $(READY)  ## resolve requirements.lock anew, for Python 3.11 to 3.13 at once
 	@{ echo "# Exact versions for Python 3.11 to 3.13, resolved together; \`make lock\` writes this file."; \

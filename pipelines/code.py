@@ -15,37 +15,24 @@ from importlib import metadata
 from pathlib import Path
 from typing import Any
 
+import chebsplat
 
-def installed() -> dict[str, Path]:
-    """Where the layers lie, in a checkout or in site-packages."""
-    import chebsplat
-    from chebsplat import formats, pipelines, stages
-    from chebsplat.formats.teacher_model import EMBEDDED
-
-    layers = {"chebsplat": chebsplat, "formats": formats, "stages": stages, "pipelines": pipelines}
-    return {name: Path(module.__path__[0]) for name, module in layers.items()} | {"teachers": EMBEDDED.parent}
-
-
-PLUMBING = {f"stages.{name}" for name in ("config", "settings", "registry", "command", "progress", "stopping")}
+PACKAGE = Path(chebsplat.__file__).parent
+PLUMBING = {
+    f"chebsplat.stages.{name}" for name in ("config", "settings", "registry", "command", "progress", "stopping")
+}
 PLUMBING |= {"chebsplat.settings"}
 TEMPLATES = {".html", ".css", ".js"}  # of a package: what its modules fill
-LAYERS = ("formats", "stages", "pipelines", "teachers")
-OPTIONAL = {
-    "av",
-    "gsplat",
-    "pillow_heif",
-    "tokenizers",
-    "transformers",
-}  # of extras: their versions count only where a scene uses them
+OPTIONAL = {"av", "gsplat", "pillow_heif", "tokenizers", "transformers"}  # of extras: count where a scene uses them
 
 
 class Code:
-    """Reads modules below `folders` (layer name -> folder). `memo` maps a path to what was found in it at a (mtime,
-    size); the caller keeps it, so that an unchanged file is not parsed again.
+    """Reads the modules of ours below `package`, the folder of `chebsplat`. `memo` maps a path to what was found in it
+    at a (mtime, size); the caller keeps it, so that an unchanged file is not parsed again.
     """
 
-    def __init__(self, folders: dict[str, Path], memo: dict[str, list]):
-        self.folders, self.memo = folders, memo
+    def __init__(self, package: Path, memo: dict[str, list]):
+        self.package, self.memo = package, memo
         self.read_now = 0  # files parsed in this process
         self._versions: dict[str, str | None] = {}
         self._stages: dict[str, dict[str, Any]] = {}
@@ -63,7 +50,7 @@ class Code:
     def _identity(self, name: str) -> dict[str, Any]:
         seen: dict[str, str] = {}
         packages: set[str] = set()
-        waiting = [f"stages.{name}"]
+        waiting = [f"chebsplat.stages.{name}"]
         while waiting:
             module = waiting.pop()
             path = self._path(module)
@@ -75,9 +62,9 @@ class Code:
                 templates = (file for file in sorted(path.parent.iterdir()) if file.suffix in TEMPLATES)
                 seen |= {f"{module}/{file.name}": self._read(file)[0] for file in templates}
             for imported in imports:
-                first, _, rest = imported.partition(".")
+                first = imported.partition(".")[0]
                 if first == "chebsplat":
-                    waiting += self._modules(rest)
+                    waiting += self._modules(imported)
                 elif first not in sys.stdlib_module_names:
                     packages.add(first)
         text = "\n".join(f"{module} {digest}" for module, digest in sorted(seen.items()))
@@ -88,20 +75,13 @@ class Code:
         return {name: version for name in sorted(packages) if (version := self._version(name))}
 
     def _modules(self, dotted: str) -> list[str]:
-        """Modules that `import chebsplat.<dotted>` runs: the packages on the way, and the module itself."""
-        first = dotted.split(".")[0]
-        base = [] if first in LAYERS else ["chebsplat"]
-        parts = [p for p in dotted.split(".") if p]
-        modules = []
-        for n in range(len(parts) + 1):
-            module = ".".join(base + parts[:n])
-            if module and self._path(module) is not None:
-                modules.append(module)
-        return modules
+        """Modules that `import <dotted>` runs: the packages on the way, and the module itself."""
+        parts = dotted.split(".")
+        modules = (".".join(parts[:n]) for n in range(1, len(parts) + 1))
+        return [module for module in modules if self._path(module) is not None]
 
     def _path(self, module: str) -> Path | None:
-        first, *rest = module.split(".")
-        path = self.folders[first].joinpath(*rest)
+        path = self.package.joinpath(*module.split(".")[1:])
         for candidate in (path.with_name(path.name + ".py"), path / "__init__.py"):
             if candidate.is_file():
                 return candidate

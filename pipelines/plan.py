@@ -14,7 +14,7 @@ from chebsplat.errors import ConfigError
 from chebsplat.formats.names import unprintable
 from chebsplat.formats.teacher_model import EMBEDDED, read_teacher
 from chebsplat.pipelines import folders, store
-from chebsplat.pipelines.code import Code, installed
+from chebsplat.pipelines.code import PACKAGE, Code
 from chebsplat.pipelines.keys import PLACES, step_key
 from chebsplat.pipelines.needs import (
     left_out_channels,
@@ -122,13 +122,13 @@ def parsed(key: str, value: str) -> Any:
 class Planner:
     """Plans scenes; remembers hashes of code and raw files between runs.
 
-    Args: code: where the layers lie; running: what is planned will run, so that the work folder is made, and a folder
-          gets its name for good; device: that steps which can use a GPU run on.
+    Args: code: the folder of `chebsplat`; running: what is planned will run, so that the work folder is made, and a
+          folder gets its name for good; device: that steps which can use a GPU run on.
     """
 
-    def __init__(self, code: dict[str, Path] | None = None, running: bool = False, device: str = "cpu"):
+    def __init__(self, code: Path = PACKAGE, running: bool = False, device: str = "cpu"):
         self.code_memo, self.file_memo = store.Memo("code"), store.Memo("files")
-        self.code, self.running = Code(code or installed(), self.code_memo.values), running
+        self.code, self.running = Code(code, self.code_memo.values), running
         self.device = device
 
     def save(self) -> None:

@@ -13,6 +13,12 @@ case "$device" in
   *) echo "setup: device=$device is none of auto, cpu, cuda" >&2; exit 2 ;;
 esac
 
+# A checkout without symbolic links (core.symlinks=false), or a zip unpacked without them, has files in their place.
+if [ -f chebsplat/stages ]; then
+  echo "setup: chebsplat/stages is a file where a link belongs: putting the links in place" >&2
+  for folder in formats pipelines stages teachers; do ln -sfn ../$folder chebsplat/$folder; done
+fi
+
 # A torch that lies in a folder which pip is told to look in (find-links) decides for the Pythons it is built for.
 links=$(python3 -m pip config get global.find-links 2>/dev/null || true)
 wheels=$(for folder in $links; do compgen -G "$folder/torch-2.13.0*.whl" || true; done)

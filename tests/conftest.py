@@ -11,10 +11,10 @@ from tiny_teachers import color_reference, color_teacher, knowing_rooms
 @pytest.fixture(scope="session")
 def code_memo():
     """What `work/.cache/code.json` holds once every stage's code has been read: a planner is then quick."""
-    from chebsplat.pipelines.code import Code, installed
+    from chebsplat.pipelines.code import PACKAGE, Code
     from chebsplat.stages.registry import STAGES
 
-    code = Code(installed(), {})
+    code = Code(PACKAGE, {})
     for stage in STAGES:
         code.stage(stage)
     return json.dumps(code.memo)

@@ -1,6 +1,10 @@
 """Imports run one way: {pipelines, teachers} -> stages -> {chebsplat, formats}."""
 
 import ast
+import json
+import os
+import subprocess
+import sys
 from pathlib import Path
 
 import pytest
@@ -81,15 +85,33 @@ def test_formats_know_no_torch():
 
 
 def test_a_stage_is_known_by_every_kernel_it_runs_and_every_package_it_loads():
-    from chebsplat.pipelines.code import Code, installed
+    from chebsplat.pipelines.code import PACKAGE, Code
 
     found: dict[str, list] = {}
-    code = Code(installed(), found)
+    code = Code(PACKAGE, found)
     for stage in ("sfm", "train", "lift", "refine"):
         code.stage(stage)
-    kernels = [
-        path for path in installed()["chebsplat"].rglob("*.py") if "chebsplat.kernels.jit import" in path.read_text()
-    ]
+    kernels = [path for path in PACKAGE.rglob("*.py") if "chebsplat.kernels.jit import" in path.read_text()]
     assert len(kernels) > 8
     assert not [path for path in kernels if str(path) not in found]
     assert {"onnx", "onnxruntime", "torch"} <= set(code.stage("onnx")["packages"])
+
+
+def test_tools_that_walk_the_links_see_each_file_once(tmp_path):
+    from mypy.modulefinder import FindModuleCache, SearchPaths
+    from mypy.options import Options
+
+    listed = subprocess.run(
+        [sys.executable, "-m", "ruff", "check", "--show-files", *LAYERS], cwd=ROOT, capture_output=True, text=True
+    )
+    shown = [Path(line) for line in listed.stdout.splitlines()]
+    assert sorted(path for path in shown if path.suffix == ".py") == sorted(SOURCES)
+    finder = FindModuleCache(SearchPaths((str(ROOT),), (), (), ()), None, Options())
+    typed = [Path(module.path).resolve() for module in finder.find_modules_recursive("chebsplat") if module.path]
+    assert sorted(path for path in typed if path.suffix == ".py") == sorted(SOURCES)
+    command = [sys.executable, "-P", "-m", "coverage"]
+    traced = os.environ | {"COVERAGE_FILE": str(tmp_path / "data")}
+    for words in (["run", "-m", "chebsplat.pipelines.cli", "settings"], ["json", "-q", "-o", str(tmp_path / "json")]):
+        subprocess.run([*command, *words], cwd=ROOT, env=traced, check=True, capture_output=True)
+    covered = [(ROOT / name).resolve() for name in json.loads((tmp_path / "json").read_text())["files"]]
+    assert sorted(covered) == sorted(SOURCES)

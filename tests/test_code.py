@@ -6,7 +6,7 @@ import sys
 import pytest
 from tiny_teachers import color_teacher
 
-from chebsplat.pipelines.code import OPTIONAL, Code, installed
+from chebsplat.pipelines.code import OPTIONAL, PACKAGE, Code
 from chebsplat.pipelines.plan import Planner
 from chebsplat.stages.registry import STAGES
 
@@ -18,18 +18,15 @@ pytestmark = pytest.mark.usefixtures("own_work")
 
 @pytest.fixture
 def wheel(tmp_path):
-    """The layers as a wheel lays them out: all below one folder."""
+    """The package as a wheel lays it out: no links."""
     root = tmp_path / "site-packages/chebsplat"
-    leave = shutil.ignore_patterns("__pycache__")
-    for name, folder in sorted(installed().items()):  # chebsplat first
-        shutil.copytree(folder, root if name == "chebsplat" else root / name, ignore=leave, dirs_exist_ok=True)
-    return {name: root if name == "chebsplat" else root / name for name in installed()}
+    return shutil.copytree(PACKAGE, root, ignore=shutil.ignore_patterns("__pycache__"))
 
 
 def test_the_code_of_a_stage_is_the_same_in_a_checkout_and_in_a_wheel(wheel):
-    checkout, installation = Code(installed(), {}), Code(wheel, {})
+    checkout, installation = Code(PACKAGE, {}), Code(wheel, {})
     assert {stage: checkout.stage(stage) for stage in STAGES} == {stage: installation.stage(stage) for stage in STAGES}
-    with (wheel["teachers"] / "__init__.py").open("a") as file:
+    with (wheel / "teachers/__init__.py").open("a") as file:
         file.write("ANOTHER = 1\n")
     edited = Code(wheel, installation.memo)
     assert {s for s in STAGES if edited.stage(s) != checkout.stage(s)} == set()  # nothing runs what trained it
@@ -39,7 +36,7 @@ def test_the_code_of_a_stage_is_the_same_in_a_checkout_and_in_a_wheel(wheel):
 def test_a_template_is_code_of_the_report_and_of_no_other_stage(wheel, name):
     before = Code(wheel, {})
     digests = {stage: before.stage(stage) for stage in STAGES}
-    with (wheel["stages"] / "pages" / name).open("a") as file:
+    with (wheel / "stages/pages" / name).open("a") as file:
         file.write("<!-- another -->\n")
     after = Code(wheel, before.memo)
     assert {stage for stage in STAGES if after.stage(stage) != digests[stage]} == {"report"}

@@ -14,7 +14,7 @@ from shared import ROOT, finish, photo_folder, remember
 from chebsplat.errors import ConfigError, InputError
 from chebsplat.formats.teacher_model import EMBEDDED
 from chebsplat.pipelines import store
-from chebsplat.pipelines.code import installed
+from chebsplat.pipelines.code import PACKAGE
 from chebsplat.pipelines.plan import Planner, suffix
 from chebsplat.pipelines.raw import content_hash, hashes
 from chebsplat.pipelines.run import failures, wanted_steps
@@ -37,15 +37,11 @@ def work(tmp_path, monkeypatch, code_memo):
 @pytest.fixture
 def source_tree(tmp_path):
     """A copy of the code that a test may edit."""
-    folders = {}
-    for name, folder in installed().items():
-        folders[name] = tmp_path / "code" / name
-        shutil.copytree(folder, folders[name], ignore=shutil.ignore_patterns("__pycache__"))
-    return folders
+    return shutil.copytree(PACKAGE, tmp_path / "code/chebsplat", ignore=shutil.ignore_patterns("__pycache__"))
 
 
-def stale(folders=None, scene="toy", **options):
-    planner = Planner(folders)
+def stale(package=PACKAGE, scene="toy", **options):
+    planner = Planner(package)
     plan = planner.plan(scene, **options)
     planner.save()
     return [step.stage for step in plan.steps if not step.fresh]
@@ -58,39 +54,39 @@ def edit(path, old, new):
 
 
 def touch(tree):
-    os.utime(tree["chebsplat"] / "training/trainer.py", (1, 1))
+    os.utime(tree / "training/trainer.py", (1, 1))
 
 
 def comment(tree):
-    edit(tree["chebsplat"] / "training/trainer.py", "class Trainer", "# a remark\n\n\nclass Trainer")
+    edit(tree / "training/trainer.py", "class Trainer", "# a remark\n\n\nclass Trainer")
 
 
 def docstring(tree):
-    edit(tree["stages"] / "ingest.py", '"""ingest: ', '"""ingest, that is ')
+    edit(tree / "stages/ingest.py", '"""ingest: ', '"""ingest, that is ')
 
 
 def plumbing(tree):
-    edit(tree["stages"] / "progress.py", "every: float = 10.0", "every: float = 5.0")
+    edit(tree / "stages/progress.py", "every: float = 10.0", "every: float = 5.0")
 
 
 def trainer_code(tree):
-    edit(tree["chebsplat"] / "training/schedule.py", '"means": 0.01', '"means": 0.02')
+    edit(tree / "training/schedule.py", '"means": 0.01', '"means": 0.02')
 
 
 def deep_code(tree):
-    edit(tree["chebsplat"] / "synthetic/light.py", "0.95 * light", "0.96 * light")
+    edit(tree / "synthetic/light.py", "0.95 * light", "0.96 * light")
 
 
 def report_code(tree):
-    edit(tree["stages"] / "pages/report.html", "<h2>Test views</h2>", "<h2>Views</h2>")
+    edit(tree / "stages/pages/report.html", "<h2>Test views</h2>", "<h2>Views</h2>")
 
 
 def descriptor_code(tree):
-    edit(tree["chebsplat"] / "shape/albo.py", "\nimport torch\n", "\nimport torch\n\nEXTRA = 1\n")
+    edit(tree / "shape/albo.py", "\nimport torch\n", "\nimport torch\n\nEXTRA = 1\n")
 
 
 def format_code(tree):
-    edit(tree["formats"] / "scene.py", "32767", "32766")
+    edit(tree / "formats/scene.py", "32767", "32766")
 
 
 CODE_CHANGES = [

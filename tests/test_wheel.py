@@ -4,22 +4,65 @@ import os
 import shutil
 import subprocess
 import sys
+import tarfile
 import zipfile
+from pathlib import Path
 
 import pytest
 from shared import ROOT
 
+LINKS = ("formats", "pipelines", "stages", "teachers")
+
 
 @pytest.fixture(scope="module")
-def wheel(tmp_path_factory):
-    tmp_path = tmp_path_factory.mktemp("wheel")
-    source = tmp_path / "source"
+def source(tmp_path_factory):
+    """A copy of the checkout that builds leave their files in."""
     ignored = shutil.ignore_patterns(".*", "work", "build", "*.egg-info", "__pycache__", "tests")
-    shutil.copytree(ROOT, source, ignore=ignored)
-    command = [sys.executable, "-m", "build", "--wheel", "--no-isolation", "--outdir", str(tmp_path), str(source)]
+    return shutil.copytree(ROOT, tmp_path_factory.mktemp("wheel") / "source", symlinks=True, ignore=ignored)
+
+
+def build(source, *kind):
+    """What `python -m build` makes of a folder."""
+    command = [sys.executable, "-m", "build", *kind, "--no-isolation", "--outdir", f"{source}-dist", str(source)]
     done = subprocess.run(command, capture_output=True, text=True)
     assert done.returncode == 0, done.stderr
-    return next(tmp_path.glob("*.whl"))
+    return Path(f"{source}-dist")
+
+
+@pytest.fixture(scope="module")
+def built(source):
+    return build(source)
+
+
+@pytest.fixture(scope="module")
+def wheel(built):
+    return next(built.glob("*.whl"))
+
+
+def with_plain_files(source, target):
+    """A copy in which the links are files, as where a zip is unpacked by what knows no links."""
+    shutil.copytree(source, target, symlinks=True)
+    for name in LINKS:
+        (target / "chebsplat" / name).unlink()
+        (target / "chebsplat" / name).write_text(f"../{name}")
+    return target
+
+
+def test_an_sdist_and_a_zip_without_links_hold_what_the_wheel_holds(source, built, wheel, tmp_path):
+    with tarfile.open(next(built.glob("*.tar.gz"))) as archive:
+        held = {name.split("/", 1)[1] for name in archive.getnames() if "/" in name}
+    files = {name for name in zipfile.ZipFile(wheel).namelist() if ".dist-info/" not in name}
+    assert files <= held
+    again = next(build(with_plain_files(source, tmp_path / "unpacked"), "--wheel").glob("*.whl"))
+    assert zipfile.ZipFile(again).namelist() == zipfile.ZipFile(wheel).namelist()
+
+
+def test_setup_puts_links_in_the_place_of_files_and_says_so_in_one_line(source, tmp_path):
+    checkout = with_plain_files(source, tmp_path / "checkout")
+    nowhere = os.environ | {"PYTHON": "/nowhere/python"}  # ends it there
+    done = subprocess.run(["bash", "pipelines/setup.sh"], cwd=checkout, env=nowhere, capture_output=True, text=True)
+    assert "is a file where a link belongs" in done.stderr.splitlines()[0]
+    assert [(checkout / "chebsplat" / name).readlink() for name in LINKS] == [Path("..") / name for name in LINKS]
 
 
 def test_a_wheel_mounts_every_layer_under_chebsplat(wheel):
