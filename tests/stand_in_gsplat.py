@@ -1,4 +1,4 @@
-"""gsplat 1.5.3's `rasterization` without a GPU: its signature and its rules, on our reference rasterizer.
+"""gsplat 1.5.3's `rasterization` and `spherical_harmonics` without a GPU: their signatures and rules, on our twins.
 
 Its rules: shapes as its assertions have them, float32 on one GPU, channels in chunks whose count its kernels are made
 for, each of which overwrites the absolute gradient of the one before; radii by axis, [C, N, 2], int32.
@@ -14,6 +14,7 @@ import torch
 from torch import Tensor
 
 from chebsplat.rasterize import reference
+from chebsplat.splats.sh import basis
 
 NATIVE = (1, 2, 3, 4, 5, 8, 9, 16, 17, 32, 33, 64, 65, 128, 129, 256, 257, 512, 513)
 CEILING = 0.999
@@ -89,3 +90,13 @@ def rasterization(
             backgrounds=backgrounds, absgrad=absgrad,
         )  # fmt: skip
     return image, alpha, meta | {"radii": meta["radii"][..., None].expand(-1, -1, 2).int()}
+
+
+def spherical_harmonics(degrees_to_use: int, dirs: Tensor, coeffs: Tensor, masks: Tensor | None = None) -> Tensor:
+    assert masks is None, "an option that chebsplat never gives"
+    assert (degrees_to_use + 1) ** 2 <= coeffs.shape[-2], coeffs.shape
+    assert dirs.shape == (len(coeffs), 3) and coeffs.shape[-1] == 3
+    assert dirs.dtype == coeffs.dtype == torch.float32 and dirs.device.type == coeffs.device.type == "cuda"
+    with within[-1]() if within else nullcontext():
+        values = basis(torch.nn.functional.normalize(dirs, dim=-1), degrees_to_use)
+        return torch.einsum("nk,nkc->nc", values, coeffs[:, : (degrees_to_use + 1) ** 2])

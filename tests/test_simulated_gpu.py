@@ -4,7 +4,6 @@ import chebsplat  # noqa: F401  # isort: skip
 import json
 import logging
 import sys
-import types
 from contextlib import nullcontext
 
 import numpy as np
@@ -36,7 +35,7 @@ REGIONS = {"n_regions": 24, "region_size": 8}
 def gpu(monkeypatch):
     """A simulated GPU, on which gsplat's stand-in renders; "cuda" is a device while `gpu.active()`."""
     simulated = SimulatedGpu()
-    monkeypatch.setitem(sys.modules, "gsplat", types.SimpleNamespace(rasterization=stand_in_gsplat.rasterization))
+    monkeypatch.setitem(sys.modules, "gsplat", stand_in_gsplat)
     monkeypatch.setattr(stand_in_gsplat, "within", [simulated.uncounted])
     losses._taps.cache_clear()  # of another device of this name
     yield simulated
@@ -199,7 +198,9 @@ def test_a_finished_scene_renders_there_as_on_the_cpu(gpu):
     parameters = {"means": means, "quats": quats, "log_scales": np.log(scales)}
     parameters["logit_opacities"] = np.zeros_like(opacities)
     parameters |= {"sh0": rng.normal(size=(150, 1, 3)).astype(np.float32), "features": np.ones((150, 4), np.float32)}
-    parameters |= {"shN": rng.normal(size=(150, 15, 3)).astype(np.float32), "degrees": np.sort(rng.integers(0, 4, 150))}
+    degrees, band = np.sort(rng.integers(0, 4, 150)), np.repeat([1, 2, 3], [3, 5, 7])  # nothing is above a degree
+    shN = rng.normal(size=(150, 15, 3)) * (band <= degrees[:, None])[..., None]
+    parameters |= {"shN": shN.astype(np.float32), "degrees": degrees}
     viewmats, Ks, width, height = camera()
     view = View(Ks[0], viewmats[0], width, height)
     wanted, depth = SceneRenderer(parameters).render(view, True), SceneRenderer(parameters).render_depth(view)

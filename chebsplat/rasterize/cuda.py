@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from typing import Any
 
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -38,12 +39,13 @@ def rasterize(
 
     Raises: ValueError unless the Gaussians are float32 on a GPU, for a `max_alpha` above 0.999, or beyond 512 channels;
       ImportError, with the remedy, without gsplat.
-    Choices: gsplat fixes the ceiling of alpha at 0.999; a lower one is kept by what a Gaussian's opacity is at most, so
-      that no alpha exceeds it. Renders are those of the other backends where no opacity is above `max_alpha`; where one
-      is, alpha is the same at its middle and lower by up to a hundredth around it. The gradient passes as if there were
-      no ceiling: a Gaussian that has reached it can become fainter again. All channels go at once: of gsplat's chunks
-      only one would leave its absolute gradient. A broken Gaussian is replaced by one that nobody sees, because gsplat
-      would draw a NaN opaque.
+    Choices: gsplat fixes the ceiling of alpha at 0.999; a lower one is kept by what a Gaussian's opacity is at most,
+      so that no alpha exceeds it. Renders are those of the other backends where no opacity is above `max_alpha`;
+      where one is, alpha is the same at its middle and lower by up to a hundredth around it. The gradient passes as
+      if there were no ceiling: a Gaussian that has reached it can become fainter again. What lies in the near plane
+      is cut, as elsewhere. Covariances are float32: a needle a billion times as long as wide is drawn wider than it
+      is. All channels go at once: of gsplat's chunks only one would leave its absolute gradient. A broken Gaussian is
+      replaced by one that nobody sees, because gsplat would draw a NaN opaque.
     """
     is_antialiased(rasterize_mode)
     if means.dtype != torch.float32 or means.device.type != "cuda":
@@ -66,9 +68,10 @@ def rasterize(
     if backgrounds is not None:
         backgrounds = torch.nn.functional.pad(backgrounds, (0, colors.shape[-1] - n_colors))
     gaussians = _without_broken(means, quats, scales, _at_most(opacities, max_alpha), colors)
+    nearest = float(np.nextafter(np.float32(near_plane), np.float32(np.inf)))
     renders, alphas, gsplat_meta = rasterization(
         *gaussians, viewmats, Ks, width, height,
-        near_plane=near_plane, far_plane=far_plane, eps2d=eps2d, sh_degree=None, packed=False, render_mode="RGB",
+        near_plane=nearest, far_plane=far_plane, eps2d=eps2d, sh_degree=None, packed=False, render_mode="RGB",
         backgrounds=backgrounds, absgrad=absgrad, rasterize_mode=rasterize_mode,
         channel_chunk=max(CHUNK, colors.shape[-1]),
     )  # fmt: skip
@@ -83,23 +86,22 @@ def _at_most(opacities: Tensor, ceiling: float) -> Tensor:
     return opacities + (opacities.clamp_max(ceiling) - opacities).detach()
 
 
-def _without_broken(
-    means: Tensor, quats: Tensor, scales: Tensor, opacities: Tensor, colors: Tensor
-) -> tuple[Tensor, ...]:
-    """Gaussians with harmless values and opacity 0 where one is not finite or has no rotation; quaternions scaled."""
+def _without_broken(means: Tensor, quats: Tensor, scales: Tensor, opacities: Tensor, colors: Tensor) -> list[Tensor]:
+    """Gaussians with harmless values and opacity 0 where one is not finite or has no rotation; quaternions scaled.
+
+    Choices: a Gaussian's values are looked at together, by their sum, which is finite where each of them is (or takes
+      one for broken whose values are beyond all measure): each question to a GPU takes as long as a sum.
+    """
+    by_camera = colors.ndim == 3
+    columns = [means, quats, scales, opacities[:, None], colors.movedim(0, 1).flatten(1) if by_camera else colors]
+    values = torch.cat(columns, 1)
     longest = quats.detach().abs().amax(-1)
-    finite_colors = torch.isfinite(colors).all(-1)
-    whole = torch.isfinite(opacities) & torch.isfinite(longest) & (longest > 1e-12)
-    whole &= torch.isfinite(means).all(-1) & torch.isfinite(scales).all(-1)
-    whole &= finite_colors if colors.ndim == 2 else finite_colors.all(0)
-    rows = whole[:, None]
-    return (
-        torch.where(rows, means, 0),
-        torch.where(rows, quats / torch.where(whole, longest, 1)[:, None], 1),
-        torch.where(rows, scales, 1),
-        torch.where(whole, opacities, 0),
-        torch.where(rows, colors, 0),
-    )
+    whole = torch.isfinite(values.detach().sum(1)) & (longest > 1e-12)
+    values = torch.where(whole[:, None], values, 0)
+    means, quats, scales, alone, flat = values.split([part.shape[1] for part in columns], 1)
+    quats = quats / torch.where(whole, longest, 1)[:, None] + ~whole[:, None]
+    colors = flat.unflatten(1, (colors.shape[0], -1)).movedim(1, 0) if by_camera else flat
+    return [part.contiguous() for part in (means, quats, scales, alone[:, 0], colors)]
 
 
 def own_meta(gsplat_meta: dict[str, Any]) -> dict[str, Any]:

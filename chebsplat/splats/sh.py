@@ -51,6 +51,20 @@ def basis(directions: Tensor, degree: int) -> Tensor:
     return torch.stack(columns, -1)
 
 
+def light(coefficients: Tensor, directions: Tensor, degree: int) -> Tensor:
+    """Light [N, 3] along directions [N, 3], normalised here, of coefficients [N, at least (degree + 1)², 3].
+
+    Choices: on a GPU gsplat's own kernel, for which fifty operations there would be one each to wait for.
+    """
+    if coefficients.device.type == "cuda":
+        from gsplat import spherical_harmonics
+
+        seen: Tensor = spherical_harmonics(degree, directions, coefficients)
+        return seen
+    values = basis(torch.nn.functional.normalize(directions, dim=-1), degree)
+    return torch.einsum("nk,nkc->nc", values, coefficients[:, : n_coefficients(degree)])
+
+
 def eval_sh(sh0: Tensor, shN: Tensor, directions: Tensor, degree: int) -> Tensor:
     """Colour seen along a direction; the half-grey offset is added and negative light cut off.
 
@@ -61,6 +75,5 @@ def eval_sh(sh0: Tensor, shN: Tensor, directions: Tensor, degree: int) -> Tensor
       degree:     highest band to use.
     Returns: [N, 3], at least 0.
     """
-    values = basis(torch.nn.functional.normalize(directions, dim=-1), degree)
     coefficients = torch.cat([sh0, shN[:, : n_coefficients(degree) - 1]], 1)
-    return (torch.einsum("nk,nkc->nc", values, coefficients) + 0.5).clamp_min(0)
+    return (light(coefficients, directions, degree) + 0.5).clamp_min(0)

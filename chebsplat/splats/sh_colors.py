@@ -9,7 +9,7 @@ from torch import Tensor
 
 from chebsplat.kernels.dispatch import is_compiled
 from chebsplat.splats.rows import take
-from chebsplat.splats.sh import basis
+from chebsplat.splats.sh import light
 
 
 def colors_in_view(
@@ -36,23 +36,18 @@ def colors_in_view(
         from chebsplat.splats import sh_kernels
 
         return sh_kernels.colors_in_view(bands, masks, index, means, eye, degree)
-    return _plain(bands, masks, index, means, eye, degree)
+    coefficients = _coefficients(bands[: degree + 1], masks, index)
+    directions = means.detach().index_select(0, index) - eye
+    return (light(coefficients, directions, min(degree, len(bands) - 1)) + 0.5).relu()
 
 
-def _plain(
-    bands: Sequence[Tensor], masks: Tensor | None, index: Tensor, means: Tensor, eye: Tensor, degree: int
-) -> Tensor:
-    """In plain torch, on any device. Choices: a band that only the first Gaussians have is filled up with zeros, rather
-    than cut to those in view that have it: a cut has to wait for their number.
+def _coefficients(bands: Sequence[Tensor], masks: Tensor | None, index: Tensor) -> Tensor:
+    """Masked coefficients [V, K, 3] of all bands. Choices: a band that only the first Gaussians have is filled up with
+    zeros, rather than cut to those in view that have it: a cut has to wait for their number.
     """
-    used = bands[: degree + 1]
-    directions = torch.nn.functional.normalize(means.detach().index_select(0, index) - eye, dim=-1)
-    values = basis(directions, len(used) - 1)
-    colors, first, n = torch.full_like(directions, 0.5), 0, len(bands[0])
-    for at, band in enumerate(used):
-        size = band.shape[1]
+    parts, n = [], len(bands[0])
+    for at, band in enumerate(bands):
         whole = band if len(band) == n else torch.nn.functional.pad(band, (0, 0, 0, 0, 0, n - len(band)))
-        part = torch.einsum("nk,nkc->nc", values[:, first : first + size], take(whole, index))
-        colors = colors + (part if masks is None or at == 0 else part * masks[:, at - 1, None])
-        first += size
-    return colors.relu()
+        rows = take(whole, index)
+        parts.append(rows if masks is None or at == 0 else rows * masks[:, at - 1, None, None])
+    return torch.cat(parts, 1)
