@@ -43,7 +43,8 @@ def ssim_map(a: Tensor, b: Tensor) -> Tensor:
     mean_a, mean_b, square_a, square_b, product = blurred.split(a.shape[-1], -1)
     var_a, var_b, covariance = square_a - mean_a**2, square_b - mean_b**2, product - mean_a * mean_b
     top = (2 * mean_a * mean_b + float(C1)) * (2 * covariance + float(C2))
-    return top / ((mean_a**2 + mean_b**2 + float(C1)) * (var_a + var_b + float(C2)))
+    similarity: Tensor = top / ((mean_a**2 + mean_b**2 + float(C1)) * (var_a + var_b + float(C2)))
+    return similarity
 
 
 def ssim(a: np.ndarray, b: np.ndarray) -> float:
