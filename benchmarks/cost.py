@@ -36,9 +36,9 @@ from chebsplat.pipelines.plan import merged
 from chebsplat.pipelines.scenes import read_toml
 from chebsplat.settings import MOST_STEPS
 from chebsplat.splats.gaussians import local_shape
-from chebsplat.stages.config import Config
-from chebsplat.stages.measured_depth import with_depth_loss
-from chebsplat.stages.train_inputs import model_of, training_views
+from chebsplat.stages.runtime.config import Config
+from chebsplat.stages.training.depth import with_depth_loss
+from chebsplat.stages.training.inputs import model_of, training_views
 from chebsplat.training.trainer import Trainer
 
 BAR, TURN, REHEARSAL = 1.25, 50, 100

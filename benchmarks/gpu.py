@@ -28,9 +28,9 @@ from chebsplat.pipelines.run import execute
 from chebsplat.rasterize import rasterize
 from chebsplat.render import SceneRenderer
 from chebsplat.settings import TrainSection
-from chebsplat.stages.config import Config
-from chebsplat.stages.device import resolve
-from chebsplat.stages.fidelity import timing
+from chebsplat.stages.measuring.image_quality import timing
+from chebsplat.stages.runtime.config import Config
+from chebsplat.stages.runtime.device import resolve
 from chebsplat.views import View
 
 DEVICE, SCENE, SETTINGS, REPEATS = "cuda", "office0", "train.steps=3000", 5

@@ -21,8 +21,8 @@ from chebsplat.formats.capture import Capture
 from chebsplat.formats.meshes import Mesh, cleaned, fused
 from chebsplat.pipelines.api import load
 from chebsplat.splats.cubes import first_of_each
-from chebsplat.stages.mesh import LEAST_PART, LONGEST_HOLE, frames, labels_at
-from chebsplat.stages.progress import Progress
+from chebsplat.stages.runtime.progress import Progress
+from chebsplat.stages.tools.mesh import LEAST_PART, LONGEST_HOLE, frames, labels_at
 
 NEAR, MIDDLE = 0.02, 0.05  # metres
 SPACING = 0.01  # metres, of the truth

@@ -22,7 +22,7 @@ from chebsplat.formats.scene import Scene
 from chebsplat.formats.teacher_model import EMBEDDED
 from chebsplat.labels.relevancy import relevancy
 from chebsplat.pipelines import store
-from chebsplat.stages.query import CANONICAL, understood
+from chebsplat.stages.tools.query import CANONICAL, understood
 from chebsplat.synthetic import CLASS_NAMES
 
 SCENES = "office0,office1,room0,shuffled0,shuffled1"

@@ -30,9 +30,9 @@ from chebsplat.shape import teach
 from chebsplat.shape.point_encoder import PointEncoder
 from chebsplat.shape.point_inputs import PointInputs
 from chebsplat.stages.settings import KnowledgeSection
+from chebsplat.stages.shape_models.teaching_rooms import Room, held, prepare
 from chebsplat.stages.teach import lesson_of
-from chebsplat.stages.teaching_rooms import Room, held, prepare
-from chebsplat.stages.text import found
+from chebsplat.stages.teacher_models.text_encoder import found
 from chebsplat.synthetic import CLASS_NAMES
 from chebsplat.synthetic.seeds import KNOWLEDGE
 

@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from chebsplat.errors import ChebsplatError, ConfigError
-from chebsplat.stages.opened import Camera, OpenedScene, Picture
+from chebsplat.stages.tools.scene import Camera, OpenedScene, Picture
 
 __all__ = ["Camera", "OpenedScene", "Picture", "load", "run_stage", "train"]
 
@@ -67,8 +67,8 @@ def run_stage(
     from tempfile import TemporaryDirectory
 
     from chebsplat.formats.names import suggest
-    from chebsplat.stages.command import publish
     from chebsplat.stages.registry import STAGES
+    from chebsplat.stages.runtime.command import publish
 
     if name not in STAGES:
         near = suggest(name, STAGES, 1)

@@ -14,7 +14,7 @@ from contextlib import contextmanager, suppress
 from pathlib import Path
 from types import FrameType
 
-from chebsplat.stages.stopping import PATIENCE
+from chebsplat.stages.runtime.stopping import PATIENCE
 
 # Snakemake's own words go to a file; its jobs inherit the real stderr, which may be a terminal. Its
 # standard input is a pipe that ends with the run, however that ends: its session is then stopped, and

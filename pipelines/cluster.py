@@ -24,7 +24,7 @@ from chebsplat.pipelines import leases, store
 from chebsplat.pipelines.store import say
 from chebsplat.settings import MOST_STEPS
 from chebsplat.stages.registry import MODEL_FREE
-from chebsplat.stages.stopping import end_itself
+from chebsplat.stages.runtime.stopping import end_itself
 
 HERE = Path(__file__).parent
 LOCAL, SLURM = "local", "slurm"

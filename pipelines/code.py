@@ -18,10 +18,7 @@ from typing import Any
 import chebsplat
 
 PACKAGE = Path(chebsplat.__file__).parent
-PLUMBING = {
-    f"chebsplat.stages.{name}" for name in ("config", "settings", "registry", "command", "progress", "stopping")
-}
-PLUMBING |= {"chebsplat.settings"}
+PLUMBING = tuple(f"chebsplat.{name}." for name in ("settings", "stages.settings", "stages.registry", "stages.runtime"))
 TEMPLATES = {".html", ".css", ".js"}  # of a package: what its modules fill
 OPTIONAL = {"av", "gsplat", "pillow_heif", "tokenizers", "transformers"}  # of extras: count where a scene uses them
 
@@ -54,7 +51,7 @@ class Code:
         while waiting:
             module = waiting.pop()
             path = self._path(module)
-            if module in seen or module in PLUMBING or path is None:
+            if module in seen or f"{module}.".startswith(PLUMBING) or path is None:
                 continue
             digest, imports = self._read(path)
             seen[module] = digest

@@ -16,8 +16,8 @@ from chebsplat.pipelines import leases, store
 from chebsplat.pipelines.raw import unchanged
 from chebsplat.pipelines.rehearsal import rehearsed
 from chebsplat.pipelines.store import say
-from chebsplat.stages.command import n_threads, publish
-from chebsplat.stages.stopping import exit_code
+from chebsplat.stages.runtime.command import n_threads, publish
+from chebsplat.stages.runtime.stopping import exit_code
 
 FINAL = {error.exit_code for error in (ConfigError, InputError, DataFailure)}
 CODE = "{:<4d}"  # of a job, written over in place: a full disk does not keep it from being told

@@ -14,7 +14,7 @@ from chebsplat.pipelines.scenes import expanded
 from chebsplat.stages.registry import STAGES
 
 if TYPE_CHECKING:
-    from chebsplat.stages.config import Config
+    from chebsplat.stages.runtime.config import Config
 
 
 def teaching(planner: Planner, model: Path | None, settings: str = "") -> Plan:
@@ -22,7 +22,7 @@ def teaching(planner: Planner, model: Path | None, settings: str = "") -> Plan:
 
     Raises: ConfigError on a closed-set teacher, whose classes no shape is taught.
     """
-    from chebsplat.stages import config as configs
+    from chebsplat.stages.runtime import config as configs
 
     file = (model or EMBEDDED).expanduser().resolve()
     teacher = read_teacher(file)

@@ -110,7 +110,7 @@ def text_packages(model: TeacherModel | None, labels: str | None) -> tuple[str, 
       pinned to one version, so that it is left out where only such names could need it; a model of the user's is not.
     """
     from chebsplat.formats.teacher_model import TEXT_PACKAGE, read_label_set, read_label_table
-    from chebsplat.stages.text import found
+    from chebsplat.stages.teacher_models.text_encoder import found
 
     if model is None or model.text is None or model.output != "features":
         return ()

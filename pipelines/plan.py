@@ -31,7 +31,7 @@ from chebsplat.pipelines.scenes import absent, expanded, folder_of, is_source, r
 from chebsplat.stages.registry import STAGES, Stage
 
 if TYPE_CHECKING:
-    from chebsplat.stages.config import Config
+    from chebsplat.stages.runtime.config import Config
 
 
 @dataclass
@@ -152,8 +152,8 @@ class Planner:
         Choices: a scene of a sequence, or on a basis, trains the encoder of regions, which a basis is of.
         """
         from chebsplat.pipelines.knowledge import given
-        from chebsplat.stages import config as configs
         from chebsplat.stages import ingest
+        from chebsplat.stages.runtime import config as configs
 
         name, own = scene_values(scene)
         values, title = merged(own, values or {}), ""

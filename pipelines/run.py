@@ -39,7 +39,7 @@ def device_of(wanted: str, on: str = cluster.LOCAL) -> str:
     """What `--device` means to all jobs of a run; says once why it is not the GPU that is there. Whether a cluster's
     nodes have one is for them to say: a job that asks in vain ends with exit code 2.
     """
-    from chebsplat.stages.device import resolve
+    from chebsplat.stages.runtime.device import resolve
 
     if on != cluster.LOCAL and wanted == "cuda":
         return wanted

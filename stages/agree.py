@@ -6,7 +6,7 @@ import logging
 from typing import TYPE_CHECKING
 
 from chebsplat.errors import DataFailure, InputError
-from chebsplat.stages.command import Job
+from chebsplat.stages.runtime.command import Job
 
 if TYPE_CHECKING:
     import numpy as np
@@ -32,7 +32,7 @@ def run(job: Job) -> None:
     from chebsplat.formats.features import Features
     from chebsplat.formats.points import Points
     from chebsplat.labels.agreement import between, far_pairs
-    from chebsplat.stages.thinning import even
+    from chebsplat.stages.reconstruction.thinning import even
 
     settings, capture = job.config.agree, Capture.read(job.inputs["capture"])
     points, features = Points.read(job.inputs["points"]), Features.read(job.inputs["features"])

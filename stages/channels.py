@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any
 
 from chebsplat.errors import ConfigError, DataFailure, InputError
 from chebsplat.formats.images import SUFFIXES, read_rgb
-from chebsplat.stages.command import Job, n_threads
+from chebsplat.stages.runtime.command import Job, n_threads
 
 if TYPE_CHECKING:
     import numpy as np
@@ -38,7 +38,7 @@ def run(job: Job) -> None:
     from chebsplat.formats.channels import ChannelMap
     from chebsplat.formats.teacher_model import EMBEDDED, read_teacher
     from chebsplat.labels import channels as maths
-    from chebsplat.stages.teacher_inference import TeacherInference
+    from chebsplat.stages.teacher_models.image_encoder import TeacherInference
 
     settings = job.config.channels
     teacher = read_teacher(Path(settings.model) if settings.model else EMBEDDED)

@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import TYPE_CHECKING, Any
 
 from chebsplat.errors import DataFailure
-from chebsplat.stages.command import Job
+from chebsplat.stages.runtime.command import Job
 
 if TYPE_CHECKING:
     from chebsplat.formats.gaussians import Gaussians
@@ -22,7 +22,7 @@ def run(job: Job) -> None:
     from chebsplat.formats.artifact import read_manifest
     from chebsplat.formats.basis import Basis, read_basis, write_basis
     from chebsplat.formats.gaussians import Gaussians
-    from chebsplat.stages.restored import restored_encoder, without_basis
+    from chebsplat.stages.training.saves import restored_encoder, without_basis
 
     settings = job.config.cks
     old = read_basis(job.inputs["basis"]) if "basis" in job.inputs else Basis({}, {})
@@ -76,7 +76,7 @@ def descriptor_spread(job: Job, gaussians: Gaussians) -> float:
     from chebsplat.shape.cks import spread
     from chebsplat.shape.refresh import Descriptors
     from chebsplat.shape.regions import regions_of
-    from chebsplat.stages.restored import trained_with
+    from chebsplat.stages.training.saves import trained_with
 
     trained = trained_with(job.inputs["gaussians"])
     if not trained["train"]["albo"]:

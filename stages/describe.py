@@ -5,7 +5,7 @@ from __future__ import annotations
 import logging
 
 from chebsplat.errors import DataFailure
-from chebsplat.stages.command import Job
+from chebsplat.stages.runtime.command import Job
 
 log = logging.getLogger("chebsplat")
 

@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from chebsplat.errors import ConfigError, DataFailure, InputError
-from chebsplat.stages.command import Job
+from chebsplat.stages.runtime.command import Job
 
 if TYPE_CHECKING:
     import numpy as np
@@ -32,7 +32,7 @@ def run(job: Job) -> None:
     from chebsplat.formats.evaluation import Evaluation
     from chebsplat.formats.scene import Scene
     from chebsplat.render import SceneRenderer
-    from chebsplat.stages.fidelity import frame_split, image_figures, perceptual, timing
+    from chebsplat.stages.measuring.image_quality import frame_split, image_figures, perceptual, timing
 
     settings = job.config.evaluate
     capture, scene = Capture.read(job.inputs["capture"]), Scene.read(job.inputs["scene"])

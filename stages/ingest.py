@@ -8,8 +8,8 @@ from pathlib import Path
 from typing import Any
 
 from chebsplat.errors import ConfigError, DataFailure, InputError
-from chebsplat.stages.command import Job
-from chebsplat.stages.progress import Progress
+from chebsplat.stages.runtime.command import Job
+from chebsplat.stages.runtime.progress import Progress
 from chebsplat.stages.settings import IngestSection, SourceSection
 
 log = logging.getLogger("chebsplat")

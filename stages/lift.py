@@ -6,7 +6,7 @@ from collections.abc import Iterator
 from typing import TYPE_CHECKING, Any
 
 from chebsplat.errors import DataFailure, InputError
-from chebsplat.stages.command import Job
+from chebsplat.stages.runtime.command import Job
 
 if TYPE_CHECKING:
     import numpy as np
@@ -15,7 +15,7 @@ if TYPE_CHECKING:
     from chebsplat.formats.capture import Capture
     from chebsplat.formats.features import Features
     from chebsplat.rasterize.lift import Lifted
-    from chebsplat.stages.progress import Progress
+    from chebsplat.stages.runtime.progress import Progress
 
 MEDIAN_STEPS = 5  # of Weiszfeld's, from the mean of the views towards their geometric median
 LEAST_WEIGHT = 0.1  # pixels that a Gaussian makes up of a view that sees it

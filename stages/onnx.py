@@ -6,8 +6,8 @@ from pathlib import Path
 from typing import Any
 
 from chebsplat.errors import DataFailure
-from chebsplat.stages.command import Job
-from chebsplat.stages.contract import contract
+from chebsplat.stages.runtime.command import Job
+from chebsplat.stages.shape_models.contract import contract
 
 SIZES = (
     (1, 1),
@@ -30,8 +30,8 @@ def run(job: Job) -> None:
 
     from chebsplat.formats.encoder import DYNAMIC, FLOAT, FUSED, write_encoder
     from chebsplat.formats.gaussians import Gaussians
-    from chebsplat.stages.onnx_graphs import encoder_model, fusion_model
-    from chebsplat.stages.restored import restored_encoder, trained_with
+    from chebsplat.stages.shape_models.region_graph import encoder_model, fusion_model
+    from chebsplat.stages.training.saves import restored_encoder, trained_with
 
     path = job.inputs["gaussians"]
     gaussians = Gaussians.read(path)

@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import TYPE_CHECKING, Any
 
 from chebsplat.errors import ConfigError, DataFailure, InputError
-from chebsplat.stages.command import Job
+from chebsplat.stages.runtime.command import Job
 
 if TYPE_CHECKING:
     import numpy as np
@@ -86,7 +86,7 @@ def known(job: Job, gaussians: Gaussians, capture: Capture | None, unit: float) 
     from chebsplat.formats.points import Points
     from chebsplat.lifting.carry import carry
     from chebsplat.splats.gaussians import surface_of
-    from chebsplat.stages.known_shapes import known_shapes, measured, shown, swept
+    from chebsplat.stages.shape_models.predictions import known_shapes, measured, shown, swept
 
     if "knowledge" not in job.inputs:
         return None

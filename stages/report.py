@@ -6,7 +6,7 @@ import csv
 from typing import TYPE_CHECKING, Any
 
 from chebsplat.errors import DataFailure
-from chebsplat.stages.command import Job
+from chebsplat.stages.runtime.command import Job
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -55,7 +55,7 @@ def run(job: Job) -> None:
     from chebsplat.formats.gaussians import Gaussians
     from chebsplat.stages.pages import parts
     from chebsplat.stages.pages import pictures as draw
-    from chebsplat.stages.pages.template import REPORT, rendered
+    from chebsplat.stages.pages.parts import REPORT, rendered
 
     evaluation = Evaluation.read(job.inputs["evaluation"])
     gaussians = Gaussians.read(job.inputs["gaussians"])

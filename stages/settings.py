@@ -11,7 +11,7 @@ from pydantic import AfterValidator, Field
 
 from chebsplat.formats.names import unprintable
 from chebsplat.settings import Section, number, seed, setting
-from chebsplat.stages.label_space import MAX_CHANNELS
+from chebsplat.stages.teacher_models.label_space import MAX_CHANNELS
 
 
 def printable(text: str) -> str:

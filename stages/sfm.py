@@ -6,10 +6,10 @@ import logging
 from typing import TYPE_CHECKING, Any
 
 from chebsplat.errors import DataFailure
-from chebsplat.stages.command import Job
-from chebsplat.stages.dense import MOST, swept, wants_more
-from chebsplat.stages.pose_check import wants_adjustment
-from chebsplat.stages.thinning import by_color, edge_of, thin
+from chebsplat.stages.reconstruction.dense import MOST, swept, wants_more
+from chebsplat.stages.reconstruction.pose_check import wants_adjustment
+from chebsplat.stages.reconstruction.thinning import by_color, edge_of, thin
+from chebsplat.stages.runtime.command import Job
 
 if TYPE_CHECKING:
     import numpy as np
@@ -50,9 +50,9 @@ def run(job: Job) -> None:
         job.left_out("feature matching", "poses and depth are given: points come from depth")
         _, cloud = reduced(from_depth(job, capture, settings), settings.max_points, settings.spacing)
     else:
-        from chebsplat.stages import reconstruction
+        from chebsplat.stages.reconstruction import mapping
 
-        cloud = reconstruction.reconstruct(job, capture, settings, adjusted)
+        cloud = mapping.reconstruct(job, capture, settings, adjusted)
         if "poses_kept" in cloud["notes"] and capture.depth is not None:
             measured = from_depth(job, capture, settings, cloud["cam_from_world"])
             cloud = filled(cloud, measured, settings.max_points, settings.spacing)

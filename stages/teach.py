@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from chebsplat.errors import ConfigError, DataFailure, InputError
-from chebsplat.stages.command import Job, n_threads
+from chebsplat.stages.runtime.command import Job, n_threads
 
 if TYPE_CHECKING:
     import numpy as np
@@ -22,7 +22,7 @@ if TYPE_CHECKING:
     from chebsplat.shape.point_inputs import PointInputs
     from chebsplat.shape.teach import Lesson
     from chebsplat.stages.settings import KnowledgeSection
-    from chebsplat.stages.teaching_rooms import Room
+    from chebsplat.stages.shape_models.teaching_rooms import Room
 
 log = logging.getLogger("chebsplat")
 
@@ -40,7 +40,7 @@ def run(job: Job) -> None:
     from chebsplat.settings import DescribeSection
     from chebsplat.shape.teach import LEAST_VIEWS
     from chebsplat.stages.channels import digest
-    from chebsplat.stages.text import found
+    from chebsplat.stages.teacher_models.text_encoder import found
     from chebsplat.synthetic import CLASS_NAMES
 
     settings, channels = job.config.knowledge, ChannelMap.read(job.inputs["channels"])
@@ -84,7 +84,7 @@ def exported(job: Job, encoder: PointEncoder, inputs: PointInputs) -> float:
     from chebsplat.formats.knowledge import ENCODER
     from chebsplat.shape.point_encoder import cloud_of
     from chebsplat.stages.onnx import annotate, compare
-    from chebsplat.stages.point_graph import point_contract, point_model
+    from chebsplat.stages.shape_models.point_graph import point_contract, point_model
 
     tolerance, path = job.config.onnx.tolerance, job.out / ENCODER
     onnx.save(point_model(encoder), path)
@@ -99,7 +99,7 @@ def exported(job: Job, encoder: PointEncoder, inputs: PointInputs) -> float:
 def vocabulary(teacher: TeacherModel, names: list[str], matrix: np.ndarray) -> tuple[list[str], np.ndarray]:
     """Words that the teacher knows, of its table, otherwise these names; and their embeddings f32 [W, d]."""
     from chebsplat.formats.teacher_model import read_label_table
-    from chebsplat.stages.text import text_embeddings
+    from chebsplat.stages.teacher_models.text_encoder import text_embeddings
 
     words = names if teacher.labels is None else read_label_table(teacher.labels)[0]
     return words, text_embeddings(words, teacher) @ matrix
@@ -111,7 +111,7 @@ def prepared(job: Job, settings: KnowledgeSection, matrix: np.ndarray) -> list[l
     import os
     from concurrent.futures import ProcessPoolExecutor, as_completed
 
-    from chebsplat.stages.teaching_rooms import held, kept_as, prepare
+    from chebsplat.stages.shape_models.teaching_rooms import held, kept_as, prepare
     from chebsplat.synthetic.seeds import KNOWLEDGE
 
     seeds = [*KNOWLEDGE[: settings.n_rooms], *KNOWLEDGE[-settings.n_held_out :]]

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 
 from chebsplat.errors import ConfigError, DataFailure
 from chebsplat.formats.artifact import read_manifest, sha256_file
-from chebsplat.stages.command import Job
+from chebsplat.stages.runtime.command import Job
 
 if TYPE_CHECKING:
     from chebsplat.formats.capture import Capture
@@ -46,10 +46,10 @@ def from_onnx(job: Job, capture: Capture, settings: TeacherSection) -> None:
     from chebsplat.formats.channels import ChannelMap
     from chebsplat.formats.features import FeatureWriter
     from chebsplat.formats.teacher_model import EMBEDDED, read_teacher
-    from chebsplat.stages.command import n_threads
-    from chebsplat.stages.inference import CUDA, GPU_REMEDY, providers
-    from chebsplat.stages.label_space import MAX_CHANNELS, closed_set, label_set, open_vocabulary
-    from chebsplat.stages.teacher_inference import TeacherInference
+    from chebsplat.stages.runtime.command import n_threads
+    from chebsplat.stages.teacher_models.image_encoder import TeacherInference
+    from chebsplat.stages.teacher_models.label_space import MAX_CHANNELS, closed_set, label_set, open_vocabulary
+    from chebsplat.stages.teacher_models.onnx_session import CUDA, GPU_REMEDY, providers
 
     teacher = read_teacher(Path(settings.model) if settings.model else EMBEDDED)
     network = TeacherInference(teacher, n_threads(), job.device)

@@ -8,12 +8,10 @@ from functools import partial
 from typing import TYPE_CHECKING, Any
 
 from chebsplat.errors import DataFailure
-from chebsplat.stages.command import Job, n_threads
-from chebsplat.stages.exposures import exposures
-from chebsplat.stages.measured_depth import with_depth_loss
-from chebsplat.stages.resume import Saves
-from chebsplat.stages.stopping import deferred
-from chebsplat.stages.train_inputs import (
+from chebsplat.stages.runtime.command import Job, n_threads
+from chebsplat.stages.runtime.stopping import deferred
+from chebsplat.stages.training.depth import with_depth_loss
+from chebsplat.stages.training.inputs import (
     begin_features,
     described,
     first_regions,
@@ -23,6 +21,8 @@ from chebsplat.stages.train_inputs import (
     with_feature_loss,
     within_cap,
 )
+from chebsplat.stages.training.photos import exposures
+from chebsplat.stages.training.saves import Saves
 
 if TYPE_CHECKING:
     import numpy as np

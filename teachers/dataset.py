@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 
 from chebsplat.formats.files import atomic_path
-from chebsplat.stages.progress import Progress
+from chebsplat.stages.runtime.progress import Progress
 from chebsplat.teachers.rooms import generator_digest, training_views
 
 

@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 
 from chebsplat.formats.teacher_model import read_label_set
-from chebsplat.stages.text import sentence_embeddings
+from chebsplat.stages.teacher_models.text_encoder import sentence_embeddings
 
 NOUNS = Path(__file__).with_name("nouns.txt")
 TABLE = Path(__file__).with_name("embedded.npz")

@@ -19,8 +19,8 @@ import numpy as np
 
 from chebsplat.evaluation.metrics import IGNORE, confusion, segmentation
 from chebsplat.formats.teacher_model import EMBEDDED, read_teacher
-from chebsplat.stages.teacher_inference import TeacherInference
-from chebsplat.stages.text import text_embeddings
+from chebsplat.stages.teacher_models.image_encoder import TeacherInference
+from chebsplat.stages.teacher_models.text_encoder import text_embeddings
 from chebsplat.synthetic import CLASS_NAMES
 from chebsplat.synthetic.seeds import HELD_OUT
 from chebsplat.teachers.words import words

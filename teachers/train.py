@@ -22,7 +22,7 @@ from torch.nn import functional as F
 
 from chebsplat.evaluation.metrics import confusion, segmentation
 from chebsplat.formats.teacher_model import EMBEDDED
-from chebsplat.stages.progress import Progress
+from chebsplat.stages.runtime.progress import Progress
 from chebsplat.synthetic import CLASS_NAMES
 from chebsplat.synthetic.seeds import TRAINING
 from chebsplat.teachers.augment import crops, recolored

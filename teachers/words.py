@@ -22,7 +22,7 @@ def words(which: str) -> dict[str, list[str]]:
 
 def embedded(texts: list[str]) -> np.ndarray:
     """Unit rows f32 [L, 384] of the sentence model. Raises ConfigError where the extra `text` is missing."""
-    from chebsplat.stages.text import sentence_embeddings
+    from chebsplat.stages.teacher_models.text_encoder import sentence_embeddings
 
     try:
         return sentence_embeddings(texts)

@@ -108,7 +108,7 @@ def run_stage(stage, out, inputs=None, config=None):
     """Run a stage's own command; returns its exit code."""
     from importlib import import_module
 
-    from chebsplat.stages.command import command
+    from chebsplat.stages.runtime.command import command
 
     out.parent.mkdir(parents=True, exist_ok=True)
     file = out.parent / f"{out.name}.json"

@@ -11,7 +11,7 @@ from chebsplat.errors import ConfigError, InputError
 from chebsplat.pipelines.cli import main
 from chebsplat.pipelines.plan import Planner
 from chebsplat.pipelines.scenes import ONE, names, read_toml
-from chebsplat.stages.config import known_keys
+from chebsplat.stages.runtime.config import known_keys
 
 
 def asked(*arguments):

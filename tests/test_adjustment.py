@@ -6,9 +6,9 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from chebsplat.cameras import centers
-from chebsplat.stages.adjustment import adjust, alignment, differences, frame, localized
-from chebsplat.stages.command import Job
-from chebsplat.stages.config import Config
+from chebsplat.stages.reconstruction.adjustment import adjust, alignment, differences, frame, localized
+from chebsplat.stages.runtime.command import Job
+from chebsplat.stages.runtime.config import Config
 from chebsplat.stages.sfm import filled
 
 
@@ -188,7 +188,7 @@ def test_views_with_few_matches_stay_near_where_they_were_given(synthetic, weak)
 
 
 def test_only_the_last_round_decides_whether_views_share_enough(synthetic, monkeypatch):
-    from chebsplat.stages import adjustment
+    from chebsplat.stages.reconstruction import adjustment
 
     job, database, names, truth = synthetic
     monkeypatch.setattr(adjustment, "ROUNDS", (0.01, 4.0, 2.0))  # at a hundredth of a pixel no point is left at first
@@ -198,7 +198,7 @@ def test_only_the_last_round_decides_whether_views_share_enough(synthetic, monke
 
 
 def test_poses_stay_where_few_views_share_points(synthetic, monkeypatch):
-    from chebsplat.stages import adjustment
+    from chebsplat.stages.reconstruction import adjustment
 
     job, database, names, truth = synthetic
     monkeypatch.setattr(adjustment, "SHARED", 10_000)

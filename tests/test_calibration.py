@@ -27,7 +27,7 @@ from chebsplat.labels.calibration import (
     strongest,
 )  # fmt: skip
 from chebsplat.pipelines.cli import main
-from chebsplat.stages import calibration
+from chebsplat.stages.tools import calibrate
 from chebsplat.synthetic import seeds
 
 OF = Calibration(margin=14.0, cosine=9.0, bias=-4.0, strength=1.0, offset=2.0)
@@ -105,9 +105,9 @@ def test_the_embedded_teacher_ships_with_its_calibration_on_rooms_of_its_own():
     held = files.read_calibration(EMBEDDED)
     assert held.teacher == read_teacher(EMBEDDED).name
     assert set(held.rivals) <= set(read_label_table(EMBEDDED.with_name("embedded.npz"))[0])
-    assert held.made["first_seed"] == calibration.SEEDS[0]
+    assert held.made["first_seed"] == calibrate.SEEDS[0]
     ranges = [value for value in vars(seeds).values() if isinstance(value, range)]
-    assert not any({calibration.SEEDS[0], calibration.SEEDS[-1]} & set(other) for other in ranges)
+    assert not any({calibrate.SEEDS[0], calibrate.SEEDS[-1]} & set(other) for other in ranges)
     listed = tomllib.loads((ROOT / "teachers/words.toml").read_text())["absent"]
     assert not set(listed["calibration"]) & set(listed["measured"])
     assert len(listed["measured"]) == 30
@@ -217,8 +217,8 @@ def test_a_damaged_calibration_is_named(folder, damage, said):
 
 
 def test_a_teacher_is_calibrated_by_one_command_and_never_twice_by_accident(tmp_path, monkeypatch):
-    monkeypatch.setattr(calibration, "N_VIEWS", 2)
-    monkeypatch.setattr(calibration, "N_POINTS", 1500)
+    monkeypatch.setattr(calibrate, "N_VIEWS", 2)
+    monkeypatch.setattr(calibrate, "N_POINTS", 1500)
     model = knowing_rooms(color_teacher(tmp_path))
     done = CliRunner().invoke(main, ["calibrate", str(model), "--rooms", "3"])
     assert done.exit_code == 0, done.stderr
@@ -228,9 +228,9 @@ def test_a_teacher_is_calibrated_by_one_command_and_never_twice_by_accident(tmp_
     assert CliRunner().invoke(main, ["calibrate", str(model)]).exit_code == 2
     shutil.copy(model, tmp_path / "other.onnx")
     with pytest.raises(ConfigError, match="3 to 100 rooms"):
-        calibration.calibrate(model, 2, None)
+        calibrate.calibrate(model, 2, None)
 
 
 def test_a_segmenter_has_nothing_to_calibrate(tmp_path):
     with pytest.raises(ConfigError, match="logits"):
-        calibration.calibrate(color_teacher(tmp_path, output="logits"), 3, None)
+        calibrate.calibrate(color_teacher(tmp_path, output="logits"), 3, None)

@@ -78,7 +78,7 @@ def test_jobs_ask_for_the_most_that_a_step_needs_for_the_time_of_all_and_for_a_g
 
 
 def test_a_gpu_of_nodes_is_not_looked_for_where_jobs_are_submitted(monkeypatch):
-    monkeypatch.setattr("chebsplat.stages.device.missing", lambda: "no GPU answers")
+    monkeypatch.setattr("chebsplat.stages.runtime.device.missing", lambda: "no GPU answers")
     assert device_of("cuda", "slurm") == "cuda"
     with pytest.raises(ConfigError, match="no GPU answers"):
         device_of("cuda")

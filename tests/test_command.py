@@ -9,7 +9,7 @@ from shared import KEY
 
 from chebsplat.errors import DataFailure
 from chebsplat.formats import artifact
-from chebsplat.stages.command import command, publish
+from chebsplat.stages.runtime.command import command, publish
 
 
 @pytest.fixture(autouse=True)

@@ -12,8 +12,8 @@ from shared import ROOT
 
 from chebsplat.errors import ConfigError
 from chebsplat.pipelines.plan import OFF_IS_CHOICE
-from chebsplat.stages import config
 from chebsplat.stages.registry import STAGES
+from chebsplat.stages.runtime import config
 
 SETTINGS = {
     f"{section}.{key}": setting

@@ -7,9 +7,9 @@ import pytest
 import torch
 
 from chebsplat.photos import consistency, plane_sweep
-from chebsplat.stages import dense
-from chebsplat.stages.command import Job
-from chebsplat.stages.config import Config
+from chebsplat.stages.reconstruction import dense
+from chebsplat.stages.runtime.command import Job
+from chebsplat.stages.runtime.config import Config
 from chebsplat.stages.settings import SfmSection
 
 FOCAL, SIZE = 160.0, (160, 120)

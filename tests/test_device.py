@@ -15,7 +15,7 @@ from chebsplat.formats import artifact
 from chebsplat.pipelines.cli import main
 from chebsplat.pipelines.plan import Planner
 from chebsplat.pipelines.run import entry
-from chebsplat.stages import device
+from chebsplat.stages.runtime import device
 
 LACKS = {
     "CUDA": "torch .* is built without CUDA .`make setup device=cuda` adds it.",

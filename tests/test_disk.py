@@ -13,7 +13,7 @@ from chebsplat.errors import DiskFailure, InputError
 from chebsplat.formats import artifact, disk
 from chebsplat.formats.manifest import Manifest
 from chebsplat.pipelines.run import failures
-from chebsplat.stages.resume import Saves
+from chebsplat.stages.training.saves import Saves
 
 MOUNT = 'mount -t tmpfs -o "$0" tmpfs "$1" && shift && exec "$@"'
 

@@ -19,8 +19,8 @@ from chebsplat.formats.points import Points
 from chebsplat.formats.record import layout_of
 from chebsplat.formats.refined import Refined
 from chebsplat.formats.scene import RaggedScene, Scene
-from chebsplat.stages.config import known_keys
 from chebsplat.stages.registry import STAGES
+from chebsplat.stages.runtime.config import known_keys
 
 PAGES = [ROOT / name for name in ("README.md", "CONTRIBUTING.md")] + sorted((ROOT / "docs").glob("*.md"))
 CODE = re.compile(r"`([\w/]+\.py)(?::([\w.]+))?`|\b((?:chebsplat|formats|stages|pipelines)/[\w/]+\.py):(\w+)")

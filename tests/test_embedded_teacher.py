@@ -9,7 +9,7 @@ import pytest
 from shared import ROOT
 
 from chebsplat.formats.teacher_model import EMBEDDED, read_teacher
-from chebsplat.stages.teacher_inference import TeacherInference
+from chebsplat.stages.teacher_models.image_encoder import TeacherInference
 from chebsplat.synthetic import CLASS_NAMES, seeds
 
 
@@ -37,7 +37,7 @@ def test_the_rank_of_its_features_is_small(encoder):
 
 def test_a_held_out_room_is_told_about_as_well_as_the_published_figures_say():
     from chebsplat.evaluation.metrics import confusion, segmentation
-    from chebsplat.stages.text import text_embeddings
+    from chebsplat.stages.teacher_models.text_encoder import text_embeddings
     from chebsplat.teachers.quality import held_out_room, labelled, runner
 
     published = json.loads((EMBEDDED.parent / "quality.json").read_text())["held_out"]

@@ -20,11 +20,11 @@ from chebsplat.pipelines.cli import main
 from chebsplat.settings import DescribeSection
 from chebsplat.shape.encoder import RegionEncoder
 from chebsplat.shape.region_inputs import region_inputs
-from chebsplat.stages.config import Config
-from chebsplat.stages.contract import contract
 from chebsplat.stages.onnx import compare, example, fusion_example, quantize, restored_fusion
-from chebsplat.stages.onnx_graphs import encoder_model
-from chebsplat.stages.restored import trained_with
+from chebsplat.stages.runtime.config import Config
+from chebsplat.stages.shape_models.contract import contract
+from chebsplat.stages.shape_models.region_graph import encoder_model
+from chebsplat.stages.training.saves import trained_with
 
 pytestmark = pytest.mark.xdist_group("toy")
 

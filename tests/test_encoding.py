@@ -10,7 +10,7 @@ from chebsplat.labels.noisy_teacher import confusable, confuse_segments, noisy_f
 from chebsplat.shape.encoder import RegionEncoder, Standardize
 from chebsplat.shape.regions import build_regions
 from chebsplat.splats.gaussians import activated, covariances, initial_gaussians, local_shape
-from chebsplat.stages.config import Config
+from chebsplat.stages.runtime.config import Config
 from chebsplat.stages.train import agreement
 from chebsplat.training.model import SceneModel
 

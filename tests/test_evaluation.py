@@ -21,7 +21,7 @@ from chebsplat.formats.scene import Scene
 from chebsplat.pipelines.plan import Planner
 from chebsplat.render import SceneRenderer
 from chebsplat.stages.evaluate import camera
-from chebsplat.stages.fidelity import image_figures, perceptual
+from chebsplat.stages.measuring.image_quality import image_figures, perceptual
 from chebsplat.stages.sources import generated
 
 

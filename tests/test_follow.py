@@ -9,10 +9,10 @@ import torch
 
 from chebsplat.errors import Stopped
 from chebsplat.settings import TrainSection
-from chebsplat.stages import config as configs
-from chebsplat.stages.command import Job
-from chebsplat.stages.progress import Progress
-from chebsplat.stages.stopping import heeded
+from chebsplat.stages.runtime import config as configs
+from chebsplat.stages.runtime.command import Job
+from chebsplat.stages.runtime.progress import Progress
+from chebsplat.stages.runtime.stopping import heeded
 from chebsplat.stages.train import follow
 
 SETTINGS = TrainSection(encode_every=4, report_every=6)

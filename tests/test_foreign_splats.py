@@ -18,8 +18,8 @@ from chebsplat.formats.ply import read_ply
 from chebsplat.pipelines.cli import main
 from chebsplat.pipelines.plan import Planner
 from chebsplat.render import SceneRenderer
-from chebsplat.stages.opened import OpenedScene
-from chebsplat.stages.page import foreign
+from chebsplat.stages.tools.page import foreign
+from chebsplat.stages.tools.scene import OpenedScene
 
 N = 150_000
 

@@ -5,7 +5,7 @@ import pytest
 import torch
 
 from benchmarks.cost import trainer_from
-from chebsplat.stages import config as configs
+from chebsplat.stages.runtime import config as configs
 
 pytestmark = pytest.mark.gpu
 SETTINGS = {"densify": "off", "encoder": "transformer", "encode_from": 0.1, "prune_from": 0.1}

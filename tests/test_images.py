@@ -14,8 +14,9 @@ from source_folders import SETTINGS, image
 from chebsplat.errors import InputError
 from chebsplat.formats import images
 from chebsplat.formats.images import header, opened, read_rgb, seen_size, turned
-from chebsplat.stages import channels, teacher_check
+from chebsplat.stages import channels
 from chebsplat.stages.sources import photos
+from chebsplat.stages.tools import check_teacher
 
 
 @pytest.mark.parametrize("how", ["ingest", "channels", "check-teacher"])
@@ -32,7 +33,7 @@ def test_an_image_that_is_a_program_is_never_run(tmp_path, monkeypatch, how):
     read = {
         "ingest": lambda: photos.read(folder, SETTINGS),
         "channels": lambda: list(channels.photos([folder / "b.png"])),
-        "check-teacher": lambda: teacher_check.shown(folder / "b.png"),
+        "check-teacher": lambda: check_teacher.shown(folder / "b.png"),
     }[how]
     with pytest.raises(InputError, match=r"b\.png is no PNG, JPEG or HEIC"):
         read()

@@ -5,7 +5,7 @@ import pytest
 from shared import data
 
 from chebsplat.stages.settings import IngestSection
-from chebsplat.stages.sources import lens, photos
+from chebsplat.stages.sources import photos
 from chebsplat.stages.sources.cameras import Camera
 from chebsplat.stages.sources.common import Frame
 
@@ -19,17 +19,17 @@ def simple(width, height, focal):
 
 
 def test_the_corner_moves_as_the_model_says():
-    found = lens.Lens(1.2, -0.1, 0.5)
-    camera = lens._bent(simple(1000, 750, 1200.0), found).colmap
+    found = photos.Lens(1.2, -0.1, 0.5)
+    camera = photos._bent(simple(1000, 750, 1200.0), found).colmap
     corner = np.array([500.0, 375.0]) / 1200
     moved = np.asarray(camera.img_from_cam(np.array([[*corner, 1.0]])))[0] - [500, 375]
-    assert lens.corner_shift(found, 1000, 750) == pytest.approx(625 - np.linalg.norm(moved), rel=1e-6)
+    assert photos.corner_shift(found, 1000, 750) == pytest.approx(625 - np.linalg.norm(moved), rel=1e-6)
 
 
 def test_photos_of_one_lens_share_it_either_way_up_and_others_keep_theirs(tmp_path, monkeypatch):
-    monkeypatch.setattr(lens, "estimate", lambda frames, upright: lens.Lens(1.1, -0.08, 0.5))
+    monkeypatch.setattr(photos, "estimate", lambda frames, upright: photos.Lens(1.1, -0.08, 0.5))
     cameras = [simple(800, 600, 960.0)] * 9 + [simple(600, 800, 960.0), simple(800, 600, 500.0)]
-    frames, note = lens.with_lens(frames_of(tmp_path, cameras), True)
+    frames, note = photos.with_lens(frames_of(tmp_path, cameras), True)
     assert [frame.camera.model for frame in frames] == ["SIMPLE_RADIAL"] * 10 + ["SIMPLE_PINHOLE"]
     assert frames[0].camera.params == pytest.approx((880, 400, 300, -0.08))
     assert frames[9].camera.params == pytest.approx((880, 300, 400, -0.08))
@@ -37,20 +37,20 @@ def test_photos_of_one_lens_share_it_either_way_up_and_others_keep_theirs(tmp_pa
 
 
 @pytest.mark.parametrize(
-    ("found", "said"), [(None, "could not be estimated"), (lens.Lens(1.1, 0.001, 0.5), "is straight")]
+    ("found", "said"), [(None, "could not be estimated"), (photos.Lens(1.1, 0.001, 0.5), "is straight")]
 )
 def test_photos_stay_where_no_lens_is_found_or_it_is_straight(tmp_path, monkeypatch, found, said):
-    monkeypatch.setattr(lens, "estimate", lambda frames, upright: found)
+    monkeypatch.setattr(photos, "estimate", lambda frames, upright: found)
     given = frames_of(tmp_path, [simple(800, 600, 960.0)] * 8)
-    frames, note = lens.with_lens(given, True)
+    frames, note = photos.with_lens(given, True)
     assert frames == given
     assert said in note
 
 
 def test_few_or_small_photos_are_not_looked_at(tmp_path, monkeypatch):
-    monkeypatch.setattr(lens, "estimate", lambda *_: pytest.fail("estimated"))
-    for camera, n in ((simple(800, 600, 960.0), lens.LEAST - 1), (simple(300, 200, 360.0), 20)):
-        assert lens.with_lens(frames_of(tmp_path, [camera] * n), True)[1] == ""
+    monkeypatch.setattr(photos, "estimate", lambda *_: pytest.fail("estimated"))
+    for camera, n in ((simple(800, 600, 960.0), photos.LEAST - 1), (simple(300, 200, 360.0), 20)):
+        assert photos.with_lens(frames_of(tmp_path, [camera] * n), True)[1] == ""
 
 
 def bent(pixels, focal, k, cut):

@@ -14,10 +14,10 @@ from chebsplat.formats.ply import write_ply
 from chebsplat.formats.points import Points
 from chebsplat.formats.scene import Scene
 from chebsplat.labels.decode import decode_labels
-from chebsplat.stages.config import build
-from chebsplat.stages.lift_ply import lift_ply
-from chebsplat.stages.progress import Progress
-from chebsplat.stages.train_inputs import model_of, start_features, training_views
+from chebsplat.stages.runtime.config import build
+from chebsplat.stages.runtime.progress import Progress
+from chebsplat.stages.tools.lift_ply import lift_ply
+from chebsplat.stages.training.inputs import model_of, start_features, training_views
 
 ROLES = {"capture": "ingest", "gaussians": "train", "features": "teacher"}
 

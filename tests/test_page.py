@@ -23,9 +23,9 @@ from chebsplat.labels.relevancy import relevancy
 from chebsplat.pipelines.api import load
 from chebsplat.pipelines.cli import main
 from chebsplat.render import SceneRenderer
-from chebsplat.stages.camera_files import read_cameras
 from chebsplat.stages.evaluate import camera
-from chebsplat.stages.page import write_page
+from chebsplat.stages.tools.camera_files import read_cameras
+from chebsplat.stages.tools.page import write_page
 
 
 @pytest.fixture(scope="module")

@@ -15,12 +15,12 @@ from chebsplat.formats.points import Points
 from chebsplat.photos import exposures as measuring
 from chebsplat.photos.exposures import measured_exposures, own_part, relit
 from chebsplat.settings import TrainSection
-from chebsplat.stages import config
-from chebsplat.stages.command import Job
-from chebsplat.stages.exposures import exposures
-from chebsplat.stages.measured_depth import WEIGHT, with_depth_loss
+from chebsplat.stages.runtime import config
+from chebsplat.stages.runtime.command import Job
 from chebsplat.stages.sources.disturbed import displaced, recolored
-from chebsplat.stages.train_inputs import training_views
+from chebsplat.stages.training.depth import WEIGHT, with_depth_loss
+from chebsplat.stages.training.inputs import training_views
+from chebsplat.stages.training.photos import exposures
 from chebsplat.training.losses import depth_distance
 
 K = torch.tensor([[40.0, 0, 24], [0, 40, 20], [0, 0, 1]])

@@ -9,7 +9,7 @@ from test_adjustment import poses_of, synthetic  # noqa: F401 the fixture
 
 from chebsplat.cameras import centers
 from chebsplat.photos.epipolar import fundamental, sampson_distance
-from chebsplat.stages import pose_check
+from chebsplat.stages.reconstruction import pose_check
 from chebsplat.stages.settings import SfmSection
 
 K = np.array([[900.0, 0, 512], [0, 900, 384], [0, 0, 1]])

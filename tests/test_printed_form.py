@@ -127,7 +127,7 @@ def test_the_exported_fusion_has_the_trained_inflation_and_temperature(tmp_path)
     import onnx
 
     from chebsplat.stages.onnx import compare, fusion_example
-    from chebsplat.stages.onnx_graphs import fusion_model
+    from chebsplat.stages.shape_models.region_graph import fusion_model
 
     torch.manual_seed(0)
     differences = []

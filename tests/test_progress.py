@@ -3,7 +3,7 @@
 import json
 import logging
 
-from chebsplat.stages.progress import Progress
+from chebsplat.stages.runtime.progress import Progress
 
 
 def work(progress, n=3):

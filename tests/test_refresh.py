@@ -4,7 +4,7 @@ import pytest
 import torch
 
 from chebsplat.shape.branch import ShapeBranch
-from chebsplat.stages.config import Config
+from chebsplat.stages.runtime.config import Config
 
 
 def scene(n=600, seed=0):

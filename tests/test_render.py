@@ -18,10 +18,10 @@ from chebsplat.errors import ConfigError, InputError
 from chebsplat.formats.evaluation import Evaluation
 from chebsplat.pipelines.cli import main
 from chebsplat.render import SceneRenderer
-from chebsplat.stages import camera_files, camera_paths, video
-from chebsplat.stages.frames import kinds_of
-from chebsplat.stages.opened import Camera
 from chebsplat.stages.sources.colmap_model import read_model
+from chebsplat.stages.tools import camera_files, camera_paths, frames
+from chebsplat.stages.tools.frames import kinds_of
+from chebsplat.stages.tools.scene import Camera
 
 TOLERANCE = 1e-12  # of text with all of a double's digits, through an inverse
 
@@ -254,4 +254,4 @@ def test_a_video_without_its_package_is_one_line(folder, tmp_path, monkeypatch):
     monkeypatch.setitem(sys.modules, "av", None)
     refused = run("render", folder, "--out", tmp_path / "room.mp4", code=2)
     assert refused.stderr.strip().count("\n") == 0
-    assert video.INSTALL in refused.stderr
+    assert frames.INSTALL in refused.stderr

@@ -11,7 +11,7 @@ from chebsplat.errors import ConfigError
 from chebsplat.formats.features import Features
 from chebsplat.labels.noisy_teacher import IGNORE, noisy_features
 from chebsplat.settings import TrainSection
-from chebsplat.stages.train_inputs import with_feature_loss
+from chebsplat.stages.training.inputs import with_feature_loss
 from chebsplat.training.semantic_loss import label_entropy, semantic_loss
 from chebsplat.views import TaughtLabels
 

@@ -16,9 +16,9 @@ from simulated_gpu import GPU, SimulatedGpu
 from benchmarks.cost import trainer_from
 from chebsplat.rasterize import rasterize
 from chebsplat.render import SceneRenderer
-from chebsplat.stages import config as configs
 from chebsplat.stages import evaluate, train
-from chebsplat.stages.command import Job
+from chebsplat.stages.runtime import config as configs
+from chebsplat.stages.runtime.command import Job
 from chebsplat.training import losses
 from chebsplat.training.trainer import READ_EVERY
 from chebsplat.views import View

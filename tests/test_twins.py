@@ -6,7 +6,7 @@ import torch
 
 from benchmarks.cost import trainer_from
 from chebsplat.shape import cks
-from chebsplat.stages import config as configs
+from chebsplat.stages.runtime import config as configs
 from chebsplat.training.losses import feature_distance
 
 STEPS = 200

@@ -12,7 +12,7 @@ from chebsplat.photos.frames import STEP, choose, progress, shifts
 from chebsplat.pipelines import scenes
 from chebsplat.pipelines.needs import media_packages
 from chebsplat.pipelines.raw import raw_files
-from chebsplat.stages.progress import Progress
+from chebsplat.stages.runtime.progress import Progress
 from chebsplat.stages.settings import IngestSection
 from chebsplat.stages.sources import common, video
 

@@ -3,7 +3,17 @@
 import numpy as np
 import pytest
 
-from chebsplat.stages.view_pairs import APART, FEW, IN_A_ROW, exhaustive, mode, n_matches, nearest, posed, sequential
+from chebsplat.stages.reconstruction.matching import (
+    APART,
+    FEW,
+    IN_A_ROW,
+    all_pairs,
+    in_sequence,
+    matching_mode,
+    n_matches,
+    nearest,
+    nearest_by_pose,
+)
 
 
 def ring(n, outward=False):
@@ -25,7 +35,7 @@ def described(rng, n):
 
 @pytest.mark.parametrize("outward", [True, False])
 def test_each_camera_of_a_ring_is_paired_with_its_neighbours(outward):
-    pairs = posed(ring(24, outward), 4)
+    pairs = nearest_by_pose(ring(24, outward), 4)
     assert (pairs[:, 0] < pairs[:, 1]).all() and len(np.unique(pairs, axis=0)) == len(pairs) == 48
     gap = (pairs[:, 1] - pairs[:, 0]) % 24
     assert set(np.minimum(gap, 24 - gap)) == {1, 2}
@@ -35,7 +45,7 @@ def test_cameras_that_face_away_from_each_other_are_no_pair_however_near():
     poses = ring(9, outward=True)
     poses[:, :3, 3] = 0  # all at one place: only directions differ
     forward = poses[:, 2, :3]
-    first, second = posed(poses, 8).T
+    first, second = nearest_by_pose(poses, 8).T
     turned = np.degrees(np.arccos(np.clip((forward[first] * forward[second]).sum(1), -1, 1)))
     assert len(first) == 18 and turned.max() < APART  # 40 and 80 degrees
 
@@ -45,7 +55,7 @@ def test_a_loop_is_closed_by_what_views_show():
     rng = np.random.default_rng(0)
     places = [described(rng, 60) for _ in range(31)]
     places[30] = places[0]
-    pairs = set(map(tuple, sequential([np.concatenate(places[k : k + 2]) for k in range(30)], 2)))
+    pairs = set(map(tuple, in_sequence([np.concatenate(places[k : k + 2]) for k in range(30)], 2)))
     assert (0, 29) in pairs and (0, 28) not in pairs
     assert {(k, j) for k in range(30) for j in range(k + 1, min(k + IN_A_ROW, 29) + 1)} <= pairs
 
@@ -66,7 +76,7 @@ def test_nearest_never_pairs_what_has_no_finite_cost():
 
 
 def test_auto_follows_poses_and_count():
-    assert mode("auto", 1000, True) == "posed"
-    assert mode("auto", FEW, False) == "exhaustive" and len(exhaustive(FEW)) == FEW * (FEW - 1) // 2
-    assert mode("auto", FEW + 1, False) == "sequential"
-    assert mode("exhaustive", 1000, True) == "exhaustive"
+    assert matching_mode("auto", 1000, True) == "posed"
+    assert matching_mode("auto", FEW, False) == "exhaustive" and len(all_pairs(FEW)) == FEW * (FEW - 1) // 2
+    assert matching_mode("auto", FEW + 1, False) == "sequential"
+    assert matching_mode("exhaustive", 1000, True) == "exhaustive"

@@ -18,7 +18,7 @@ import torch
 from benchmarks.stability.case import Outcome, case
 from chebsplat.errors import DataFailure
 from chebsplat.splats.gaussians import initial_gaussians, local_shape
-from chebsplat.stages.config import Config
+from chebsplat.stages.runtime.config import Config
 from chebsplat.training.model import SceneModel
 from chebsplat.training.trainer import Trainer
 from chebsplat.views import Views

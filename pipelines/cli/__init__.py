@@ -34,7 +34,7 @@ class Commands(Guarded):
         if args[0] in STAGES and not (of_a_file and args[0] in self.commands):  # `lift` is of a file, too
             from importlib import import_module
 
-            from chebsplat.stages.command import command
+            from chebsplat.stages.runtime.command import command
 
             return args[0], command(args[0], import_module(f"chebsplat.stages.{args[0]}").run), args[1:]
         return super().resolve_command(context, args)

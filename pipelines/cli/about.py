@@ -39,7 +39,7 @@ def settings(section: str | None) -> None:
     from chebsplat.formats.names import suggest
     from chebsplat.pipelines.scenes import shown
     from chebsplat.pipelines.tables import show_rows
-    from chebsplat.stages.config import Config, known_keys
+    from chebsplat.stages.runtime.config import Config, known_keys
 
     asked = section or ""
     chosen = [key for key in known_keys() if not asked or asked in (key, key.partition(".")[0])]

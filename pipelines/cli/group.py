@@ -14,7 +14,7 @@ from typing import NoReturn
 import click
 
 from chebsplat.pipelines import store
-from chebsplat.stages.stopping import exit_code
+from chebsplat.stages.runtime.stopping import exit_code
 
 
 def say(text: str) -> None:

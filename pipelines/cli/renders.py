@@ -61,10 +61,9 @@ def render(
     from chebsplat.formats.artifact import read_manifest
     from chebsplat.pipelines.api import load
     from chebsplat.pipelines.finished import artifact_of
-    from chebsplat.stages.camera_paths import fitted, path_of, size_of
-    from chebsplat.stages.frames import Shot, kinds_of, render_frames
-    from chebsplat.stages.progress import Progress
-    from chebsplat.stages.video import render_video
+    from chebsplat.stages.runtime.progress import Progress
+    from chebsplat.stages.tools.camera_paths import fitted, path_of, size_of
+    from chebsplat.stages.tools.frames import Shot, kinds_of, render_frames, render_video
 
     opened, pixels = load(scene), size_of(size)
     kinds = kinds_of(what, opened, query is not None)
@@ -87,8 +86,8 @@ def render(
 def cameras(scene: str, path: str, frames: int | None, size: str | None, out: Path) -> None:
     """Write the cameras of a SCENE as COLMAP's text model, transforms.json and 3DGS' cameras.json."""
     from chebsplat.pipelines.api import load
-    from chebsplat.stages.camera_files import write_cameras
-    from chebsplat.stages.camera_paths import fitted, path_of, size_of
+    from chebsplat.stages.tools.camera_files import write_cameras
+    from chebsplat.stages.tools.camera_paths import fitted, path_of, size_of
 
     pixels = size_of(size)
     for file in write_cameras(out, [fitted(camera, pixels) for camera in path_of(load(scene), path, frames)]):
@@ -140,7 +139,7 @@ def _write_page(scene: str, out: Path, sh: int, words: Path | None, against: lis
     from chebsplat.formats.scene import Scene
     from chebsplat.formats.teacher_model import read_label_set
     from chebsplat.pipelines.finished import artifact_of, teacher_of
-    from chebsplat.stages.page import foreign, write_page
+    from chebsplat.stages.tools.page import foreign, write_page
 
     theirs = scene.endswith(".ply")
     if theirs:

@@ -10,8 +10,8 @@ import click
 
 from chebsplat.errors import ConfigError
 from chebsplat.formats.names import suggest
-from chebsplat.stages.device import DEVICES
 from chebsplat.stages.registry import STAGES
+from chebsplat.stages.runtime.device import DEVICES
 
 
 def plans(

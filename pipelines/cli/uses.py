@@ -30,7 +30,7 @@ def told(figures: Mapping[str, Any], out: Path) -> None:
 def query(scene: str, text: str, against: list[str], top: int) -> None:
     """Is TEXT, such as "something to sit on", in a finished SCENE, and how likely are its Gaussians that, by label?"""
     from chebsplat.pipelines.api import load
-    from chebsplat.stages.query import table
+    from chebsplat.stages.tools.query import table
 
     opened = load(scene)
     answer = opened.ask(text, against)
@@ -44,7 +44,7 @@ def query(scene: str, text: str, against: list[str], top: int) -> None:
 @click.option("--labels", help="text file of labels; default: the teacher's own")
 def check_teacher(model: Path, photo: Path | None, labels: str | None) -> None:
     """Run one image through a teacher MODEL (.onnx): what it is, what it costs, what it sees."""
-    from chebsplat.stages.teacher_check import check
+    from chebsplat.stages.tools.check_teacher import check
 
     for what, finding in check(model, photo, labels):
         print(f"{what:9s}{finding}")
@@ -56,7 +56,7 @@ def check_teacher(model: Path, photo: Path | None, labels: str | None) -> None:
 @click.option("--file", "graph", default="onnx/model.onnx", show_default=True, help="the ONNX file in the repository")
 def get_teacher(name: str, out: Path | None, graph: str) -> None:
     """Fetch a segmenter from the Hugging Face hub as a teacher: segformer-b0-ade, or hf:OWNER/NAME[@REVISION]."""
-    from chebsplat.stages.get_teacher import get_teacher as fetch
+    from chebsplat.stages.tools.get_teacher import get_teacher as fetch
 
     model, findings = fetch(name, out, graph)
     for what, finding in findings:
@@ -84,8 +84,8 @@ def extract(
 ) -> None:
     """Write part of a finished scene as one PLY: by words, label, opacity, box."""
     from chebsplat.pipelines.api import load
-    from chebsplat.stages.extract import corners
-    from chebsplat.stages.extract import extract as write
+    from chebsplat.stages.tools.extract import corners
+    from chebsplat.stages.tools.extract import extract as write
 
     if against and text is None:
         raise ConfigError("--against is of a query; add --query TEXT")
@@ -103,7 +103,7 @@ def extract(
 def encode(scene: str, encoder: str | None, features: Path | None, out: Path, device: str) -> None:
     """Fused features of a finished SCENE (or a .ply), by onnxruntime, without torch."""
     from chebsplat.pipelines.finished import artifact_of, scene_folder
-    from chebsplat.stages.encode import encode as write
+    from chebsplat.stages.tools.encode import encode as write
 
     if scene.endswith(".ply"):
         if encoder is None:
@@ -128,7 +128,7 @@ def lift(ply: Path, capture: str | None, teacher: Path | None, out: Path) -> Non
     Without a .PLY, the stage of this name: --help says more.
     """
     from chebsplat.pipelines.finished import artifact_of, is_artifact, links, scene_folder
-    from chebsplat.stages.lift_ply import import_ply, lift_ply
+    from chebsplat.stages.tools.lift_ply import import_ply, lift_ply
 
     if capture is None:
         if teacher is not None:
@@ -176,8 +176,8 @@ def calibrate(model: Path | None, rooms: int, force: bool) -> None:
     """Find out on generated rooms what the relevancy of a teacher MODEL (.onnx) means; kept beside it, for `query`."""
     from chebsplat.formats.calibration import beside, write_calibration
     from chebsplat.formats.teacher_model import EMBEDDED
-    from chebsplat.stages.calibration import calibrate as measure
-    from chebsplat.stages.progress import Progress
+    from chebsplat.stages.runtime.progress import Progress
+    from chebsplat.stages.tools.calibrate import calibrate as measure
 
     path = beside(model or EMBEDDED)
     if path.exists() and not force:
@@ -201,7 +201,7 @@ def label(ply: Path, words: list[str] | None, up: str, unit: float | None, knowl
     import numpy as np
 
     from chebsplat.formats.knowledge import SHIPPED
-    from chebsplat.stages.label_ply import label_ply
+    from chebsplat.stages.tools.lift_ply import label_ply
     from chebsplat.synthetic import CLASS_NAMES
 
     try:
@@ -229,8 +229,8 @@ def mesh(scene: str, out: Path, voxel: float | None, triangles: int, raw: bool) 
     """Write the surface of a finished SCENE as triangles with colours and labels, in the scene's frame."""
     from chebsplat.formats.meshes import write_mesh
     from chebsplat.pipelines.api import load
-    from chebsplat.stages.mesh import mesh_of
-    from chebsplat.stages.progress import Progress
+    from chebsplat.stages.runtime.progress import Progress
+    from chebsplat.stages.tools.mesh import mesh_of
 
     opened = load(scene)
     made, facts = mesh_of(opened, voxel, triangles, raw, Progress())

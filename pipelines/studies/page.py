@@ -61,7 +61,7 @@ def write(
     }
     (out / "results.md").write_text(markdown(parts))
     from chebsplat.pipelines.studies.pictures import gallery
-    from chebsplat.stages.pages.template import rendered
+    from chebsplat.stages.pages.parts import rendered
     from chebsplat.stages.report import LARGEST
 
     drawing = base64.b64encode((out / PICTURE).read_bytes()).decode()

@@ -18,7 +18,7 @@ from chebsplat.pipelines.run import Outcome, say, snakemake, wanted_steps
 from chebsplat.pipelines.scenes import read_named, read_toml, scene_values
 from chebsplat.pipelines.sequences import scenes_of
 from chebsplat.pipelines.studies.progress import reported
-from chebsplat.stages.config import checked
+from chebsplat.stages.runtime.config import checked
 from chebsplat.stages.settings import Section, Text, printable
 
 LAST = "evaluate"  # a study measures; a page and an ONNX file for each of its runs would be waste

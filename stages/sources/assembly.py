@@ -13,8 +13,16 @@ import numpy as np
 from chebsplat.errors import DataFailure, InputError
 from chebsplat.stages.sources.cameras import DISTORTED, Camera, undistorted
 from chebsplat.stages.sources.common import Frame, Listing, natural
-from chebsplat.stages.sources.label_images import indexed, label_ids
-from chebsplat.stages.sources.pictures import DEEP, GREY, companion, confidences, nearest, open_photo
+from chebsplat.stages.sources.pictures import (
+    DEEP,
+    GREY,
+    companion,
+    confidences,
+    indexed,
+    label_ids,
+    nearest,
+    open_photo,
+)
 
 if TYPE_CHECKING:
     from chebsplat.stages.settings import IngestSection

@@ -11,7 +11,7 @@ from chebsplat.errors import InputError
 from chebsplat.stages.sources import assembly, cameras, common, texts
 from chebsplat.stages.sources.colmap_model import Model, read_model
 from chebsplat.stages.sources.common import Frame, Listing
-from chebsplat.stages.sources.label_images import names_by_id
+from chebsplat.stages.sources.pictures import names_by_id
 
 HELP = "correct source.path; a COLMAP source holds images/ and sparse/0/{cameras,images,points3D}.bin or .txt"
 COMPANIONS = {"depth": "depth", "semantic": "labels"}  # folder: what its PNGs are

@@ -12,7 +12,7 @@ from chebsplat.errors import InputError
 from chebsplat.formats.images import header
 from chebsplat.stages.sources import assembly, cameras, common, texts
 from chebsplat.stages.sources.common import Frame, Listing
-from chebsplat.stages.sources.label_images import names_by_id
+from chebsplat.stages.sources.pictures import names_by_id
 
 VOID = 0  # Semantic-NeRF's id of pixels without a class
 SEQUENCE = "Sequence_1"

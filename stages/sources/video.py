@@ -16,7 +16,7 @@ from chebsplat.stages.sources import assembly, cameras
 from chebsplat.stages.sources.photos import GUESS
 
 if TYPE_CHECKING:
-    from chebsplat.stages.progress import Progress
+    from chebsplat.stages.runtime.progress import Progress
 
 MOST = 150  # frames, where ingest.max_views says nothing
 SIDE, THUMBNAIL = 640, 192  # pixels of the longer side, on which sharpness and movement are measured

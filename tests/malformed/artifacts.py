@@ -33,8 +33,8 @@ from chebsplat.formats.points import Points
 from chebsplat.formats.refined import Refined
 from chebsplat.formats.scene import Scene
 from chebsplat.settings import DescribeSection
-from chebsplat.stages.config import Config
 from chebsplat.stages.registry import STAGES
+from chebsplat.stages.runtime.config import Config
 from malformed.edits import DEEP, Edit, changed, cut, flipped, no_file, npy, put, remove
 from malformed.row import Arguments, Row, stage
 

@@ -1,0 +1,174 @@
+"""Points between those that were matched: depth of the photos by a plane sweep, and where several views agree on it."""
+
+from __future__ import annotations
+
+import logging
+from typing import TYPE_CHECKING, Any
+
+from chebsplat.stages.runtime.command import Job
+
+if TYPE_CHECKING:
+    import numpy as np
+
+    from chebsplat.formats.capture import Capture
+    from chebsplat.stages.runtime.progress import Progress
+    from chebsplat.stages.settings import SfmSection
+
+log = logging.getLogger("chebsplat")
+
+SIDE = 160  # pixels of the longer side that photos are reduced to
+DEPTHS, NEIGHBORS = 96, 8  # depths that are tried, evenly spaced in 1 / z; views that each is compared with
+WITNESSES = 64  # views, the nearest, that confirm or deny what a view has found
+NEAR, FAR = 0.7, 5.0  # of the nearest point in a photo (1st percentile), and of the farthest one in any (99th)
+MOST_COST, AGREE = 0.5, 2  # what counts: cost, views that confirm a depth
+LEAST = 0.2  # of the points in the cube of a middling one, and three: what few pixels show is seldom there
+MOST = 12_000  # points in all: the first Gaussians, which growth needs room beside
+CELLS = 20  # cells along the longer side of a photo, of which it is asked how many hold a point
+COVERED = 0.8  # part of the cells under which matched points leave too much of the photos empty
+
+
+def covered(Ks: np.ndarray, poses: np.ndarray, means: np.ndarray, size: tuple[int, int]) -> float:
+    """The share of the views' cells, CELLS along the longer side of `size`, in which a point [N, 3] lies."""
+    import numpy as np
+
+    width, height = size
+    edge = max(size) / CELLS
+    columns, rows = int(np.ceil(width / edge)), int(np.ceil(height / edge))
+    shares = []
+    for K, pose in zip(Ks, poses, strict=True):
+        cells = (in_photo(K, pose, means, size)[:, :2] // edge).astype(int)
+        shares.append(len(np.unique(cells[:, 1] * columns + cells[:, 0])) / (columns * rows))
+    return float(np.mean(shares))
+
+
+def in_photo(K: np.ndarray, pose: np.ndarray, means: np.ndarray, size: tuple[int, int]) -> np.ndarray:
+    """Pixels and depth [M, 3] of those of the points [N, 3] that lie in a photo of `size` (width, height)."""
+    import numpy as np
+
+    camera = means @ pose[:3, :3].T + pose[:3, 3]
+    camera = camera[camera[:, 2] > 0]
+    pixels = (camera @ K.T)[:, :2] / camera[:, 2:]
+    inside = ((pixels >= 0) & (pixels < size)).all(1)
+    return np.concatenate([pixels, camera[:, 2:]], 1)[inside]
+
+
+def wants_more(job: Job, capture: Capture, cloud: dict[str, Any], settings: SfmSection) -> bool:
+    """Whether points are added to a cloud, as `sfm.dense` says: to those that leave much of the photos empty.
+
+    Choices: depth that a capture brings, and generated views, which have it, need none of this.
+    """
+    if settings.dense != "auto" or capture.depth is not None:
+        return settings.dense == "on"
+    share = covered(cloud["Ks"], cloud["cam_from_world"], cloud["means"], capture.size)
+    job.facts["covered"] = share
+    log.info("%d points lie in %.0f %% of the photos' cells", len(cloud["means"]), 100 * share)
+    return share < COVERED
+
+
+def swept(job: Job, capture: Capture, cloud: dict[str, Any]) -> dict[str, Any]:
+    """means, colors and seen_from of points that a plane sweep of the training views finds, as a cloud has them, and
+    depths f32 [V, h, w] of the cloud's views, 0 where they do not agree, of photos reduced to SIDE.
+
+    Choices: test views give no points, and have no depth. Depths that are tried begin before what is in the photo:
+      points behind its edges, beside the camera, would have all of them end there.
+    """
+    import numpy as np
+
+    from chebsplat.cameras import unproject
+
+    row = {name: k for k, name in enumerate(capture.names)}
+    rows = np.array([row[name] for name in cloud["names"]])
+    used = np.flatnonzero(~capture.is_test[rows])
+    factor = max(round(max(capture.size) / SIDE), 1)
+    small = np.stack([reduced(capture.images[view], factor) for view in rows[used]]) / 255
+    valid = np.ones(small.shape[:3], np.float32)
+    if capture.loss_mask is not None:
+        valid = np.stack([reduced(capture.loss_mask[view][..., None], factor)[..., 0] for view in rows[used]])
+    poses, Ks = cloud["cam_from_world"][used], cloud["Ks"][used].copy()
+    z = [in_photo(K, pose, cloud["means"], capture.size)[:, 2] for K, pose in zip(Ks, poses, strict=True)]
+    Ks[:, :2] /= factor
+    found = depth_of_photos(small, valid, Ks, poses, z, job.progress)
+    depths = np.zeros((len(rows), *small.shape[1:3]), np.float32)
+    depths[used] = found
+    means, colors, seen = [np.zeros((0, 3))], [np.zeros((0, 3), np.uint8)], [np.zeros(0, np.int64)]
+    for view, index in enumerate(used):
+        pixels = np.argwhere(found[view] > 0)
+        means.append(unproject(found[view], Ks[view], poses[view], pixels))
+        colors.append((small[view][tuple(pixels.T)] * 255).round().astype(np.uint8))
+        seen.append(np.full(len(pixels), index))
+    points = fused(np.concatenate(means), np.concatenate(colors), np.concatenate(seen))
+    total, count = sum(map(len, means)), len(points["means"])
+    share = total / max(found.size, 1)
+    log.info("a sweep of %d photos finds %.0f %% of their pixels' depth, %d points", len(used), 100 * share, count)
+    job.facts["swept"] = round(share, 3)
+    return points | {"depths": depths}
+
+
+def depth_of_photos(
+    colors: np.ndarray,
+    valid: np.ndarray,
+    Ks: np.ndarray,
+    poses: np.ndarray,
+    z: list[np.ndarray],
+    progress: Progress | None = None,
+) -> np.ndarray:
+    """Depth f32 [V, h, w] of photos, 0 where none is known: by a plane sweep, and by planes where there is no texture.
+
+    Args:    colors f32 [V, h, w, 3] in [0, 1]; valid [V, h, w]: 1 where a pixel counts; Ks [V, 3, 3] in its pixels;
+             poses [V, 4, 4]; z: of each photo, the depths of some points in it.
+    Choices: a pixel counts where AGREE of the other views have its depth, and few see through it; so does what planes
+      add to these.
+    """
+    import numpy as np
+    import torch
+
+    from chebsplat.photos.consistency import agreed
+    from chebsplat.photos.planar import completed
+    from chebsplat.photos.plane_sweep import swept_depth
+    from chebsplat.stages.reconstruction.matching import apart
+
+    bounds = np.array([np.percentile(some, (1, 99)) if len(some) else (np.nan, np.nan) for some in z])
+    near, far = NEAR * bounds[:, 0], FAR * np.nanmax(bounds[:, 1])
+    cost = apart(poses)
+    nearest = np.where(np.isfinite(np.sort(cost)), np.argsort(cost), -1)
+    grey, counts = torch.from_numpy(colors.mean(-1)).float(), torch.from_numpy(valid).float()
+    cameras = torch.from_numpy(Ks).float(), torch.from_numpy(poses).float()
+    depth = np.zeros(colors.shape[:3], np.float32)
+    views = range(len(colors))
+    for view, _ in progress.track(views, len(colors), "depth of photos") if progress else ((v, None) for v in views):
+        neighbors = [int(k) for k in nearest[view, :NEIGHBORS] if k >= 0]
+        if np.isfinite(near[view]) and len(neighbors) >= AGREE:
+            tried = 1 / torch.linspace(1 / float(near[view]), 1 / float(far), DEPTHS)
+            found, costs = swept_depth(grey, counts, *cameras, view, neighbors, tried)
+            depth[view] = torch.where((costs < MOST_COST) & (counts[view] > 0.9), found, 0).numpy()
+    witnesses = nearest[:, :WITNESSES]
+    depth = agreed(depth, Ks, poses, witnesses, AGREE)
+    whole = np.stack([completed(*photo) for photo in zip(depth, colors, strict=True)])
+    return agreed(np.where(valid > 0.9, whole, 0), Ks, poses, witnesses, AGREE)
+
+
+def fused(means: np.ndarray, colors: np.ndarray, seen_from: np.ndarray) -> dict[str, Any]:
+    """The means of the points in each cube that holds enough of them (LEAST); seen from where the first of them is.
+
+    Choices: of twice as many cubes as points are wanted, since what lies off the surfaces fills half of them.
+    """
+    import numpy as np
+
+    from chebsplat.splats.cubes import cubes_of, means_of_each
+    from chebsplat.stages.reconstruction.thinning import edge_of
+
+    if len(means) == 0:
+        return {"means": means, "colors": colors, "seen_from": seen_from}
+    numbers = cubes_of(means, edge_of(means, 2 * MOST))
+    _, first, cube = np.unique(numbers, return_index=True, return_inverse=True)
+    is_dense, middle, color = means_of_each(cube, LEAST, means, colors)
+    return {"means": middle, "colors": color.round().astype(np.uint8), "seen_from": seen_from[first[is_dense]]}
+
+
+def reduced(image: np.ndarray, factor: int) -> np.ndarray:
+    """Means of blocks of [H, W, C], f32."""
+    import numpy as np
+
+    height, width = (side // factor for side in image.shape[:2])
+    blocks = np.asarray(image[: height * factor, : width * factor], np.float32)
+    return np.asarray(blocks.reshape(height, factor, width, factor, -1).mean((1, 3)))

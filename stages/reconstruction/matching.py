@@ -1,0 +1,267 @@
+"""Features of a capture's views and their matches, by pycolmap, in a database that mapping and triangulation read.
+
+Which views are matched with each other: all, those of near cameras, or those alike. Views are counted 0...V-1 in the
+capture's order, which is that of their names. Pairs are int [P, 2], smaller index first, each once and sorted.
+"""
+
+from __future__ import annotations
+
+import logging
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from chebsplat.cameras import centers
+from chebsplat.stages.runtime.command import Job, n_threads
+
+if TYPE_CHECKING:
+    from collections.abc import Iterable, Iterator, Sequence
+
+    from chebsplat.formats.capture import Capture
+    from chebsplat.stages.settings import SfmSection
+
+log = logging.getLogger("chebsplat")
+PHOTOS, PAIRS = 8, 64  # a thread's share between two lines of progress; each such block of pairs indexes its views anew
+LEAST = 15  # matches of a pair that has any: pycolmap's own, of a free search
+LARGEST = 128  # features of a view, by size, that say how alike two views are
+
+
+def file_of(view: int) -> str:
+    """The image of a view in the scratch folder: pycolmap's lists of pairs allow no name with a space."""
+    return f"{view:06d}.png"
+
+
+def match(job: Job, capture: Capture, settings: SfmSection, pairs: np.ndarray) -> Path:
+    """Extract SIFT from the capture's own pixels and match given pairs [P, 2] of its views.
+
+    Choices: views that occur in no pair have no features either.
+    """
+    database = with_features(job, capture, settings, sorted(set(pairs.ravel().tolist())))
+    match_freely(job, database, pairs, settings)
+    return database
+
+
+def with_features(job: Job, capture: Capture, settings: SfmSection, views: Sequence[int]) -> Path:
+    """A database of views with SIFT from the capture's own pixels."""
+    import pycolmap
+
+    job.scratch.mkdir(parents=True, exist_ok=True)
+    pycolmap.logging.minloglevel = pycolmap.logging.ERROR.value if hasattr(pycolmap.logging, "ERROR") else 2
+    folder, database = _write_images(job, capture, views), job.scratch / "database.db"
+    database.unlink(missing_ok=True)
+    pycolmap.Database.open(database).close()  # creates it
+    files = [file_of(view) for view in views]
+    reader = pycolmap.ImageReaderOptions()
+    reader.camera_model = "PINHOLE"
+    if capture.loss_mask is not None:
+        reader.mask_path = str(job.scratch / "masks")
+    mode = pycolmap.CameraMode.PER_IMAGE if _cameras_differ(capture) else pycolmap.CameraMode.SINGLE
+    if not _cameras_differ(capture):
+        K = capture.Ks[0]
+        reader.camera_params = ",".join(str(float(v)) for v in (K[0, 0], K[1, 1], K[0, 2], K[1, 2]))
+    pycolmap.import_images(database, folder, mode, image_names=files, options=reader)
+    extraction = pycolmap.FeatureExtractionOptions()
+    extraction.sift.peak_threshold = settings.peak_threshold
+    extraction.sift.max_num_features = settings.max_features
+    extraction.use_gpu, extraction.num_threads = False, n_threads()
+    for some in _in_blocks(job, files, PHOTOS * n_threads(), "features"):
+        pycolmap.extract_features(database, folder, some, mode, reader, extraction)
+    return database
+
+
+def match_freely(job: Job, database: Path, pairs: np.ndarray, settings: SfmSection) -> None:
+    """Match pairs of views [P, 2] as if nothing were known of their poses; what RANSAC verifies is kept."""
+    import pycolmap
+
+    matching, verification = pycolmap.FeatureMatchingOptions(), pycolmap.TwoViewGeometryOptions()
+    matching.use_gpu, matching.num_threads = False, n_threads()
+    verification.ransac.random_seed = settings.seed
+    listed = pycolmap.ImportedPairingOptions()
+    listed.match_list_path = job.scratch / "pairs.txt"
+    for some in _in_blocks(job, pairs.tolist(), PAIRS * n_threads(), "matching"):
+        lines = [f"{file_of(first)} {file_of(second)}\n" for first, second in some]
+        listed.match_list_path.write_text("".join(lines))
+        pycolmap.match_image_pairs(database, matching, listed, verification)
+
+
+def match_along_lines(job: Job, database: Path, pairs: np.ndarray, capture: Capture) -> None:
+    """Match pairs of views [P, 2] along the epipolar lines that their poses make, which fit the photos.
+
+    Choices: a pair of fewer than LEAST matches has none, as in a free search. Features of one block's views are in
+      memory at once.
+    """
+    import numpy as np
+    import pycolmap
+
+    from chebsplat.photos.epipolar import fundamental
+    from chebsplat.photos.guided import along_lines
+
+    poses, Ks, n_matches = capture.cam_from_world, capture.Ks, 0
+    assert poses is not None
+    with pycolmap.Database.open(database) as opened:
+        ids = {int(image.name[:-4]): image.image_id for image in opened.read_all_images()}
+        opened.clear_two_view_geometries()  # those of the pairs that told whether the poses fit
+        for some in _in_blocks(job, pairs.tolist(), PAIRS * n_threads(), "matching"):
+            views, rows = np.unique(some, return_inverse=True)
+            pixels = [opened.read_keypoints(ids[view])[:, :2] for view in views]
+            descriptors = [opened.read_descriptors(ids[view]).data for view in views]
+            lines = np.stack([fundamental(Ks[a], poses[a], Ks[b], poses[b]) for a, b in some])
+            found = along_lines(pixels, descriptors, rows.reshape(-1, 2), lines)
+            for (a, b), matches in zip(some, found, strict=True):
+                if len(matches) < LEAST:
+                    continue
+                geometry = pycolmap.TwoViewGeometry()
+                geometry.config = pycolmap.TwoViewGeometryConfiguration.CALIBRATED
+                geometry.inlier_matches = matches.astype(np.uint32)
+                opened.write_two_view_geometry(ids[a], ids[b], geometry)
+                n_matches += len(matches)
+    job.facts["n_matches_along_lines"] = n_matches
+
+
+def chosen_pairs(job: Job, database: Path, capture: Capture, settings: SfmSection) -> np.ndarray:
+    """Pairs of views to match, int [P, 2], as `sfm.matching` says."""
+    n, poses = len(capture.names), capture.cam_from_world
+    mode = matching_mode(settings.matching, n, poses is not None)
+    if mode == "posed":
+        assert poses is not None
+        pairs, why = nearest_by_pose(poses, settings.n_matched), f"{settings.n_matched} nearest of each by its pose"
+    elif mode == "sequential":
+        pairs = in_sequence(_largest_descriptors(database, n), settings.n_matched)
+        why = f"{IN_A_ROW} before and after each, {settings.n_matched} most alike"
+    else:
+        pairs, why = all_pairs(n), "all"
+    log.info("%s: %d of %d pairs (%s; sfm.matching is %s)", mode, len(pairs), n * (n - 1) // 2, why, settings.matching)
+    job.facts["n_pairs"] = len(pairs)
+    return pairs
+
+
+def _largest_descriptors(database: Path, n_views: int) -> list[np.ndarray]:
+    """f32 [k, 128] of unit length per view, of its LARGEST features."""
+    import numpy as np
+    import pycolmap
+
+    found = [np.zeros((0, 128), np.float32)] * n_views
+    with pycolmap.Database.open(database) as opened:
+        for image in opened.read_all_images():
+            shape = opened.read_keypoints(image.image_id)[:, 2:]  # affine [n, 4], rows
+            largest = np.argsort(-np.hypot(shape[:, 0], shape[:, 2]), kind="stable")[:LARGEST]
+            some = opened.read_descriptors(image.image_id).data[largest].astype(np.float32)
+            found[int(image.name[:-4])] = some / np.maximum(np.linalg.norm(some, axis=1, keepdims=True), 1e-9)
+    return found
+
+
+def _write_images(job: Job, capture: Capture, views: Iterable[int]) -> Path:
+    """The images of some of the capture's views, and where it has them their masks, as pycolmap reads them."""
+    import numpy as np
+    from PIL import Image
+
+    folder, masks = job.scratch / "images", job.scratch / "masks"
+    folder.mkdir(exist_ok=True)
+    masks.mkdir(exist_ok=True)
+    for view in views:
+        Image.fromarray(capture.images[view]).save(folder / file_of(view), compress_level=0)
+        if capture.loss_mask is not None:
+            mask = np.where(capture.loss_mask[view], 255, 0).astype(np.uint8)
+            Image.fromarray(mask).save(masks / f"{file_of(view)}.png")
+    return folder
+
+
+def _in_blocks(job: Job, items: list[Any], size: int, what: str) -> Iterator[list[Any]]:
+    """Blocks of so many items, with rate and time left: pycolmap says nothing while it works."""
+    blocks = [items[at : at + size] for at in range(0, len(items), size)]
+    done = 0
+    for block, status in job.progress.track(blocks, len(blocks), what):
+        yield block
+        done += len(block)
+        status["done"] = f"{done} of {len(items)}"
+
+
+def _cameras_differ(capture: Capture) -> bool:
+    import numpy as np
+
+    return not np.allclose(capture.Ks, capture.Ks[:1])
+
+
+FEW = 40  # views that are all matched with each other: 780 pairs, two to three minutes of a core
+TURN = 30.0  # degrees between two viewing directions that weigh like the capture's median distance of two cameras
+APART = 90.0  # degrees; views that face farther from each other share no feature that SIFT could match
+IN_A_ROW = 5  # views on either side in the order of names
+RATIO = 0.8  # Lowe's, of the distances of the nearest and the second nearest descriptor
+
+
+def matching_mode(wanted: str, n_views: int, posed: bool) -> str:
+    """`exhaustive`, `posed` or `sequential`: the one that is wanted, and for `auto` the one that fits.
+
+    Choices: given poses choose pairs at any number of views; without poses few views are all matched.
+    """
+    if wanted == "auto":
+        return "posed" if posed else "exhaustive" if n_views <= FEW else "sequential"
+    return wanted
+
+
+def all_pairs(n_views: int) -> np.ndarray:
+    """All pairs."""
+    return np.stack(np.triu_indices(n_views, 1), 1)
+
+
+def nearest_by_pose(cam_from_world: np.ndarray, n_neighbors: int) -> np.ndarray:
+    """Each view with the `n_neighbors` that are nearest by position and viewing direction.
+
+    Args:    cam_from_world: [V, 4, 4].
+    Choices: distance over the capture's median distance, plus angle over TURN: no depth of the scene is needed. On 50
+      photos with poses (fox) 10 neighbours are a quarter of the pairs and leave 98 % of the points; frusta at guessed
+      depths choose no better.
+    """
+    return nearest(apart(cam_from_world), n_neighbors)
+
+
+def apart(cam_from_world: np.ndarray) -> np.ndarray:
+    """How far two views lie apart [V, V], in median distances and TURNs; infinite beyond APART and with itself."""
+    eye, forward = centers(cam_from_world), cam_from_world[:, 2, :3]
+    distance = np.linalg.norm(eye[:, None] - eye[None], axis=-1)
+    angle = np.degrees(np.arccos(np.clip(forward @ forward.T, -1, 1)))
+    usual = float(np.median(distance[np.triu_indices(len(eye), 1)])) or 1.0
+    cost = np.where(angle > APART, np.inf, distance / usual + angle / TURN)
+    np.fill_diagonal(cost, np.inf)
+    return cost
+
+
+def in_sequence(descriptors: list[np.ndarray], n_neighbors: int) -> np.ndarray:
+    """Each view with IN_A_ROW before and after it, and with the `n_neighbors` most alike wherever they are.
+
+    Args:    descriptors: per view [k, 128], of its largest features: those are seen from far and near.
+    Choices: being alike is the number of matches between these few (mutual, by Lowe's ratio). That takes milliseconds
+      a pair, needs no vocabulary, closes loops, and finds neighbours where names say nothing about the order. With 128
+      features a view it chooses as well as given poses do: in a quarter of fox's pairs both keep 65 % of all inliers.
+    """
+    n = len(descriptors)
+    alike = np.zeros((n, n))
+    for i, j in all_pairs(n):
+        alike[i, j] = alike[j, i] = n_matches(descriptors[i], descriptors[j])
+    row = np.arange(n)
+    near = np.abs(row[:, None] - row[None]) <= IN_A_ROW
+    in_a_row = np.argwhere(np.triu(near, 1))
+    return np.unique(np.concatenate([in_a_row, nearest(np.where(alike > 0, -alike, np.inf), n_neighbors)]), axis=0)
+
+
+def nearest(cost: np.ndarray, count: int) -> np.ndarray:
+    """Pairs of each view with the `count` of least finite cost [V, V]; a pair counts if either view chooses it."""
+    cost = cost.copy()
+    np.fill_diagonal(cost, np.inf)
+    order = np.argsort(cost, 1, kind="stable")[:, :count]
+    chosen = np.zeros(cost.shape, bool)
+    np.put_along_axis(chosen, order, np.isfinite(np.take_along_axis(cost, order, 1)), 1)
+    return np.argwhere(np.triu(chosen | chosen.T, 1))
+
+
+def n_matches(first: np.ndarray, second: np.ndarray) -> int:
+    """Mutual nearest neighbours by Lowe's ratio among descriptors f32 [n, 128] and [m, 128] of unit length."""
+    if len(first) < 1 or len(second) < 2:
+        return 0
+    cosine = first @ second.T
+    row, best = np.arange(len(first)), cosine.argmax(1)
+    mutual = cosine.argmax(0)[best] == row
+    top = cosine[row, best]
+    cosine[row, best] = -1
+    return int((mutual & (1 - top < RATIO**2 * (1 - cosine.max(1)))).sum())

@@ -1,0 +1,1 @@
+"""What every stage runs in: its command, settings, device, progress and signals."""

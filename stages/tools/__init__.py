@@ -1,0 +1,1 @@
+"""Commands on finished scenes, and on teachers."""

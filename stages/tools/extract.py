@@ -1,0 +1,115 @@
+"""Part of a finished scene as one 3DGS PLY: chosen by words, label, opacity and box."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from chebsplat.errors import ConfigError, DataFailure
+from chebsplat.formats.names import suggest
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+    import numpy as np
+
+    from chebsplat.formats.scene import Scene
+    from chebsplat.stages.tools.query import Query
+    from chebsplat.stages.tools.scene import OpenedScene
+
+CONVERT = "npx @playcanvas/splat-transform@2.7.1 scene.ply scene.compressed.ply"  # or scene.spz --spz-version 3
+
+
+def extract(
+    scene: OpenedScene,
+    out: Path,
+    labels: tuple[str, ...],
+    min_opacity: float,
+    box: tuple[float, ...] | None,
+    query: Query | None = None,
+) -> dict[str, int]:
+    """Write the Gaussians that pass every filter, trimmed to the highest SH degree among them.
+
+    Args:
+      out:         the PLY to write; never overwritten.
+      labels:      names to keep; all where there are none.
+      min_opacity: activated, in [0, 1]; box: x0, y0, z0, x1, y1, z1 of centres, scene units.
+      query:       what its cut selects, in the parts that hang together; None: all.
+    Returns: how many Gaussians were kept, and how many each filter alone would leave out.
+    Raises:  ConfigError on a filter that the scene cannot answer, DataFailure if nothing is left.
+    """
+    import numpy as np
+
+    if out.suffix != ".ply" or out.name.endswith(".compressed.ply"):
+        raise ConfigError(f"{out}: only a plain .ply is written; convert that, for instance: {CONVERT}")
+    filters = passing(scene.exported, scene.source, labels, min_opacity, box)
+    if query is not None:
+        filters["query"] = asked_for(scene.exported, query)
+    n = len(scene)
+    left_out = {name: int(n - keep.sum()) for name, keep in filters.items()}
+    kept = np.logical_and.reduce([np.ones(n, bool), *filters.values()])
+    if not kept.any():
+        why = ", ".join(f"{name} {number}" for name, number in left_out.items())
+        raise DataFailure(f"no Gaussian of {n} is left ({why}); choose wider filters")
+    scene.select(kept).to_ply(out)
+    return {"kept": int(kept.sum()), "of": n} | {f"left out by {name}": number for name, number in left_out.items()}
+
+
+def passing(
+    scene: Scene, path: Path, labels: tuple[str, ...], min_opacity: float, box: Sequence[float] | None
+) -> dict[str, np.ndarray]:
+    """Which Gaussians pass each filter that is asked for, bool [N] by its name. Args and errors as of `extract`."""
+    import numpy as np
+    from scipy.special import expit
+
+    filters: dict[str, np.ndarray] = {}
+    if labels:
+        filters["label"] = has_label(scene, path, labels)
+    if min_opacity > 0:
+        filters["opacity"] = expit(scene.parameters["logit_opacities"]) >= min_opacity
+    if box is not None:
+        means = scene.parameters["means"]
+        filters["box"] = np.all((means >= list(box[:3])) & (means <= list(box[3:])), axis=1)
+    return filters
+
+
+def asked_for(scene: Scene, query: Query) -> np.ndarray:
+    """Which Gaussians the query selects, bool [N], crumbs apart. Raises DataFailure where it is probably not here."""
+    import numpy as np
+
+    from chebsplat.splats.parts import substantial
+
+    answer = query.answer(scene.parameters["features"])
+    if answer.present is False or not answer.selected.any():
+        raise DataFailure(f"{answer}; ask for something else, or name a label with --keep-label")
+    return substantial(scene.parameters["means"], np.exp(scene.parameters["log_scales"]), answer.selected)
+
+
+def has_label(scene: Scene, path: Path, names: tuple[str, ...]) -> np.ndarray:
+    """Which Gaussians bear one of the names. Raises ConfigError, with the nearest name, for one that is unknown."""
+    import numpy as np
+
+    if scene.labels is None or scene.label_names is None:
+        why = scene.summary.get("left_out", {}).get("labels", "it has no semantics")
+        raise ConfigError(f"{path} has no labels: {why}")
+    for name in names:
+        if name not in scene.label_names:
+            near = suggest(name, scene.label_names, 1)
+            advice = f"did you mean {near[0]}?" if near else f"there are: {', '.join(scene.label_names)}"
+            raise ConfigError(f"no label is called {name}; {advice}")
+    return np.isin(scene.labels, [scene.label_names.index(name) for name in names])
+
+
+def corners(text: str | None) -> tuple[float, ...] | None:
+    """Six numbers from "x0,y0,z0,x1,y1,z1". Raises ConfigError if they are no box."""
+    import math
+
+    if text is None:
+        return None
+    try:
+        box = tuple(float(part) for part in text.split(","))
+    except ValueError:
+        box = ()
+    if len(box) != 6 or not all(math.isfinite(v) for v in box) or any(box[k] >= box[k + 3] for k in range(3)):
+        raise ConfigError(f"--box {text}: six numbers x0,y0,z0,x1,y1,z1 with x0 < x1 and so on are needed")
+    return box

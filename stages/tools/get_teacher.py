@@ -1,0 +1,169 @@
+"""A closed-set segmenter from the Hugging Face hub, or its cache, as the three files of a teacher."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import re
+import shutil
+from pathlib import Path
+from typing import Any
+
+from chebsplat.errors import ChebsplatError, ConfigError, InputError
+from chebsplat.formats.artifact import sha256_file
+from chebsplat.formats.files import parse_json
+from chebsplat.formats.teacher_model import read_teacher
+
+TEACHERS = {"segformer-b0-ade": "Xenova/segformer-b0-finetuned-ade-512-512"}  # ours: the hub's
+REPOSITORY = re.compile(r"hf:([\w.-]+/[\w.-]+?)(?:@([\w./-]+))?")
+GRAPH, CLASSES, PREPARATION = "onnx/model.onnx", "config.json", "preprocessor_config.json"
+WIDER = 4 / 3  # of a photo than of the square that a segmenter is trained on
+AGAIN = "run the same command again"
+
+
+def get_teacher(name: str, out: Path | None = None, graph: str = GRAPH) -> tuple[Path, list[tuple[str, str]]]:
+    """Fetch a teacher into a folder, as NAME.onnx, NAME.toml and NAME.txt; the .onnx, and what
+    `check-teacher` finds.
+
+    Args: name: of TEACHERS, or hf:OWNER/NAME[@REVISION]; out: the folder, otherwise one called
+          like the teacher, here; graph: the ONNX file in the repository.
+    Raises: ConfigError on a name or folder that cannot be; InputError naming what is missing,
+            damaged or not reached.
+    """
+    from chebsplat.stages.tools.check_teacher import check
+
+    repository, revision, short = parsed(name)
+    folder = out or Path(short)
+    model = folder / f"{short}.onnx"
+    origin = f"hf:{repository}@{revision}/{graph}"
+    if folder.exists():
+        if not model.is_file() or read_teacher(model).origin != origin:
+            raise ConfigError(f"{folder} exists and is not {origin}; remove it, or choose another --out")
+        return model, check(model)
+    held = {file: fetched(repository, file, revision) for file in (CLASSES, PREPARATION, graph)}
+    part = folder.with_name(f".part-{folder.name}")
+    shutil.rmtree(part, ignore_errors=True)
+    part.mkdir(parents=True)
+    try:
+        made = part / model.name
+        shutil.copyfile(held[graph], made)
+        classes = class_names(held[CLASSES], repository)
+        made.with_suffix(".txt").write_text("\n".join(classes) + "\n", encoding="utf-8")
+        values = {"name": short, "output": "logits", "labels": f"{short}.txt", "origin": origin}
+        values |= {"sha256": sha256_file(made)} | preparation(held[PREPARATION], repository)
+        lines = (f"{k} = {json.dumps(value, ensure_ascii=False)}\n" for k, value in values.items())
+        made.with_suffix(".toml").write_text("".join(lines), encoding="utf-8")
+        part.rename(folder)
+        return model, check(model)
+    except ChebsplatError:  # what was fetched is no teacher
+        shutil.rmtree(part, ignore_errors=True)
+        shutil.rmtree(folder, ignore_errors=True)
+        raise
+
+
+def parsed(name: str) -> tuple[str, str, str]:
+    """(repository, revision, what its files are called)."""
+    if name in TEACHERS:
+        return TEACHERS[name], "main", name
+    if not (found := REPOSITORY.fullmatch(name)):
+        known = ", ".join(TEACHERS)
+        raise ConfigError(f"{name[:100]!a} is no teacher; there are {known}, and hf:OWNER/NAME[@REVISION]")
+    return found[1], found[2] or "main", found[1].rpartition("/")[2].lower()
+
+
+def fetched(repository: str, file: str, revision: str) -> Path:
+    """A file of a repository in the hub's cache, of the right checksum; downloaded if need be."""
+    try:
+        import httpx2
+        from huggingface_hub import constants, errors, hf_hub_download
+    except ImportError:
+        raise ConfigError(
+            "get-teacher needs the package huggingface_hub: .venv/bin/pip install -e '.[hub]' installs it"
+        ) from None
+
+    where = f"{repository}: {file}"
+    try:
+        return verified(Path(hf_hub_download(repository, file, revision=revision)))
+    except errors.LocalEntryNotFoundError as fault:
+        why = f"{constants.ENDPOINT} is not reached"
+        if isinstance(fault.__cause__, errors.OfflineModeIsEnabled):
+            why = "HF_HUB_OFFLINE is set"
+        elif isinstance(fault.__cause__, errors.FileMetadataError):
+            why = f"{constants.ENDPOINT} answers as no hub does"
+        remedy = f"connect, or set HF_ENDPOINT to a mirror, and {AGAIN}"
+        raise InputError(f"{where} is not in the hub's cache and {why}; {remedy}") from None
+    except errors.HfHubHTTPError as fault:
+        raise InputError(refusal(fault, repository, file, revision)) from None
+    except (httpx2.TransportError, OSError, RuntimeError) as fault:
+        if isinstance(fault, OSError) and fault.errno is not None:  # of the disk
+            raise
+        said = str(fault).partition("\n")[0]
+        raise InputError(f"{where} broke off ({said}); {AGAIN}") from None
+
+
+def refusal(fault: Any, repository: str, file: str, revision: str) -> str:
+    """One line about what the hub answers instead of a file."""
+    kind = type(fault).__name__
+    if kind == "RemoteEntryNotFoundError":
+        return f"hf:{repository} has no {file} at {revision}; name another ONNX file with --file, or another repository"
+    if kind in ("RepositoryNotFoundError", "RevisionNotFoundError", "GatedRepoError"):
+        return f"hf:{repository}@{revision} is not there, private or gated; correct the name, or log in (hf auth login)"
+    return f"hf:{repository}: the hub answers {fault.response.status_code} for {file}; {AGAIN}"
+
+
+def verified(path: Path) -> Path:
+    """A file of the hub's cache, if it has the checksum by which the cache calls it: sha256 of what
+    Git LFS holds, git's own of small files.
+
+    Raises: InputError naming the file and both checksums.
+    """
+    if not path.is_symlink():
+        raise InputError(
+            f"{path} is no link, as the hub's cache has them to files called by their checksums; set "
+            f"HF_HOME to a folder of another disk, and {AGAIN}"
+        )
+    checksum, blob = path.readlink().name, path.resolve()
+    if re.fullmatch(r"[0-9a-f]{64}", checksum):
+        found = sha256_file(blob)
+    else:
+        data = blob.read_bytes()
+        found = hashlib.sha1(b"blob %d\0" % len(data) + data).hexdigest()
+    if found != checksum:
+        told = f"{blob} has the checksum {found}, {checksum} is right"
+        raise InputError(f"{told}: damaged on the way; remove it, and {AGAIN}")
+    return blob
+
+
+def document(path: Path) -> dict[str, Any]:
+    """A JSON object. Raises InputError naming a file that is none."""
+    if not isinstance(values := parse_json(path, AGAIN), dict):
+        raise InputError(f"{path} is no JSON object; {AGAIN}")
+    return values
+
+
+def class_names(path: Path, repository: str) -> list[str]:
+    """Names of the classes in the order of the channels, unique, as a file of labels can hold them."""
+    named = document(path).get("id2label")
+    if not isinstance(named, dict) or set(named) != {str(k) for k in range(len(named))} or not named:
+        raise InputError(f"hf:{repository}: config.json names no classes (id2label); a closed-set segmenter is needed")
+    names: list[str] = []
+    for k in range(len(named)):
+        name = re.sub(r"[:#\s]+", " ", str(named[str(k)])).strip() or f"class {k}"
+        names.append(f"{name} ({k})" if name in names else name)
+    return names
+
+
+def preparation(path: Path, repository: str) -> dict[str, Any]:
+    """mean, std, size and base of what the model is fed."""
+    values = document(path)
+    size = values.get("size")
+    if isinstance(size, dict):
+        size = [size.get("height", size.get("shortest_edge")), size.get("width", size.get("shortest_edge"))]
+    sides: list[Any] = list(size) if isinstance(size, list) else [size, size]
+    mean, std = values.get("image_mean"), values.get("image_std")
+    if len(sides) != 2 or not all(isinstance(side, int) for side in sides) or mean is None or std is None:
+        raise InputError(
+            f"hf:{repository}: {PREPARATION} has no size, image_mean or image_std as an image encoder needs; export "
+            "the model yourself (docs/teachers.md)"
+        )
+    return {"mean": mean, "std": std, "size": sides, "base": round(max(sides) * WIDER)}

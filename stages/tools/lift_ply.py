@@ -1,0 +1,173 @@
+"""A splat that someone else trained, as a scene: as it is, with what the 2D teacher says by a capture's photos, or with
+the names of its Gaussians by shape and knowledge alone.
+"""
+
+from __future__ import annotations
+
+import json
+import logging
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from chebsplat.errors import ConfigError, InputError
+from chebsplat.formats import artifact
+from chebsplat.stages.runtime.command import publish
+
+if TYPE_CHECKING:
+    import numpy as np
+
+    from chebsplat.formats.cameras import Cameras
+
+
+def lift_ply(
+    ply: Path, capture: Path, points: Path | None, features: Path | None, model: Path | None, out: Path
+) -> dict[str, Any]:
+    """Lift features to the Gaussians of a PLY, and export them.
+
+    Args:
+      ply:      a 3DGS PLY in the frame of the cameras.
+      capture:  a `capture` artifact; points: a `points` artifact with its cameras, where the capture has no poses.
+      features: a `features` artifact of this capture; None: the teacher is run.
+      model:    .onnx of the teacher to run; None: the embedded one.
+      out:      becomes a folder of artifacts by name, as a scene's: gaussians, lift, export, and what the teacher made.
+    Returns: counts.
+    Raises:  InputError on what cannot be read, DataFailure if no view sees a Gaussian.
+    """
+    from chebsplat.formats.features import Features
+    from chebsplat.stages import export, lift
+    from chebsplat.stages.tools.page import foreign
+
+    taken_over(ply, foreign(ply).parameters, cameras_of(capture, points), out)
+    config = out / "settings.json"
+    config.write_text(json.dumps({"train": {"features": "lifted"}}))
+    if features is None:
+        features = taught(capture, model, out)
+    inputs = {"capture": capture, "gaussians": out / "gaussians", "features": features}
+    publish("lift", lift.run, out / "lift", inputs, config)
+    inputs = {"gaussians": out / "gaussians", "features": features, "lifted": out / "lift"}
+    publish("export", export.run, out / "export", inputs, config)
+    for name, path in {"ingest": capture, "teacher": features}.items():  # as the links of a scene
+        if not (out / name).exists():
+            (out / name).symlink_to(path.resolve())
+    facts = artifact.read_manifest(out / "lift").facts
+    return {"gaussians": facts["n_gaussians"], "seen by no view": facts["n_unseen"], "views": facts["n_views"],
+            "labels": len(Features.read(features).label_names)}  # fmt: skip
+
+
+def import_ply(ply: Path, out: Path) -> dict[str, Any]:
+    """A PLY as a scene without semantics, of `gaussians` and `export` below `out`; one camera sees its middle half.
+
+    Returns: counts. Raises: InputError on what cannot be read.
+    """
+    from chebsplat.stages import export
+    from chebsplat.stages.tools.page import foreign
+
+    scene = foreign(ply)
+    taken_over(ply, scene.parameters, scene.cameras, out)
+    publish("export", export.run, out / "export", {"gaussians": out / "gaussians"})
+    return {"gaussians": artifact.read_manifest(out / "export").facts["n_gaussians"]}
+
+
+def taken_over(ply: Path, parameters: dict[str, np.ndarray], cameras: Cameras, out: Path) -> None:
+    """Make the folder `out`, and in it `gaussians` of what a PLY holds."""
+    from chebsplat.formats.gaussians import Gaussians
+    from chebsplat.formats.manifest import Manifest
+
+    out.mkdir(parents=True)
+    given = {"path": ply.name, "sha256": artifact.sha256_file(ply)}
+    manifest = Manifest(Gaussians.SCHEMA, artifact.digest(given), "train", facts={"source": given})
+    with artifact.publish(out / "gaussians", manifest) as tmp:
+        Gaussians(parameters, cameras, notes={"left_out": {"training": "the splat was given"}}).write(tmp)
+
+
+def cameras_of(capture: Path, points: Path | None) -> Cameras:
+    """The cameras of a capture, or of the points that were reconstructed from it. Raises InputError without poses."""
+    from chebsplat.formats.cameras import Cameras
+    from chebsplat.formats.capture import Capture
+    from chebsplat.formats.points import Points
+
+    held = Capture.read(capture)
+    if points is not None:
+        found = Points.read(points)
+        return Cameras(found.names, found.Ks, found.cam_from_world, *held.size)
+    if held.cam_from_world is None:
+        raise InputError(f"{capture} has no poses; name the scene, whose sfm has them, or ingest a source with poses")
+    return Cameras(held.names, held.Ks, held.cam_from_world, *held.size)
+
+
+def taught(capture: Path, model: Path | None, out: Path) -> Path:
+    """Features of a capture by an ONNX teacher, in the channels that a run would give a scene; below `out`."""
+    from chebsplat.formats.teacher_model import EMBEDDED, read_teacher
+    from chebsplat.stages import channels, teacher
+
+    used = str((model or EMBEDDED).absolute())
+    config, inputs = out / "teacher.json", {"capture": capture}
+    config.write_text(json.dumps({"teacher": {"kind": "onnx", "model": used}, "channels": {"model": used}}))
+    if read_teacher(Path(used)).output == "features":
+        publish("channels", channels.run, out / "channels", {}, config)
+        inputs["channels"] = out / "channels"
+    publish("teacher", teacher.run, out / "teacher", inputs, config)
+    return out / "teacher"
+
+
+log = logging.getLogger("chebsplat")
+
+
+def label_ply(
+    ply: Path, knowledge: Path, words: list[str], up: np.ndarray, unit: float | None, out: Path
+) -> dict[str, Any]:
+    """Write the PLY again with a label a Gaussian, and beside it an .npz: names, labels [N], confidence f32 [N].
+
+    Args:
+      ply:       a 3DGS PLY of a room; knowledge: a `knowledge` artifact; words: to choose among.
+      up:        [3] against gravity, in the PLY's frame; unit: its units in a metre; None: by the room's extent.
+    Returns: counts, and the share of each name.
+    Raises:  ConfigError if `out` exists or a word is not known; InputError on what cannot be read; DataFailure where
+             the splat shows no surface.
+    Choices: shape is described on the surface that is rendered from within, and carried to the Gaussians beside it. The
+      confidence is that of the label among the words, times the length of the answer: how alike a teacher's views were
+      where shapes were like this one.
+    """
+    import numpy as np
+    from scipy.special import expit
+
+    from chebsplat.formats.files import atomic_path
+    from chebsplat.formats.knowledge import read_knowledge
+    from chebsplat.formats.names import suggest
+    from chebsplat.formats.ply import read_ply, write_ply
+    from chebsplat.labels.decode import decode
+    from chebsplat.lifting.carry import carry
+    from chebsplat.lifting.smoothing import room_unit
+    from chebsplat.lifting.surface import LOOKOUT_SIZE, lookouts
+    from chebsplat.splats.gaussians import surface_of
+    from chebsplat.stages.shape_models.predictions import answered, shown
+    from chebsplat.stages.teacher_models.text_encoder import found
+
+    beside = out.with_suffix(".npz")
+    for path in (out, beside):
+        if path.exists():
+            raise ConfigError(f"{path} exists; remove it, or choose another --out")
+    held = read_knowledge(knowledge)
+    rows = found(words, held.words)
+    if -1 in rows:
+        word = words[rows.index(-1)]
+        near = ", ".join(suggest(word, held.words))
+        raise ConfigError(f"{knowledge} has no word {word}" + (f"; near: {near}" if near else ""))
+    parameters, degree, _ = read_ply(ply)
+    if not len(parameters["means"]):
+        raise InputError(f"{ply} holds no Gaussians; choose another")
+    unit = room_unit(parameters["means"]) if unit is None else unit
+    poses, Ks = lookouts(parameters["means"].astype(np.float64), expit(parameters["logit_opacities"]), up)
+    cloud = shown(parameters, poses, Ks, LOOKOUT_SIZE, unit)
+    log.info("%d points of a surface, %.3g units a metre", len(cloud.means), unit)
+    answers = answered(knowledge, held, cloud, up, unit)
+    normals = surface_of(parameters)[0]
+    carried, _ = carry(answers, cloud.means, cloud.normals, parameters["means"], normals, unit)
+    labels, sure = decode(carried, held.embeddings[rows].astype(np.float32))
+    confidence = sure * np.linalg.norm(carried, axis=1).clip(0, 1)
+    with atomic_path(beside) as temporary, temporary.open("wb") as stream:
+        np.savez(stream, names=np.array(words), labels=labels, confidence=confidence.astype(np.float32))
+    with atomic_path(out) as temporary:
+        write_ply(temporary, parameters, degree, labels, words)
+    shares = {word: float((labels == k).mean()) for k, word in enumerate(words)}
+    return {"gaussians": len(labels), "points": len(cloud.means), "unit": unit, "shares": shares}

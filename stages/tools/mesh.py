@@ -1,0 +1,90 @@
+"""mesh: the surface of a finished scene as triangles with colours and labels."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from typing import Any
+
+import numpy as np
+
+from chebsplat.errors import ConfigError, DataFailure
+from chebsplat.evaluation.surface import features_at
+from chebsplat.formats.meshes import Frame, Mesh, cleaned, fused, meshlab
+from chebsplat.labels.decode import decode_labels
+from chebsplat.stages.runtime.progress import Progress
+from chebsplat.stages.tools.scene import OpenedScene
+
+N_VOXELS = 250  # along the longest side of the room, where no voxel is asked for
+OPAQUE = 0.6  # least coverage of a pixel whose depth counts
+STEP = 0.05  # of its depth, by which a neighbouring pixel may lie deeper: beyond, a pixel is on an edge
+LONGEST_HOLE = 60  # edges
+LEAST_PART = 12.0  # voxels across a connected part that stays
+
+
+def mesh_of(
+    scene: OpenedScene, voxel: float | None, n_triangles: int, raw: bool, progress: Progress
+) -> tuple[Mesh, dict[str, Any]]:
+    """The mesh of a scene in its own frame and units, and facts: voxel, and how many triangles before and after.
+
+    Args: voxel: edge, scene units; None: the 250th part of the room; n_triangles: at most; raw: nothing is cleaned.
+    Raises: ConfigError on a scene without cameras; DataFailure where its Gaussians show no surface.
+    Choices: depth is that of `render_depth`, from every view of the capture; a pixel on an edge of depth has none. A
+      vertex means what the Gaussians around it mean (`evaluation.surface.features_at`).
+    """
+    if not scene.cameras:
+        raise ConfigError(f"{scene.source} has no cameras to see its surface from; open a scene that was trained")
+    if not raw:
+        meshlab()  # a missing extra is said before minutes are spent
+    extent = room_extent(scene)
+    edge = extent / N_VOXELS if voxel is None else voxel
+    made = fused(frames(scene, progress), edge, 2 * extent)
+    if not len(made.triangles):
+        raise DataFailure(f"{scene.source} shows no surface of voxels of {edge:.3g}; choose larger ones: --voxel")
+    facts = {"voxel": float(f"{edge:.3g}"), "triangles fused": len(made.triangles)}
+    if not raw:
+        made = cleaned(made, n_triangles, LEAST_PART * edge, LONGEST_HOLE, edge)
+    if not len(made.triangles):
+        raise DataFailure(f"nothing of the surface is larger than {LEAST_PART:g} voxels of {edge:.3g}; take --raw")
+    if scene.features is not None and scene.label_embeddings is not None:
+        made = made._replace(labels=labels_at(scene, made.vertices))
+    return made, facts | {"written": len(made.triangles), "vertices": len(made.vertices)}
+
+
+def frames(scene: OpenedScene, progress: Progress) -> Iterator[Frame]:
+    """Depth of the surface and colour from each camera."""
+    for camera, _ in progress.track(scene.cameras, len(scene.cameras), "views"):
+        view = camera.view()
+        depth, covered = scene.renderer.render_depth(view)
+        depth[covered < OPAQUE] = 0
+        color, _ = scene.renderer.render(view)
+        yield Frame(without_edges(depth), color, camera.K, camera.cam_from_world)
+
+
+def without_edges(depth: np.ndarray) -> np.ndarray:
+    """Depth [H, W], 0 or nan where unknown, as f32 with 0 there, and where a neighbour is deeper or nearer by STEP."""
+    logarithm = np.log(np.where(depth > 0, depth, np.nan))
+    on_edge = np.zeros(depth.shape, bool)
+    for axis in (0, 1):
+        far = np.abs(np.diff(logarithm, axis=axis, append=np.nan)) > STEP  # nan is no edge
+        on_edge |= far | np.roll(far, 1, axis)
+    return np.where(on_edge | np.isnan(logarithm), 0, depth).astype(np.float32)
+
+
+def room_extent(scene: OpenedScene) -> float:
+    """The longest side of the box that holds 98 % of the opaque Gaussians along each axis, scene units."""
+    means, logits = scene.parameters["means"], scene.parameters["logit_opacities"]
+    solid = means[logits > 0] if (logits > 0).any() else means
+    low, high = np.quantile(solid, (0.01, 0.99), axis=0)
+    return max(float((high - low).max()), 1e-9)
+
+
+def labels_at(scene: OpenedScene, points: np.ndarray) -> np.ndarray:
+    """The label of each of points [M, 3], i32 [M], of what the Gaussians around it mean; -1 where there is none.
+
+    Args: scene: with semantics.
+    """
+    assert scene.label_embeddings is not None
+    held = scene.renderer
+    gaussians = held.means, held.quats, held.scales, held.opacities, held.raw["features"]
+    features, weights = features_at(points, *(part.numpy() for part in gaussians))
+    return np.where(weights > 0, decode_labels(features, scene.label_embeddings), -1).astype(np.int32)

@@ -1,0 +1,217 @@
+"""One HTML page of a scene that opens without a server: Gaussians, what they mean, and the words to ask them for."""
+
+from __future__ import annotations
+
+import base64
+import gzip
+import logging
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from chebsplat.errors import ConfigError, InputError
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+    import numpy as np
+
+    from chebsplat.formats.scene import Scene
+    from chebsplat.labels.calibration import Calibration
+
+log = logging.getLogger("chebsplat")
+
+TEMPLATE = Path(__file__).parents[1] / "pages/scene/page.html"
+WARM = 16  # colours of the scale of heat
+
+
+@dataclass
+class Words:
+    """What a page can be asked: L words, embeddings f32 [L, C], and f32 [K, C] of the phrases they are weighed against.
+
+    against: None where words are the scene's labels, each weighed against all others.
+    rivals, calibration: f32 [R, C] and coefficients, where the teacher's relevancy is calibrated: words but the
+    `uncalibrated` ones, rows of `words`, are answered in probabilities, as `query` does.
+    """
+
+    words: list[str]
+    embeddings: np.ndarray
+    against: list[str] | None
+    phrases: np.ndarray
+    rivals: np.ndarray | None = None
+    calibration: Calibration | None = None
+    uncalibrated: Sequence[int] = ()
+
+
+def write_page(
+    scene: Scene, name: str, teacher: Path | None, out: Path, sh_degree: int = 0, phrases: Sequence[str] = (),
+    more: Sequence[str] = (),
+) -> dict[str, int]:  # fmt: skip
+    """Write the page, in the place of what is there.
+
+    Args:
+      scene:     from `Scene.read`, or `foreign`; name: the page's title.
+      teacher:   the scene's `features` artifact, whose teacher's words are embedded; None: the labels alone.
+      sh_degree: 0 or 1; phrases: what words are weighed against, as of `query`; more: words beside the teacher's own.
+    Returns: counts: Gaussians, views, labels, words, bytes.
+    Raises:  InputError where the teacher is not the scene's or does not know a word.
+    """
+    import numpy as np
+
+    from chebsplat.formats.files import atomic_path
+    from chebsplat.formats.packed import pack, signed, to_bytes
+    from chebsplat.stages.pages.parts import rendered
+    from chebsplat.stages.pages.pictures import palette, warm
+
+    means = scene.parameters["means"].astype(np.float64)
+    center = np.median(means, axis=0)
+    up, extent = up_and_extent(scene)
+    packed = pack(scene.parameters, sh_degree)
+    arrays: dict[str, np.ndarray] = packed.arrays | {"views": camera_rows(scene, center)}
+    about: dict[str, Any] = {
+        "name": name, "ranges": packed.ranges, "center": center.tolist(), "up": up.tolist(), "extent": extent,
+        "width": scene.cameras.width, "height": scene.cameras.height, "views": scene.cameras.names,
+    }  # fmt: skip
+    counts = {"Gaussians": len(means), "views": len(scene.cameras.names)}
+    words = None
+    if scene.labels is not None and scene.label_names is not None and scene.label_embeddings is not None:
+        words = vocabulary(scene, teacher, list(phrases), list(more))
+        colors = ["#" + bytes(color).hex() for color in palette(len(scene.label_names))]
+        about["labels"] = [{"name": n, "color": c} for n, c in zip(scene.label_names, colors, strict=True)]
+        about |= {"words": words.words, "against": words.against}
+        about["warm"] = (warm(np.linspace(0, 1, WARM)[:, None]) / 255).round(4).tolist()
+        embedded, steps = signed(words.embeddings)
+        about["word_step"] = steps["step"]
+        arrays |= {
+            "words": embedded.T,
+            "against": words.phrases.astype(np.float32),
+            "label_embeddings": scene.label_embeddings.astype(np.float32),
+            "labels": (scene.labels + 1).astype(np.uint16),
+        }
+        if words.calibration is not None and words.rivals is not None:
+            about |= {"calibration": words.calibration._asdict(), "uncalibrated": list(words.uncalibrated)}
+            arrays["rivals"] = words.rivals.astype(np.float32)
+        counts |= {"labels": len(scene.label_names), "words": len(words.words)}
+    blob, about["places"] = to_bytes(arrays)
+    text = rendered(
+        TEMPLATE,
+        name=name,
+        n=len(means),
+        labels=about.get("labels"),
+        words=f"{len(words.words):,}" if words else None,
+        weighed=weighed(words),
+        example=next((n for n in (scene.label_names or []) if n in ("chair", "sofa")), "a word"),
+        note=f"SH degree {sh_degree}, quantised; made by chebsplat. Nothing is fetched or sent.",
+        about=about,
+        data=base64.b64encode(gzip.compress(blob, 9, mtime=0)).decode(),
+    )
+    with atomic_path(out) as temporary:
+        temporary.write_text(text)
+    return counts | {"bytes": len(text.encode())}
+
+
+def foreign(ply: Path) -> Scene:
+    """A scene of a 3DGS PLY from elsewhere: no semantics, and one camera that sees its middle half.
+
+    Raises: InputError naming the file. Choices: up is -y, as in COLMAP's and 3DGS' own frames.
+    """
+    import numpy as np
+
+    from chebsplat.formats.cameras import Cameras
+    from chebsplat.formats.ply import read_ply
+    from chebsplat.formats.scene import Scene
+
+    parameters, degree, _ = read_ply(ply)
+    if not len(parameters["means"]):
+        raise InputError(f"{ply} holds no Gaussians; choose another")
+    degrees = parameters.setdefault("degrees", np.full(len(parameters["means"]), degree, np.uint8))
+    order = np.argsort(degrees, kind="stable")  # as renderers take them
+    parameters = {name: values[order] for name, values in parameters.items()}
+    means = parameters["means"]
+    low, high = np.quantile(means.astype(np.float64), (0.25, 0.75), axis=0)
+    pose = np.eye(4)
+    pose[:3, 3] = [0, 0, 2 * max(float((high - low).max()), 1e-3)] - (low + high) / 2
+    K = np.array([[554.0, 0, 320], [0, 554, 240], [0, 0, 1]])  # 60 degrees across
+    return Scene(parameters, Cameras(["start"], K[None], pose[None], 640, 480), order)
+
+
+def camera_rows(scene: Scene, center: np.ndarray) -> np.ndarray:
+    """f32 [V, 16]: cam_from_world's three rows of a frame whose origin is `center`, then fx, fy, cx, cy."""
+    import numpy as np
+
+    poses = scene.cameras.cam_from_world[:, :3].copy()
+    poses[:, :, 3] += poses[:, :, :3] @ center
+    Ks = scene.cameras.Ks
+    lenses = np.stack([Ks[:, 0, 0], Ks[:, 1, 1], Ks[:, 0, 2], Ks[:, 1, 2]], 1)
+    return np.concatenate([poses.reshape(-1, 12), lenses], 1).astype(np.float32)
+
+
+def up_and_extent(scene: Scene) -> tuple[np.ndarray, float]:
+    """Up, unit [3]: the mean of the views' own; and the longest side of the box of 90 % of the centres by each axis."""
+    import numpy as np
+
+    up = -scene.cameras.cam_from_world[:, 1, :3].mean(0)
+    length = np.linalg.norm(up)
+    up = up / length if length > 0.1 else -scene.cameras.cam_from_world[0, 1, :3]
+    low, high = np.quantile(scene.parameters["means"].astype(np.float64), (0.05, 0.95), axis=0)
+    return up, max(float((high - low).max()), 1e-6)
+
+
+def vocabulary(scene: Scene, teacher: Path | None, phrases: list[str], more: list[str]) -> Words:
+    """The words of a page: the scene's labels, the teacher's table (or nouns, by its text encoder), and `more`.
+
+    Raises: as `query.understood`; ConfigError on phrases or more where a scene knows its labels alone.
+    """
+    import numpy as np
+
+    from chebsplat.formats.calibration import calibration_of
+    from chebsplat.labels.calibration import Calibration
+    from chebsplat.stages.teacher_models.text_encoder import folded
+    from chebsplat.stages.tools.query import are_words, embedded, is_closed, taught, teacher_of, understood
+
+    names, rows = scene.label_names, scene.label_embeddings
+    assert names is not None and rows is not None  # the caller's
+    features, model = (None, None) if teacher is None else taught(teacher)
+    if teacher is None or features is None or is_closed(features):
+        if phrases or more:
+            raise ConfigError("this scene knows its labels and no other words; leave out --against and --words")
+        log.info("only the scene's labels can be asked for%s", "" if teacher else ": it has no teacher's artifact")
+        return Words(names, rows, None, rows)
+    known = {folded(name) for name in names}
+    others = [word for word in dict.fromkeys([*more, *table_words(model)]) if folded(word) not in known]
+    weighed = understood(teacher, others[0], phrases, calibrated=False)
+    found = embedded(others, features, model)
+    order = sorted(range(len(names) + len(others)), key=[*names, *others].__getitem__)
+    every = [*names, *others]
+    words = Words([every[k] for k in order], np.concatenate([rows, found])[order], weighed.phrases, weighed.against)
+    held = teacher_of(features, model)
+    if not phrases and (calibration := calibration_of(held.path)) is not None:
+        words.rivals, words.calibration = (
+            embedded(calibration.rivals, features, model),
+            Calibration(**calibration.calibration),
+        )
+        words.uncalibrated = [k for k, known in enumerate(are_words(words.words, held)) if not known]
+    return words
+
+
+def weighed(words: Words | None) -> str:
+    """What a page says of how its words are answered."""
+    if words is None or words.against is None:
+        return "the labels alone"
+    if words.calibration is None:
+        return f"weighed against {', '.join(words.against)}"
+    others = f", but {len(words.uncalibrated):,} by LERF's relevancy" * bool(words.uncalibrated)
+    return f"answered in probabilities{others}"
+
+
+def table_words(model: str | None) -> list[str]:
+    """The words that a teacher knows as they are; indoor nouns where it has a text encoder and no table."""
+    from chebsplat.formats.teacher_model import EMBEDDED, read_label_set, read_label_table, read_teacher
+
+    teacher = read_teacher(Path(model) if model else EMBEDDED)
+    if teacher.labels is not None:
+        names, embeddings = read_label_table(teacher.labels)
+        if embeddings is not None:
+            return names
+    log.info("the words of a page are embedded by %s; that takes a while", teacher.text)
+    return list(read_label_set(EMBEDDED.with_name("nouns.txt")))

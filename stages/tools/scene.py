@@ -1,0 +1,206 @@
+"""A finished scene, opened: render it, ask it, take a part of it. Nothing is written but by `to_ply`."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from functools import cached_property
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from chebsplat.errors import ConfigError
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+    import numpy as np
+
+    from chebsplat.formats.scene import Scene
+    from chebsplat.render import SceneRenderer
+    from chebsplat.stages.tools.query import Query, Relevancy
+    from chebsplat.views import View
+
+COVERED = 0.5  # of a pixel, below which it has no label
+
+
+@dataclass(frozen=True, eq=False)
+class Camera:
+    """A pinhole camera in OpenCV's frame. K [3, 3] pixels (the centre of the first one at 0.5, 0.5), cam_from_world
+    [4, 4] scene units, size in pixels.
+    """
+
+    name: str
+    K: np.ndarray
+    cam_from_world: np.ndarray
+    width: int
+    height: int
+
+    def resized(self, width: int, height: int) -> Camera:
+        """The same view in another number of pixels."""
+        scale = [[width / self.width], [height / self.height], [1.0]]
+        return replace(self, K=self.K * scale, width=width, height=height)
+
+    @property
+    def position(self) -> np.ndarray:
+        """[3], scene units."""
+        position: np.ndarray = -self.cam_from_world[:3, :3].T @ self.cam_from_world[:3, 3]
+        return position
+
+    def view(self) -> View:
+        """For `render.SceneRenderer`."""
+        import torch
+
+        from chebsplat.views import View
+
+        K, pose = (torch.from_numpy(matrix).float() for matrix in (self.K, self.cam_from_world))
+        return View(K, pose, self.width, self.height)
+
+
+@dataclass(frozen=True, eq=False)
+class Picture:
+    """What a camera sees. color u8 [H, W, 3]; depth f32 [H, W] along its axis, scene units, nan where nothing is;
+    alpha f32 [H, W], how far each pixel is covered; where there are semantics features f32 [H, W, C] and labels i32
+    [H, W], rows of `label_names`, -1 where a pixel is less than half covered.
+    """
+
+    color: np.ndarray
+    depth: np.ndarray
+    alpha: np.ndarray
+    features: np.ndarray | None = None
+    labels: np.ndarray | None = None
+
+
+class OpenedScene:
+    """N Gaussians with their colours and, where there is a teacher, what they mean.
+
+    parameters: raw, as `formats.scene.Scene` holds them; `features` f32 [N, C], `labels` i32 [N] (-1: none) and
+    `label_names` and `label_embeddings` f32 [L, C] are None without semantics; `cameras`: of the capture, in its order.
+    """
+
+    def __init__(self, scene: Scene, source: Path, teacher: Path | None = None):
+        self.source, self.exported, self._teacher = source, scene, teacher
+        self.parameters, self.labels, self.label_names = scene.parameters, scene.labels, scene.label_names
+        self.label_embeddings, held = scene.label_embeddings, scene.cameras
+        views = zip(held.names, held.Ks, held.cam_from_world, strict=True)
+        self.cameras = [Camera(name, K, pose, held.width, held.height) for name, K, pose in views]
+
+    def __len__(self) -> int:
+        return len(self.parameters["means"])
+
+    def __repr__(self) -> str:
+        return f"<{self.source}: {len(self):,} Gaussians, {len(self.label_names or [])} labels>"
+
+    @property
+    def features(self) -> np.ndarray | None:
+        """f32 [N, C]; None without semantics."""
+        return self.parameters.get("features")
+
+    @cached_property
+    def renderer(self) -> SceneRenderer:
+        """Renders all Gaussians; made on first use."""
+        from chebsplat.render import SceneRenderer
+
+        return SceneRenderer(self.parameters)
+
+    def camera(self, name: str) -> Camera:
+        """The capture's view of this name. Raises ConfigError, with the nearest names."""
+        from chebsplat.formats.names import suggest
+
+        found = [camera for camera in self.cameras if camera.name == name]
+        if not found:
+            near = ", ".join(suggest(name, [camera.name for camera in self.cameras]))
+            raise ConfigError(f"{self.source} has no view {name}" + (f"; near: {near}" if near else ""))
+        return found[0]
+
+    def render(self, camera: Camera) -> Picture:
+        """Colour, depth and, where there are semantics, features and labels from `camera`."""
+        import numpy as np
+
+        from chebsplat.labels.decode import decode_labels
+
+        view = camera.view()
+        depth, alpha = self.renderer.render_depth(view)
+        color, features = self.renderer.render(view, with_features=True)
+        if features is None or self.label_embeddings is None:
+            return Picture(color, depth, alpha, features)
+        labels = decode_labels(features, self.label_embeddings).astype(np.int32)
+        return Picture(color, depth, alpha, features, np.where(alpha < COVERED, -1, labels))
+
+    def query(self, text: str, against: Sequence[str] = ()) -> np.ndarray:
+        """How likely each Gaussian is what the words mean, f32 [N] in [0, 1]: the scores of `ask`."""
+        return self.ask(text, against).scores
+
+    def ask(self, text: str, against: Sequence[str] = ()) -> Relevancy:
+        """What the scene answers to words: scores, a cut, what is selected, and whether the scene has it at all.
+
+        Args: against: what the words are weighed against, by LERF's relevancy; default: the calibration of the scene's
+              teacher; where it has none, or the words are a phrase, LERF's phrases; or all other labels.
+        Raises: ConfigError without semantics, or on words that the scene's teacher cannot know.
+        """
+        asked = self.understood(text, against)
+        assert self.features is not None
+        return asked.answer(self.features)
+
+    def understood(self, text: str, against: Sequence[str] = ()) -> Query:
+        """Words in the scene's own channels. Args and errors as of `query`."""
+        from chebsplat.stages.tools.query import understood
+
+        if self.features is None:
+            raise ConfigError(f"{self.source} has no semantics; train the scene with a teacher")
+        if self._teacher is None:
+            raise ConfigError(f"{self.source} has no teacher's artifact beside it; open the scene's folder")
+        if not text.strip():
+            raise ConfigError("the query is empty; say what to look for")
+        return understood(self._teacher, text.strip(), list(against))
+
+    def select(
+        self,
+        mask: np.ndarray | None = None,
+        *,
+        label: str | Sequence[str] | None = None,
+        min_opacity: float = 0.0,
+        box: Sequence[float] | None = None,
+    ) -> OpenedScene:
+        """The Gaussians that pass every filter, as a scene; it shares no memory with this one.
+
+        Args: mask: bool [N]; label: names to keep; min_opacity: in [0, 1]; box: x0, y0, z0, x1, y1, z1 of centres.
+        Raises: ConfigError on a label that is not there, a mask of another shape, or where nothing is left.
+        """
+        import numpy as np
+
+        from chebsplat.stages.tools.extract import passing
+
+        names = () if label is None else (label,) if isinstance(label, str) else tuple(label)
+        kept = np.ones(len(self), bool) if mask is None else np.asarray(mask)
+        if kept.shape != (len(self),) or kept.dtype != bool:
+            raise ConfigError(f"a mask bool [{len(self)}] is needed, not {kept.dtype} {list(kept.shape)}")
+        kept = np.logical_and.reduce([kept, *passing(self.exported, self.source, names, min_opacity, box).values()])
+        if not kept.any():
+            raise ConfigError(f"no Gaussian of {len(self)} is left; choose wider filters")
+        parameters = {name: values[kept] for name, values in self.parameters.items()}
+        part = replace(
+            self.exported,
+            parameters=parameters,
+            order=np.argsort(np.argsort(self.exported.order[kept], kind="stable"), kind="stable"),
+            labels=None if self.labels is None else self.labels[kept],
+        )
+        return OpenedScene(part, self.source, self._teacher)
+
+    def points(self) -> tuple[np.ndarray, np.ndarray]:
+        """Centres f32 [N, 3], scene units, and colours u8 [N, 3] of SH degree 0."""
+        import numpy as np
+
+        from chebsplat.splats.gaussians import surface_of
+
+        return self.parameters["means"], np.round(surface_of(self.parameters)[1] * 255).astype(np.uint8)
+
+    def to_ply(self, path: str | Path) -> Path:
+        """Write a 3DGS PLY with labels, trimmed to the highest SH degree in use; raises ConfigError if it exists."""
+        from chebsplat.formats.files import atomic_path
+        from chebsplat.formats.ply import write_ply
+
+        path = Path(path)
+        if path.exists():
+            raise ConfigError(f"{path} exists; remove it, or choose another path")
+        with atomic_path(path) as temporary:
+            write_ply(temporary, self.parameters, int(self.parameters["degrees"].max()), self.labels, self.label_names)
+        return path

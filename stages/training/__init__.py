@@ -1,0 +1,1 @@
+"""From artifacts and settings to a training."""

@@ -1,0 +1,103 @@
+"""An interrupted training goes on where it was last saved, to the same bytes."""
+
+from __future__ import annotations
+
+import logging
+import time
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from chebsplat.errors import InputError
+from chebsplat.formats.artifact import digest, read_manifest
+from chebsplat.formats.files import atomic_path
+from chebsplat.stages.runtime.command import Job, n_threads
+
+if TYPE_CHECKING:
+    import numpy as np
+    from torch import Tensor
+
+    from chebsplat.formats.gaussians import Gaussians
+    from chebsplat.shape.encoder import RegionEncoder
+
+log = logging.getLogger("chebsplat")
+SECONDS = 30.0  # between two saves
+
+
+class Saves:
+    """States of one training, the last one kept, in the job's scratch folder.
+
+    A state fits only the same settings, inputs, package versions, device and number of threads: from another one the
+    training starts anew and says so.
+    """
+
+    def __init__(self, job: Job):
+        from importlib.metadata import version
+
+        inputs = {role: read_manifest(path).key for role, path in job.inputs.items()}
+        settings = job.config.sections(("describe", "train"))
+        versions = {name: version(name) for name in ("torch", "numba")}
+        self.identity = digest(
+            {"inputs": inputs, "config": settings, "device": job.device, "versions": versions, "threads": n_threads()}
+        )
+        self.file = job.scratch / "training.pt"
+        self.saved = time.monotonic()
+
+    def load(self) -> dict[str, Any] | None:
+        """The last state, or None."""
+        import torch
+
+        if not self.file.is_file():
+            return None
+        try:
+            held = torch.load(self.file, weights_only=True)
+        except Exception as error:  # whatever a damaged file makes torch raise
+            log.warning("%s is damaged (%s): training starts anew", self.file, error)
+            return None
+        if held["identity"] != self.identity:
+            log.warning("%s is of another training: this one starts anew", self.file)
+            return None
+        return dict(held["state"])
+
+    def offer(self, state: Any, now: bool = False) -> None:
+        """Save what `state()` returns if the last save is long ago, or `now`: whole or not at all."""
+        if not now and time.monotonic() - self.saved < SECONDS:
+            return
+        import torch
+
+        self.saved, held = time.monotonic(), {"identity": self.identity, "state": state()}
+        try:
+            with atomic_path(self.file) as temporary, temporary.open("wb") as handle:
+                torch.save(held, handle)
+        except (OSError, RuntimeError) as error:  # torch has its own word for a full disk
+            log.warning("%s cannot be saved (%s): the training goes on without", self.file, error)
+
+
+def trained_with(path: Path) -> dict[str, Any]:
+    """The sections `describe` and `train` that the checkpoint was made with. Raises InputError if it names none."""
+    from chebsplat.formats.artifact import read_manifest
+    from chebsplat.settings import DescribeSection, TrainSection
+    from chebsplat.stages.runtime.config import checked
+
+    config, file = read_manifest(path).config, path / "artifact.json"
+    if not {"describe", "train"} <= set(config):
+        raise InputError(f"{file} does not say how the scene was trained; train it again")
+    return {
+        "describe": checked(DescribeSection, config["describe"], f"{file}: describe", InputError).model_dump(),
+        "train": checked(TrainSection, config["train"], f"{file}: train", InputError).model_dump(),
+    }
+
+
+def restored_encoder(gaussians: Gaussians) -> RegionEncoder:
+    """The local encoder of a checkpoint. Raises InputError if the scene was trained without one."""
+    from chebsplat.shape.encoder import RegionEncoder
+
+    return RegionEncoder.restored(*gaussians.encoder())
+
+
+def without_basis(maps: dict[str, Tensor], bases: dict[str, np.ndarray]) -> tuple[list[str], list[str]]:
+    """Names of linear maps [q, p] that have no basis of q rows: of those that read what a scene brings, and of others.
+
+    The width of a token's inputs follows teacher and settings; all other widths are the encoder's own.
+    """
+    unfit = [name for name, W in maps.items() if name not in bases or len(bases[name]) != len(W)]
+    return [n for n in unfit if n.startswith("embed_")], [n for n in unfit if not n.startswith("embed_")]
