@@ -32,8 +32,8 @@ from chebsplat.formats.capture import Capture
 from chebsplat.formats.features import Features
 from chebsplat.formats.manifest import Manifest
 from chebsplat.formats.points import Points
-from chebsplat.pipelines.plan import merged
-from chebsplat.pipelines.scenes import read_toml
+from chebsplat.pipelines.planning.plan import merged
+from chebsplat.pipelines.work.scenes import read_toml
 from chebsplat.settings import MOST_STEPS
 from chebsplat.splats.gaussians import local_shape
 from chebsplat.stages.runtime.config import Config

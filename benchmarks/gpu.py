@@ -22,9 +22,9 @@ from benchmarks.cost import trainer_from
 from chebsplat.errors import ConfigError
 from chebsplat.formats.artifact import read_manifest
 from chebsplat.formats.scene import Scene
-from chebsplat.pipelines import store
-from chebsplat.pipelines.plan import Plan, Planner
-from chebsplat.pipelines.run import execute
+from chebsplat.pipelines.planning.plan import Plan, Planner
+from chebsplat.pipelines.running.run import execute
+from chebsplat.pipelines.work import store
 from chebsplat.rasterize import rasterize
 from chebsplat.render import SceneRenderer
 from chebsplat.settings import TrainSection

@@ -16,9 +16,9 @@ import numba
 import torch
 
 import chebsplat
-from chebsplat.pipelines.plan import Plan, Planner
-from chebsplat.pipelines.run import execute
-from chebsplat.pipelines.scenes import data_of
+from chebsplat.pipelines.planning.plan import Plan, Planner
+from chebsplat.pipelines.running.run import execute
+from chebsplat.pipelines.work.scenes import data_of
 
 
 def parser(name: str, description: str | None, work: bool = False) -> ArgumentParser:

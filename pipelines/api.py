@@ -22,7 +22,7 @@ def load(scene: str | Path) -> OpenedScene:
     Raises: ConfigError or InputError, which name what is missing and the remedy.
     """
     from chebsplat.formats.scene import Scene
-    from chebsplat.pipelines.finished import artifact_of, teacher_of
+    from chebsplat.pipelines.work.finished import artifact_of, teacher_of
 
     return OpenedScene(Scene.read(artifact_of(str(scene), "export")), Path(scene), teacher_of(str(scene)))
 
@@ -44,9 +44,9 @@ def train(
       settings: sections of settings by name, as `train={"steps": 1000}` (`chebsplat settings` lists them).
     Raises: ConfigError or InputError before anything runs; ChebsplatError if a stage fails, whose log says why.
     """
-    from chebsplat.pipelines import store
-    from chebsplat.pipelines.cli.runs import plans
-    from chebsplat.pipelines.run import device_of, execute
+    from chebsplat.pipelines.running.run import device_of, execute
+    from chebsplat.pipelines.selection import plans
+    from chebsplat.pipelines.work import store
 
     used = device_of(device)
     chosen = plans(str(capture), None, as_text(settings), ablation, basis, running=True, device=used)

@@ -11,7 +11,7 @@ from tiny_teachers import color_reference, color_teacher, knowing_rooms
 @pytest.fixture(scope="session")
 def code_memo():
     """What `work/.cache/code.json` holds once every stage's code has been read: a planner is then quick."""
-    from chebsplat.pipelines.code import PACKAGE, Code
+    from chebsplat.pipelines.planning.code import PACKAGE, Code
     from chebsplat.stages.registry import STAGES
 
     code = Code(PACKAGE, {})
@@ -76,7 +76,7 @@ def mixed(toy, tmp_path_factory):
 @pytest.fixture
 def quick_plans(tmp_path, monkeypatch):
     """A work folder that is not there yet, beside where the test stands; planning does not read the code."""
-    from chebsplat.pipelines.code import Code
+    from chebsplat.pipelines.planning.code import Code
 
     monkeypatch.setattr(Code, "stage", lambda self, name, *used: {"hash": name})
     monkeypatch.setenv("CHEBSPLAT_WORK", str(tmp_path / "work"))

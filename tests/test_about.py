@@ -9,8 +9,8 @@ from shared import ROOT, photo_folder
 
 from chebsplat.errors import ConfigError, InputError
 from chebsplat.pipelines.cli import main
-from chebsplat.pipelines.plan import Planner
-from chebsplat.pipelines.scenes import ONE, names, read_toml
+from chebsplat.pipelines.planning.plan import Planner
+from chebsplat.pipelines.work.scenes import ONE, names, read_toml
 from chebsplat.stages.runtime.config import known_keys
 
 

@@ -8,9 +8,9 @@ from chebsplat.errors import ChebsplatError, ConfigError
 from chebsplat.formats.capture import Capture
 from chebsplat.formats.ply import read_ply
 from chebsplat.formats.scene import Scene
-from chebsplat.pipelines import run
 from chebsplat.pipelines.api import as_text
-from chebsplat.pipelines.plan import overrides
+from chebsplat.pipelines.planning.plan import overrides
+from chebsplat.pipelines.running import run
 from chebsplat.render import SceneRenderer
 from chebsplat.stages.evaluate import camera
 

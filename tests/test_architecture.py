@@ -85,7 +85,7 @@ def test_formats_know_no_torch():
 
 
 def test_a_stage_is_known_by_every_kernel_it_runs_and_every_package_it_loads():
-    from chebsplat.pipelines.code import PACKAGE, Code
+    from chebsplat.pipelines.planning.code import PACKAGE, Code
 
     found: dict[str, list] = {}
     code = Code(PACKAGE, found)

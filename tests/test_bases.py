@@ -11,9 +11,10 @@ from shared import ROOT, key_of
 from chebsplat.formats import artifact, heads
 from chebsplat.formats.basis import SCHEMA, Basis, read_basis, write_basis
 from chebsplat.formats.manifest import Manifest
-from chebsplat.pipelines import bases, store
+from chebsplat.pipelines.bases import revisions
 from chebsplat.pipelines.cli.basis import basis as command
-from chebsplat.pipelines.cli.runs import plans
+from chebsplat.pipelines.selection import plans
+from chebsplat.pipelines.work import store
 from chebsplat.shape.cks import update
 
 NAMES = ("blocks.0.query", "blocks.0.key")
@@ -52,7 +53,7 @@ def chain():
         lineage.append({"scene": scene, "gaussians": f"g{number}", "spread": 1.0, "maps": reports})
         earlier = key_of(number - 1) if number > 1 else None
         found.append(publish(key_of(number), Basis(dict(grown), weights, list(lineage)), earlier))
-        assert heads.advance(bases.head_folder("shared"), number - 1, found[-1])
+        assert heads.advance(revisions.head_folder("shared"), number - 1, found[-1])
     return found
 
 

@@ -12,7 +12,7 @@ from chebsplat.formats.artifact import read_manifest
 from chebsplat.formats.channels import ChannelMap
 from chebsplat.formats.images import SUFFIXES
 from chebsplat.formats.teacher_model import EMBEDDED, read_teacher
-from chebsplat.pipelines.plan import Planner
+from chebsplat.pipelines.planning.plan import Planner
 from chebsplat.stages import channels
 from chebsplat.stages.channels import generated, shipped
 from chebsplat.stages.settings import ChannelsSection

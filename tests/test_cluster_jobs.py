@@ -8,10 +8,13 @@ from graphlib import TopologicalSorter
 import pytest
 
 from chebsplat.errors import ConfigError
-from chebsplat.pipelines import children, cluster, job, leases, sequences, store
-from chebsplat.pipelines.plan import Planner
-from chebsplat.pipelines.run import device_of, entry, write_plan
+from chebsplat.pipelines.planning import sequences
+from chebsplat.pipelines.planning.plan import Planner
+from chebsplat.pipelines.running import cluster, job
+from chebsplat.pipelines.running import processes as children
+from chebsplat.pipelines.running.run import device_of, entry, write_plan
 from chebsplat.pipelines.studies.study import checked_study, expand, outstanding
+from chebsplat.pipelines.work import leases, store
 from chebsplat.stages.registry import STAGES
 
 pytestmark = pytest.mark.usefixtures("quick_plans")

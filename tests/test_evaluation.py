@@ -18,7 +18,7 @@ from chebsplat.formats.capture import Capture
 from chebsplat.formats.evaluation import Evaluation
 from chebsplat.formats.features import Features
 from chebsplat.formats.scene import Scene
-from chebsplat.pipelines.plan import Planner
+from chebsplat.pipelines.planning.plan import Planner
 from chebsplat.render import SceneRenderer
 from chebsplat.stages.evaluate import camera
 from chebsplat.stages.measuring.image_quality import image_figures, perceptual

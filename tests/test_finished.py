@@ -7,10 +7,10 @@ from click.testing import CliRunner
 from shared import finish, photo_folder
 
 from chebsplat.errors import ConfigError, InputError
-from chebsplat.pipelines import store
 from chebsplat.pipelines.cli import main
-from chebsplat.pipelines.finished import artifact_of, artifacts, scene_folder
-from chebsplat.pipelines.plan import Planner
+from chebsplat.pipelines.planning.plan import Planner
+from chebsplat.pipelines.work import store
+from chebsplat.pipelines.work.finished import artifact_of, artifacts, scene_folder
 
 
 @pytest.fixture(autouse=True)

@@ -8,8 +8,8 @@ import pytest
 from shared import finish, photo_folder
 
 from chebsplat.errors import ConfigError
-from chebsplat.pipelines import finished, folders, inventory, store
-from chebsplat.pipelines.plan import Planner
+from chebsplat.pipelines.planning.plan import Planner
+from chebsplat.pipelines.work import finished, folders, inventory, store
 
 
 @pytest.fixture(autouse=True)

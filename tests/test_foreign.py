@@ -51,7 +51,7 @@ def test_what_the_user_says_of_telemetry_stands(said):
 
 
 def test_git_is_not_asked_about_a_repository_that_chebsplat_is_merely_installed_in(tmp_path):
-    from chebsplat.pipelines.run import HERE, git_state
+    from chebsplat.pipelines.running.run import HERE, git_state
 
     layer = tmp_path / "project/.venv/site-packages/chebsplat/pipelines"
     layer.mkdir(parents=True)

@@ -16,7 +16,7 @@ from chebsplat.formats.gaussians import Gaussians
 from chebsplat.formats.packed import Packed, unpack
 from chebsplat.formats.ply import read_ply
 from chebsplat.pipelines.cli import main
-from chebsplat.pipelines.plan import Planner
+from chebsplat.pipelines.planning.plan import Planner
 from chebsplat.render import SceneRenderer
 from chebsplat.stages.tools.page import foreign
 from chebsplat.stages.tools.scene import OpenedScene

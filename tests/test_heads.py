@@ -18,7 +18,8 @@ from chebsplat.formats.basis import Basis, read_basis, read_lineage, write_basis
 from chebsplat.formats.cameras import Cameras
 from chebsplat.formats.gaussians import Gaussians
 from chebsplat.formats.manifest import Manifest
-from chebsplat.pipelines import bases, store
+from chebsplat.pipelines.bases import revisions
+from chebsplat.pipelines.work import store
 from chebsplat.shape.encoder import RegionEncoder
 from chebsplat.stages import cks
 
@@ -145,22 +146,22 @@ def work(tmp_path, monkeypatch):
 
 def test_a_head_grows_by_scenes_and_a_scene_it_knows_adds_nothing(work):
     for seed in range(3):
-        found = bases.extend("shared", trained(work / f"trained/{seed}", key_of(seed), seed), f"room{seed}")
+        found = revisions.extend("shared", trained(work / f"trained/{seed}", key_of(seed), seed), f"room{seed}")
         assert len(found) == seed + 1
-    again = bases.extend("shared", work / "trained/1", "room1")
+    again = revisions.extend("shared", work / "trained/1", "room1")
     assert again == found
-    assert bases.revisions("shared@2") == found[:2]
+    assert revisions.revisions("shared@2") == found[:2]
     assert {basis.shape[1] for basis in read_basis(found[-1]).bases.values()} == {3}
     assert [entry["scene"] for entry in read_lineage(found[-1])] == ["room0", "room1", "room2"]
-    assert bases.head_names() == ["shared"]
+    assert revisions.head_names() == ["shared"]
     assert store.unnamed() == []  # its links keep its artifacts, and its plans are gone
     with pytest.raises(ConfigError, match="has 3 revisions"):
-        bases.revisions("shared@4")
+        revisions.revisions("shared@4")
     with pytest.raises(ConfigError, match="did you mean shared"):
-        bases.revisions("shard")
+        revisions.revisions("shard")
     for name in ("offices", "a/b", "a@1", ""):
         with pytest.raises(ConfigError, match="cannot be called"):
-            bases.extend(name, work / "trained/0", "room0")
+            revisions.extend(name, work / "trained/0", "room0")
 
 
 def test_a_head_whose_stage_fails_raises_its_error_and_stays_as_it_is(work, monkeypatch):
@@ -169,8 +170,8 @@ def test_a_head_whose_stage_fails_raises_its_error_and_stays_as_it_is(work, monk
 
     monkeypatch.setattr(cks, "run", fail)
     with pytest.raises(DataFailure, match="no column is left"):
-        bases.extend("shared", trained(work / "trained/0", key_of(0), 0), "room0")
-    assert bases.head_names() == []
+        revisions.extend("shared", trained(work / "trained/0", key_of(0), 0), "room0")
+    assert revisions.head_names() == []
     assert not list((work / ".plans").iterdir())
 
 

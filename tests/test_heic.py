@@ -12,7 +12,7 @@ from source_folders import SETTINGS, image
 from chebsplat.errors import InputError
 from chebsplat.formats import images
 from chebsplat.photos.sharpness import blurred, detail
-from chebsplat.pipelines.needs import media_packages
+from chebsplat.pipelines.planning.needs import media_packages
 from chebsplat.stages import ingest
 from chebsplat.stages.settings import IngestSection, SourceSection
 from chebsplat.stages.sources import common, photos

@@ -8,7 +8,7 @@ import time
 
 import pytest
 
-from chebsplat.pipelines import leases, store
+from chebsplat.pipelines.work import leases, store
 
 ENDLESS = """
 import sys, time

@@ -13,12 +13,12 @@ from shared import ROOT, finish, photo_folder, remember
 
 from chebsplat.errors import ConfigError, InputError
 from chebsplat.formats.teacher_model import EMBEDDED
-from chebsplat.pipelines import store
-from chebsplat.pipelines.code import PACKAGE
-from chebsplat.pipelines.plan import Planner, suffix
-from chebsplat.pipelines.raw import content_hash, hashes
-from chebsplat.pipelines.run import failures, wanted_steps
-from chebsplat.pipelines.scenes import CONFIGS, names, read_toml
+from chebsplat.pipelines.planning.code import PACKAGE
+from chebsplat.pipelines.planning.plan import Planner, suffix
+from chebsplat.pipelines.planning.raw import content_hash, hashes
+from chebsplat.pipelines.running.run import failures, wanted_steps
+from chebsplat.pipelines.work import store
+from chebsplat.pipelines.work.scenes import CONFIGS, names, read_toml
 from chebsplat.stages.registry import STAGES
 
 PLANNED = {name for name, stage in STAGES.items() if stage.of_scene}

@@ -67,7 +67,7 @@ def test_a_scene_learns_from_its_source_s_pseudo_labels(toy, tmp_path, capsys):
 
 
 def test_pseudo_labels_that_the_source_does_not_bring_are_refused_before_anything_runs(tmp_path, monkeypatch):
-    from chebsplat.pipelines.plan import Planner
+    from chebsplat.pipelines.planning.plan import Planner
 
     monkeypatch.setenv("CHEBSPLAT_WORK", str(tmp_path))
     with pytest.raises(ConfigError, match="brings no pseudo labels"):

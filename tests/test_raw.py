@@ -11,10 +11,12 @@ from tiny_teachers import color_reference, color_teacher
 
 from chebsplat.errors import InputError
 from chebsplat.formats import artifact
-from chebsplat.pipelines import job, raw, store
-from chebsplat.pipelines.plan import Planner
-from chebsplat.pipelines.raw import hashes, raw_files, unchanged
-from chebsplat.pipelines.run import entry, write_plan
+from chebsplat.pipelines.planning import raw
+from chebsplat.pipelines.planning.plan import Planner
+from chebsplat.pipelines.planning.raw import hashes, raw_files, unchanged
+from chebsplat.pipelines.running import job
+from chebsplat.pipelines.running.run import entry, write_plan
+from chebsplat.pipelines.work import store
 
 pytestmark = pytest.mark.usefixtures("own_work")
 

@@ -11,7 +11,7 @@ import pytest
 from shared import ROOT
 
 from chebsplat.kernels import jit
-from chebsplat.pipelines import rehearsal
+from chebsplat.pipelines.running import precompile as rehearsal
 
 TRAINS = """
 import sys

@@ -4,10 +4,10 @@ import pytest
 from shared import ROOT
 
 from chebsplat.errors import ConfigError
-from chebsplat.pipelines.cli.runs import checked_stage, plans
-from chebsplat.pipelines.plan import Planner, overrides
-from chebsplat.pipelines.run import wanted_steps
-from chebsplat.pipelines.sequences import chain, scenes_of
+from chebsplat.pipelines.planning.plan import Planner, overrides
+from chebsplat.pipelines.planning.sequences import chain, scenes_of
+from chebsplat.pipelines.running.run import wanted_steps
+from chebsplat.pipelines.selection import checked_stage, plans
 
 BEFORE_TRAIN = {"ingest", "sfm", "teacher", "agree", "describe"}
 LABELS = "teacher.kind=labels"

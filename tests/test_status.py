@@ -9,10 +9,11 @@ import pytest
 from click.testing import CliRunner
 from shared import finish
 
-from chebsplat.pipelines import cluster, job, store
 from chebsplat.pipelines.cli import main
-from chebsplat.pipelines.plan import Planner
-from chebsplat.pipelines.run import entry, plan_of
+from chebsplat.pipelines.planning.plan import Planner
+from chebsplat.pipelines.running import cluster, job
+from chebsplat.pipelines.running.run import entry, plan_of
+from chebsplat.pipelines.work import store
 
 pytestmark = pytest.mark.usefixtures("quick_plans")
 

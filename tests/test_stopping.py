@@ -13,8 +13,9 @@ from click.testing import CliRunner
 from soak.tiny import Run, artifacts, contents, hidden, kill
 
 from chebsplat.errors import Stopped
-from chebsplat.pipelines import children, store
 from chebsplat.pipelines.cli.group import Guarded
+from chebsplat.pipelines.running import processes as children
+from chebsplat.pipelines.work import store
 from chebsplat.stages.runtime import stopping
 
 

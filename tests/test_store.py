@@ -9,8 +9,9 @@ from shared import ROOT, finish, key_of, remember
 from chebsplat.errors import ConfigError, InputError
 from chebsplat.formats import artifact
 from chebsplat.formats.manifest import Manifest
-from chebsplat.pipelines import bases, store
-from chebsplat.pipelines.plan import Planner
+from chebsplat.pipelines.bases import revisions
+from chebsplat.pipelines.planning.plan import Planner
+from chebsplat.pipelines.work import store
 
 
 @pytest.fixture(autouse=True)
@@ -80,7 +81,7 @@ def test_links_and_heads_never_lead_out_of_the_work_folder(work, name):
     with pytest.raises(ConfigError):
         store.link(name, {})
     with pytest.raises(ConfigError):
-        bases.revisions(f"{name}@1")
+        revisions.revisions(f"{name}@1")
     assert sorted(work.parent.rglob("*")) == before
 
 

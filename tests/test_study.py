@@ -17,15 +17,15 @@ from chebsplat.formats.artifact import publish
 from chebsplat.formats.capture import Capture
 from chebsplat.formats.evaluation import Evaluation
 from chebsplat.formats.manifest import Manifest
-from chebsplat.pipelines import plan
-from chebsplat.pipelines.scenes import data_of, names
-from chebsplat.pipelines.sequences import scenes_of
+from chebsplat.pipelines.planning import plan
+from chebsplat.pipelines.planning.sequences import scenes_of
 from chebsplat.pipelines.studies import figures
 from chebsplat.pipelines.studies.page import write
 from chebsplat.pipelines.studies.pictures import gallery
 from chebsplat.pipelines.studies.results import compare, row_of, traces
 from chebsplat.pipelines.studies.study import checked_study, execute, expand, outstanding, read_study
 from chebsplat.pipelines.studies.tables import Section
+from chebsplat.pipelines.work.scenes import data_of, names
 from chebsplat.stages.registry import STAGES
 
 

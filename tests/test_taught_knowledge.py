@@ -19,8 +19,8 @@ from chebsplat.formats.knowledge import ENCODER, SHIPPED, read_knowledge
 from chebsplat.formats.refined import Refined
 from chebsplat.formats.teacher_model import read_teacher
 from chebsplat.lifting.surface import Surface
-from chebsplat.pipelines.knowledge import teaching
-from chebsplat.pipelines.plan import Planner
+from chebsplat.pipelines.planning.plan import Planner
+from chebsplat.pipelines.planning.sequences import teaching
 from chebsplat.shape.point_encoder import PointEncoder
 from chebsplat.shape.point_inputs import point_inputs
 from chebsplat.splats.gaussians import local_shape

@@ -5,7 +5,8 @@ from shared import ROOT
 from test_study import finish, study
 
 from chebsplat.errors import ConfigError
-from chebsplat.pipelines.studies import reaching, transfer
+from chebsplat.pipelines.studies import tables as reaching
+from chebsplat.pipelines.studies import transfer
 from chebsplat.pipelines.studies.page import write
 from chebsplat.pipelines.studies.results import row_of
 from chebsplat.pipelines.studies.study import Budgets, expand

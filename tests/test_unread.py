@@ -4,7 +4,7 @@ import pytest
 from source_folders import image
 
 from chebsplat.errors import InputError
-from chebsplat.pipelines.needs import source_sentence
+from chebsplat.pipelines.planning.needs import source_sentence
 from chebsplat.stages import ingest
 from chebsplat.stages.settings import IngestSection, SourceSection
 from chebsplat.stages.sources import common

@@ -9,9 +9,9 @@ from scipy.ndimage import gaussian_filter, uniform_filter1d, zoom
 from chebsplat.errors import DataFailure, InputError
 from chebsplat.formats import videos
 from chebsplat.photos.frames import STEP, choose, progress, shifts
-from chebsplat.pipelines import scenes
-from chebsplat.pipelines.needs import media_packages
-from chebsplat.pipelines.raw import raw_files
+from chebsplat.pipelines.planning.needs import media_packages
+from chebsplat.pipelines.planning.raw import raw_files
+from chebsplat.pipelines.work import scenes
 from chebsplat.stages.runtime.progress import Progress
 from chebsplat.stages.settings import IngestSection
 from chebsplat.stages.sources import common, video

@@ -16,9 +16,9 @@ WIDEST = 36  # characters of a column of ranges
 @click.command()
 def scenes() -> None:
     """List the scenes, ablations, sequences and studies that have a name, and scenes whose data must be brought."""
-    from chebsplat.pipelines.bases import head_names
-    from chebsplat.pipelines.scenes import data_of, names
-    from chebsplat.pipelines.tables import show_rows
+    from chebsplat.pipelines.bases.revisions import head_names
+    from chebsplat.pipelines.work.scenes import data_of, names
+    from chebsplat.pipelines.work.summary import show_rows
 
     needed = {name: found for name in names("scenes") if (found := data_of(name))}
     print(f"scenes: {' '.join(name for name in names('scenes') if name not in needed)}")
@@ -37,8 +37,8 @@ def scenes() -> None:
 def settings(section: str | None) -> None:
     """List every setting (of a SECTION, or one section.key): name, default, range, meaning."""
     from chebsplat.formats.names import suggest
-    from chebsplat.pipelines.scenes import shown
-    from chebsplat.pipelines.tables import show_rows
+    from chebsplat.pipelines.work.scenes import shown
+    from chebsplat.pipelines.work.summary import show_rows
     from chebsplat.stages.runtime.config import Config, known_keys
 
     asked = section or ""
@@ -76,7 +76,7 @@ def version(context: click.Context, _: click.Parameter, wanted: bool) -> None:
         return
     from importlib import metadata
 
-    from chebsplat.pipelines.run import HERE, git_state
+    from chebsplat.pipelines.running.run import HERE, git_state
 
     state = git_state(HERE)
     commit = f"commit {state['commit'][:10]}{' with changes' if state['dirty'] else ''}, " if state else ""

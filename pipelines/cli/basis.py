@@ -10,7 +10,7 @@ import click
 
 from chebsplat.pipelines.cli.group import Guarded
 from chebsplat.pipelines.cli.options import NewPath
-from chebsplat.pipelines.tables import show_rows
+from chebsplat.pipelines.work.summary import show_rows
 
 if TYPE_CHECKING:
     from chebsplat.formats.basis import Basis
@@ -24,7 +24,7 @@ def basis() -> None:
 def newest(name: str) -> tuple[Path, Basis]:
     """Path and content of a basis' newest revision. Raises ConfigError on an unknown name."""
     from chebsplat.formats.basis import read_basis
-    from chebsplat.pipelines.bases import revisions
+    from chebsplat.pipelines.bases.revisions import revisions
 
     path = revisions(name)[-1]
     return path, read_basis(path)
@@ -34,7 +34,7 @@ def newest(name: str) -> tuple[Path, Basis]:
 @click.argument("name")
 def log(name: str) -> None:
     """Revisions: the scene, ranks, ρ before and after, σ_f and ρ′, energy; means over linear maps."""
-    from chebsplat.pipelines import lineage
+    from chebsplat.pipelines.bases import lineage
 
     show_rows(lineage.log_table(newest(name)[1]))
 
@@ -43,7 +43,7 @@ def log(name: str) -> None:
 @click.argument("name")
 def show(name: str) -> None:
     """One revision: each linear map, and which scene added which of its columns."""
-    from chebsplat.pipelines import lineage
+    from chebsplat.pipelines.bases import lineage
 
     path, one = newest(name)
     print(f"{path}: revision {one.revision}, {len(one.weights)} arrays of weights")
@@ -55,7 +55,7 @@ def show(name: str) -> None:
 @click.argument("second")
 def diff(first: str, second: str) -> None:
     """What two revisions share, and how far their spans and weights lie apart."""
-    from chebsplat.pipelines import lineage
+    from chebsplat.pipelines.bases import lineage
 
     (_, one), (_, other) = newest(first), newest(second)
     count = lineage.common(one, other)
@@ -71,7 +71,7 @@ def diff(first: str, second: str) -> None:
 @click.argument("name")
 def verify(name: str) -> None:
     """Every revision: digests, BᵀB = I, ranks below their ceiling, each the continuation of the one before."""
-    from chebsplat.pipelines import lineage
+    from chebsplat.pipelines.bases import lineage
 
     path, one = newest(name)
     chain = lineage.ancestors(path)
@@ -99,10 +99,11 @@ def extend(name: str, scene: str) -> None:
 
     Any number of processes may do so at once, and one that was killed may be repeated.
     """
-    from chebsplat.pipelines import bases, finished
+    from chebsplat.pipelines.bases import revisions
+    from chebsplat.pipelines.work import finished
 
     gaussians = finished.artifact_of(scene, "train")
     known = finished.holder(gaussians) or gaussians
-    made = bases.extend(name, gaussians.resolve(), known.name.partition("@")[0])
+    made = revisions.extend(name, gaussians.resolve(), known.name.partition("@")[0])
     print(f"{name}@{len(made)}", file=sys.stderr)
     print(made[-1])

@@ -13,7 +13,7 @@ from typing import NoReturn
 
 import click
 
-from chebsplat.pipelines import store
+from chebsplat.pipelines.work import store
 from chebsplat.stages.runtime.stopping import exit_code
 
 

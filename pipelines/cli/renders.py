@@ -60,7 +60,7 @@ def render(
     """Render a finished SCENE along a path of cameras, as frames or a video; frames that are there are kept."""
     from chebsplat.formats.artifact import read_manifest
     from chebsplat.pipelines.api import load
-    from chebsplat.pipelines.finished import artifact_of
+    from chebsplat.pipelines.work.finished import artifact_of
     from chebsplat.stages.runtime.progress import Progress
     from chebsplat.stages.tools.camera_paths import fitted, path_of, size_of
     from chebsplat.stages.tools.frames import Shot, kinds_of, render_frames, render_video
@@ -115,8 +115,8 @@ def view(scene: str, sh: int, words: Path | None, against: list[str]) -> None:
 
     The page lies in the scene's folder, that of a .ply where you stand; each call writes it anew.
     """
-    from chebsplat.pipelines.finished import scene_folder
-    from chebsplat.pipelines.inventory import PAGE
+    from chebsplat.pipelines.work.finished import scene_folder
+    from chebsplat.pipelines.work.inventory import PAGE
 
     out = Path(f"{_name(scene)}.{PAGE}")
     if not scene.endswith(".ply"):
@@ -138,7 +138,7 @@ def _write_page(scene: str, out: Path, sh: int, words: Path | None, against: lis
     """Write the page and say where it is."""
     from chebsplat.formats.scene import Scene
     from chebsplat.formats.teacher_model import read_label_set
-    from chebsplat.pipelines.finished import artifact_of, teacher_of
+    from chebsplat.pipelines.work.finished import artifact_of, teacher_of
     from chebsplat.stages.tools.page import foreign, write_page
 
     theirs = scene.endswith(".ply")

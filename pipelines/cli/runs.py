@@ -8,59 +8,7 @@ from typing import Any
 
 import click
 
-from chebsplat.errors import ConfigError
-from chebsplat.formats.names import suggest
-from chebsplat.stages.registry import STAGES
 from chebsplat.stages.runtime.device import DEVICES
-
-
-def plans(
-    scene: str | None,
-    sequence: str | None,
-    settings: str,
-    ablation: str,
-    basis: str,
-    running: bool = False,
-    device: str = "cpu",
-) -> list[Any]:
-    """The plan of a scene, after those of the scenes that its basis comes from, or the plans of a sequence."""
-    from chebsplat.pipelines import bases, sequences
-    from chebsplat.pipelines.plan import Planner
-
-    if (scene is None) == (sequence is None):
-        raise ConfigError("name one of scene= and sequence=")
-    if sequence is not None and basis:
-        raise ConfigError("a sequence starts from nothing; basis= goes with scene=")
-    planner = Planner(running=running, device=device)
-    try:
-        if sequence is not None:
-            return sequences.chain(planner, sequence, settings, ablation)
-        if basis == "none":
-            settings = ",".join(part for part in (settings, "refine.knowledge=none") if part)
-        if basis in ("", "none"):
-            return [planner.plan(str(scene), settings, ablation)]
-        earlier, path, name = bases.before(planner, basis, settings, ablation)
-        plan = planner.plan(str(scene), settings, ablation, path)
-        plan.title += ("+" if ablation or settings else "@") + f"basis={name}"
-        for one in earlier:
-            one.asked = False
-        return [*earlier, plan]
-    finally:
-        planner.save()
-
-
-def checked_stage(stage: str | None, chosen: list[Any]) -> str | None:
-    """Raises ConfigError for a stage that does not exist or that this scene leaves out."""
-    if stage is None:
-        return None
-    if stage not in STAGES:
-        near = suggest(stage, STAGES, 1)
-        raise ConfigError(f"no stage is called {stage}" + (f"; did you mean {near[0]}?" if near else ""))
-    for plan in chosen:
-        if plan.asked and stage not in plan.targets:
-            raise ConfigError(f"{plan.title} leaves out {stage}: {plan.left_out.get(stage, 'not needed')}")
-    return stage
-
 
 OPTIONS = [
     click.option("--scene", help="a name from `chebsplat scenes`, a folder, or a video"),
@@ -96,12 +44,14 @@ def with_scene(command: Any) -> Any:
 @ON
 def run(stage: str | None, cores: int | None, device: str, on: str, **choice: Any) -> int:
     """Bring a scene up to date; recompute only what is stale."""
-    from chebsplat.pipelines import cluster
-    from chebsplat.pipelines.run import device_of, execute
+    from chebsplat.pipelines.running import cluster
+    from chebsplat.pipelines.running.run import device_of, execute
 
     where = cluster.checked(on)
     used = device_of(device, where)
     cores = cores or (os.cpu_count() or 1 if where == cluster.LOCAL else 4)
+    from chebsplat.pipelines.selection import checked_stage, plans
+
     chosen = plans(**choice, running=True, device=used)
     return execute(chosen, checked_stage(stage or None, chosen), cores, used, where)
 
@@ -111,7 +61,8 @@ def run(stage: str | None, cores: int | None, device: str, on: str, **choice: An
 @ON_DEVICE
 def plan(device: str, **choice: Any) -> None:
     """Show what would run, what is fresh, and what the scene leaves out, and why."""
-    from chebsplat.pipelines.run import device_of, wanted_steps
+    from chebsplat.pipelines.running.run import device_of, wanted_steps
+    from chebsplat.pipelines.selection import plans
 
     chosen = plans(**choice, device=device_of(device))
     keys = {step.key for one in chosen if one.asked for step in wanted_steps(one, None, chosen)}
@@ -138,10 +89,11 @@ def study(
     name: str, cores: int | None, threads: int, out: Path | None, only_plan: bool, no_run: bool, device: str, on: str
 ) -> int:
     """Run a study (of pipelines/configs/studies, or a .toml): its table, figure and page; goes on where it stopped."""
-    from chebsplat.pipelines import cluster
-    from chebsplat.pipelines.run import Outcome, device_of, say
-    from chebsplat.pipelines.studies import page, reaching, results, transfer
+    from chebsplat.pipelines.running import cluster
+    from chebsplat.pipelines.running.run import Outcome, device_of, say
+    from chebsplat.pipelines.studies import page, results, transfer
     from chebsplat.pipelines.studies import study as studies
+    from chebsplat.pipelines.studies import tables as reaching
 
     where, asked = cluster.checked(on), studies.read_study(name)
     computing = device_of(device, where)
@@ -173,9 +125,9 @@ def study(
 @click.option("--elsewhere", is_flag=True, help="on a node of a cluster, which no pipe of the run reaches")
 def job(plan: Path, keys: tuple[str, ...], elsewhere: bool) -> int:
     """Steps of a plan, one after the other until one fails, as Snakemake runs them."""
-    from chebsplat.pipelines import job as jobs
-    from chebsplat.pipelines.children import in_turn
-    from chebsplat.pipelines.cluster import watch_run
+    from chebsplat.pipelines.running import job as jobs
+    from chebsplat.pipelines.running.cluster import watch_run
+    from chebsplat.pipelines.running.processes import in_turn
 
     jobs.use_threads()
     if len(keys) > 1:
@@ -191,7 +143,7 @@ def rehearse(semantic: bool) -> int:
     """Compile what a training needs, as long as the run lasts that this is of."""
     import os
 
-    from chebsplat.pipelines.rehearsal import rehearsed
+    from chebsplat.pipelines.running.precompile import rehearsed
 
     os.nice(5)
     with rehearsed(2, semantic):

@@ -30,8 +30,8 @@ class Age(click.ParamType):
 @click.command("ls")
 def list_scenes() -> None:
     """List scenes, studies and sequences in work: source, stages done, bytes, when, and what was measured."""
-    from chebsplat.pipelines import inventory, store
-    from chebsplat.pipelines.tables import show_rows
+    from chebsplat.pipelines.work import inventory, store
+    from chebsplat.pipelines.work.summary import show_rows
 
     scenes = inventory.scenes()
     if not scenes:
@@ -46,7 +46,7 @@ def list_scenes() -> None:
 @click.option("--yes", is_flag=True, help="remove what is listed")
 def rm(scenes: tuple[str, ...], yes: bool) -> None:
     """Remove SCENES: their links and pages, and the artifacts that nothing else names."""
-    from chebsplat.pipelines import inventory
+    from chebsplat.pipelines.work import inventory
 
     chosen = list(dict.fromkeys(inventory.in_work(scene) for scene in scenes))
     artifacts = inventory.only_of(chosen)
@@ -60,7 +60,7 @@ def rm(scenes: tuple[str, ...], yes: bool) -> None:
 
 def remove(chosen: list[Path], artifacts: list[tuple[Path, int]]) -> None:
     """Remove the links of these folders, and these artifacts and leftovers."""
-    from chebsplat.pipelines import inventory, store
+    from chebsplat.pipelines.work import inventory, store
 
     for folder in chosen:
         inventory.unlink(folder)
@@ -81,7 +81,7 @@ def show_sizes(sizes: list, done: bool, advice: str) -> None:
 def verify(scenes: tuple[str, ...]) -> int:
     """Recompute every digest of SCENES' artifacts, or of artifacts."""
     from chebsplat.formats.artifact import verify as check
-    from chebsplat.pipelines.finished import artifacts
+    from chebsplat.pipelines.work.finished import artifacts
 
     codes = [0]
     for path in [path for scene in scenes for path in artifacts(scene)]:
@@ -100,7 +100,7 @@ def verify(scenes: tuple[str, ...]) -> int:
 @click.option("--older-than", type=Age(), help="give up scenes and studies, too, that nothing was added to for so long")
 def clean_stale(yes: bool, keep_newer: float, older_than: float | None) -> None:
     """List the artifacts that no scene names any more, and leftovers of killed runs."""
-    from chebsplat.pipelines import inventory, store
+    from chebsplat.pipelines.work import inventory, store
 
     old = [] if older_than is None else inventory.untouched(older_than)
     leftovers = store.unnamed(set(old))
@@ -116,8 +116,8 @@ def clean_stale(yes: bool, keep_newer: float, older_than: float | None) -> None:
 @click.command()
 def status() -> None:
     """Say what runs, waits and has failed, with seconds and the end of the log, here and on a cluster."""
-    from chebsplat.pipelines import status as runs
-    from chebsplat.pipelines import store
+    from chebsplat.pipelines.work import status as runs
+    from chebsplat.pipelines.work import store
 
     said = False
     for line in runs.lines():

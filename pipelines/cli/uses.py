@@ -102,7 +102,7 @@ def extract(
 @click.option("--device", type=click.Choice(["cpu", "cuda"]), default="cpu", show_default=True, help="of the models")
 def encode(scene: str, encoder: str | None, features: Path | None, out: Path, device: str) -> None:
     """Fused features of a finished SCENE (or a .ply), by onnxruntime, without torch."""
-    from chebsplat.pipelines.finished import artifact_of, scene_folder
+    from chebsplat.pipelines.work.finished import artifact_of, scene_folder
     from chebsplat.stages.tools.encode import encode as write
 
     if scene.endswith(".ply"):
@@ -127,7 +127,7 @@ def lift(ply: Path, capture: str | None, teacher: Path | None, out: Path) -> Non
 
     Without a .PLY, the stage of this name: --help says more.
     """
-    from chebsplat.pipelines.finished import artifact_of, is_artifact, links, scene_folder
+    from chebsplat.pipelines.work.finished import artifact_of, is_artifact, links, scene_folder
     from chebsplat.stages.tools.lift_ply import import_ply, lift_ply
 
     if capture is None:
@@ -149,10 +149,10 @@ def lift(ply: Path, capture: str | None, teacher: Path | None, out: Path) -> Non
 def knowledge(teacher: Path | None, settings: str, out: Path | None, cores: int) -> int:
     """Teach what shapes look like to a TEACHER, over generated rooms; scenes of that teacher start from it."""
     from chebsplat.formats import artifact
-    from chebsplat.pipelines import store
-    from chebsplat.pipelines.knowledge import teaching
-    from chebsplat.pipelines.plan import Planner
-    from chebsplat.pipelines.run import execute
+    from chebsplat.pipelines.planning.plan import Planner
+    from chebsplat.pipelines.planning.sequences import teaching
+    from chebsplat.pipelines.running.run import execute
+    from chebsplat.pipelines.work import store
 
     planner = Planner(running=True)
     try:

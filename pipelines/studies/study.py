@@ -11,13 +11,13 @@ from typing import Annotated, Any
 from pydantic import AfterValidator, Field, model_validator
 
 from chebsplat.errors import ConfigError
-from chebsplat.pipelines import store
-from chebsplat.pipelines.cluster import LOCAL
-from chebsplat.pipelines.plan import Plan, Planner, Step, merged, suffix
-from chebsplat.pipelines.run import Outcome, say, snakemake, wanted_steps
-from chebsplat.pipelines.scenes import read_named, read_toml, scene_values
-from chebsplat.pipelines.sequences import scenes_of
+from chebsplat.pipelines.planning.plan import Plan, Planner, Step, merged, suffix
+from chebsplat.pipelines.planning.sequences import scenes_of
+from chebsplat.pipelines.running.cluster import LOCAL
+from chebsplat.pipelines.running.run import Outcome, say, snakemake, wanted_steps
 from chebsplat.pipelines.studies.progress import reported
+from chebsplat.pipelines.work import store
+from chebsplat.pipelines.work.scenes import read_named, read_toml, scene_values
 from chebsplat.stages.runtime.config import checked
 from chebsplat.stages.settings import Section, Text, printable
 

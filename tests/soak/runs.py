@@ -60,8 +60,8 @@ def measured(number: int, stage: str, seconds: float, work: Path) -> Count:
 
 def runs(work: Path, count: int) -> list[Count]:
     """All runs, by turns for the cheap stages and for all of them, in this process."""
-    from chebsplat.pipelines.plan import Planner
-    from chebsplat.pipelines.run import execute
+    from chebsplat.pipelines.planning.plan import Planner
+    from chebsplat.pipelines.running.run import execute
     from soak.tiny import SET
 
     rows: list[Count] = []

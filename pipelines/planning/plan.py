@@ -13,10 +13,9 @@ from typing import TYPE_CHECKING, Any
 from chebsplat.errors import ConfigError
 from chebsplat.formats.names import unprintable
 from chebsplat.formats.teacher_model import EMBEDDED, read_teacher
-from chebsplat.pipelines import folders, store
-from chebsplat.pipelines.code import PACKAGE, Code
-from chebsplat.pipelines.keys import PLACES, step_key
-from chebsplat.pipelines.needs import (
+from chebsplat.pipelines.planning.code import PACKAGE, Code
+from chebsplat.pipelines.planning.keys import PLACES, step_key
+from chebsplat.pipelines.planning.needs import (
     left_out_channels,
     left_out_knowledge,
     left_out_stages,
@@ -26,8 +25,9 @@ from chebsplat.pipelines.needs import (
     text_packages,
     unread_inputs,
 )
-from chebsplat.pipelines.raw import Hashes, content_hash, hashes, raw_files
-from chebsplat.pipelines.scenes import absent, expanded, folder_of, is_source, read_toml, scene_values
+from chebsplat.pipelines.planning.raw import Hashes, content_hash, hashes, raw_files
+from chebsplat.pipelines.work import folders, store
+from chebsplat.pipelines.work.scenes import absent, expanded, folder_of, is_source, read_toml, scene_values
 from chebsplat.stages.registry import STAGES, Stage
 
 if TYPE_CHECKING:
@@ -151,7 +151,7 @@ class Planner:
         Raises: ConfigError, InputError.
         Choices: a scene of a sequence, or on a basis, trains the encoder of regions, which a basis is of.
         """
-        from chebsplat.pipelines.knowledge import given
+        from chebsplat.pipelines.planning.needs import knowledge_given
         from chebsplat.stages import ingest
         from chebsplat.stages.runtime import config as configs
 
@@ -180,7 +180,7 @@ class Planner:
         model = read_teacher(Path(teacher.model)) if kind == "onnx" and teacher.model else None
         left_out = left_out_stages(config, kind, why, probe) | left_out_channels(kind, model)
         left_out |= left_out_knowledge(config, kind, why, basis, keep_knowledge)
-        known, unknown = given(config, kind, self.running) if "refine" not in left_out else (None, "")
+        known, unknown = knowledge_given(config, kind, self.running) if "refine" not in left_out else (None, "")
         left_out |= {"knowledge of shape": unknown} if unknown else {}
         config = config.model_copy(update={"refine": config.refine.model_copy(update={"knowledge": None})})  # an input
         steps: dict[str, Step] = {}

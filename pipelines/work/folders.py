@@ -12,8 +12,8 @@ from contextlib import suppress
 from pathlib import Path
 
 from chebsplat.errors import ConfigError
-from chebsplat.pipelines import store
-from chebsplat.pipelines.scenes import folder_name
+from chebsplat.pipelines.work import store
+from chebsplat.pipelines.work.scenes import folder_name
 
 LONGEST = 80  # bytes of a name; its settings follow in the name of the folder of links
 

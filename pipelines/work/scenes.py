@@ -12,9 +12,9 @@ from chebsplat.errors import ConfigError, InputError
 from chebsplat.formats.files import parse_toml
 from chebsplat.formats.names import suggest
 from chebsplat.formats.videos import is_video
-from chebsplat.pipelines.store import is_name
+from chebsplat.pipelines.work.store import is_name
 
-CONFIGS = Path(__file__).parent / "configs"
+CONFIGS = Path(__file__).parents[1] / "configs"
 ONE = {"scenes": "scene", "ablations": "ablation", "sequences": "sequence", "studies": "study"}
 VARIABLE = re.compile(r"\$\{(\w+):-([^}]*)\}")  # ${NAME:-default}
 

@@ -8,8 +8,8 @@ from pathlib import Path
 
 from chebsplat.errors import ConfigError, InputError
 from chebsplat.formats.names import suggest
-from chebsplat.pipelines import folders, store
-from chebsplat.pipelines.scenes import is_source, names, shown
+from chebsplat.pipelines.work import folders, store
+from chebsplat.pipelines.work.scenes import is_source, names, shown
 from chebsplat.stages.registry import STAGES
 
 

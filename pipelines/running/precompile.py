@@ -132,7 +132,7 @@ def rehearsed(n_threads: int, semantic: bool) -> Iterator[None]:
 def beside(parts: Sequence[Callable[[], None]]) -> Iterator[BaseProcess]:
     """A process that rehearses parts, and ends with the block; forked from one that is ready to compile."""
     context = get_context("forkserver")
-    context.set_forkserver_preload(["chebsplat.pipelines.compiler"])
+    context.set_forkserver_preload(["chebsplat.pipelines.running.compiler"])
     process = context.Process(target=alone, args=(5, *parts), daemon=True)
     process.start()
     try:

@@ -18,13 +18,15 @@ from typing import Any
 
 from chebsplat.formats import disk
 from chebsplat.formats.files import atomic_write
-from chebsplat.pipelines import children, cluster, job, leases, store, summary
-from chebsplat.pipelines.plan import Plan, Step
-from chebsplat.pipelines.store import say
-from chebsplat.pipelines.tables import aligned
+from chebsplat.pipelines.planning.plan import Plan, Step
+from chebsplat.pipelines.running import cluster, job
+from chebsplat.pipelines.running import processes as children
+from chebsplat.pipelines.work import leases, store, summary
+from chebsplat.pipelines.work.store import say
+from chebsplat.pipelines.work.summary import aligned
 from chebsplat.stages.registry import STAGES
 
-HERE = Path(__file__).parent
+HERE = Path(__file__).parents[1]  # of the Snakefile
 
 
 @dataclass

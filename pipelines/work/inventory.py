@@ -11,8 +11,8 @@ from pathlib import Path
 from chebsplat.errors import ConfigError, InputError
 from chebsplat.formats import artifact
 from chebsplat.formats.manifest import Manifest
-from chebsplat.pipelines import folders, store, summary
-from chebsplat.pipelines.finished import is_artifact, links, scene_folder, titles
+from chebsplat.pipelines.work import folders, store, summary
+from chebsplat.pipelines.work.finished import is_artifact, links, scene_folder, titles
 from chebsplat.stages.registry import STAGES
 
 PAGE = "view.html"  # of `chebsplat view`, in a scene's folder

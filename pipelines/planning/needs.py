@@ -1,4 +1,4 @@
-"""What a scene needs: its teacher, the stages it leaves out and why, and which source it really is."""
+"""What a scene needs: its teacher, the knowledge it is refined with, the stages it leaves out and why, its source."""
 
 from __future__ import annotations
 
@@ -9,7 +9,11 @@ from typing import TYPE_CHECKING, Any
 
 from chebsplat.errors import ConfigError
 from chebsplat.formats.images import is_heic, is_image, require_heic
+from chebsplat.formats.knowledge import SCHEMA, SHIPPED, read_card
+from chebsplat.formats.teacher_model import EMBEDDED, read_teacher
 from chebsplat.formats.videos import is_video, require_av
+from chebsplat.pipelines.work import store
+from chebsplat.pipelines.work.scenes import expanded
 from chebsplat.stages.sources.common import unread
 
 if TYPE_CHECKING:
@@ -150,3 +154,22 @@ def source_sentence(name: str, asked: Any, source: Any) -> str:
     if asked.kind == "named":
         note = " (REPLICA_ROOT has no such scene)" if os.environ.get("REPLICA_ROOT") else " (REPLICA_ROOT is not set)"
     return f"generated scene {name}: preset {source.preset}, seed {source.seed}{note}"
+
+
+def knowledge_given(config: Any, kind: str, running: bool) -> tuple[Path | None, str]:
+    """The knowledge that a scene is refined with, in the store, and why there is none if there is none.
+
+    Raises: InputError on a damaged artifact.
+    Choices: a scene of labels or of a segmenter is given that of the embedded teacher, which reaches it through words.
+    """
+    wanted = config.refine.knowledge
+    if wanted == "none":
+        return None, "refine.knowledge is none"
+    if wanted is None and config.train.encoder != "points":
+        return None, f"train.encoder is {config.train.encoder}"
+    if wanted is not None:
+        return store.taken_in(Path(expanded(wanted)).expanduser().resolve(), "teach", SCHEMA, running), ""
+    model = read_teacher(Path(config.teacher.model or EMBEDDED)) if kind == "onnx" else None
+    if model is not None and model.output == "features" and model.name != read_card(SHIPPED)["teacher"]:
+        return None, f"none was taught for the teacher {model.name}; `chebsplat knowledge` teaches it"
+    return store.taken_in(SHIPPED, "teach", SCHEMA, running), ""

@@ -1,13 +1,16 @@
-"""Sequences: scenes in order, each starting from the knowledge of those before it."""
+"""Plans of more than a scene: scenes in order, each starting from the knowledge of those before; what teaches it."""
 
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Any
 
 from chebsplat.errors import ConfigError
 from chebsplat.formats.names import unprintable
-from chebsplat.pipelines.plan import Plan, Planner
-from chebsplat.pipelines.scenes import read_named
+from chebsplat.formats.teacher_model import EMBEDDED, read_teacher
+from chebsplat.pipelines.planning.plan import Plan, Planner, merged, overrides, placed
+from chebsplat.pipelines.work.scenes import read_named
+from chebsplat.stages.registry import STAGES
 
 LONGEST = 1000  # scenes of a sequence
 
@@ -40,3 +43,22 @@ def chain(planner: Planner, name: str, settings: str = "", ablation: str = "", l
         basis = plan.targets.get("cks", basis)
         found.append(plan)
     return found
+
+
+def teaching(planner: Planner, model: Path | None, settings: str = "") -> Plan:
+    """The steps that teach knowledge for a teacher, the embedded one if none is named.
+
+    Raises: ConfigError on a closed-set teacher, whose classes no shape is taught.
+    """
+    from chebsplat.stages.runtime import config as configs
+
+    file = (model or EMBEDDED).expanduser().resolve()
+    teacher = read_teacher(file)
+    if teacher.output != "features":
+        raise ConfigError(f"{teacher.settings}: output is {teacher.output}; knowledge is taught in features")
+    of: dict[str, Any] = {"channels": {"model": str(file)}, "knowledge": {"model": str(file)} if model else {}}
+    config = placed(configs.build(merged(of, overrides(settings)), f"knowledge for {teacher.name}"))
+    channels = planner.step(STAGES["channels"], config, {}, {})
+    inputs = {"channels": channels.path}
+    teach = planner.step(STAGES["teach"], config, inputs, {"channels": channels.key})
+    return Plan(f"knowledge-{teacher.name}", f"knowledge for the teacher {teacher.name}", [channels, teach])

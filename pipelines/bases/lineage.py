@@ -10,7 +10,7 @@ from chebsplat.errors import InputError
 from chebsplat.formats import artifact
 from chebsplat.formats.basis import SCHEMA, Basis, last_report, off_orthonormal, read_basis
 from chebsplat.formats.manifest import remedy_of
-from chebsplat.pipelines import store
+from chebsplat.pipelines.work import store
 
 Table = list[list[str]]  # header first
 

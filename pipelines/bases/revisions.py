@@ -11,11 +11,12 @@ from chebsplat.errors import ConfigError
 from chebsplat.formats import artifact, heads
 from chebsplat.formats.basis import SCHEMA, read_lineage
 from chebsplat.formats.names import suggest
-from chebsplat.pipelines import job, store
-from chebsplat.pipelines.plan import Plan, Planner
-from chebsplat.pipelines.run import HERE, entry, git_state, plan_of
-from chebsplat.pipelines.scenes import names
-from chebsplat.pipelines.sequences import chain, scenes_of
+from chebsplat.pipelines.planning.plan import Plan, Planner
+from chebsplat.pipelines.planning.sequences import chain, scenes_of
+from chebsplat.pipelines.running import job
+from chebsplat.pipelines.running.run import HERE, entry, git_state, plan_of
+from chebsplat.pipelines.work import store
+from chebsplat.pipelines.work.scenes import names
 from chebsplat.stages.registry import STAGES
 from chebsplat.stages.runtime.device import resolve
 

@@ -12,10 +12,10 @@ from pathlib import Path
 from typing import Any
 
 from chebsplat.errors import ConfigError, DataFailure, InputError
-from chebsplat.pipelines import leases, store
-from chebsplat.pipelines.raw import unchanged
-from chebsplat.pipelines.rehearsal import rehearsed
-from chebsplat.pipelines.store import say
+from chebsplat.pipelines.planning.raw import unchanged
+from chebsplat.pipelines.running.precompile import rehearsed
+from chebsplat.pipelines.work import leases, store
+from chebsplat.pipelines.work.store import say
 from chebsplat.stages.runtime.command import n_threads, publish
 from chebsplat.stages.runtime.stopping import exit_code
 

@@ -18,7 +18,7 @@ from chebsplat.errors import ConfigError, InputError
 from chebsplat.formats import artifact
 from chebsplat.formats.files import atomic_write
 from chebsplat.formats.manifest import parse_manifest
-from chebsplat.pipelines import leases
+from chebsplat.pipelines.work import leases
 
 
 def work() -> Path:

@@ -20,13 +20,13 @@ from typing import Any
 import yaml
 
 from chebsplat.errors import ConfigError
-from chebsplat.pipelines import leases, store
-from chebsplat.pipelines.store import say
+from chebsplat.pipelines.work import leases, store
+from chebsplat.pipelines.work.store import say
 from chebsplat.settings import MOST_STEPS
 from chebsplat.stages.registry import MODEL_FREE
 from chebsplat.stages.runtime.stopping import end_itself
 
-HERE = Path(__file__).parent
+HERE = Path(__file__).parents[1]
 LOCAL, SLURM = "local", "slurm"
 EXTRA = ".venv/bin/python -m uv pip install --python .venv/bin/python --editable '.[slurm]'"
 

@@ -1,0 +1,1 @@
+"""The knowledge that a sequence of scenes hands on."""

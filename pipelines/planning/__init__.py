@@ -1,0 +1,1 @@
+"""Which steps a scene needs, and under which keys."""

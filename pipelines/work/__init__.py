@@ -1,0 +1,1 @@
+"""The work folder: what is stored, linked, leased and listed there."""
