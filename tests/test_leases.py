@@ -13,7 +13,7 @@ from chebsplat.pipelines.work import leases, store
 ENDLESS = """
 import sys, time
 from pathlib import Path
-from chebsplat.pipelines import leases
+from chebsplat.pipelines.work import leases
 with leases.held(Path(sys.argv[1])):
     print("held", flush=True)
     time.sleep(600)

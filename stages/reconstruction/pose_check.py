@@ -96,10 +96,10 @@ def measured(job: Job, capture: Capture, database: Path | None) -> Fit:
 
 def probed(job: Job, capture: Capture, settings: SfmSection) -> Path | None:
     """A database of PROBED pairs of neighbouring views, evenly chosen, and large features; None without pairs."""
-    from chebsplat.stages.reconstruction.matching import posed
+    from chebsplat.stages.reconstruction.matching import nearest_by_pose
 
     assert capture.cam_from_world is not None
-    pairs = posed(capture.cam_from_world, settings.n_matched)
+    pairs = nearest_by_pose(capture.cam_from_world, settings.n_matched)
     if len(pairs) < LEAST:
         return None
     few = settings.model_copy(update={"max_features": min(FEATURES, settings.max_features)})

@@ -144,8 +144,8 @@ def _listing(folder: Path) -> Listing:
     reduced = _is_reduced(folder)
     protocol = scannet_closed if reduced else scannet_open
     listing = Listing("scannet", frames, class_names=protocol.CLASSES if place or pseudo else None, any_label_size=True)
-    reduced_names = dict(enumerate(("void", *scannet_closed.CLASSES)))
-    listing.pseudo_names = reduced_names if pseudo else None
+    by_id = dict(enumerate(("void", *scannet_closed.CLASSES)))
+    listing.pseudo_names = by_id if pseudo else None
     listing.notes.append(f"ScanNet as {'Panoptic Lifting' if reduced else 'Semantic Gaussians'} lays it out.")
     if extra := sum(path.stem not in set(names) for path in (folder / "pose").glob("*.txt")):
         listing.notes.append(f"{extra} poses have no image in color/ and are left out.")
@@ -153,9 +153,9 @@ def _listing(folder: Path) -> Listing:
         depth_size, _ = header(folder / f"depth/{names[0]}.png")
         listing.depth_camera = _camera(folder, "depth", depth_size, depth_size[0])
     if place == "rs_semantics":
-        listing.label_names = reduced_names
+        listing.label_names = by_id
     elif place == "semantics":
-        listing.label_names, listing.corrections = reduced(_table(folder), folder.resolve().name)
+        listing.label_names, listing.corrections = reduced_names(_table(folder), folder.resolve().name)
         if listing.corrections:
             listing.notes.append(f"{len(listing.corrections)} objects take the hand-corrected labels of this scene.")
     elif place == "label-filt":
@@ -190,7 +190,7 @@ def mapped(path: Path | None) -> dict[int, str]:
     return {raw: names[value] for raw, value in _column(path, MODIFIED, "cocomapid", len(names)).items()}
 
 
-def reduced(path: Path | None, scene: str) -> tuple[dict[int, str], dict[int, int]]:
+def reduced_names(path: Path | None, scene: str) -> tuple[dict[int, str], dict[int, int]]:
     """Class names by raw id through the table's column `nyu40id`, and the scene's corrections by object id.
 
     Choices: an id whose `nyu40id` is empty is NYU's 40, other props; 0 is void.
