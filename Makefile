@@ -67,7 +67,7 @@ test-all: $(READY)  ## all tests, the slow ones too
 	@$(PY) -m pytest -q -n auto --dist loadgroup -m "not gpu" $(args)
 
 cluster-test: slurm  ## study=toys on a Slurm of its own on 127.0.0.1 (apt-get install munge slurm-wlm): build/cluster.csv
-	@$(PY) -m pytest -q -rs tests/test_cluster.py $(args)
+	@$(PY) -m pytest -q -rs tests/pipelines/test_cluster.py $(args)
 	@[ ! -f build/cluster.csv ] || cat build/cluster.csv
 
 gpu: $(READY)  ## tests that need an NVIDIA GPU, then office0 on it beside the CPU: build/bench/gpu.csv (under 10 minutes)

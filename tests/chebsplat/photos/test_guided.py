@@ -3,10 +3,10 @@
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
-from test_adjustment import poses_of
 
 from chebsplat.photos.epipolar import fundamental, sampson_distance
 from chebsplat.photos.guided import ALIKE, BAND, RATIO, along_lines
+from tests.stages.reconstruction.test_adjustment import poses_of
 
 K = np.array([[500.0, 0, 320], [0, 500, 240], [0, 0, 1]])
 

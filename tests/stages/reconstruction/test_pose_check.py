@@ -5,12 +5,12 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
-from test_adjustment import poses_of, synthetic  # noqa: F401 the fixture
 
 from chebsplat.cameras import centers
 from chebsplat.photos.epipolar import fundamental, sampson_distance
 from chebsplat.stages.reconstruction import pose_check
 from chebsplat.stages.settings import SfmSection
+from tests.stages.reconstruction.test_adjustment import poses_of, synthetic  # noqa: F401 the fixture
 
 K = np.array([[900.0, 0, 512], [0, 900, 384], [0, 0, 1]])
 

@@ -10,7 +10,6 @@ from click.testing import CliRunner
 from driven import driven
 from scipy.special import expit
 from shared import INPUTS, TOY, data, run_stage
-from test_page import decibels, held_in, picture
 
 from chebsplat.formats.gaussians import Gaussians
 from chebsplat.formats.packed import Packed, unpack
@@ -20,6 +19,7 @@ from chebsplat.pipelines.planning.plan import Planner
 from chebsplat.render import SceneRenderer
 from chebsplat.stages.tools.page import foreign
 from chebsplat.stages.tools.scene import OpenedScene
+from tests.stages.tools.test_page import decibels, held_in, picture
 
 N = 150_000
 

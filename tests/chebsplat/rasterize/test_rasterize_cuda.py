@@ -6,10 +6,10 @@ import types
 import pytest
 import torch
 from raster import NAMES, camera, gradients, scene, undecided
-from test_rasterize import tiny_case
-from test_rasterize_exact import EXTREMES
 
 from chebsplat.rasterize import rasterize
+from tests.chebsplat.rasterize.test_rasterize import tiny_case
+from tests.chebsplat.rasterize.test_rasterize_exact import EXTREMES
 
 CEILING = 0.999  # gsplat's
 

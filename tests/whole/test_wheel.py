@@ -17,7 +17,11 @@ LINKS = ("formats", "pipelines", "stages", "teachers")
 @pytest.fixture(scope="module")
 def source(tmp_path_factory):
     """A copy of the checkout that builds leave their files in."""
-    ignored = shutil.ignore_patterns(".*", "work", "build", "*.egg-info", "__pycache__", "tests")
+
+    def ignored(folder, names):
+        here = {"work", "build", "tests", ".git", ".venv"} if folder == str(ROOT) else set()
+        return (here & set(names)) | shutil.ignore_patterns(".*", "*.egg-info", "__pycache__")(folder, names)
+
     return shutil.copytree(ROOT, tmp_path_factory.mktemp("wheel") / "source", symlinks=True, ignore=ignored)
 
 

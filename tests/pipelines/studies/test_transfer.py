@@ -2,7 +2,6 @@
 
 import pytest
 from shared import ROOT
-from test_study import finish, study
 
 from chebsplat.errors import ConfigError
 from chebsplat.pipelines.studies import tables as reaching
@@ -10,6 +9,7 @@ from chebsplat.pipelines.studies import transfer
 from chebsplat.pipelines.studies.page import write
 from chebsplat.pipelines.studies.results import row_of
 from chebsplat.pipelines.studies.study import Budgets, expand
+from tests.pipelines.studies.test_study import finish, study
 
 
 @pytest.fixture(autouse=True)

@@ -6,8 +6,6 @@ import numpy as np
 import pytest
 import torch
 from scipy.special import erf
-from test_printed_gates import randomized
-from test_printed_gates import weights as arrays
 
 from chebsplat.shape.cks import update
 from chebsplat.shape.encoder import N_FREQUENCIES, RegionEncoder, positional_encoding
@@ -16,6 +14,8 @@ from chebsplat.shape.region_inputs import in_scene
 from chebsplat.splats.rotations import rotation_matrices
 from chebsplat.training.densify import densify, region_gradients
 from chebsplat.training.losses import feature_distance, feature_distance_reference
+from tests.chebsplat.training.test_printed_gates import randomized
+from tests.chebsplat.training.test_printed_gates import weights as arrays
 
 N, M, C = 50, 6, 5
 RADIUS = 0.4

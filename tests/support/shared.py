@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-ROOT = Path(__file__).parents[1]
+ROOT = Path(__file__).parents[2]
 KEY = "0" * 16  # of artifacts whose identity is no matter
 DATA = Path(os.environ.get("CHEBSPLAT_TEST_DATA", ROOT / "../shared/data"))
 

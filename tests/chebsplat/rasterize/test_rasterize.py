@@ -1,19 +1,16 @@
 """The rasterizer reproduces gsplat's image; rotations and harmonics are what they are called."""
 
 import math
-import os
-from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
 from safetensors.torch import load_file
+from shared import DATA
 
 from chebsplat.rasterize import rasterize
 from chebsplat.splats import sh
 from chebsplat.splats.rotations import rotation_matrices
-
-DATA = Path(os.environ.get("CHEBSPLAT_TEST_DATA", Path(__file__).parents[2] / "shared/data"))
 
 
 def tiny_case():

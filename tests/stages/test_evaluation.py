@@ -6,7 +6,6 @@ import pytest
 import torch
 from safetensors.torch import save_file
 from shared import INPUTS, published, run_stage
-from test_stages import changed, inputs_of
 
 from chebsplat.cameras import unproject
 from chebsplat.errors import InputError
@@ -23,6 +22,7 @@ from chebsplat.render import SceneRenderer
 from chebsplat.stages.evaluate import camera
 from chebsplat.stages.measuring.image_quality import image_figures, perceptual
 from chebsplat.stages.sources import generated
+from tests.stages.test_stages import changed, inputs_of
 
 
 def widths():

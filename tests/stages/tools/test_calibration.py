@@ -8,7 +8,6 @@ import numpy as np
 import pytest
 from click.testing import CliRunner
 from shared import ROOT
-from test_query import EMBEDDINGS, N, asked, write_toy
 from tiny_teachers import color_teacher, knowing_rooms
 
 import chebsplat
@@ -29,6 +28,7 @@ from chebsplat.labels.calibration import (
 from chebsplat.pipelines.cli import main
 from chebsplat.stages.tools import calibrate
 from chebsplat.synthetic import seeds
+from tests.stages.tools.test_query import EMBEDDINGS, N, asked, write_toy
 
 OF = Calibration(margin=14.0, cosine=9.0, bias=-4.0, strength=1.0, offset=2.0)
 

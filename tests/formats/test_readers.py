@@ -78,7 +78,7 @@ def by_spark(path, packages, tmp_path):
     """Positions in the axes of the file."""
     import gsply
 
-    command = ["node", ROOT / "tests/readers.mjs", "spark", path, tmp_path / "out.spz", packages]
+    command = ["node", ROOT / "tests/support/readers.mjs", "spark", path, tmp_path / "out.spz", packages]
     subprocess.run([str(c) for c in command], check=True, capture_output=True)
     return gsply.read_spz(tmp_path / "out.spz").means
 
@@ -185,7 +185,7 @@ def test_ragged_arrays_open_in_zarr_and_zarrita(exported, name, packages, tmp_pa
     path, p, _ = exported
     group = zarr.open_group(str(path), mode="r")
     plain = np.asarray(group[name][:])
-    command = ["node", ROOT / "tests/readers.mjs", "zarrita", path / name, tmp_path / "out.bin", packages]
+    command = ["node", ROOT / "tests/support/readers.mjs", "zarrita", path / name, tmp_path / "out.bin", packages]
     subprocess.run([str(c) for c in command], check=True, capture_output=True)
     assert np.array_equal(np.fromfile(tmp_path / "out.bin", plain.dtype).reshape(plain.shape), plain)
     band = int(name[-1]) if name[-1].isdigit() else 0

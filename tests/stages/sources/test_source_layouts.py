@@ -8,7 +8,6 @@ import numpy as np
 import pytest
 from shared import data, published, run_stage
 from source_folders import SETTINGS, image, save, tiny
-from test_sources import agreement
 
 from chebsplat.cameras import centers, unproject
 from chebsplat.errors import InputError
@@ -18,6 +17,7 @@ from chebsplat.formats.capture import Capture
 from chebsplat.formats.points import Points
 from chebsplat.stages.settings import IngestSection
 from chebsplat.stages.sources import colmap, common, generated, replica, scannet, seven_scenes
+from tests.stages.sources.test_sources import agreement
 
 KINDS = {"replica": replica, "colmap": colmap, "scannet": scannet, "seven_scenes": seven_scenes}
 

@@ -9,14 +9,14 @@ from plyfile import PlyData
 from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 from shared import published
-from test_page import held_in
-from test_readers import CONVERSIONS, GRID, packages, transform  # noqa: F401  # a fixture among them
 
 import chebsplat
 from chebsplat.formats.packed import Packed, unpack
 from chebsplat.formats.ply import read_ply
 from chebsplat.formats.scene import Scene
 from chebsplat.pipelines.cli import main
+from tests.formats.test_readers import CONVERSIONS, GRID, packages, transform  # noqa: F401  # a fixture among them
+from tests.stages.tools.test_page import held_in
 
 SCALE, SHIFT = 3.7, np.array([120.0, -45.0, 18.0])
 TURN = np.linalg.qr(np.random.default_rng(4).normal(size=(3, 3)))[0]

@@ -92,7 +92,7 @@ def rows_of(record, prefix=""):
 def test_the_architecture_lists_the_arrays_of_each_record():
     """CHEBSPLAT_WRITE_DOCS=1 writes the table anew."""
     page = ROOT / "docs/architecture.md"
-    begin, end = "<!-- layouts: written by tests/test_docs.py -->\n", "<!-- end of layouts -->"
+    begin, end = "<!-- layouts: written by tests/whole/test_docs.py -->\n", "<!-- end of layouts -->"
     lines = ["", "| array | dtype | axes | units |", "|---|---|---|---|"]
     for record in RECORDS:
         lines += [f"| **{record.SCHEMA.removeprefix('chebsplat.')}** | | | |", *rows_of(record)]
