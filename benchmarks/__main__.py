@@ -29,21 +29,23 @@ class Benchmark:
 BENCHMARKS = {
     "raster": Benchmark("raster", "the rasterizer against its bars: milliseconds, ratios"),
     "cost": Benchmark(
-        "cost", "whole trainings beside plain 3DGS; --growth: by Gaussians, pixels, views", ("sfm", "teacher")
+        "training.cost", "whole trainings beside plain 3DGS; --growth: by Gaussians, pixels, views", ("sfm", "teacher")
     ),
     "descriptor": Benchmark("descriptor", "the descriptor: regions a second, error, growth of sampling"),
     "lift": Benchmark(
-        "lift", "features lifted to a finished scene: seconds", ("train", "teacher"), "train.features=lifted"
+        "scenes.lift", "features lifted to a finished scene: seconds", ("train", "teacher"), "train.features=lifted"
     ),
     "refine": Benchmark(
-        "refine", "what follows a training: error against run time of lift, smoothing, encoders by size", ("lift",)
+        "scenes.refine",
+        "error against run time of what follows a training: lift, smoothing, encoders",
+        ("lift",),
     ),
-    "trust": Benchmark("trust", "whether views' agreement ranks 2D teachers as their true mIoU does; no training"),
-    "mesh": Benchmark("mesh", "the mesh against exact depth: F-score, labels, seconds by voxel", ("report",)),
-    "label": Benchmark("label", "which Gaussians of a PLY are named right by shape alone; trains its scenes"),
-    "teaching": Benchmark("teaching", "what the encoder of points owes to rooms, radii, descriptor, size"),
-    "query": Benchmark("query", "asking at the suggested cut: precision, recall, absent words refused; trains 5 rooms"),
-    "gpu": Benchmark("gpu", "office0 on a GPU beside the CPU: seconds, PSNR, mIoU, frames/s, memory; needs a GPU"),
+    "trust": Benchmark("teachers.trust", "whether views' agreement ranks 2D teachers as true mIoU does; no training"),
+    "mesh": Benchmark("scenes.mesh", "the mesh against exact depth: F-score, labels, seconds by voxel", ("report",)),
+    "label": Benchmark("scenes.label", "which Gaussians of a PLY are named right by shape alone; trains its scenes"),
+    "teaching": Benchmark("teachers.teaching", "what the encoder of points owes to rooms, radii, descriptor, size"),
+    "query": Benchmark("scenes.query", "asking at the suggested cut: precision, recall, absent words; trains 5 rooms"),
+    "gpu": Benchmark("training.gpu", "office0 on a GPU beside the CPU: seconds, PSNR, mIoU, frames/s, memory"),
     "stability": Benchmark("stability.main", "every extreme case of the maths; fails if one does"),
 }
 

@@ -85,7 +85,7 @@ def test_make_runs_one_by_name(words):
 def test_what_awaits_a_gpu_runs_to_its_end_where_the_cpu_stands_in(tmp_path, monkeypatch):
     import torch
 
-    from benchmarks import gpu
+    from benchmarks.training import gpu
     from chebsplat.rasterize import rasterize
 
     def rasterization(*gaussians, packed):

@@ -13,7 +13,7 @@ import torch
 from raster import camera, gradients, scene
 from simulated_gpu import GPU, SimulatedGpu
 
-from benchmarks.cost import trainer_from
+from benchmarks.training.cost import trainer_from
 from chebsplat.rasterize import rasterize
 from chebsplat.render import SceneRenderer
 from chebsplat.stages import evaluate, train

@@ -4,7 +4,7 @@ import chebsplat  # noqa: F401  # isort: skip
 import pytest
 import torch
 
-from benchmarks.cost import trainer_from
+from benchmarks.training.cost import trainer_from
 from chebsplat.shape import cks
 from chebsplat.stages.runtime import config as configs
 from chebsplat.training.losses import feature_distance

@@ -15,7 +15,7 @@ from typing import Any, TypeVar
 import numpy as np
 
 from benchmarks import shared
-from benchmarks.teaching import made, taught
+from benchmarks.teachers.teaching import made, taught
 from chebsplat.evaluation.metrics import confusion, segmentation
 from chebsplat.formats.capture import Capture
 from chebsplat.formats.features import Features

@@ -18,7 +18,7 @@ import numpy as np
 import torch
 
 from benchmarks import shared
-from benchmarks.cost import trainer_from
+from benchmarks.training.cost import trainer_from
 from chebsplat.errors import ConfigError
 from chebsplat.formats.artifact import read_manifest
 from chebsplat.formats.scene import Scene

@@ -1,0 +1,1 @@
+"""What a finished scene costs to use."""

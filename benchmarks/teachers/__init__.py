@@ -1,0 +1,1 @@
+"""What teaching knowledge takes, and how far views agree."""

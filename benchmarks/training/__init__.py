@@ -1,0 +1,1 @@
+"""What a training costs, on a CPU and on a GPU."""
