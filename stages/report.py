@@ -99,6 +99,7 @@ def run(job: Job) -> None:
         stages=stages,
         total=sum(seconds for _, seconds, *_ in stages),
         left_out=sorted(left_out.items()),
+        decided=decided_rows(facts["gaussians"]),
         versions=sorted(versions.items()),
         code=next((m.code for m in manifests.values() if "commit" in m.code), None),
         settings=json.dumps(settings, indent=1, sort_keys=True),
@@ -111,6 +112,13 @@ def run(job: Job) -> None:
         known = facts["descriptors"]
         kept = ("spectrum", "n_cuts", "n_cuts_in_clusters", "n_in_float64")
         job.facts["descriptors"] = {name: known[name] for name in kept if name in known}
+
+
+def decided_rows(facts: dict[str, Any]) -> list[tuple[str, str, str]]:
+    """Settings that the training's config left open: name, value, and what decided it."""
+    words = {name: of["value"] for name, of in facts.get("decided", {}).items()}
+    shown = {name: f"{value:.3g}" if isinstance(value, float) else str(value) for name, value in words.items()}
+    return [(f"train.{name}", value, facts["decided"][name]["by"]) for name, value in shown.items()]
 
 
 def teacher_words(facts: dict[str, Any]) -> tuple[str, str]:

@@ -31,11 +31,11 @@ from chebsplat.shape.point_encoder import PointEncoder
 from chebsplat.shape.point_inputs import point_inputs
 from chebsplat.splats.gaussians import surface_of
 from chebsplat.stages.evaluate import camera
-from chebsplat.stages.lift import lifted_from
 from chebsplat.stages.runtime.progress import Progress
 from chebsplat.stages.settings import KnowledgeSection, LiftSection
 from chebsplat.stages.shape_models.predictions import into_channels, up_of
 from chebsplat.stages.teacher_models.text_encoder import found
+from chebsplat.stages.training.lifting import lifted_from
 from chebsplat.synthetic import CLASS_NAMES
 from chebsplat.synthetic.seeds import KNOWLEDGE
 

@@ -19,6 +19,7 @@ from benchmarks.stability.case import Outcome, case
 from chebsplat.errors import DataFailure
 from chebsplat.splats.gaussians import initial_gaussians, local_shape
 from chebsplat.stages.runtime.config import Config
+from chebsplat.stages.training.defaults import Evidence, resolved
 from chebsplat.training.model import SceneModel
 from chebsplat.training.trainer import Trainer
 from chebsplat.views import Views
@@ -70,7 +71,10 @@ def tiny_trainer(
     )
     torch.manual_seed(config.train.seed)
     model = SceneModel(initial_gaussians(means, colors, shapes, opacity=0.5), config.describe, config.train, CHANNELS)
-    return Trainer(model, four_views() if views is None else views, config.train, 1.0)
+    views = four_views() if views is None else views
+    n_views, height, width = views.images.shape[:3]
+    train = resolved(config.train, Evidence(n_views, n_views * height * width))
+    return Trainer(model, views, train, 1.0)
 
 
 def _with_views(*, prune_gate: str = "product", sh_masks: str = "logits", **changes: Callable[[Views], Any]) -> Trainer:

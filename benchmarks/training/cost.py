@@ -12,6 +12,7 @@ from __future__ import annotations
 
 import json
 import math
+import os
 import subprocess
 import sys
 import tempfile
@@ -23,22 +24,20 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from torch import Tensor
 
 from benchmarks import shared
-from chebsplat.cameras import extent, unproject
+from chebsplat.cameras import unproject
 from chebsplat.formats import artifact
 from chebsplat.formats.capture import Capture
-from chebsplat.formats.features import Features
 from chebsplat.formats.manifest import Manifest
 from chebsplat.formats.points import Points
 from chebsplat.pipelines.planning.plan import merged
 from chebsplat.pipelines.work.scenes import read_toml
 from chebsplat.settings import MOST_STEPS
 from chebsplat.splats.gaussians import local_shape
+from chebsplat.stages.runtime.command import Job
 from chebsplat.stages.runtime.config import Config
-from chebsplat.stages.training.depth import with_depth_loss
-from chebsplat.stages.training.inputs import model_of, training_views
+from chebsplat.stages.training.assembly import Inputs, assemble, read_inputs
 from chebsplat.training.trainer import Trainer
 
 BAR, TURN, REHEARSAL = 1.25, 50, 100
@@ -52,24 +51,21 @@ GROWTH = {
 WARM, TIMED, BOUND = 10, 30, 6.0  # steps of a case before those that are timed, and these; gigabytes
 
 
-def trainer_from(
-    work: Path,
-    config: Config,
-    backend: str = "auto",
-    basis: dict[str, Tensor] | None = None,
-    device: str = "cpu",
-) -> Trainer:
-    """A trainer before its first step, of a scene that has been run up to its teacher.
+def job_of(config: Config, inputs: dict[str, Path], device: str = "cpu") -> Job:
+    """A job of a training that publishes nothing."""
+    nowhere = Path(os.devnull)
+    return Job(inputs, config, nowhere, nowhere, device)
+
+
+def trainer_from(work: Path, config: Config, backend: str = "auto", device: str = "cpu") -> Trainer:
+    """The train stage's trainer before its first step, of a scene that has been run up to its teacher.
 
     Args: work: folder of the links `ingest`, `sfm` and, if semantics are trained, `teacher`; backend: of the
-          rasterizer; basis: earlier knowledge, as `Trainer` takes it; device: `cpu` or `cuda`.
+          rasterizer; device: `cpu` or `cuda`.
     """
-    capture, points = Capture.read(work / "ingest"), Points.read(work / "sfm")
-    features = Features.read(work / "teacher") if config.train.semantics else None
-    train, _ = with_depth_loss(config.train, capture, points)
-    model = model_of(points, features, train, config.describe, device, backend)
-    views = training_views(capture, points, features, bool(train.weight_depth)).to(device)
-    return Trainer(model, views, train, extent(points.cam_from_world), basis=basis)
+    inputs = {"capture": work / "ingest", "points": work / "sfm"}
+    job = job_of(config, inputs | ({"features": work / "teacher"} if config.train.semantics else {}), device)
+    return assemble(job, read_inputs(job), backend)
 
 
 def begun(work: Path, ablation: str, steps: int) -> Trainer:
@@ -138,10 +134,7 @@ def measured(capture: Path, n_gaussians: int) -> dict[str, float]:
     )  # fmt: skip
     settings = {"steps": 3000, "semantics": False, "max_gaussians": 2 * n_gaussians, "weight_depth": 0.8}
     config = Config.model_validate({"train": settings})
-    trainer = Trainer(
-        model_of(points, None, config.train, config.describe),
-        training_views(held, points, None, True), config.train, extent(points.cam_from_world),
-    )  # fmt: skip
+    trainer = assemble(job_of(config, {}), Inputs(held, points))
     trainer.step = int(config.train.steps * 0.1)  # at full resolution, before growth
     steps = trainer.steps()
     for _ in range(WARM):

@@ -9,72 +9,34 @@ from chebsplat.splats.sh import MAX_DEGREE
 from chebsplat.training.model import SceneModel
 from chebsplat.training.prune import SemanticGate
 
-TRAVEL, MOST = 10.0, 5e-2  # a rate that is not given: less than TRAVEL over all steps does not arrive
 LR_OPACITIES = 5e-2  # of opacities before the sigmoid, 3DGS's
 LR_MODULES, LR_GATES = 3e-3, 1e-2  # of the encoder, and of the printed gates' weights
 FASTER = {"means": 0.01, "features": 0.01, "modules": 0.01}  # what a rate has fallen to at the end; 0.1 elsewhere
 
 
-PUBLISHED = 30_000  # steps that 3DGS's rates are for
-FEWEST = 1000  # steps below which rates rise no further, and that a training has unless it is told
-
-
-def n_steps(settings: TrainSection, n_pixels: int) -> int:
-    """Steps of a training on photos of `n_pixels` pixels in all.
-
-    Choices: 280 a megapixel, in hundreds, from FEWEST to MOST_STEPS, by held-out training views (docs/results.md, "How
-      many steps"): the more there is to see, the longer a training gains. 70 photos of 320×240 pixels are best served
-      by 1500 steps, and with 3000 lose 0.5 dB again; 43 of 360×640 gain until 3000.
-    """
-    by_photos = 100 * round(2.8 * n_pixels / 1e6)
-    return min(max(by_photos, FEWEST), MOST_STEPS) if settings.steps is None else settings.steps
-
-
-def by_steps(given: float | None, published: float, power: float, steps: int) -> float:
-    """A rate that is not given: the published one times (30,000 / steps)^power, since fewer steps must each go further.
-
-    Choices: powers from 1000-step trainings of office0 and fox, where means 8 times, scales and rotations 3 times and
-      colours 4 times as fast were best on held-out training views; 1 from 30,000 steps on.
-    """
-    return published * max(PUBLISHED / max(steps, FEWEST), 1) ** power if given is None else given
-
-
-def feature_every(settings: TrainSection, n_views: int) -> int:
-    """Steps from one that renders and teaches features to the next.
-
-    Choices: one step in four teaches them as well as every one, for less than half of what they add to a step's time;
-      where views are few, features hold the Gaussians in place, too (ten views: 24.3 dB, and 23.1 in one of four).
-    """
-    return min(max(n_views // 10, 1), 4) if settings.feature_every is None else settings.feature_every
-
-
-def starts_lifted(settings: TrainSection, n_views: int) -> bool:
-    """Whether features start as what the views say of the Gaussians, not at nothing.
-
-    Choices: where views are few, features that are there from the first step pull Gaussians towards what single views
-      show (six, ten, twenty views of one room: 3.6, 3.6 and 1.0 dB less; seventy: none).
-    """
-    return n_views >= 40 if settings.feature_start is None else settings.feature_start == "lifted"
+def decided(settings: TrainSection) -> None:
+    """Raises ValueError naming a setting that is still open (`stages.training.defaults.resolved` decides them)."""
+    left = [name for name, value in settings if value is None and name not in ("seconds", "start")]
+    if left:
+        raise ValueError(f"train.{left[0]} is open: pass a section that is resolved")
 
 
 def rates(settings: TrainSection) -> dict[str, float]:
     """Learning rate of each raw parameter before any schedule; that of `means` is relative to the scene's extent."""
-    features, steps = settings.lr_features, settings.steps or MOST_STEPS
-    taught = max(steps // (settings.feature_every or 1), 1)
-    sh = by_steps(settings.lr_sh, 1.25e-4, 0.41, steps)
-    return {
-        "means": by_steps(settings.lr_means, 1.6e-4, 0.61, steps),
-        "log_scales": by_steps(settings.lr_scales, 5e-3, 0.52, steps),
-        "quats": by_steps(settings.lr_quats, 1e-3, 0.52, steps),
+    given = {
+        "means": settings.lr_means,
+        "log_scales": settings.lr_scales,
+        "quats": settings.lr_quats,
         "logit_opacities": LR_OPACITIES,
-        "sh0": by_steps(settings.lr_sh0, 2.5e-3, 0.41, steps),
-        "sh1": sh,
-        "sh2": sh,
-        "sh3": sh,
-        "features": min(TRAVEL / taught, MOST) if features is None else features,
+        "sh0": settings.lr_sh0,
+        "sh1": settings.lr_sh,
+        "sh2": settings.lr_sh,
+        "sh3": settings.lr_sh,
+        "features": settings.lr_features,
         "prune_logits": settings.lr_masks,
         "sh_logits": settings.lr_sh_masks,
     }
+    return {name: rate for name, rate in given.items() if rate is not None}
 
 
 def adam(model: SceneModel, settings: TrainSection, extent: float) -> torch.optim.Adam:
@@ -96,12 +58,14 @@ def adam(model: SceneModel, settings: TrainSection, extent: float) -> torch.opti
 
 
 class Schedule:
-    """Of a train section whose steps are known. A budget is a number of steps, or seconds of training: then the pace is
+    """Of a resolved train section. A budget is a number of steps, or seconds of training: then the pace is
     the machine's, and two runs are not the same.
     """
 
     def __init__(self, settings: TrainSection):
-        self.settings, self.steps = settings, settings.steps or MOST_STEPS
+        decided(settings)
+        assert settings.steps is not None
+        self.settings, self.steps = settings, settings.steps
         self.seconds: float | None = settings.seconds
         self.growth = [] if settings.densify == "off" else self._while_growing(settings.n_densify)
         self.resets = self._while_growing(settings.opacity_resets)

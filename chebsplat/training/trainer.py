@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 import time
 from collections.abc import Iterator
 from typing import Any
@@ -21,7 +20,7 @@ from chebsplat.training.laps import Laps
 from chebsplat.training.losses import depth_distance, photometric
 from chebsplat.training.model import Rendered, SceneModel
 from chebsplat.training.population import Population, broken
-from chebsplat.training.schedule import Schedule, adam, feature_every, n_steps
+from chebsplat.training.schedule import Schedule, adam
 from chebsplat.training.semantic_loss import semantic_loss
 from chebsplat.views import Views
 
@@ -34,6 +33,7 @@ class Trainer:
     """Iterate over `steps()`, then call `finish()`.
 
     Args:
+      settings: resolved, nothing left open (`stages.training.defaults`).
       extent:   scene units, scales the means' learning rate.
       basis:    matrices [q, r] by name of an earlier scene's knowledge; None: of none.
       regions, descriptors: of the model's Gaussians as they are; None: they are computed.
@@ -56,13 +56,12 @@ class Trainer:
         regions: Regions | None = None,
         descriptors: Tensor | None = None,
     ):
-        self.feature_every = feature_every(settings, len(views.names))
-        known = {"feature_every": self.feature_every, "steps": n_steps(settings, math.prod(views.images.shape[:3]))}
-        settings = settings.model_copy(update=known)
         self.model, self.views, self.settings, self.extent = model, views, settings, extent
         given = basis if basis and model.shape is not None else {}
         self.basis = {name: value.to(model.device) for name, value in given.items()}
         self.schedule = Schedule(settings)
+        assert settings.feature_every is not None and settings.weight_depth is not None
+        self.feature_every, self.weight_depth = settings.feature_every, settings.weight_depth
         self.guidance: Tensor | None = None
         self.optimizer = adam(self.model, self.settings, self.extent)
         self.order_generator = np.random.default_rng(settings.seed)
@@ -234,7 +233,7 @@ class Trainer:
         losses = self._losses(rendered, target, mask, wanted, index)
         if surface is not None and rendered.inverse_depth is not None:
             distance = depth_distance(rendered.inverse_depth, rendered.alpha, surface, mask)
-            losses["depth"] = (settings.weight_depth or 0) * distance
+            losses["depth"] = self.weight_depth * distance
         loss = torch.stack(list(losses.values())).sum()
         if self.reads and not torch.isfinite(loss):
             bad = [name for name, value in losses.items() if not torch.isfinite(value)]

@@ -13,7 +13,7 @@ from chebsplat.stages.runtime import config as configs
 from chebsplat.stages.runtime.command import Job
 from chebsplat.stages.runtime.progress import Progress
 from chebsplat.stages.runtime.stopping import heeded
-from chebsplat.stages.train import follow
+from chebsplat.stages.training.loop import follow
 
 SETTINGS = TrainSection(encode_every=4, report_every=6)
 
@@ -24,7 +24,7 @@ class Alternating:
     reads = True
 
     def __init__(self, stop_at=None):
-        self.step, self.seconds, self.stop_at = 0, 0.0, stop_at
+        self.step, self.seconds, self.stop_at, self.settings = 0, 0.0, stop_at, SETTINGS
         self.views, self.feature_every = SimpleNamespace(names=["a", "b"]), 1
         self.model = SimpleNamespace(sh_kept=lambda: 0.5)
         self.schedule = SimpleNamespace(last_step=lambda step, seconds: 12)
@@ -64,14 +64,14 @@ def job(folder):
 
 def test_the_progress_line_does_not_jump_with_terms_that_alternate(tmp_path):
     made = job(tmp_path)
-    follow(made, Alternating(), SETTINGS)
+    follow(made, Alternating())
     assert {line["mean loss"] for line in made.progress.lines[3:]} == {"3.0000"}
     assert made.progress.lines[-1]["train PSNR"] == "30.00"
 
 
 def test_a_training_that_is_stopped_saves_the_step_it_is_at(tmp_path, caplog):
     with pytest.raises(Stopped), heeded(), caplog.at_level("INFO", "chebsplat"):
-        follow(job(tmp_path), Alternating(stop_at=5), SETTINGS)
+        follow(job(tmp_path), Alternating(stop_at=5))
     assert "saved at step 5; the same command goes on from there" in caplog.text
     held = torch.load(tmp_path / "scratch/training.pt", weights_only=True)
     assert held["state"]["trainer"]["step"] == 5

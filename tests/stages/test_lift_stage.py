@@ -17,7 +17,8 @@ from chebsplat.labels.decode import decode_labels
 from chebsplat.stages.runtime.config import build
 from chebsplat.stages.runtime.progress import Progress
 from chebsplat.stages.tools.lift_ply import lift_ply
-from chebsplat.stages.training.inputs import model_of, start_features, training_views
+from chebsplat.stages.training.assembly import model_of, start_features
+from chebsplat.stages.training.views import training_views
 
 ROLES = {"capture": "ingest", "gaussians": "train", "features": "teacher"}
 
@@ -92,7 +93,8 @@ def test_the_command_is_a_stage_without_a_file_and_a_use_with_one():
 
 def test_features_of_a_training_start_as_what_the_views_say_of_its_gaussians(up_to_teacher):
     capture, points = Capture.read(up_to_teacher / "ingest"), Points.read(up_to_teacher / "sfm")
-    features, config = Features.read(up_to_teacher / "teacher"), build({}, "toy")
+    features = Features.read(up_to_teacher / "teacher")
+    config = build({"train": {"opacity": 0.7}}, "toy")
     model = model_of(points, features, config.train, config.describe)
     views = training_views(capture, points, features)
     start_features(model, capture, points, features, Progress(False))
@@ -110,7 +112,8 @@ def test_features_of_a_training_start_as_what_the_views_say_of_its_gaussians(up_
 
 def test_features_start_at_nothing_where_no_view_says_anything(up_to_teacher):
     capture, points = Capture.read(up_to_teacher / "ingest"), Points.read(up_to_teacher / "sfm")
-    features, config = Features.read(up_to_teacher / "teacher"), build({}, "toy")
+    features = Features.read(up_to_teacher / "teacher")
+    config = build({"train": {"opacity": 0.7}}, "toy")
     features.pseudo_labels = np.full_like(features.pseudo_labels, -1)
     model = model_of(points, features, config.train, config.describe)
     assert start_features(model, capture, points, features, Progress(False)) == 0

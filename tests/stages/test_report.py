@@ -22,6 +22,7 @@ from chebsplat.formats.manifest import Manifest
 from chebsplat.stages import report
 from chebsplat.stages.pages import pictures as draw
 from chebsplat.stages.pages.parts import class_rows, label_names, legend, picture_rows
+from chebsplat.stages.training.defaults import DEFAULTS
 
 pytestmark = pytest.mark.xdist_group("toy")
 
@@ -59,6 +60,13 @@ def test_the_report_is_one_page_that_fetches_nothing(toy):
         assert told in text
     assert (toy["report"] / "figures.csv").read_text().startswith("figure,")
     assert (toy["report"] / "trace.csv").read_text().startswith("step,seconds,")
+
+
+def test_the_page_tells_what_the_scene_decided(toy):
+    facts = read_manifest(toy["train"]).facts["decided"]
+    assert facts.keys() == DEFAULTS.keys() - {"steps"}  # which the config names
+    page = (toy["report"] / "report.html").read_text()
+    assert all(f"<code>train.{name}</code>" in page and decided["by"] in page for name, decided in facts.items())
 
 
 def test_the_page_s_pictures_are_those_of_the_evaluation(toy):

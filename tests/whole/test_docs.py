@@ -19,8 +19,10 @@ from chebsplat.formats.points import Points
 from chebsplat.formats.record import layout_of
 from chebsplat.formats.refined import Refined
 from chebsplat.formats.scene import RaggedScene, Scene
+from chebsplat.settings import TrainSection
 from chebsplat.stages.registry import STAGES
 from chebsplat.stages.runtime.config import known_keys
+from chebsplat.stages.training.defaults import DEFAULTS, OPEN
 
 PAGES = [ROOT / name for name in ("README.md", "CONTRIBUTING.md")] + sorted((ROOT / "docs").glob("*.md"))
 CODE = re.compile(r"`([\w/]+\.py)(?::([\w.]+))?`|\b((?:chebsplat|formats|stages|pipelines)/[\w/]+\.py):(\w+)")
@@ -103,6 +105,21 @@ def test_the_architecture_lists_the_arrays_of_each_record():
     assert page.read_text() == wanted
     stored = {stage.schema for stage in STAGES.values()}
     assert stored >= {record.SCHEMA for record in RECORDS}
+
+
+def test_usage_lists_each_setting_that_a_scene_decides():
+    """CHEBSPLAT_WRITE_DOCS=1 writes the table anew."""
+    page = ROOT / "docs/usage.md"
+    begin, end = "<!-- decided: written by tests/whole/test_docs.py -->\n", "<!-- end of decided -->"
+    lines = ["", "| setting | decided by |", "|---|---|"]
+    lines += [f"| `train.{name}` | {default.by} |" for name, default in DEFAULTS.items()]
+    before, rest = page.read_text().split(begin)
+    wanted = before + begin + "\n".join(lines) + "\n\n" + end + rest.split(end)[1]
+    if os.environ.get("CHEBSPLAT_WRITE_DOCS"):
+        page.write_text(wanted)
+    assert page.read_text() == wanted
+    open_settings = {name for name, value in TrainSection() if value in OPEN}
+    assert open_settings - {"seconds", "start"} == set(DEFAULTS)
 
 
 def test_citations_of_the_method_lead_to_a_section():

@@ -18,9 +18,10 @@ from chebsplat.settings import TrainSection
 from chebsplat.stages.runtime import config
 from chebsplat.stages.runtime.command import Job
 from chebsplat.stages.sources.disturbed import displaced, recolored
-from chebsplat.stages.training.depth import WEIGHT, with_depth_loss
-from chebsplat.stages.training.inputs import training_views
-from chebsplat.stages.training.photos import exposures
+from chebsplat.stages.training.assembly import Inputs, assemble
+from chebsplat.stages.training.defaults import DEPTH_WEIGHT, evidence_of, resolved
+from chebsplat.stages.training.photos import own_exposures
+from chebsplat.stages.training.views import training_views
 from chebsplat.training.losses import depth_distance
 
 K = torch.tensor([[40.0, 0, 24], [0, 40, 20], [0, 0, 1]])
@@ -81,12 +82,11 @@ def test_own_exposures_of_many_views_are_told_of_every_second_one_by_itself(monk
     assert np.allclose(halves[::2], own) and np.allclose(halves[1::2], own)
 
 
-def test_an_exposure_that_no_neighbour_shares_is_undone_in_training(tmp_path):
+def test_an_exposure_that_no_neighbour_shares_is_undone_in_training():
     """One photo of eight is half as bright, and is trained on as bright as the others."""
     capture, points = photographed("colmap", [1, 1, 1, 0.5, 1, 1, 1, 1])
     points.cam_from_world[:, 0, 3] = np.linspace(-0.2, 0.2, 8)
-    job = Job({}, config.build({}, "test"), tmp_path, tmp_path)
-    undone = exposures(job, capture, points)
+    undone, _ = own_exposures(capture, points)
     photos = training_views(capture, points, None, exposures=undone).images.float()
     assert photos.mean((1, 2, 3)).std() < 3 and capture.images[3].max() == 50
 
@@ -135,18 +135,18 @@ def test_the_depth_loss_is_on_where_views_tell_the_same_depth():
     capture, points = photographed("colmap", [1, 1, 1])
 
     def decided(**given):
-        train, why = with_depth_loss(TrainSection(**given), capture, points)
-        return train.weight_depth, why
+        evidence = evidence_of(TrainSection(**given), capture, points, None, None)
+        return resolved(TrainSection(**given), evidence).weight_depth, evidence.no_depth
 
     assert decided() == (0, "the capture has no depth in the unit of its poses")
     points.depths = np.full((3, 20, 24), 5, np.float32)
-    assert decided() == (WEIGHT, "")
+    assert decided() == (DEPTH_WEIGHT, "")
     points.depths = None
     capture.cam_from_world[1, 2, 3], capture.cam_from_world[2, 2, 3] = 5.5, 6.0  # each half a unit farther back
     capture.depth = np.stack([np.full((40, 48), z, np.float32) for z in (5, 5.5, 6)])
     capture.depth[:, :3] = np.nan
-    assert decided() == (WEIGHT, "")
-    assert decided(weight_depth=0.5) == (0.5, "") and decided(weight_depth=0) == (0, "train.weight_depth is 0")
+    assert decided() == (DEPTH_WEIGHT, "")
+    assert decided(weight_depth=0.5) == (0.5, "") and decided(weight_depth=0) == (0, "")
     capture.depth[1] *= 1.01
     weight, why = decided()
     assert weight == 0 and "differ by 0.9% between views" in why  # as seen from the farther one
@@ -207,8 +207,10 @@ def photographed(kind, gains):
 def test_exposures_are_undone_where_photos_of_the_same_points_differ(tmp_path, kind, gains, chosen, wanted, why):
     job = Job({}, config.build({"train": {"exposure": chosen}}, "test"), tmp_path, tmp_path)
     capture, points = photographed(kind, gains)
-    found = exposures(job, capture, points)
-    assert (found is not None) == wanted and why in job.facts.get("left_out", {}).get("exposure by photo", "")
+    trainer = assemble(job, Inputs(capture, points))
+    assert (trainer.settings.exposure == "measured") == wanted and why in job.facts.get("left_out", {}).get(
+        "exposure by photo", ""
+    )
     assert ("exposure_stops" in job.facts) == (chosen != "off" and kind != "generated")
 
 

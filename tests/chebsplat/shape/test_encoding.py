@@ -11,7 +11,7 @@ from chebsplat.shape.encoder import RegionEncoder, Standardize
 from chebsplat.shape.regions import build_regions
 from chebsplat.splats.gaussians import activated, covariances, initial_gaussians, local_shape
 from chebsplat.stages.runtime.config import Config
-from chebsplat.stages.train import agreement
+from chebsplat.stages.training.facts import agreement
 from chebsplat.training.model import SceneModel
 
 

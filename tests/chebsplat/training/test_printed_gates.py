@@ -6,7 +6,7 @@ import torch
 
 from benchmarks.stability.training import tiny_trainer
 from chebsplat.splats.sh import basis
-from chebsplat.stages.train import guidance
+from chebsplat.stages.training.facts import guidance
 from chebsplat.training import prune, sh_mask_network
 from chebsplat.training.sh_mask_network import BandMaskNetwork, nested, region_histograms
 

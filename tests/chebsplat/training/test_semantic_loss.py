@@ -1,6 +1,7 @@
 """What a teacher has no label for pulls nothing, and what it is unsure of pulls less."""
 
 import math
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -11,7 +12,7 @@ from chebsplat.errors import ConfigError
 from chebsplat.formats.features import Features
 from chebsplat.labels.noisy_teacher import IGNORE, noisy_features
 from chebsplat.settings import TrainSection
-from chebsplat.stages.training.inputs import with_feature_loss
+from chebsplat.stages.training.defaults import evidence_of, resolved
 from chebsplat.training.semantic_loss import label_entropy, semantic_loss
 from chebsplat.views import TaughtLabels
 
@@ -86,14 +87,21 @@ def stored(kind, with_labels=True):
     return Features(["a"], values, ["wall"], np.eye(1, C, dtype=np.float32), *labels, convention={"kind": kind})
 
 
+def decided(train, features):
+    """The section resolved for these features."""
+    capture = SimpleNamespace(names=["a"], is_test=np.zeros(1, bool), size=(1, 1), depth=None, cam_from_world=None)
+    points = SimpleNamespace(names=["a"], notes={}, depths=None)
+    return resolved(train, evidence_of(train, capture, points, features, None))
+
+
 def test_labels_that_a_source_brings_are_learned_by_cross_entropy_unless_told_otherwise():
-    assert with_feature_loss(TrainSection(), stored("given")).feature_loss == "cross-entropy"
-    assert with_feature_loss(TrainSection(), stored("labels")).feature_loss == "length"
-    assert with_feature_loss(TrainSection(feature_loss="l1"), stored("given")).feature_loss == "l1"
+    assert decided(TrainSection(), stored("given")).feature_loss == "cross-entropy"
+    assert decided(TrainSection(), stored("labels")).feature_loss == "length"
+    assert decided(TrainSection(feature_loss="l1"), stored("given")).feature_loss == "l1"
     asked = TrainSection(feature_loss="cross-entropy")
-    assert with_feature_loss(asked, stored("labels")) is asked
+    assert decided(asked, stored("labels")).feature_loss == "cross-entropy"
     with pytest.raises(ConfigError, match="no labels with a confidence"):
-        with_feature_loss(asked, stored("onnx", with_labels=False))
+        decided(asked, stored("onnx", with_labels=False))
     with pytest.raises(ValueError, match="labels"):
         semantic_loss(torch.zeros(2, 2, C), torch.zeros(2, 2, C), None, None, asked)
 

@@ -13,7 +13,8 @@ from shared import ROOT
 from benchmarks.stability.training import tiny_trainer
 from chebsplat.errors import DataFailure
 from chebsplat.settings import TrainSection
-from chebsplat.training.schedule import Schedule, feature_every, n_steps, rates, starts_lifted
+from chebsplat.stages.training.defaults import Evidence, resolved
+from chebsplat.training.schedule import Schedule, rates
 
 
 def test_closed_bands_leave_parameters_and_moments_and_the_picture_stays():
@@ -257,13 +258,17 @@ def test_the_features_rate_fits_the_number_of_steps(settings, rate):
     assert groups["features"] == pytest.approx(rate)
 
 
+def decided(n_views=1, **train):
+    """A train section of views of 320×240 pixels, resolved."""
+    return resolved(TrainSection(**{"steps": 1000} | train), Evidence(n_views, n_views * 320 * 240))
+
+
 def test_features_are_taught_in_one_step_of_so_many_unless_views_are_few():
-    settings = TrainSection(steps=1000)
-    assert [feature_every(settings, n) for n in (1, 10, 20, 40, 300)] == [1, 1, 2, 4, 4]
-    assert feature_every(TrainSection(feature_every=7), 10) == 7
-    assert [starts_lifted(settings, n) for n in (10, 39, 40)] == [False, False, True]
-    assert starts_lifted(TrainSection(feature_start="lifted"), 2)
-    assert rates(TrainSection(steps=1000, feature_every=4))["features"] == pytest.approx(4e-2)
+    assert [decided(n).feature_every for n in (1, 10, 20, 40, 300)] == [1, 1, 2, 4, 4]
+    assert decided(10, feature_every=7).feature_every == 7
+    assert [decided(n).feature_start for n in (10, 39, 40)] == ["zero", "zero", "lifted"]
+    assert decided(2, feature_start="lifted").feature_start == "lifted"
+    assert rates(decided(40, feature_every=4))["features"] == pytest.approx(4e-2)
     made = tiny_trainer(steps=8, densify="off", prune=False, sh_prune=False, feature_every=3)
     steps, changed = made.steps(), []
     for _ in range(8):
@@ -275,9 +280,9 @@ def test_features_are_taught_in_one_step_of_so_many_unless_views_are_few():
 
 
 def test_a_training_that_is_not_told_has_steps_by_the_pixels_of_its_photos():
-    found = [n_steps(TrainSection(), n_views * 320 * 240) for n_views in (1, 46, 47, 70, 100, 139, 140, 5000)]
+    found = [decided(n_views, steps=None).steps for n_views in (1, 46, 47, 70, 100, 139, 140, 5000)]
     assert found == [1000, 1000, 1000, 1500, 2200, 3000, 3000, 3000]
-    assert n_steps(TrainSection(steps=7), 10**9) == 7
+    assert decided(5000, steps=7).steps == 7
     made = tiny_trainer(steps=None, n_densify=0)
     assert made.schedule.last_step(0, 0.0) == made.settings.steps == 1000
     told = tiny_trainer(steps=1000, n_densify=0)
@@ -286,24 +291,24 @@ def test_a_training_that_is_not_told_has_steps_by_the_pixels_of_its_photos():
 
 
 def test_rates_follow_the_number_of_steps_unless_they_are_given():
-    published = rates(TrainSection(steps=30_000))
+    published = rates(decided(steps=30_000))
     assert published["means"] == 1.6e-4 and published["sh0"] == 2.5e-3
-    assert rates(TrainSection(steps=100_000))["means"] == published["means"]
-    short, default = rates(TrainSection(steps=1000)), rates(TrainSection(steps=3000))
+    assert rates(decided(steps=100_000))["means"] == published["means"]
+    short, default = rates(decided(steps=1000)), rates(decided(steps=3000))
     for name, factor in (("means", 8), ("log_scales", 5.86), ("quats", 5.86), ("sh0", 4), ("sh3", 4)):
         assert short[name] / published[name] == pytest.approx(factor, rel=0.02)
         assert published[name] < default[name] < short[name]
-    assert rates(TrainSection(steps=60))["means"] == short["means"]
-    assert rates(TrainSection(steps=1000, lr_means=1.6e-4))["means"] == 1.6e-4
+    assert rates(decided(steps=60))["means"] == short["means"]
+    assert rates(decided(lr_means=1.6e-4))["means"] == 1.6e-4
 
 
 def test_pruning_masks_go_no_farther_in_long_trainings_and_nothing_else_slows():
     def travel(name, steps):
-        schedule = Schedule(TrainSection(steps=steps))
+        schedule = Schedule(decided(steps=steps))
         return sum(schedule.rate(name, step / steps, steps) for step in range(1, steps + 1))
 
     assert travel("prune_logits", 1500) == pytest.approx(travel("prune_logits", 3000) / 2, rel=1e-2)
     assert travel("prune_logits", 9000) == pytest.approx(travel("prune_logits", 3000), rel=1e-2)
     assert travel("sh_logits", 9000) == pytest.approx(3 * travel("sh_logits", 3000), rel=1e-2)
-    timed = Schedule(TrainSection(seconds=120.0))  # as many steps as the pace tells
+    timed = Schedule(decided(seconds=120.0))  # as many steps as the pace tells
     assert timed.rate("prune_logits", 0.5, timed.last_step(4000, 60.0)) == pytest.approx(3 / 8 * 0.1**0.5)

@@ -1,5 +1,7 @@
 """Points that stay: one a cube, of cubes that are smaller where colours change."""
 
+from types import SimpleNamespace
+
 import numpy as np
 import pytest
 
@@ -8,7 +10,8 @@ from chebsplat.splats.cubes import cubes_of, first_of_each, means_of_each
 from chebsplat.stages.reconstruction.thinning import LEVELS, by_color, edge_of, even, thin
 from chebsplat.stages.runtime.config import Config
 from chebsplat.stages.sfm import reduced
-from chebsplat.stages.training.inputs import model_of
+from chebsplat.stages.training.assembly import model_of
+from chebsplat.stages.training.defaults import evidence_of, resolved
 
 
 def wall(n=60_000, seed=0):
@@ -116,9 +119,11 @@ def test_gaussians_start_surer_where_depth_is_measured(notes, opacity):
     shapes = np.tile(np.eye(3, dtype=np.float32), (50, 1, 1))
     nothing = np.zeros((0, 2), np.int32)
     given = Points(
-        [], np.zeros((0, 3, 3)), np.zeros((0, 4, 4)), places, colors, np.zeros((50, 3)), shapes, nothing, notes
+        ["a"], np.zeros((1, 3, 3)), np.zeros((1, 4, 4)), places, colors, np.zeros((50, 3)), shapes, nothing, notes
     )  # fmt: skip
     config = Config()
+    capture = SimpleNamespace(names=["a"], is_test=np.zeros(1, bool), size=(1, 1), depth=None, cam_from_world=None)
     for wanted, train in ((opacity, config.train), (0.2, config.train.model_copy(update={"opacity": 0.2}))):
+        train = resolved(train, evidence_of(train, capture, given, None, None))
         model = model_of(given, None, train, config.describe)
         assert model.raw["logit_opacities"].detach().sigmoid().numpy() == pytest.approx(wanted)

@@ -1,0 +1,241 @@
+"""From artifacts and settings to a trainer before its first step: one way for the stage and for every benchmark."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from chebsplat.cameras import extent
+from chebsplat.errors import ConfigError, DataFailure, InputError
+from chebsplat.formats.basis import read_basis
+from chebsplat.formats.cameras import Cameras
+from chebsplat.formats.capture import Capture
+from chebsplat.formats.descriptors import Descriptors, read_descriptors
+from chebsplat.formats.features import Features
+from chebsplat.formats.ply import read_ply
+from chebsplat.formats.points import Points, thinned
+from chebsplat.settings import DescribeSection, TrainSection
+from chebsplat.shape.regions import Regions
+from chebsplat.splats.gaussians import initial_gaussians
+from chebsplat.stages.runtime.command import Job, n_threads
+from chebsplat.stages.runtime.progress import Progress
+from chebsplat.stages.settings import LiftSection
+from chebsplat.stages.training.defaults import LIFTED_FROM, OPEN, decided, evidence_of, resolved
+from chebsplat.stages.training.lifting import lifted_from
+from chebsplat.stages.training.photos import own_exposures
+from chebsplat.stages.training.saves import without_basis
+from chebsplat.stages.training.views import training_views
+from chebsplat.training.model import SceneModel
+from chebsplat.training.trainer import Trainer
+
+
+@dataclass
+class Inputs:
+    """What a training starts from. features: None without semantics; descriptors: None: the training makes its own."""
+
+    capture: Capture
+    points: Points
+    features: Features | None = None
+    descriptors: Descriptors | None = None
+
+
+def read_inputs(job: Job) -> Inputs:
+    """The artifacts that this training reads, and as many of the points as `train.max_gaussians` lets in.
+
+    Raises: InputError if artifacts do not belong together or are damaged.
+    """
+    train = job.config.train
+    capture, given = Capture.read(job.inputs["capture"]), Points.read(job.inputs["points"])
+    descriptors, points = described(job, given), within_cap(job, given)
+    taught = "features" in job.inputs and train.semantics and train.features == "trained"
+    features = Features.read(job.inputs["features"]) if taught else None
+    return Inputs(capture, points, features, descriptors if points is given and not train.start else None)
+
+
+def assemble(job: Job, inputs: Inputs, backend: str = "auto") -> Trainer:
+    """A trainer before its first step, its open settings resolved; what it does without goes into the job's facts.
+
+    Args: backend: of `rasterize`.
+    Raises: ConfigError, InputError or DataFailure, as its parts do.
+    """
+    capture, points, features = inputs.capture, inputs.points, inputs.features
+    exposures = _exposures(job, capture, points)
+    evidence = evidence_of(job.config.train, capture, points, features, job.facts.get("exposure_stops", {}).get("own"))
+    train = resolved(job.config.train, evidence)
+    job.facts["decided"] = decided(job.config.train, train)
+    _note_left_out(job, train, features is not None, evidence.no_depth)
+    torch.set_num_threads(n_threads())  # sums of torch depend on it; the same bytes are promised for the same number
+    model = model_of(points, features, train, job.config.describe, job.device, backend)
+    regions, descriptors = first_regions(inputs.descriptors)
+    undone = exposures if train.exposure == "measured" else None
+    views = training_views(capture, points, features, bool(train.weight_depth), undone).to(job.device)
+    if features is not None and train.feature_start == "lifted":
+        if not start_features(model, capture, points, features, job.progress):
+            job.left_out("lifted start of features", "no training view says anything of a Gaussian")
+    elif features is not None:
+        why = "train.feature_start is zero"
+        if job.config.train.feature_start in OPEN:
+            why = f"of {len(views.names)} training views, fewer than {LIFTED_FROM}, it costs colour"
+        job.left_out("lifted start of features", why)
+    basis = knowledge(job, model, train)
+    scale = extent(points.cam_from_world)
+    return Trainer(model, views, train, scale, basis=basis, regions=regions, descriptors=descriptors)
+
+
+def _exposures(job: Job, capture: Capture, points: Points) -> np.ndarray | None:
+    """Exposures [V, 3] that training photos have alone, in stops, and their spread as a fact; None: not measured."""
+    wanted = job.config.train.exposure
+    if wanted == "off" or (wanted == "auto" and capture.source.get("kind") == "generated"):
+        return None
+    exposures, job.facts["exposure_stops"] = own_exposures(capture, points)
+    return exposures
+
+
+def _note_left_out(job: Job, train: TrainSection, has_semantics: bool, no_depth: str) -> None:
+    """Say what this training does without, and why. train: resolved."""
+    given = job.config.train
+    stops = job.facts.get("exposure_stops", {}).get("own")
+    if not train.weight_depth:
+        job.left_out("depth loss", "train.weight_depth is 0" if given.weight_depth is not None else no_depth)
+    if train.exposure == "off" and stops is not None:
+        job.left_out("exposure by photo", f"photos differ by {stops:.2f} stops from those about them")
+    elif train.exposure == "off":
+        off = given.exposure == "off"
+        job.left_out("exposure by photo", "train.exposure is off" if off else "views are generated, all alike")
+    if not has_semantics:
+        why = "no teacher features: rendering only" if train.semantics else "train.semantics is false"
+        if train.semantics and train.features == "lifted":
+            why = "train.features is lifted: they follow the training"
+        job.left_out("semantic branch", why)
+    unneeded = {
+        "shape encoder": [
+            (not has_semantics, "no semantics to encode"),
+            (not train.trains_encoder, f"train.encoder is {train.encoder}"),
+        ],
+        "pruning": [(not train.prune, "train.prune is false")],
+        "densification": [(train.densify == "off", "train.densify is off")],
+        "SH pruning": [(not train.sh_prune, "train.sh_prune is false")],
+        "knowledge basis": [("basis" not in job.inputs, "no sequence is named: this scene starts from nothing")],
+    }
+    for what, reasons in unneeded.items():
+        applying = [reason for applies, reason in reasons if applies]
+        if applying:
+            job.left_out(what, applying[0])
+
+
+def model_of(
+    points: Points,
+    features: Features | None,
+    train: TrainSection,
+    describe: DescribeSection,
+    device: str = "cpu",
+    backend: str = "auto",
+) -> SceneModel:
+    """The scene before training: a Gaussian at each point, or those of `train.start`; modules drawn by the training's
+    seed. train: resolved; backend: of `rasterize`.
+    """
+    torch.manual_seed(train.seed)
+    if train.start:
+        initial = started(Path(train.start), train)
+    else:
+        assert train.opacity is not None
+        initial = initial_gaussians(points.means, points.colors, points.covariances, train.opacity)
+    raw = {name: value.to(device) for name, value in initial.items()}
+    return SceneModel(raw, describe, train, None if features is None else features.features.shape[-1], backend)
+
+
+def start_features(model: SceneModel, capture: Capture, points: Points, features: Features, progress: Progress) -> int:
+    """Features begin as what the teacher says of the Gaussians where they are, by one pass over the training views.
+
+    Returns: of how many Gaussians anything is said.
+    Choices: means of the views, without steps towards their median: training follows.
+    """
+    cameras = Cameras(points.names, points.Ks, points.cam_from_world, *capture.size)
+    parameters = {name: value.detach().cpu().numpy() for name, value in model.raw.items()}
+    try:
+        gate = LiftSection().gate
+        lifted = lifted_from(capture, cameras, parameters, features, gate, progress, median_steps=0)
+    except DataFailure:
+        return 0
+    with torch.no_grad():
+        model.raw["features"].copy_(torch.from_numpy(lifted.features))
+    return int(lifted.features.any(1).sum())
+
+
+def started(ply: Path, train: TrainSection) -> dict[str, Tensor]:
+    """Raw parameters of the Gaussians of a 3DGS PLY, in the frame of the scene's cameras, with its SH bands.
+
+    Raises: InputError naming the file; ConfigError where they are more than `train.max_gaussians`.
+    """
+    parameters, degree, _ = read_ply(ply)
+    n = len(parameters["means"])
+    if n == 0:
+        raise InputError(f"{ply} holds no Gaussians; choose another train.start")
+    if n > train.max_gaussians:
+        raise ConfigError(f"{ply} holds {n} Gaussians; set train.max_gaussians={n} or more")
+    raw = {name: parameters[name] for name in ("means", "log_scales", "quats", "logit_opacities", "sh0")}
+    for band in range(1, min(degree, train.sh_degree) + 1):
+        raw[f"sh{band}"] = parameters["shN"][:, band**2 - 1 : (band + 1) ** 2 - 1]
+    return {name: torch.tensor(values, dtype=torch.float32) for name, values in raw.items()}
+
+
+def knowledge(job: Job, model: SceneModel, train: TrainSection) -> dict[str, Tensor]:
+    """Bases of earlier scenes; with `train.warm_start` the encoder also starts from their weights."""
+    if "basis" not in job.inputs or model.shape is None:
+        return {}
+    basis, maps = read_basis(job.inputs["basis"]), model.shape.encoder.linear_maps()
+    unfit, wrong = without_basis(maps, basis.bases)
+    if wrong:
+        raise InputError(f"{job.inputs['basis']} does not fit the encoder at {wrong[0]}; start another sequence")
+    if unfit:
+        job.left_out(f"knowledge of {', '.join(unfit)}", "the earlier encoder has none of this shape")
+    if train.warm_start:
+        state = model.shape.encoder.state_dict()
+        fitting = {k: torch.from_numpy(v) for k, v in basis.weights.items() if k in state and state[k].shape == v.shape}
+        model.shape.encoder.load_state_dict(state | fitting)
+        model.shape.keeps_norm = any(name.startswith("norm_input.") for name in fitting)
+        job.facts["warm_started"] = len(fitting)
+        if other := sorted(state.keys() - fitting.keys()):
+            job.left_out(f"warm start of {', '.join(other)}", "the earlier encoder has none of this shape")
+    followed = maps.keys() - set(unfit) if train.weight_basis > 0 else set()
+    return {name: torch.from_numpy(basis.bases[name]) for name in maps if name in followed}
+
+
+def within_cap(job: Job, points: Points) -> Points:
+    """The points that a training starts from: all, or as many as `max_gaussians` lets in."""
+    n, most = len(points.means), job.config.train.max_gaussians
+    if n > most:
+        job.left_out(f"{n - most} of {n} initial points, and regions of all", f"train.max_gaussians is {most}")
+    return thinned(points, most, job.config.train.seed)
+
+
+def described(job: Job, points: Points) -> Descriptors | None:
+    """The describe stage's regions where there are any. Raises InputError unless they are of these points and settings.
+
+    They are read before anything is built, so that a wrong artifact costs no time.
+    """
+    if "descriptors" not in job.inputs:
+        return None
+    path = job.inputs["descriptors"]
+    stored = read_descriptors(path)
+    if max(stored.members.max(initial=-1), stored.centers.max(initial=-1)) >= len(points.means):
+        raise InputError(f"{path} describes other points; run the describe stage on these points")
+    describe = job.config.describe
+    wrong = [f"describe.{name}" for name, value in describe.model_dump().items() if stored.settings.get(name) != value]
+    if wrong:
+        raise InputError(f"{path} has another {wrong[0]}; run the describe stage with this config")
+    if stored.values.shape[1:3] != (stored.members.shape[1], describe.n_angles):
+        raise InputError(f"{path} has descriptors of another shape; run the describe stage again")
+    return stored
+
+
+def first_regions(stored: Descriptors | None) -> tuple[Regions | None, Tensor | None]:
+    """The describe stage's regions and descriptors for a training to start from; None: it makes its own."""
+    if stored is None:
+        return None, None
+    regions = Regions(stored.centers, stored.members, stored.settings["radius"], stored.settings["share"])
+    return regions, torch.from_numpy(stored.values)

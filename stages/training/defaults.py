@@ -1,0 +1,184 @@
+"""Training settings that the config leaves open, decided once from what is known of the scene."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
+
+from chebsplat.errors import ConfigError
+from chebsplat.formats.capture import Capture
+from chebsplat.formats.features import Features
+from chebsplat.formats.points import Points
+from chebsplat.settings import MOST_STEPS, TrainSection
+from chebsplat.stages.training.views import disagreement, training_rows
+
+OPEN = (None, "auto")  # values of a setting that leave it open
+FEWEST = 1000  # steps below which rates rise no further, and that a training has unless it is told
+PUBLISHED = 30_000  # steps that 3DGS's rates are for
+TRAVEL, FASTEST = 10.0, 5e-2  # a features' rate: less than TRAVEL over all steps does not arrive
+DEPTH_WEIGHT = 0.8
+MOST_APART = 0.003  # of its depth, where views still tell the same of a point
+LIFTED_FROM = 40  # views
+LEAST_SPREAD = 0.05  # stops between the photos' own exposures, from which on they are undone
+
+
+@dataclass(frozen=True)
+class Evidence:
+    """What is known of a scene before its training.
+
+    n_views, n_pixels: of the training photos, in all.
+    points_measured: initial points lie on measured surfaces.
+    no_depth: why measured depth is not relied on ("": it is).
+    labels: that the teacher brings with a confidence: `none`, `taught`, or `given` by the source; None: no teacher.
+    exposure_spread: of the photos' own exposures, stops; None: not measured.
+    """
+
+    n_views: int
+    n_pixels: int
+    points_measured: bool = False
+    no_depth: str = "there is no depth"
+    labels: str | None = None
+    exposure_spread: float | None = None
+
+
+@dataclass(frozen=True)
+class Default:
+    """How an open setting is decided: `value` of the section so far and the evidence; `by`: in words, for the docs."""
+
+    value: Callable[[TrainSection, Evidence], Any]
+    by: str
+
+
+def _steps(_: TrainSection, evidence: Evidence) -> int:
+    """By held-out training views (docs/results.md, "How many steps"): the more there is to see, the longer a training
+    gains. 70 photos of 320×240 pixels are best served by 1500 steps, and with 3000 lose 0.5 dB again; 43 of 360×640
+    gain until 3000.
+    """
+    return min(max(100 * round(2.8 * evidence.n_pixels / 1e6), FEWEST), MOST_STEPS)
+
+
+def _feature_every(_: TrainSection, evidence: Evidence) -> int:
+    """One step in four teaches features as well as every one, for less than half of what they add to a step's time.
+    Where views are few, features hold the Gaussians in place, too (ten views: 24.3 dB, and 23.1 in one of four).
+    """
+    return min(max(evidence.n_views // 10, 1), 4)
+
+
+def _feature_start(_: TrainSection, evidence: Evidence) -> str:
+    """Where views are few, features that are there from the first step pull Gaussians towards what single views show
+    (six, ten, twenty views of one room: 3.6, 3.6 and 1.0 dB less; seventy: none).
+    """
+    return "lifted" if evidence.n_views >= LIFTED_FROM else "zero"
+
+
+def _by_steps(published: float, power: float) -> Default:
+    """A rate of 3DGS's for trainings of fewer steps, which must each go further.
+
+    Powers are from 1000-step trainings of office0 and fox, where means 8 times, scales and rotations 3 times and
+    colours 4 times as fast were best on held-out training views; 1 from 30,000 steps on.
+    """
+
+    def rate(train: TrainSection, _: Evidence) -> float:
+        assert train.steps is not None
+        return published * max(PUBLISHED / max(train.steps, FEWEST), 1) ** power
+
+    return Default(rate, f"steps, as from {FEWEST} to 30,000: {published:g} (30,000 / steps)^{power:g}")
+
+
+def _features_rate(train: TrainSection, _: Evidence) -> float:
+    assert train.steps is not None and train.feature_every is not None
+    return min(TRAVEL / max(train.steps // train.feature_every, 1), FASTEST)
+
+
+def _exposure(_: TrainSection, evidence: Evidence) -> str:
+    spread = evidence.exposure_spread
+    return "off" if spread is None or spread < LEAST_SPREAD else "measured"
+
+
+DEFAULTS = {  # in this order: a later one may ask for an earlier
+    "steps": Default(_steps, "pixels of the training photos: 280 a megapixel, from 1000 to 3000"),
+    "feature_every": Default(_feature_every, "training views: a tenth of their number, from 1 to 4"),
+    "feature_start": Default(_feature_start, "training views: lifted from 40 on, otherwise zero"),
+    "feature_loss": Default(
+        lambda _, evidence: "cross-entropy" if evidence.labels == "given" else "length",
+        "labels: cross-entropy where the source brings them, otherwise length",
+    ),
+    "opacity": Default(
+        lambda _, evidence: 0.7 if evidence.points_measured else 0.3,
+        "initial points: 0.7 where depth is measured, since there is a surface at each, otherwise 0.3",
+    ),
+    "weight_depth": Default(
+        lambda _, evidence: 0.0 if evidence.no_depth else DEPTH_WEIGHT,
+        f"depth: {DEPTH_WEIGHT} where there is any and views agree on it to {MOST_APART:.1%}, otherwise 0",
+    ),
+    "exposure": Default(_exposure, f"photos: measured where they differ by {LEAST_SPREAD} stops from those about them"),
+    "lr_means": _by_steps(1.6e-4, 0.61),
+    "lr_scales": _by_steps(5e-3, 0.52),
+    "lr_quats": _by_steps(1e-3, 0.52),
+    "lr_sh0": _by_steps(2.5e-3, 0.41),
+    "lr_sh": _by_steps(1.25e-4, 0.41),
+    "lr_features": Default(_features_rate, f"steps that teach features: {TRAVEL:g} over them, at most {FASTEST:g}"),
+}
+
+
+def resolved(train: TrainSection, evidence: Evidence) -> TrainSection:
+    """The section with every setting that it leaves open decided.
+
+    Raises: ConfigError where the teacher has not what `train.feature_loss` asks for.
+    """
+    if train.feature_loss == "cross-entropy" and evidence.labels == "none":
+        raise ConfigError(
+            "train.feature_loss is cross-entropy, but the teacher brings no labels with a confidence; use length"
+        )
+    for name, default in DEFAULTS.items():
+        if getattr(train, name) in OPEN:
+            train = train.model_copy(update={name: default.value(train, evidence)})
+    return train
+
+
+def decided(train: TrainSection, done: TrainSection) -> dict[str, dict[str, Any]]:
+    """What was decided of the settings that `train` leaves open: value and evidence by name."""
+    names = [name for name in DEFAULTS if getattr(train, name) in OPEN]
+    return {name: {"value": getattr(done, name), "by": DEFAULTS[name].by} for name in names}
+
+
+def evidence_of(
+    train: TrainSection, capture: Capture, points: Points, features: Features | None, exposure_spread: float | None
+) -> Evidence:
+    """What the section's open settings are decided by; only what they ask for is measured.
+
+    Args: exposure_spread: as in `Evidence`.
+    Raises: InputError if capture and points do not belong together, DataFailure without a training view.
+    """
+    n_views = len(training_rows(capture, points))
+    labels = None if features is None else "none"
+    if features is not None and features.pseudo_labels is not None and features.confidence is not None:
+        labels = "taught"
+    if features is not None and features.convention.get("kind") == "given":
+        labels = "given"
+    return Evidence(
+        n_views=n_views,
+        n_pixels=n_views * capture.size[0] * capture.size[1],
+        points_measured=points.notes.get("how") == "depth" or "n_from_depth" in points.notes,
+        no_depth=_why_no_depth(capture, points) if train.weight_depth is None else "",
+        labels=labels,
+        exposure_spread=exposure_spread,
+    )
+
+
+def _why_no_depth(capture: Capture, points: Points) -> str:
+    """Why a training does not rely on measured depth ("": it does).
+
+    Choices: not if the capture has no poses, since its unit is not the scene's then, nor if its views contradict one
+      another, as a sensor's do: its noise and its place beside the colour camera would be taught. Swept depth is only
+      where views agree.
+    """
+    if capture.depth is None and points.depths is not None:
+        return ""
+    if capture.depth is None or capture.cam_from_world is None:
+        return "the capture has no depth in the unit of its poses"
+    apart = disagreement(capture, points)
+    if apart <= MOST_APART:
+        return ""
+    return f"depths of the same points differ by {apart:.1%} between views; train.weight_depth asks for it"
