@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import os
-import re
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -49,7 +48,7 @@ def train(
     from chebsplat.pipelines.work import store
 
     used = device_of(device)
-    chosen = plans(str(capture), None, as_text(settings), ablation, basis, running=True, device=used)
+    chosen = plans(str(capture), None, settings, ablation, basis, running=True, device=used)
     if execute(chosen, None, cores or os.cpu_count() or 1, used):
         raise ChebsplatError(f"{capture} could not be finished; the lines above name the stage and its log")
     return load(store.work() / chosen[-1].title)
@@ -83,15 +82,3 @@ def run_stage(
         config.write_text(json.dumps(settings))
         publish(name, import_module(f"chebsplat.stages.{name}").run, Path(out), given, config)
     return Path(out)
-
-
-def as_text(settings: Mapping[str, Any]) -> str:
-    """Settings by section as `set=` takes them: section.key=value,... Raises ConfigError on what is no section."""
-    parts = []
-    for section, values in settings.items():
-        if not isinstance(values, Mapping):
-            raise ConfigError(f"{section} is a section: give a dict, as {section}={{'key': value}}")
-        for key, value in values.items():
-            plain = isinstance(value, str) and not re.search(r"""["',=\s]""", value)
-            parts.append(f"{section}.{key}={value if plain else json.dumps(value)}")
-    return ",".join(parts)

@@ -6,23 +6,22 @@ from typing import Any
 
 from chebsplat.errors import ConfigError
 from chebsplat.formats.names import suggest
+from chebsplat.pipelines.bases import revisions
+from chebsplat.pipelines.planning import sequences
+from chebsplat.pipelines.planning.plan import Overrides, Planner, merged, overrides
 from chebsplat.stages.registry import STAGES
 
 
 def plans(
     scene: str | None,
     sequence: str | None,
-    settings: str,
+    settings: Overrides,
     ablation: str,
     basis: str,
     running: bool = False,
     device: str = "cpu",
 ) -> list[Any]:
     """The plan of a scene, after those of the scenes that its basis comes from, or the plans of a sequence."""
-    from chebsplat.pipelines.bases import revisions
-    from chebsplat.pipelines.planning import sequences
-    from chebsplat.pipelines.planning.plan import Planner
-
     if (scene is None) == (sequence is None):
         raise ConfigError("name one of scene= and sequence=")
     if sequence is not None and basis:
@@ -32,7 +31,7 @@ def plans(
         if sequence is not None:
             return sequences.chain(planner, sequence, settings, ablation)
         if basis == "none":
-            settings = ",".join(part for part in (settings, "refine.knowledge=none") if part)
+            settings = merged(overrides(settings), {"refine": {"knowledge": "none"}})
         if basis in ("", "none"):
             return [planner.plan(str(scene), settings, ablation)]
         earlier, path, name = revisions.before(planner, basis, settings, ablation)

@@ -11,7 +11,7 @@ from chebsplat.errors import ConfigError
 from chebsplat.formats import artifact, heads
 from chebsplat.formats.basis import SCHEMA, read_lineage
 from chebsplat.formats.names import suggest
-from chebsplat.pipelines.planning.plan import Plan, Planner
+from chebsplat.pipelines.planning.plan import Overrides, Plan, Planner
 from chebsplat.pipelines.planning.sequences import chain, scenes_of
 from chebsplat.pipelines.running import job
 from chebsplat.pipelines.running.run import HERE, entry, git_state, plan_of
@@ -70,7 +70,7 @@ def chosen(reference: Reference, count: int) -> int:
     return reference.revision or count
 
 
-def before(planner: Planner, text: str, settings: str, ablation: str) -> tuple[list[Plan], Path, str]:
+def before(planner: Planner, text: str, settings: Overrides, ablation: str) -> tuple[list[Plan], Path, str]:
     """What `basis=` means to a run: plans of the scenes it comes from, the artifact, and its name with the revision.
 
     Choices: the revision of a sequence is made where it is not there yet, with the settings of the scene that asks for

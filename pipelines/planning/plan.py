@@ -6,6 +6,7 @@ import hashlib
 import os
 import re
 import tomllib
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -32,6 +33,9 @@ from chebsplat.stages.registry import STAGES, Stage
 
 if TYPE_CHECKING:
     from chebsplat.stages.runtime.config import Config
+
+
+Overrides = str | Mapping[str, Any]  # `section.key=value,...`, or sections by name
 
 
 @dataclass
@@ -81,8 +85,11 @@ def placed(config: Config) -> Config:
     return config
 
 
-def suffix(settings: str) -> str:
-    """`set=` as part of a folder's name: as it is where it fits, otherwise cut and told apart by a digest."""
+def suffix(settings: Overrides) -> str:
+    """Settings as part of a folder's name: as they are where they fit, otherwise cut and told apart by a digest."""
+    if not isinstance(settings, str):
+        items = ((section, key, value) for section, of in settings.items() for key, value in of.items())
+        settings = ",".join(f"{section}.{key}={value}" for section, key, value in items)
     text = re.sub(r"[^\w.=+-]+", "_", settings)
     return text if len(text) <= 80 else f"{text[:71]}-{hashlib.sha256(settings.encode()).hexdigest()[:8]}"
 
@@ -92,10 +99,19 @@ def merged(base: dict[str, Any], over: dict[str, Any]) -> dict[str, Any]:
     return base | {s: base.get(s, {}) | v if isinstance(v, dict) else v for s, v in over.items()}
 
 
-def overrides(text: str) -> dict[str, Any]:
-    """`a.b=c,d.e=f` as nested values, spaces about them or not. Raises ConfigError on anything else."""
+def overrides(settings: Overrides) -> dict[str, Any]:
+    """`a.b=c,d.e=f` as nested values, spaces about them or not; nested values as they are.
+
+    Raises: ConfigError on anything else.
+    """
     values: dict[str, Any] = {}
-    for item in filter(None, map(str.strip, re.split(r",(?=\s*[\w.]+\s*=)", text))):
+    if not isinstance(settings, str):
+        for section, of in settings.items():
+            if not isinstance(of, Mapping):
+                raise ConfigError(f"{section} is a section: give a dict, as {section}={{'key': value}}")
+            values[section] = dict(of)
+        return values
+    for item in filter(None, map(str.strip, re.split(r",(?=\s*[\w.]+\s*=)", settings))):
         key, _, value = (part.strip() for part in item.partition("="))
         section, _, name = key.partition(".")
         if unprintable(item) or not (section and name and value) or "." in name:
@@ -138,7 +154,7 @@ class Planner:
     def plan(
         self,
         scene: str,
-        settings: str = "",
+        settings: Overrides = "",
         ablation: str = "",
         basis: Path | None = None,
         keep_knowledge: bool = False,
@@ -146,8 +162,8 @@ class Planner:
     ) -> Plan:
         """The steps of one scene.
 
-        Args: settings: `set=`; basis: an earlier scene's basis to train on; keep_knowledge: end with a cks step;
-              values: config sections that replace the scene's own, before ablation and settings (a study's).
+        Args: settings: over the scene's own; basis: an earlier scene's basis to train on; keep_knowledge: end with a
+              cks step; values: config sections that replace the scene's own, before ablation and settings (a study's).
         Raises: ConfigError, InputError.
         Choices: a scene of a sequence, or on a basis, trains the encoder of regions, which a basis is of.
         """

@@ -8,7 +8,7 @@ from typing import Any
 from chebsplat.errors import ConfigError
 from chebsplat.formats.names import unprintable
 from chebsplat.formats.teacher_model import EMBEDDED, read_teacher
-from chebsplat.pipelines.planning.plan import Plan, Planner, merged, overrides, placed
+from chebsplat.pipelines.planning.plan import Overrides, Plan, Planner, merged, overrides, placed
 from chebsplat.pipelines.work.scenes import read_named
 from chebsplat.stages.registry import STAGES
 
@@ -30,7 +30,9 @@ def scenes_of(name: str) -> list[str]:
     return scenes
 
 
-def chain(planner: Planner, name: str, settings: str = "", ablation: str = "", length: int | None = None) -> list[Plan]:
+def chain(
+    planner: Planner, name: str, settings: Overrides = "", ablation: str = "", length: int | None = None
+) -> list[Plan]:
     """Plans of the first `length` scenes of a sequence; the basis of each is what its `cks` step makes.
 
     Choices: a scene that has no knowledge to give (no encoder) passes on the basis that it was given.

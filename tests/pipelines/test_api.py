@@ -8,8 +8,7 @@ from chebsplat.errors import ChebsplatError, ConfigError
 from chebsplat.formats.capture import Capture
 from chebsplat.formats.ply import read_ply
 from chebsplat.formats.scene import Scene
-from chebsplat.pipelines.api import as_text
-from chebsplat.pipelines.planning.plan import overrides
+from chebsplat.pipelines.planning.plan import overrides, suffix
 from chebsplat.pipelines.running import run
 from chebsplat.render import SceneRenderer
 from chebsplat.stages.evaluate import camera
@@ -91,11 +90,12 @@ def test_what_cannot_be_is_said(scene):
         chebsplat.nothing  # noqa: B018
 
 
-def test_settings_as_the_command_takes_them():
+def test_settings_are_values_and_name_the_links_as_the_command_does():
     given = {"train": {"steps": 10, "prune": False, "lr_means": 1e-4}, "source": {"path": "a, b"}}
-    assert overrides(as_text(given)) == given
+    assert overrides(given) == given
+    assert suffix({"train": {"steps": 10}, "sfm": {"max_points": 9}}) == suffix("train.steps=10,sfm.max_points=9")
     with pytest.raises(ConfigError, match="is a section"):
-        as_text({"steps": 3})
+        overrides({"steps": 3})
 
 
 def test_one_stage_runs_alone(toy, tmp_path):
