@@ -40,6 +40,14 @@ def is_image(name: str) -> bool:
     return os.path.splitext(name)[1].lower() in SUFFIXES and not name.startswith(".")
 
 
+def images_below(folder: Path, remedy: str) -> list[Path]:
+    """The images of a folder and those below it, sorted. Raises InputError, which ends in the remedy, without any."""
+    files = sorted(path for path in folder.rglob("*") if path.suffix.lower() in SUFFIXES)
+    if not files:
+        raise InputError(f"{folder} holds no .png or .jpg image; {remedy}")
+    return files
+
+
 def is_heic(path: Path) -> bool:
     """Whether a file is a HEIC image by its first bytes. Raises InputError if it cannot be read."""
     regular(path, INCOMPLETE)

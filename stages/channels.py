@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from chebsplat.errors import ConfigError, DataFailure, InputError
-from chebsplat.formats.images import SUFFIXES, read_rgb
+from chebsplat.formats.images import images_below, read_rgb
 from chebsplat.stages.runtime.command import Job, n_threads
 
 if TYPE_CHECKING:
@@ -121,21 +121,13 @@ def digest(teacher: TeacherModel) -> str:
     return hashlib.sha256("\n".join(sha256_file(file) for file in teacher.files()).encode()).hexdigest()
 
 
-def reference_files(folder: Path) -> list[Path]:
-    """The images of a reference folder. Raises InputError if there are none."""
-    files = sorted(path for path in folder.rglob("*") if path.suffix.lower() in SUFFIXES)
-    if not files:
-        raise InputError(f"{folder} holds no .png or .jpg image; correct channels.reference")
-    return files
-
-
 def reference(settings: ChannelsSection) -> tuple[Iterator[tuple[str, np.ndarray]], int]:
     """(name, image u8 [H, W, 3]) one by one, and how many."""
     if settings.reference is None:
         from chebsplat.synthetic.seeds import REFERENCE
 
         return generated(REFERENCE[: settings.n_rooms]), settings.n_rooms * VIEWS
-    files = reference_files(Path(settings.reference))
+    files = images_below(Path(settings.reference), "correct channels.reference")
     return photos(files), len(files)
 
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import logging
-import os
 from pathlib import Path
 from typing import Any
 
@@ -11,26 +10,11 @@ from chebsplat.errors import ConfigError, DataFailure, InputError
 from chebsplat.stages.runtime.command import Job
 from chebsplat.stages.runtime.progress import Progress
 from chebsplat.stages.settings import IngestSection, SourceSection
+from chebsplat.stages.sources.common import resolve_source
 
 log = logging.getLogger("chebsplat")
 
 NAMED = 20  # blurred views in a message
-
-
-def resolve(name: str, source: SourceSection) -> SourceSection:
-    """The source really meant: `named` is Replica's scene where REPLICA_ROOT holds it, else the generated one.
-
-    The result, not `named`, enters an artifact's key, so the two can never be mistaken for each other.
-    """
-    if source.kind == "named":
-        root = os.environ.get("REPLICA_ROOT")
-        spellings = (name, name.rstrip("0123456789") + "_" + name[len(name.rstrip("0123456789")) :])
-        existing = [Path(root) / s for s in spellings if root and (Path(root) / s).is_dir()]
-        change = {"kind": "replica", "path": str(existing[0])} if existing else {"kind": "generated", "path": None}
-        source = source.model_copy(update=change)
-    if source.kind != "generated" and source.path is None:
-        raise ConfigError(f"source.kind = {source.kind} needs source.path")
-    return source
 
 
 def read(name: str, source: SourceSection, settings: IngestSection, progress: Progress | None = None) -> dict[str, Any]:
@@ -159,7 +143,7 @@ def run(job: Job) -> None:
     from chebsplat.formats.capture import Capture
 
     name, settings = job.config.scene.name, job.config.ingest
-    source = resolve(name, job.config.source)
+    source = resolve_source(name, job.config.source)
     fields = read(name, source, settings, job.progress)
     fields["source"] = {"name": name} | fields["source"]
     for note in fields["source"].get("notes", []):

@@ -10,7 +10,14 @@ from typing import TYPE_CHECKING, Any
 from chebsplat.errors import ConfigError
 from chebsplat.formats.images import is_heic, is_image, require_heic
 from chebsplat.formats.knowledge import SCHEMA, SHIPPED, read_card
-from chebsplat.formats.teacher_model import EMBEDDED, read_teacher
+from chebsplat.formats.teacher_model import (
+    EMBEDDED,
+    TEXT_PACKAGE,
+    TeacherModel,
+    read_label_set,
+    read_label_table,
+    read_teacher,
+)
 from chebsplat.formats.videos import is_video, require_av
 from chebsplat.pipelines.work import store
 from chebsplat.pipelines.work.scenes import expanded
@@ -113,7 +120,6 @@ def text_packages(model: TeacherModel | None, labels: str | None) -> tuple[str, 
     Choices: what a capture calls its classes is not known before it is read. The sentence model of the extra `text` is
       pinned to one version, so that it is left out where only such names could need it; a model of the user's is not.
     """
-    from chebsplat.formats.teacher_model import TEXT_PACKAGE, read_label_set, read_label_table
     from chebsplat.stages.teacher_models.text_encoder import found
 
     if model is None or model.text is None or model.output != "features":

@@ -30,6 +30,7 @@ from chebsplat.pipelines.planning.raw import Hashes, content_hash, hashes, raw_f
 from chebsplat.pipelines.work import folders, store
 from chebsplat.pipelines.work.scenes import absent, expanded, folder_of, is_source, read_toml, scene_values
 from chebsplat.stages.registry import STAGES, Stage
+from chebsplat.stages.sources.common import resolve_source
 
 if TYPE_CHECKING:
     from chebsplat.stages.runtime.config import Config
@@ -168,7 +169,6 @@ class Planner:
         Choices: a scene of a sequence, or on a basis, trains the encoder of regions, which a basis is of.
         """
         from chebsplat.pipelines.planning.needs import knowledge_given
-        from chebsplat.stages import ingest
         from chebsplat.stages.runtime import config as configs
 
         name, own = scene_values(scene)
@@ -183,7 +183,7 @@ class Planner:
             title += ("+" if ablation else "@") + suffix(settings)
         config = placed(configs.build(values, f"scene {scene}"))
         asked = config.source
-        source = ingest.resolve(name, asked)
+        source = resolve_source(name, asked)
         if source.path:  # REPLICA_ROOT may be relative
             source = source.model_copy(update={"path": str(Path(source.path).expanduser().resolve())})
         probe = self._probe(source, scene)

@@ -14,6 +14,8 @@ from typing import Any
 from chebsplat.errors import InputError
 from chebsplat.formats.artifact import sha256_file
 from chebsplat.formats.files import regular
+from chebsplat.formats.images import images_below
+from chebsplat.formats.teacher_model import EMBEDDED, read_teacher
 
 SETTLED = 2_000_000_000  # ns; no file system's clock is coarser. What changed later than this may yet change unseen
 Hashes = dict[str, list[Any]]  # path -> [stamp, sha256, whether it was settled when it was read]
@@ -46,25 +48,19 @@ def raw_files(stage: str, sections: dict[str, Any]) -> tuple[Path | None, list[P
 
 def _of_model(model: str | None) -> list[Path]:
     """The files of a teacher, the embedded one if none is named."""
-    from chebsplat.formats.teacher_model import EMBEDDED, read_teacher
-
     return read_teacher(Path(model) if model else EMBEDDED).files()
 
 
 def _of_teacher(settings: dict[str, Any]) -> list[Path]:
     """The model's files, and the file of labels."""
-    from chebsplat.formats.teacher_model import read_teacher
-
     labels = [_named(settings["labels"], "teacher.labels")] if settings["labels"] else []
     return [*read_teacher(Path(settings["model"])).files(), *labels]
 
 
 def _of_channels(settings: dict[str, Any]) -> list[Path]:
     """The model's files, its channel map's where it brings one, and the reference images; none of a scene's."""
-    from chebsplat.formats.teacher_model import read_teacher
-    from chebsplat.stages.channels import reference_files
-
-    images = reference_files(Path(settings["reference"])) if settings["reference"] else []
+    folder = settings["reference"]
+    images = images_below(Path(folder), "correct channels.reference") if folder else []
     teacher = read_teacher(Path(settings["model"]))
     brought = sorted(path for path in teacher.channels.rglob("*") if path.is_file())
     return [*teacher.files(), *brought, *images]

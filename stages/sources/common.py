@@ -10,12 +10,13 @@ from pathlib import Path
 
 import numpy as np
 
-from chebsplat.errors import InputError
+from chebsplat.errors import ConfigError, InputError
 from chebsplat.evaluation.protocols.split import natural
 from chebsplat.formats.images import SUFFIXES, is_image
 from chebsplat.formats.names import unprintable
 from chebsplat.formats.videos import SUFFIXES as VIDEOS
 from chebsplat.formats.videos import is_video
+from chebsplat.stages.settings import SourceSection
 from chebsplat.stages.sources.cameras import Camera
 
 # What cameras leave beside photos, or instead of them, and what makes JPEGs of it.
@@ -158,3 +159,19 @@ def images_in(folder: Path) -> list[str]:
     if not found:
         raise InputError(f"{folder} holds no .jpg, .png or .heic image; correct source.path")
     return found
+
+
+def resolve_source(name: str, source: SourceSection) -> SourceSection:
+    """The source really meant: `named` is Replica's scene where REPLICA_ROOT holds it, else the generated one.
+
+    The result, not `named`, enters an artifact's key, so the two can never be mistaken for each other.
+    """
+    if source.kind == "named":
+        root = os.environ.get("REPLICA_ROOT")
+        spellings = (name, name.rstrip("0123456789") + "_" + name[len(name.rstrip("0123456789")) :])
+        existing = [Path(root) / s for s in spellings if root and (Path(root) / s).is_dir()]
+        change = {"kind": "replica", "path": str(existing[0])} if existing else {"kind": "generated", "path": None}
+        source = source.model_copy(update=change)
+    if source.kind != "generated" and source.path is None:
+        raise ConfigError(f"source.kind = {source.kind} needs source.path")
+    return source
