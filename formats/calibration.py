@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import json
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from pydantic import TypeAdapter, ValidationError
 from typing_extensions import TypedDict
 
 from chebsplat.errors import InputError
@@ -48,8 +50,6 @@ def beside(model: Path) -> Path:
 
 def write_calibration(path: Path, of: TeacherCalibration) -> None:
     """Write it, whole or not at all."""
-    import json
-
     document = {"schema": SCHEMA} | vars(of)
     atomic_write(path, json.dumps(document, indent=1, allow_nan=False, ensure_ascii=False) + "\n")
 
@@ -69,8 +69,6 @@ def read_calibration(model: Path) -> TeacherCalibration | None:
 
     Raises: InputError naming the file where it is damaged, or of another model than the one beside it.
     """
-    from pydantic import TypeAdapter, ValidationError
-
     path = beside(model)
     if not path.is_file():
         return None

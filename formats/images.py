@@ -12,8 +12,11 @@ import threading
 import warnings
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager
+from importlib import import_module
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
+
+import numpy as np
 
 from chebsplat.errors import InputError
 from chebsplat.formats.files import regular
@@ -58,8 +61,6 @@ def is_heic(path: Path) -> bool:
 
 def require_heic(path: Path) -> None:
     """Raises InputError with the command that installs the reader of HEIC, if it is missing."""
-    from importlib import import_module
-
     try:
         import_module("pillow_heif")
     except ImportError:
@@ -90,8 +91,6 @@ def opened(path: Path, remedy: str = INCOMPLETE, check: Callable[[Any], None] | 
 
 def read_rgb(path: Path, remedy: str = INCOMPLETE) -> np.ndarray:
     """u8 [H, W, 3] as it is stored, whatever its mode. Raises InputError."""
-    import numpy as np
-
     with opened(path, remedy) as image:
         return np.asarray(image if image.mode == "RGB" else image.convert("RGB"))
 

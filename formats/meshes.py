@@ -9,6 +9,8 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
+from plyfile import PlyData, PlyElement
+from scipy.spatial import cKDTree
 
 from chebsplat.errors import ConfigError
 from chebsplat.formats.files import atomic_path
@@ -95,8 +97,6 @@ def cleaned(mesh: Mesh, n_triangles: int, least_diagonal: float, longest_hole: i
       that leaves what is wanted or EASY, and edges collapsed by quadrics from there on: the collapse alone takes four
       times as long, for 0.002 of the F-score at 5 cm.
     """
-    from scipy.spatial import cKDTree
-
     pymeshlab = meshlab()
     meshes = pymeshlab.MeshSet(verbose=False)
     meshes.add_mesh(pymeshlab.Mesh(mesh.vertices.astype(np.float64), mesh.triangles))
@@ -134,8 +134,6 @@ def write_mesh(path: Path, mesh: Mesh, names: list[str] | None = None) -> None:
 
 
 def _ply(path: Path, mesh: Mesh, names: list[str]) -> None:
-    from plyfile import PlyData, PlyElement
-
     kinds = [(axis, "f4") for axis in "xyz"] + [(channel, "u1") for channel in ("red", "green", "blue")]
     vertices = np.zeros(len(mesh.vertices), kinds + ([("label", "i4")] if mesh.labels is not None else []))
     for column, axis in enumerate("xyz"):

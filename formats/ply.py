@@ -5,6 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 
 import numpy as np
+from plyfile import PlyData, PlyElement
 
 from chebsplat.errors import InputError
 from chebsplat.formats.vertices import read_vertices
@@ -32,8 +33,6 @@ def write_ply(
     Choices: normals are written as zeros, since some loaders hard-code their presence. Tags are floats like all else:
       Open3D skips a `ushort`, and gsply 0.4 and spz-js 1.2 take any other type, or a second element, for the data.
     """
-    from plyfile import PlyData, PlyElement
-
     n, n_rest = len(parameters["means"]), REST[degree]
     names = [*_FIXED, *(f"f_rest_{i}" for i in range(3 * n_rest)), *_TAIL]
     blocks = [

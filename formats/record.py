@@ -16,17 +16,17 @@ from dataclasses import dataclass, fields
 from functools import cache
 from pathlib import Path
 from types import NoneType
-from typing import TYPE_CHECKING, Any, ClassVar, Self, get_args, get_type_hints
+from typing import Any, ClassVar, Self, get_args, get_type_hints
 
 import numpy as np
+import zarr
+from zarr.codecs import Crc32cCodec, ZstdCodec
+from zarr.storage import MemoryStore
 
 from chebsplat.errors import InputError
 from chebsplat.formats import artifact
 from chebsplat.formats.files import parse_json
 from chebsplat.formats.manifest import Manifest, remedy_of
-
-if TYPE_CHECKING:
-    import zarr
 
 BATCH = 2**25  # bytes that are compressed at a time
 ROWS = 65_536  # entries of the first axis in a chunk, where an array isn't read view by view
@@ -78,9 +78,6 @@ class Record:
 
         Raises: ValueError or TypeError on a value that JSON or UTF-8 does not have, nan among them.
         """
-        import zarr
-        from zarr.storage import MemoryStore
-
         specs = {name: spec for name, (spec, _) in _arrays_of(self)}
         attributes = {
             "schema": self.SCHEMA,
@@ -135,8 +132,6 @@ class StoredArray:
         Raises: InputError if its metadata are damaged, or the manifest does not list all of its chunks: zarr would
           read those as fill values.
         """
-        import zarr
-
         self.root, self.name, self.manifest = root, name, manifest
         artifact.checked(root, manifest, f"{name}/{METADATA}")
         with reading(root):
@@ -169,9 +164,6 @@ def create_array(
     store: Path | zarr.storage.MemoryStore, shape: tuple[int, ...], spec: Array, compressed: bool = True
 ) -> zarr.Array[Any]:
     """An array to be filled chunk by chunk. store: its folder, in that of its group, or memory."""
-    import zarr
-    from zarr.codecs import Crc32cCodec, ZstdCodec
-
     rows = 1 if spec.by_view else ROWS
     return zarr.create_array(
         store,
@@ -193,8 +185,6 @@ def write_array(path: Path, values: np.ndarray, spec: Array, compressed: bool = 
     Choices: chunks are compressed side by side in memory, so many at a time as BATCH bytes hold, and written one by
       one: twice as fast as zarr's own files, and where a disk is full no other write is under way.
     """
-    from zarr.storage import MemoryStore
-
     files: dict[str, Any] = {}
     array = create_array(MemoryStore(files), values.shape, spec, compressed)
     rows = array.chunks[0] * max(1, BATCH // max(math.prod(array.chunks) * array.dtype.itemsize, 1))

@@ -11,6 +11,7 @@ from chebsplat.errors import InputError
 from chebsplat.formats.artifact import sha256_file
 from chebsplat.formats.files import parse_toml, read_text
 from chebsplat.formats.names import check_names, suggest, unprintable
+from chebsplat.formats.npz import finite32, read_npz
 
 if TYPE_CHECKING:
     import numpy as np
@@ -156,7 +157,6 @@ def read_label_table(path: Path) -> tuple[list[str], np.ndarray | None]:
     """
     if path.suffix != ".npz":
         return list(read_label_set(path)), None
-    from chebsplat.formats.npz import finite32, read_npz
 
     arrays = read_npz(path, ("names", "embeddings"), "write it again, with names and embeddings")
     listed, embeddings = arrays.get("names"), arrays.get("embeddings")

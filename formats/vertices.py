@@ -6,6 +6,8 @@ import re
 from pathlib import Path
 from typing import Any
 
+from plyfile import PlyData, PlyListProperty, PlyParseError
+
 from chebsplat.errors import InputError
 from chebsplat.formats.files import regular
 
@@ -19,8 +21,6 @@ def read_vertices(path: Path, remedy: str) -> Any:
     Choices: a value takes a byte at least, in text and in binary; a header that declares more values than the file has
       bytes lies, and is refused before anything is allocated.
     """
-    from plyfile import PlyData, PlyListProperty, PlyParseError
-
     size = regular(path, remedy).st_size
     try:
         with path.open("rb") as handle:

@@ -6,8 +6,11 @@ import os
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
+from importlib import import_module
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
+
+import numpy as np
 
 from chebsplat.errors import InputError
 from chebsplat.formats.files import regular
@@ -48,8 +51,6 @@ class Shown:
 
     def pixels(self, grey_side: int | None = None) -> np.ndarray:
         """u8 [H, W, 3], or grey [H, W] whose longer side is at most `grey_side`."""
-        import numpy as np
-
         (width, height), kind = self._size, "rgb24"
         if grey_side is not None:
             factor, kind = min(1.0, grey_side / max(width, height)), "gray"
@@ -67,8 +68,6 @@ def quarters(frame: Any) -> int:
 
 def require_av(path: Path) -> Any:
     """The package av. Raises InputError with the command that installs it, if it is missing."""
-    from importlib import import_module
-
     try:
         return import_module("av")
     except ImportError:

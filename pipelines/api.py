@@ -5,10 +5,20 @@ from __future__ import annotations
 import json
 import os
 from collections.abc import Mapping
+from importlib import import_module
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import Any
 
 from chebsplat.errors import ChebsplatError, ConfigError
+from chebsplat.formats.names import suggest
+from chebsplat.formats.scene import Scene
+from chebsplat.pipelines.running.run import device_of, execute
+from chebsplat.pipelines.selection import plans
+from chebsplat.pipelines.work import store
+from chebsplat.pipelines.work.finished import artifact_of, teacher_of
+from chebsplat.stages.registry import STAGES
+from chebsplat.stages.runtime.command import publish
 from chebsplat.stages.tools.scene import Camera, OpenedScene, Picture
 
 __all__ = ["Camera", "OpenedScene", "Picture", "load", "run_stage", "train"]
@@ -20,9 +30,6 @@ def load(scene: str | Path) -> OpenedScene:
     Args: scene: its name, its photo folder, its folder in `work`, or an `export` artifact.
     Raises: ConfigError or InputError, which name what is missing and the remedy.
     """
-    from chebsplat.formats.scene import Scene
-    from chebsplat.pipelines.work.finished import artifact_of, teacher_of
-
     return OpenedScene(Scene.read(artifact_of(str(scene), "export")), Path(scene), teacher_of(str(scene)))
 
 
@@ -43,10 +50,6 @@ def train(
       settings: sections of settings by name, as `train={"steps": 1000}` (`chebsplat settings` lists them).
     Raises: ConfigError or InputError before anything runs; ChebsplatError if a stage fails, whose log says why.
     """
-    from chebsplat.pipelines.running.run import device_of, execute
-    from chebsplat.pipelines.selection import plans
-    from chebsplat.pipelines.work import store
-
     used = device_of(device)
     chosen = plans(str(capture), None, settings, ablation, basis, running=True, device=used)
     if execute(chosen, None, cores or os.cpu_count() or 1, used):
@@ -62,13 +65,6 @@ def run_stage(
     Args: name: of a stage; inputs: artifacts by role (`chebsplat STAGE --help` lists them); settings: sections by name.
     Raises: ConfigError, InputError, DataFailure.
     """
-    from importlib import import_module
-    from tempfile import TemporaryDirectory
-
-    from chebsplat.formats.names import suggest
-    from chebsplat.stages.registry import STAGES
-    from chebsplat.stages.runtime.command import publish
-
     if name not in STAGES:
         near = suggest(name, STAGES, 1)
         raise ConfigError(f"no stage is called {name}" + (f"; did you mean {near[0]}?" if near else ""))

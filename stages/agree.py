@@ -3,17 +3,19 @@
 from __future__ import annotations
 
 import logging
-from typing import TYPE_CHECKING
 
+import numpy as np
+
+from chebsplat.cameras import centers
 from chebsplat.errors import DataFailure, InputError
+from chebsplat.formats.agreement import ViewAgreement
+from chebsplat.formats.capture import Capture
+from chebsplat.formats.features import Features
+from chebsplat.formats.points import Points
+from chebsplat.labels.agreement import UNSEEN, between, far_pairs, project, unhidden
+from chebsplat.labels.decode import decode_labels
+from chebsplat.stages.reconstruction.thinning import even
 from chebsplat.stages.runtime.command import Job
-
-if TYPE_CHECKING:
-    import numpy as np
-
-    from chebsplat.formats.capture import Capture
-    from chebsplat.formats.features import Features
-    from chebsplat.formats.points import Points
 
 log = logging.getLogger("chebsplat")
 SEED = 0  # of the choice among points
@@ -24,16 +26,6 @@ def run(job: Job) -> None:
 
     Reads `capture`, `points` and `features`. Writes `agreement`.
     """
-    import numpy as np
-
-    from chebsplat.cameras import centers
-    from chebsplat.formats.agreement import ViewAgreement
-    from chebsplat.formats.capture import Capture
-    from chebsplat.formats.features import Features
-    from chebsplat.formats.points import Points
-    from chebsplat.labels.agreement import between, far_pairs
-    from chebsplat.stages.reconstruction.thinning import even
-
     settings, capture = job.config.agree, Capture.read(job.inputs["capture"])
     points, features = Points.read(job.inputs["points"]), Features.read(job.inputs["features"])
     views = training_views(capture, points, features)
@@ -89,11 +81,6 @@ def labels_of(
     Choices: what hides a point is told by depth, where the capture has it in the frame of the points; by the tracks of
       structure from motion, whose points were found in the views that see them; otherwise by nearer points.
     """
-    import numpy as np
-
-    from chebsplat.labels.agreement import UNSEEN, project, unhidden
-    from chebsplat.labels.decode import decode_labels
-
     means, size = points.means.astype(np.float64), capture.size
     depths = capture.depth if capture.cam_from_world is not None else None
     number_of = np.full(len(means), -1)

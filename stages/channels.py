@@ -8,19 +8,29 @@ learns about shape and meaning carries over to the next.
 
 from __future__ import annotations
 
+import hashlib
 from collections.abc import Iterator
+from concurrent.futures import ThreadPoolExecutor
+from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
+
+import numpy as np
 
 from chebsplat.errors import ConfigError, DataFailure, InputError
+from chebsplat.formats.artifact import read_manifest, sha256_file
+from chebsplat.formats.channels import ChannelMap
 from chebsplat.formats.images import images_below, read_rgb
+from chebsplat.formats.teacher_model import EMBEDDED, TeacherModel, read_label_table, read_teacher
+from chebsplat.labels import channels as maths
 from chebsplat.stages.runtime.command import Job, n_threads
-
-if TYPE_CHECKING:
-    import numpy as np
-
-    from chebsplat.formats.teacher_model import TeacherModel
-    from chebsplat.stages.settings import ChannelsSection
+from chebsplat.stages.settings import ChannelsSection
+from chebsplat.stages.sources.generated import SIZES, photograph
+from chebsplat.stages.teacher_models.image_encoder import TeacherInference
+from chebsplat.synthetic.layout import build
+from chebsplat.synthetic.path import intrinsics, walk
+from chebsplat.synthetic.rays import RayCaster
+from chebsplat.synthetic.seeds import REFERENCE
 
 ENTRY = 4  # pixels of an image that an entry of its map is wide, at least
 VIEWS = 4  # of a generated room
@@ -32,14 +42,6 @@ def run(job: Job) -> None:
 
     Reads no artifact: a teacher, its words and reference images. Writes `channels`.
     """
-    import numpy as np
-
-    from chebsplat.formats.artifact import read_manifest
-    from chebsplat.formats.channels import ChannelMap
-    from chebsplat.formats.teacher_model import EMBEDDED, read_teacher
-    from chebsplat.labels import channels as maths
-    from chebsplat.stages.teacher_models.image_encoder import TeacherInference
-
     settings = job.config.channels
     teacher = read_teacher(Path(settings.model) if settings.model else EMBEDDED)
     if teacher.output != "features":
@@ -85,9 +87,6 @@ def run(job: Job) -> None:
 
 def shipped(teacher: TeacherModel, settings: ChannelsSection) -> Path | None:
     """The artifact of this stage that lies beside the teacher, if it is of the same files and settings."""
-    from chebsplat.formats.artifact import read_manifest
-    from chebsplat.formats.channels import ChannelMap
-
     if not teacher.channels.is_dir():
         return None
     manifest, unnamed = read_manifest(teacher.channels, ChannelMap.SCHEMA), {"model"}
@@ -98,10 +97,6 @@ def shipped(teacher: TeacherModel, settings: ChannelsSection) -> Path | None:
 
 def vocabulary(job: Job, teacher: TeacherModel) -> np.ndarray | None:
     """Unit embeddings [L, C] of the teacher's table of words; None where it has none."""
-    import numpy as np
-
-    from chebsplat.formats.teacher_model import read_label_table
-
     names, embeddings = read_label_table(teacher.labels) if teacher.labels else ([], None)
     if embeddings is None:
         job.left_out("vocabulary", f"{teacher.settings} names no table of embeddings: directions go by energy alone")
@@ -114,18 +109,12 @@ def vocabulary(job: Job, teacher: TeacherModel) -> np.ndarray | None:
 
 def digest(teacher: TeacherModel) -> str:
     """One sha256 over the teacher's files."""
-    import hashlib
-
-    from chebsplat.formats.artifact import sha256_file
-
     return hashlib.sha256("\n".join(sha256_file(file) for file in teacher.files()).encode()).hexdigest()
 
 
 def reference(settings: ChannelsSection) -> tuple[Iterator[tuple[str, np.ndarray]], int]:
     """(name, image u8 [H, W, 3]) one by one, and how many."""
     if settings.reference is None:
-        from chebsplat.synthetic.seeds import REFERENCE
-
         return generated(REFERENCE[: settings.n_rooms]), settings.n_rooms * VIEWS
     files = images_below(Path(settings.reference), "correct channels.reference")
     return photos(files), len(files)
@@ -139,14 +128,6 @@ def photos(files: list[Path]) -> Iterator[tuple[str, np.ndarray]]:
 
 def generated(seeds: range) -> Iterator[tuple[str, np.ndarray]]:
     """Views of generated rooms, offices and living rooms in turn."""
-    from concurrent.futures import ThreadPoolExecutor
-    from functools import partial
-
-    from chebsplat.stages.sources.generated import SIZES, photograph
-    from chebsplat.synthetic.layout import build
-    from chebsplat.synthetic.path import intrinsics, walk
-    from chebsplat.synthetic.rays import RayCaster
-
     for seed in seeds:
         preset = ("office", "room")[seed % 2]
         _, width, height = SIZES[preset]

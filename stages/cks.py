@@ -2,13 +2,20 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any
+from typing import Any
+
+import torch
 
 from chebsplat.errors import DataFailure
+from chebsplat.formats.artifact import read_manifest
+from chebsplat.formats.basis import Basis, read_basis, write_basis
+from chebsplat.formats.gaussians import Gaussians
+from chebsplat.settings import DescribeSection
+from chebsplat.shape.cks import spread, update
+from chebsplat.shape.refresh import Descriptors
+from chebsplat.shape.regions import regions_of
 from chebsplat.stages.runtime.command import Job
-
-if TYPE_CHECKING:
-    from chebsplat.formats.gaussians import Gaussians
+from chebsplat.stages.training.saves import restored_encoder, trained_with, without_basis
 
 GEOMETRY = ("means", "quats", "log_scales")
 KAPPA = 1.0  # κ of ρ′ = ρ (1 + κ σ_f) in Eq 15: what the spread of shape within regions counts
@@ -19,17 +26,9 @@ def run(job: Job) -> None:
 
     Reads `gaussians` and, after the first scene of a sequence, the `basis` before. Writes `basis`.
     """
-    from chebsplat.formats.artifact import read_manifest
-    from chebsplat.formats.basis import Basis, read_basis, write_basis
-    from chebsplat.formats.gaussians import Gaussians
-    from chebsplat.stages.training.saves import restored_encoder, without_basis
-
     settings = job.config.cks
     old = read_basis(job.inputs["basis"]) if "basis" in job.inputs else Basis({}, {})
     checkpoint = Gaussians.read(job.inputs["gaussians"])
-    import torch  # once its inputs are known to be usable
-
-    from chebsplat.shape.cks import update
 
     encoder = restored_encoder(checkpoint)
     if not encoder.blocks:
@@ -70,14 +69,6 @@ def run(job: Job) -> None:
 
 def descriptor_spread(job: Job, gaussians: Gaussians) -> float:
     """σ_f of the trained scene (Eq 15), by the regions and descriptors that its last refresh had."""
-    import torch
-
-    from chebsplat.settings import DescribeSection
-    from chebsplat.shape.cks import spread
-    from chebsplat.shape.refresh import Descriptors
-    from chebsplat.shape.regions import regions_of
-    from chebsplat.stages.training.saves import trained_with
-
     trained = trained_with(job.inputs["gaussians"])
     if not trained["train"]["albo"]:
         job.left_out("spread of shape", "train.albo is false: the encoder sees no descriptors")

@@ -4,7 +4,14 @@ from __future__ import annotations
 
 import logging
 
+import numpy as np
+
 from chebsplat.errors import DataFailure
+from chebsplat.formats.descriptors import Descriptors, write_descriptors
+from chebsplat.formats.points import Points
+from chebsplat.shape.descriptor import describe_members
+from chebsplat.shape.regions import regions_of
+from chebsplat.splats.gaussians import activated, initial_gaussians
 from chebsplat.stages.runtime.command import Job
 
 log = logging.getLogger("chebsplat")
@@ -15,14 +22,6 @@ def run(job: Job) -> None:
 
     Reads `points`. Writes `descriptors`.
     """
-    import numpy as np
-
-    from chebsplat.formats.descriptors import Descriptors, write_descriptors
-    from chebsplat.formats.points import Points
-    from chebsplat.shape.descriptor import describe_members
-    from chebsplat.shape.regions import regions_of
-    from chebsplat.splats.gaussians import activated, initial_gaussians
-
     settings = job.config.describe
     points = Points.read(job.inputs["points"])
     if len(points.means) == 0:

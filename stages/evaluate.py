@@ -4,19 +4,26 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
+import numpy as np
+import torch
+
+from chebsplat.cameras import unproject
 from chebsplat.errors import ConfigError, DataFailure, InputError
+from chebsplat.evaluation import protocols
+from chebsplat.evaluation.lpips import NET, NORMALIZE
+from chebsplat.evaluation.protocols.task import EvaluatedView, MapsByName, Task, resized, translated
+from chebsplat.evaluation.surface import features_at
+from chebsplat.formats.capture import Capture
+from chebsplat.formats.evaluation import Evaluation
+from chebsplat.formats.features import Features
+from chebsplat.formats.scene import Scene
+from chebsplat.labels.decode import decode_labels
+from chebsplat.render import SceneRenderer
+from chebsplat.stages.measuring.image_quality import frame_split, image_figures, perceptual, timing
 from chebsplat.stages.runtime.command import Job
-
-if TYPE_CHECKING:
-    import numpy as np
-
-    from chebsplat.evaluation.protocols.task import EvaluatedView
-    from chebsplat.formats.capture import Capture
-    from chebsplat.formats.scene import Scene
-    from chebsplat.render import SceneRenderer
-    from chebsplat.views import View
+from chebsplat.views import View
 
 
 def run(job: Job) -> None:
@@ -24,16 +31,6 @@ def run(job: Job) -> None:
 
     Reads `capture`, `scene` and, for the teacher's own figures, `features`. Writes `evaluation`.
     """
-    import numpy as np
-
-    from chebsplat.evaluation import protocols
-    from chebsplat.evaluation.lpips import NET, NORMALIZE
-    from chebsplat.formats.capture import Capture
-    from chebsplat.formats.evaluation import Evaluation
-    from chebsplat.formats.scene import Scene
-    from chebsplat.render import SceneRenderer
-    from chebsplat.stages.measuring.image_quality import frame_split, image_figures, perceptual, timing
-
     settings = job.config.evaluate
     capture, scene = Capture.read(job.inputs["capture"]), Scene.read(job.inputs["scene"])
     named = str(capture.protocol.get("name"))
@@ -97,10 +94,6 @@ def run(job: Job) -> None:
 
 def camera(scene: Scene, index: int) -> View:
     """The view of a scene's camera `index`."""
-    import torch
-
-    from chebsplat.views import View
-
     cameras = scene.cameras
     K, pose = (torch.from_numpy(m[index]).float() for m in (cameras.Ks, cameras.cam_from_world))
     return View(K, pose, cameras.width, cameras.height)
@@ -108,10 +101,6 @@ def camera(scene: Scene, index: int) -> View:
 
 def placed(depth: np.ndarray, view: View) -> np.ndarray:
     """Where in the world the pixels of a view lie, f64 [H, W, 3]; nan where its depth [H, W] is."""
-    import numpy as np
-
-    from chebsplat.cameras import unproject
-
     pixels = np.indices(depth.shape).reshape(2, -1).T
     K, pose = (matrix.double().numpy() for matrix in (view.K, view.viewmat))
     return unproject(depth, K, pose, pixels).reshape(*depth.shape, 3)
@@ -119,8 +108,6 @@ def placed(depth: np.ndarray, view: View) -> np.ndarray:
 
 def task(job: Job, capture: Capture, scene: Scene, renderer: SceneRenderer) -> Any:
     """What a protocol needs beside the views: classes, and features at points of surfaces."""
-    from chebsplat.evaluation.protocols.task import Task
-    from chebsplat.evaluation.surface import features_at
 
     def at(points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         parts = (renderer.means, renderer.quats, renderer.scales, renderer.opacities)
@@ -141,11 +128,6 @@ def evaluated_views(
     shown: dict[str, list[np.ndarray]],
 ) -> Iterator[EvaluatedView]:
     """Render one view after another; `shown` collects the pictures. Everything is joined on the view's name."""
-    import numpy as np
-
-    from chebsplat.evaluation.protocols.task import EvaluatedView, MapsByName, resized, translated
-    from chebsplat.formats.features import Features
-    from chebsplat.labels.decode import decode_labels
 
     def as_classes(labels: np.ndarray) -> np.ndarray:
         """A picture whose labels are numbered as the truth's, -1 where the truth has no such class."""

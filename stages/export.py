@@ -2,13 +2,18 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any
+from typing import Any
+
+import numpy as np
 
 from chebsplat.errors import DataFailure, InputError
+from chebsplat.formats.features import Features
+from chebsplat.formats.gaussians import Gaussians
+from chebsplat.formats.lifted import Lifted
+from chebsplat.formats.refined import Refined
+from chebsplat.formats.scene import Scene
+from chebsplat.labels.decode import decode_labels
 from chebsplat.stages.runtime.command import Job
-
-if TYPE_CHECKING:
-    import numpy as np
 
 
 def run(job: Job) -> None:
@@ -20,13 +25,6 @@ def run(job: Job) -> None:
     Choices: a Gaussian that no training view sees has lifted features of zero: no label, and no part in what a view of
       the features shows.
     """
-    import numpy as np
-
-    from chebsplat.formats.features import Features
-    from chebsplat.formats.gaussians import Gaussians
-    from chebsplat.formats.scene import Scene
-    from chebsplat.labels.decode import decode_labels
-
     gaussians = Gaussians.read(job.inputs["gaussians"])
     if len(gaussians.parameters["means"]) == 0:
         raise DataFailure("the checkpoint holds no Gaussians; train the scene again with milder pruning")
@@ -67,9 +65,6 @@ def run(job: Job) -> None:
 
 def later_features(job: Job, n: int) -> np.ndarray | None:
     """Features [n, C] made after training, refined before lifted; None where the trained ones are the scene's."""
-    from chebsplat.formats.lifted import Lifted
-    from chebsplat.formats.refined import Refined
-
     records: dict[str, type[Refined | Lifted]] = {"refined": Refined, "lifted": Lifted}
     role = next((role for role in records if role in job.inputs), None)
     if role is None:

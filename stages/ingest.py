@@ -6,11 +6,29 @@ import logging
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from chebsplat.errors import ConfigError, DataFailure, InputError
+from chebsplat.evaluation import protocols
+from chebsplat.evaluation.protocols.split import every
+from chebsplat.formats.capture import MAPS, Capture
+from chebsplat.photos.sharpness import blurred, detail
 from chebsplat.stages.runtime.command import Job
 from chebsplat.stages.runtime.progress import Progress
 from chebsplat.stages.settings import IngestSection, SourceSection
+from chebsplat.stages.sources import (
+    colmap,
+    common,
+    generated,
+    photos,
+    replica,
+    scannet,
+    seven_scenes,
+    transforms,
+    video,
+)
 from chebsplat.stages.sources.common import resolve_source
+from chebsplat.stages.sources.disturbed import disturbed
 
 log = logging.getLogger("chebsplat")
 
@@ -20,15 +38,10 @@ NAMED = 20  # blurred views in a message
 def read(name: str, source: SourceSection, settings: IngestSection, progress: Progress | None = None) -> dict[str, Any]:
     """The fields of a capture, as its source gives them. Raises InputError if the source's folder is absent."""
     if source.kind == "generated":
-        from chebsplat.stages.sources import generated
-
         return generated.capture(name, source.seed, source.preset)
-    from chebsplat.stages.sources import colmap, common, photos, replica, scannet, seven_scenes, transforms
 
     folder = Path(str(source.path)).expanduser()
     if source.kind == "video":
-        from chebsplat.stages.sources import video
-
         return video.read(folder, settings, progress)
     if not folder.is_dir():
         raise InputError(f"{folder} is not a folder; correct source.path")
@@ -48,10 +61,6 @@ def read(name: str, source: SourceSection, settings: IngestSection, progress: Pr
 
 def blur_note(fields: dict[str, Any]) -> str:
     """Which views are far less sharp than the others, in one sentence; nothing where none is."""
-    import numpy as np
-
-    from chebsplat.photos.sharpness import blurred, detail
-
     images = fields["images"]
     luma = np.array([0.299, 0.587, 0.114], np.float32)
     names = [fields["names"][k] for k in np.flatnonzero(blurred(np.array([detail(image @ luma) for image in images])))]
@@ -69,11 +78,6 @@ def split(names: list[str], own: Any, settings: IngestSection) -> tuple[Any, dic
     Raises: ConfigError if the config changes a rule that is part of a protocol's name; DataFailure if it leaves no
             test or no training view.
     """
-    import numpy as np
-
-    from chebsplat.evaluation import protocols
-    from chebsplat.evaluation.protocols.split import every
-
     rule = protocols.ALL[settings.protocol]
     given = {"test_every": settings.test_every, "test_offset": settings.test_offset}
     fixed = {"test_every": rule.TEST_EVERY, "test_offset": rule.TEST_OFFSET}
@@ -98,10 +102,6 @@ def split(names: list[str], own: Any, settings: IngestSection) -> tuple[Any, dic
 
 def thinned(fields: dict[str, Any], max_train_views: int | None) -> dict[str, Any]:
     """Those of a capture's fields that hold a thing a view, with at most so many training views, evenly chosen."""
-    import numpy as np
-
-    from chebsplat.formats.capture import MAPS
-
     training = np.flatnonzero(~fields["is_test"])
     if max_train_views is None or len(training) <= max_train_views:
         return {}
@@ -121,8 +121,6 @@ def renamed(fields: dict[str, Any], classes: dict[str, list[str]]) -> dict[str, 
 
     Raises: ConfigError where the source has no labels, or no class of a name that is given.
     """
-    import numpy as np
-
     own, labels = fields.get("class_names"), fields.get("labels")
     if own is None or labels is None:
         raise ConfigError("ingest.classes renames a source's labels, and this one has none; leave it away")
@@ -138,10 +136,6 @@ def run(job: Job) -> None:
 
     Reads a source, of files or generated. Writes `capture`.
     """
-    import numpy as np
-
-    from chebsplat.formats.capture import Capture
-
     name, settings = job.config.scene.name, job.config.ingest
     source = resolve_source(name, job.config.source)
     fields = read(name, source, settings, job.progress)
@@ -156,8 +150,6 @@ def run(job: Job) -> None:
     fields |= thinned(fields, settings.max_train_views)
     strengths = settings.disturb_colors, settings.disturb_degrees, settings.disturb_shift
     if any(strengths):
-        from chebsplat.stages.sources.disturbed import disturbed
-
         if fields.get("cam_from_world") is None and any(strengths[1:]):
             raise ConfigError("ingest.disturb_degrees and disturb_shift change poses, and this source has none")
         fields |= disturbed(fields, *strengths)

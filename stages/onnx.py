@@ -2,12 +2,24 @@
 
 from __future__ import annotations
 
+import json
+import logging
 from pathlib import Path
 from typing import Any
 
+import onnx
+import onnxruntime
+import torch
+from onnxruntime.quantization import QuantType, quantize_dynamic
+
 from chebsplat.errors import DataFailure
+from chebsplat.formats.encoder import DYNAMIC, FLOAT, FUSED, write_encoder
+from chebsplat.formats.gaussians import Gaussians
+from chebsplat.shape.fusion import Fusion, Gate
 from chebsplat.stages.runtime.command import Job
 from chebsplat.stages.shape_models.contract import contract
+from chebsplat.stages.shape_models.region_graph import encoder_model, fusion_model
+from chebsplat.stages.training.saves import restored_encoder, trained_with
 
 SIZES = (
     (1, 1),
@@ -26,13 +38,6 @@ def run(job: Job) -> None:
 
     Reads `gaussians`. Writes `encoder`.
     """
-    import onnx
-
-    from chebsplat.formats.encoder import DYNAMIC, FLOAT, FUSED, write_encoder
-    from chebsplat.formats.gaussians import Gaussians
-    from chebsplat.stages.shape_models.region_graph import encoder_model, fusion_model
-    from chebsplat.stages.training.saves import restored_encoder, trained_with
-
     path = job.inputs["gaussians"]
     gaussians = Gaussians.read(path)
     encoder = restored_encoder(gaussians)
@@ -61,10 +66,6 @@ def run(job: Job) -> None:
 
 def restored_fusion(gaussians: Any, n_channels: int, train: dict[str, Any]) -> Any:
     """`fusion.Fusion` with the checkpoint's gate; train: the section that it was trained with."""
-    import torch
-
-    from chebsplat.shape.fusion import Fusion, Gate
-
     prefix, gate = "shape.gate.", Gate(n_channels)
     gate.load_state_dict(
         {k.removeprefix(prefix): torch.from_numpy(v) for k, v in gaussians.modules.items() if k.startswith(prefix)}
@@ -74,8 +75,6 @@ def restored_fusion(gaussians: Any, n_channels: int, train: dict[str, Any]) -> A
 
 def example(encoder: Any, n_regions: int, n_members: int, seed: int = 0) -> dict[str, Any]:
     """Random inputs of a size; the last member of every second region is padding."""
-    import torch
-
     generator = torch.Generator().manual_seed(seed)
     mask = torch.ones(n_regions, n_members, dtype=torch.bool)
     if n_members > 1:
@@ -89,8 +88,6 @@ def example(encoder: Any, n_regions: int, n_members: int, seed: int = 0) -> dict
 
 def fusion_example(n_channels: int, n_regions: int, n_gaussians: int, seed: int = 0) -> dict[str, Any]:
     """Random inputs of a size; every third Gaussian is covered by nothing, every second by fewer regions than fit."""
-    import torch
-
     generator = torch.Generator().manual_seed(seed)
 
     def normal(*shape: int) -> torch.Tensor:
@@ -110,11 +107,6 @@ def quantize(source: Path, target: Path) -> None:
     Choices: both unsigned. Sums of signed weights saturate where a processor has AVX2 without VNNI: the error is then
       two thirds of the answer, and a fifteenth with these.
     """
-    import logging
-
-    import onnx
-    from onnxruntime.quantization import QuantType, quantize_dynamic
-
     model = onnx.load(source)
     del model.graph.value_info[:]  # shapes of before: the quantiser transposes weights and then finds them wrong
     logging.disable(logging.WARNING)  # "please consider pre-processing", by the root logger
@@ -126,10 +118,6 @@ def quantize(source: Path, target: Path) -> None:
 
 def annotate(path: Path, agreed: dict[str, Any]) -> None:
     """Put the contract into the model's own metadata."""
-    import json
-
-    import onnx
-
     model = onnx.load(path)
     onnx.helper.set_model_props(model, {"chebsplat.contract": json.dumps(agreed)})
     onnx.save(model, path)
@@ -137,9 +125,6 @@ def annotate(path: Path, agreed: dict[str, Any]) -> None:
 
 def compare(module: Any, path: Path, given: dict[str, Any]) -> float:
     """Largest absolute difference between onnxruntime and torch."""
-    import onnxruntime
-    import torch
-
     runner = onnxruntime.InferenceSession(str(path), providers=["CPUExecutionProvider"])
     outputs = runner.run(None, {name: value.numpy() for name, value in given.items()})
     with torch.no_grad():

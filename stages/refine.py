@@ -2,17 +2,24 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any
+from typing import Any
+
+import numpy as np
 
 from chebsplat.errors import ConfigError, DataFailure, InputError
+from chebsplat.formats.capture import Capture
+from chebsplat.formats.features import Features
+from chebsplat.formats.gaussians import Gaussians
+from chebsplat.formats.lifted import Lifted
+from chebsplat.formats.points import Points
+from chebsplat.formats.refined import Refined
+from chebsplat.labels.decode import decode_labels
+from chebsplat.lifting.blend import blend, calibrate, confidence, effective, familiar, reliable, start, trusted
+from chebsplat.lifting.carry import carry
+from chebsplat.lifting.smoothing import affinities, room_unit, smooth
+from chebsplat.splats.gaussians import surface_of
 from chebsplat.stages.runtime.command import Job
-
-if TYPE_CHECKING:
-    import numpy as np
-
-    from chebsplat.formats.capture import Capture
-    from chebsplat.formats.gaussians import Gaussians
-    from chebsplat.formats.points import Points
+from chebsplat.stages.shape_models.predictions import known_shapes, measured, shown, swept
 
 REACH = 0.15  # metres from swept points, where an answer is half as long
 LEAST_TOLD = 0.5  # of the pixels of a capture without depth, which a sweep must have found
@@ -25,15 +32,6 @@ def run(job: Job) -> None:
     Reads `gaussians` and `lifted`, for the scene's unit `capture`, for what knowledge says `knowledge`, `points` and
     `features`, by which the share of labels that change is counted, too. Writes `refined`.
     """
-    from chebsplat.formats.capture import Capture
-    from chebsplat.formats.features import Features
-    from chebsplat.formats.gaussians import Gaussians
-    from chebsplat.formats.lifted import Lifted
-    from chebsplat.formats.refined import Refined
-    from chebsplat.lifting.blend import blend, calibrate, confidence, effective, familiar, reliable, start, trusted
-    from chebsplat.lifting.smoothing import affinities, smooth
-    from chebsplat.splats.gaussians import surface_of
-
     settings = job.config.refine
     gaussians, lifted = Gaussians.read(job.inputs["gaussians"]), Lifted.read(job.inputs["lifted"])
     p = gaussians.parameters
@@ -82,12 +80,6 @@ def known(job: Job, gaussians: Gaussians, capture: Capture | None, unit: float) 
       to tell. Without either knowledge is left out by default: Gaussians that ten photos have placed show a surface on
       which shape alone is right for half of them.
     """
-    from chebsplat.formats.features import Features
-    from chebsplat.formats.points import Points
-    from chebsplat.lifting.carry import carry
-    from chebsplat.splats.gaussians import surface_of
-    from chebsplat.stages.shape_models.predictions import known_shapes, measured, shown, swept
-
     if "knowledge" not in job.inputs:
         return None
     if absent := [role for role in ("points", "features") if role not in job.inputs]:
@@ -128,8 +120,6 @@ def untold(capture: Capture, points: Points) -> str:
     Choices: where fewer than half of the pixels have swept depth, things stand alone that walls surround: shape was
       right for 70 % of what is near its points, where smoothed features were for 82 % (two rooms, ten photos each).
     """
-    import numpy as np
-
     if points.depths is None:
         return "the capture has no depth, and what Gaussians show without it misleads"
     row = {name: view for view, name in enumerate(capture.names)}
@@ -142,8 +132,6 @@ def untold(capture: Capture, points: Points) -> str:
 
 def scene_unit(job: Job, capture: Capture | None, means: np.ndarray) -> float:
     """Scene units of a metre: 1 where the source is metric or has depth, otherwise by the extent; facts say which."""
-    from chebsplat.lifting.smoothing import room_unit
-
     metric = capture is not None and (capture.depth is not None or capture.source.get("kind") in METRIC)
     job.facts["unit_from"] = "source" if metric else "extent"
     return 1.0 if metric else room_unit(means)
@@ -151,9 +139,6 @@ def scene_unit(job: Job, capture: Capture | None, means: np.ndarray) -> float:
 
 def shares(job: Job, made: list[np.ndarray]) -> dict[str, Any]:
     """Share of the Gaussians whose label smoothing changes, and knowledge after it."""
-    from chebsplat.formats.features import Features
-    from chebsplat.labels.decode import decode_labels
-
     if "features" not in job.inputs:
         return {}
     embeddings = Features.read(job.inputs["features"]).label_embeddings

@@ -3,15 +3,19 @@
 from __future__ import annotations
 
 import csv
-from typing import TYPE_CHECKING, Any
+import json
+import shlex
+from pathlib import Path
+from typing import Any
 
 from chebsplat.errors import DataFailure
+from chebsplat.formats.artifact import read_manifest
+from chebsplat.formats.evaluation import Evaluation
+from chebsplat.formats.gaussians import Gaussians
+from chebsplat.stages.pages import parts
+from chebsplat.stages.pages import pictures as draw
+from chebsplat.stages.pages.parts import REPORT, rendered
 from chebsplat.stages.runtime.command import Job
-
-if TYPE_CHECKING:
-    from pathlib import Path
-
-    from chebsplat.formats.gaussians import Gaussians
 
 N_PICTURES = 4  # test views in the report
 LARGEST = 20_000_000  # bytes of the page
@@ -47,16 +51,6 @@ def run(job: Job) -> None:
     Reads `evaluation` and `gaussians`, and of `capture`, `points`, `channels`, `features`, `agreement`, `descriptors`,
     `lifted`, `refined`, `scene`, `encoder` and `basis` what there is. Writes `report`.
     """
-    import json
-    import shlex
-
-    from chebsplat.formats.artifact import read_manifest
-    from chebsplat.formats.evaluation import Evaluation
-    from chebsplat.formats.gaussians import Gaussians
-    from chebsplat.stages.pages import parts
-    from chebsplat.stages.pages import pictures as draw
-    from chebsplat.stages.pages.parts import REPORT, rendered
-
     evaluation = Evaluation.read(job.inputs["evaluation"])
     gaussians = Gaussians.read(job.inputs["gaussians"])
     if not gaussians.trace:

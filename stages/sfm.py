@@ -3,20 +3,21 @@
 from __future__ import annotations
 
 import logging
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
+import numpy as np
+
+from chebsplat.cameras import centers, unproject
 from chebsplat.errors import DataFailure
+from chebsplat.formats.capture import Capture
+from chebsplat.formats.points import Points
+from chebsplat.splats.gaussians import local_shape
+from chebsplat.stages.reconstruction import mapping
 from chebsplat.stages.reconstruction.dense import MOST, swept, wants_more
 from chebsplat.stages.reconstruction.pose_check import wants_adjustment
 from chebsplat.stages.reconstruction.thinning import by_color, edge_of, thin
 from chebsplat.stages.runtime.command import Job
-
-if TYPE_CHECKING:
-    import numpy as np
-
-    from chebsplat.formats.capture import Capture
-    from chebsplat.stages.settings import SfmSection
-
+from chebsplat.stages.settings import SfmSection
 
 log = logging.getLogger("chebsplat")
 Cloud = dict[str, Any]  # the fields of `Points` but the local shape, and seen_from [N]: the view that a point is from
@@ -31,13 +32,6 @@ def run(job: Job) -> None:
     Reads `capture`. Writes `points`. Poses, points and depth that the capture holds are taken; what it lacks is
     computed by feature matching and triangulation, as is everything where `sfm.matching` names a way to match.
     """
-    import numpy as np
-
-    from chebsplat.cameras import centers
-    from chebsplat.formats.capture import Capture
-    from chebsplat.formats.points import Points
-    from chebsplat.splats.gaussians import local_shape
-
     settings, capture = job.config.sfm, Capture.read(job.inputs["capture"])
     spares = capture.points is not None or capture.depth is not None
     given = capture.cam_from_world is not None and settings.matching == "auto" and spares
@@ -50,8 +44,6 @@ def run(job: Job) -> None:
         job.left_out("feature matching", "poses and depth are given: points come from depth")
         _, cloud = reduced(from_depth(job, capture, settings), settings.max_points, settings.spacing)
     else:
-        from chebsplat.stages.reconstruction import mapping
-
         cloud = mapping.reconstruct(job, capture, settings, adjusted)
         if "poses_kept" in cloud["notes"] and capture.depth is not None:
             measured = from_depth(job, capture, settings, cloud["cam_from_world"])
@@ -90,8 +82,6 @@ def filled(cloud: Cloud, more: Cloud, count: int, spacing: str = "even", name: s
     Choices: triangulated points show where the photos have texture, those of depth what lies between; a cube with both
       keeps the triangulated one.
     """
-    import numpy as np
-
     own = len(cloud["means"])
     both = cloud | {key: np.concatenate([cloud[key], more[key]]) for key in ("means", "colors", "seen_from")}
     kept, found = reduced(both, count, spacing)
@@ -105,8 +95,6 @@ def reduced(cloud: Cloud, count: int, spacing: str) -> tuple[np.ndarray, Cloud]:
     Args: spacing: even: one point a cube of one size; color: of cubes that are the smaller the more their points'
           colours differ, and the mean of these colours.
     """
-    import numpy as np
-
     colors, tracks, notes = cloud["colors"], cloud["tracks"], dict(cloud["notes"])
     if spacing == "color" and len(cloud["means"]) > count:
         edge = edge_of(cloud["means"], int(EVEN * count))
@@ -131,10 +119,6 @@ def from_depth(job: Job, capture: Capture, settings: SfmSection, poses: np.ndarr
     Args: poses [V, 4, 4]: of the capture's views where they were adjusted; their depth goes with them.
     Choices: test views give no points; pixels are drawn evenly over views.
     """
-    import numpy as np
-
-    from chebsplat.cameras import unproject
-
     assert capture.cam_from_world is not None and capture.depth is not None
     rng, poses = np.random.default_rng(settings.seed), capture.cam_from_world if poses is None else poses
     used = np.flatnonzero(~capture.is_test)
@@ -173,10 +157,6 @@ def from_source(capture: Capture, settings: SfmSection) -> Cloud:
     Choices: a point is taken as seen from the nearest such view, which turns its normal; walls in between are not
     looked for. A point without a colour takes the pixel's.
     """
-    import numpy as np
-
-    from chebsplat.cameras import centers
-
     assert capture.cam_from_world is not None and capture.points is not None
     kept = thin(capture.points, settings.max_points)
     points, (width, height) = capture.points[kept].astype(np.float64), capture.size
@@ -213,8 +193,6 @@ def from_source(capture: Capture, settings: SfmSection) -> Cloud:
 
 def tracks_of(capture: Capture, kept: np.ndarray) -> np.ndarray:
     """The source's tracks i32 [T, 2] (point, view) of some of its points, which are counted anew; none without any."""
-    import numpy as np
-
     if capture.points is None or capture.tracks is None:
         return np.zeros((0, 2), np.int32)
     place = np.full(len(capture.points), -1)

@@ -6,23 +6,32 @@ See docs/method.md, section 14.
 from __future__ import annotations
 
 import logging
+import multiprocessing
+import os
 from collections import deque
 from collections.abc import Sequence
+from concurrent.futures import ProcessPoolExecutor, as_completed
 from pathlib import Path
-from typing import TYPE_CHECKING
+
+import numpy as np
+import torch
 
 from chebsplat.errors import ConfigError, DataFailure, InputError
+from chebsplat.formats.channels import ChannelMap
+from chebsplat.formats.knowledge import ENCODER, Knowledge, write_knowledge
+from chebsplat.formats.teacher_model import EMBEDDED, TeacherModel, read_label_table, read_teacher
+from chebsplat.labels.decode import decode_labels
+from chebsplat.settings import DescribeSection
+from chebsplat.shape import teach
+from chebsplat.shape.point_encoder import PointEncoder, cloud_of
+from chebsplat.shape.point_inputs import PointInputs
+from chebsplat.shape.teach import LEAST_VIEWS, Lesson
 from chebsplat.stages.runtime.command import Job, n_threads
-
-if TYPE_CHECKING:
-    import numpy as np
-
-    from chebsplat.formats.teacher_model import TeacherModel
-    from chebsplat.shape.point_encoder import PointEncoder
-    from chebsplat.shape.point_inputs import PointInputs
-    from chebsplat.shape.teach import Lesson
-    from chebsplat.stages.settings import KnowledgeSection
-    from chebsplat.stages.shape_models.teaching_rooms import Room
+from chebsplat.stages.settings import KnowledgeSection
+from chebsplat.stages.shape_models.teaching_rooms import Room
+from chebsplat.stages.teacher_models.text_encoder import found, text_embeddings
+from chebsplat.synthetic import CLASS_NAMES
+from chebsplat.synthetic.seeds import KNOWLEDGE
 
 log = logging.getLogger("chebsplat")
 
@@ -32,16 +41,7 @@ def run(job: Job) -> None:
 
     Reads `channels`. Writes `knowledge`. Rooms that are finished survive a kill.
     """
-    import numpy as np
-
-    from chebsplat.formats.channels import ChannelMap
-    from chebsplat.formats.knowledge import Knowledge, write_knowledge
-    from chebsplat.formats.teacher_model import EMBEDDED, read_teacher
-    from chebsplat.settings import DescribeSection
-    from chebsplat.shape.teach import LEAST_VIEWS
     from chebsplat.stages.channels import digest
-    from chebsplat.stages.teacher_models.text_encoder import found
-    from chebsplat.synthetic import CLASS_NAMES
 
     settings, channels = job.config.knowledge, ChannelMap.read(job.inputs["channels"])
     teacher = read_teacher(Path(settings.model) if settings.model else EMBEDDED)
@@ -79,10 +79,7 @@ def exported(job: Job, encoder: PointEncoder, inputs: PointInputs) -> float:
     Raises: DataFailure where that is more than `onnx.tolerance`.
     """
     import onnx
-    import torch
 
-    from chebsplat.formats.knowledge import ENCODER
-    from chebsplat.shape.point_encoder import cloud_of
     from chebsplat.stages.onnx import annotate, compare
     from chebsplat.stages.shape_models.point_graph import point_contract, point_model
 
@@ -98,21 +95,13 @@ def exported(job: Job, encoder: PointEncoder, inputs: PointInputs) -> float:
 
 def vocabulary(teacher: TeacherModel, names: list[str], matrix: np.ndarray) -> tuple[list[str], np.ndarray]:
     """Words that the teacher knows, of its table, otherwise these names; and their embeddings f32 [W, d]."""
-    from chebsplat.formats.teacher_model import read_label_table
-    from chebsplat.stages.teacher_models.text_encoder import text_embeddings
-
     words = names if teacher.labels is None else read_label_table(teacher.labels)[0]
     return words, text_embeddings(words, teacher) @ matrix
 
 
 def prepared(job: Job, settings: KnowledgeSection, matrix: np.ndarray) -> list[list[Room]]:
     """The rooms to teach on, then those held out: clean, worn, half seen, swept; a process for each thread."""
-    import multiprocessing
-    import os
-    from concurrent.futures import ProcessPoolExecutor, as_completed
-
     from chebsplat.stages.shape_models.teaching_rooms import held, kept_as, prepare
-    from chebsplat.synthetic.seeds import KNOWLEDGE
 
     seeds = [*KNOWLEDGE[: settings.n_rooms], *KNOWLEDGE[-settings.n_held_out :]]
     folder = job.scratch / "rooms"
@@ -131,23 +120,12 @@ def prepared(job: Job, settings: KnowledgeSection, matrix: np.ndarray) -> list[l
 
 def lesson_of(room: Room, embeddings: np.ndarray) -> Lesson:
     """A room as it is taught: labels are the teacher's."""
-    import torch
-
-    from chebsplat.labels.decode import decode_labels
-    from chebsplat.shape.point_encoder import cloud_of
-    from chebsplat.shape.teach import Lesson
-
     labels = decode_labels(room.features, embeddings)
     return Lesson(cloud_of(room.inputs), torch.from_numpy(room.features), room.n_views, labels)
 
 
 def taught(job: Job, settings: KnowledgeSection, lessons: list[Lesson]) -> PointEncoder:
     """The encoder after the whole course."""
-    import torch
-
-    from chebsplat.shape import teach
-    from chebsplat.shape.point_encoder import PointEncoder
-
     torch.set_num_threads(n_threads())
     torch.manual_seed(settings.seed)
     clouds = [lesson.cloud for lesson in lessons]
@@ -164,10 +142,6 @@ def taught(job: Job, settings: KnowledgeSection, lessons: list[Lesson]) -> Point
 
 def measured(encoder: PointEncoder, rooms: Sequence[Room], embeddings: np.ndarray) -> dict[str, float]:
     """Of points of rooms held out, the share whose label is right: by the teacher's averages, by shape, and by both."""
-    import numpy as np
-
-    from chebsplat.labels.decode import decode_labels
-
     right: dict[str, list[float]] = {"teacher": [], "shape": [], "both": []}
     for room in rooms:
         shape = encoder.predict(room.inputs)

@@ -2,17 +2,27 @@
 
 from __future__ import annotations
 
+import hashlib
 import logging
-from typing import TYPE_CHECKING
+from pathlib import Path
+
+import numpy as np
 
 from chebsplat.errors import ConfigError, DataFailure
 from chebsplat.formats.artifact import read_manifest, sha256_file
-from chebsplat.stages.runtime.command import Job
-
-if TYPE_CHECKING:
-    from chebsplat.formats.capture import Capture
-    from chebsplat.formats.features import Features
-    from chebsplat.stages.settings import TeacherSection
+from chebsplat.formats.capture import Capture
+from chebsplat.formats.channels import ChannelMap
+from chebsplat.formats.features import Features, FeatureWriter
+from chebsplat.formats.teacher_model import EMBEDDED, read_teacher
+from chebsplat.labels import noisy_teacher as model
+from chebsplat.labels.class_codes import class_codes
+from chebsplat.labels.decode import decode
+from chebsplat.labels.pseudo_labels import voted
+from chebsplat.stages.runtime.command import Job, n_threads
+from chebsplat.stages.settings import TeacherSection
+from chebsplat.stages.teacher_models.image_encoder import TeacherInference
+from chebsplat.stages.teacher_models.label_space import MAX_CHANNELS, closed_set, label_set, open_vocabulary
+from chebsplat.stages.teacher_models.onnx_session import CUDA, GPU_REMEDY, providers
 
 log = logging.getLogger("chebsplat")
 
@@ -22,8 +32,6 @@ def run(job: Job) -> None:
 
     Reads `capture` and, where an ONNX teacher's channels are reduced, `channels`. Writes `features`.
     """
-    from chebsplat.formats.capture import Capture
-
     settings, capture = job.config.teacher, Capture.read(job.inputs["capture"])
     if settings.kind == "none":
         raise ConfigError("teacher.kind is none: this scene has no teacher; leave the stage out")
@@ -41,16 +49,6 @@ def from_onnx(job: Job, capture: Capture, settings: TeacherSection) -> None:
 
     Choices: test views are encoded too, because evaluate reports the teacher's own figures on them.
     """
-    from pathlib import Path
-
-    from chebsplat.formats.channels import ChannelMap
-    from chebsplat.formats.features import FeatureWriter
-    from chebsplat.formats.teacher_model import EMBEDDED, read_teacher
-    from chebsplat.stages.runtime.command import n_threads
-    from chebsplat.stages.teacher_models.image_encoder import TeacherInference
-    from chebsplat.stages.teacher_models.label_space import MAX_CHANNELS, closed_set, label_set, open_vocabulary
-    from chebsplat.stages.teacher_models.onnx_session import CUDA, GPU_REMEDY, providers
-
     teacher = read_teacher(Path(settings.model) if settings.model else EMBEDDED)
     network = TeacherInference(teacher, n_threads(), job.device)
     if job.device == "cuda" and CUDA not in providers(job.device):
@@ -106,15 +104,6 @@ def from_labels(job: Job, capture: Capture, settings: TeacherSection) -> Feature
 
     Every view draws from its own generator, seeded by its name.
     """
-    import hashlib
-
-    import numpy as np
-
-    from chebsplat.formats.features import Features
-    from chebsplat.labels import noisy_teacher as model
-    from chebsplat.labels.class_codes import class_codes
-    from chebsplat.labels.decode import decode
-
     if capture.labels is None or not capture.class_names:
         raise DataFailure("the capture has no labels; use teacher.kind = auto (the embedded teacher, or teacher.model)")
     codes = class_codes(capture.class_names, settings.n_channels)
@@ -140,12 +129,6 @@ def from_labels(job: Job, capture: Capture, settings: TeacherSection) -> Feature
 
 def from_pseudo_labels(job: Job, capture: Capture, settings: TeacherSection) -> Features:
     """What a 2D network took the views for, as the source brings it; a pixel weighs as much as it is sure."""
-    import numpy as np
-
-    from chebsplat.formats.features import Features
-    from chebsplat.labels.class_codes import class_codes
-    from chebsplat.labels.pseudo_labels import voted
-
     if capture.pseudo_labels is None or capture.confidence is None or not capture.class_names:
         raise DataFailure("the capture has no pseudo labels with confidences; use teacher.kind = auto")
     codes = class_codes(capture.class_names, settings.n_channels)

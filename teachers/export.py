@@ -6,7 +6,9 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import onnx
 import torch
+from onnx import helper, numpy_helper
 
 from chebsplat.teachers.network import MULTIPLE, Encoder
 
@@ -48,9 +50,6 @@ def export(encoder: Encoder, out: Path, mean: tuple[float, ...], std: tuple[floa
 
 def _halve(path: Path) -> None:
     """Store the large constants as float16, each behind a cast that onnxruntime folds when it loads the model."""
-    import onnx
-    from onnx import helper, numpy_helper
-
     model: Any = onnx.load(str(path))
     casts = []
     for constant in model.graph.initializer:

@@ -16,12 +16,19 @@ from typing import Any
 
 import click
 import numpy as np
+import torch
+from PIL import Image
+from torch.nn import functional as F
 
 from chebsplat.evaluation.metrics import IGNORE, confusion, segmentation
 from chebsplat.formats.teacher_model import EMBEDDED, read_teacher
+from chebsplat.stages.sources.generated import photograph
 from chebsplat.stages.teacher_models.image_encoder import TeacherInference
 from chebsplat.stages.teacher_models.text_encoder import text_embeddings
 from chebsplat.synthetic import CLASS_NAMES
+from chebsplat.synthetic.layout import build
+from chebsplat.synthetic.path import intrinsics, walk
+from chebsplat.synthetic.rays import RayCaster
 from chebsplat.synthetic.seeds import HELD_OUT
 from chebsplat.teachers.words import words
 
@@ -33,20 +40,12 @@ View = tuple[np.ndarray, np.ndarray]  # image u8 [H, W, 3], class index i64 [H, 
 
 def labelled(vectors: np.ndarray, texts: np.ndarray, height: int, width: int) -> np.ndarray:
     """Index i64 [height, width] of the text [L, C] of greatest cosine for vectors [C, h, w]."""
-    import torch
-    from torch.nn import functional as F
-
     cosines = torch.einsum("lc,chw->lhw", torch.from_numpy(texts), torch.from_numpy(vectors))[None]
     return F.interpolate(cosines, (height, width), mode="bilinear", align_corners=False)[0].argmax(0).numpy()
 
 
 def held_out_room(seed: int, n_views: int = VIEWS, width: int = WIDTH, height: int = HEIGHT) -> list[View]:
     """Views of a held-out room along its path, as the named scenes are photographed."""
-    from chebsplat.stages.sources.generated import photograph
-    from chebsplat.synthetic.layout import build
-    from chebsplat.synthetic.path import intrinsics, walk
-    from chebsplat.synthetic.rays import RayCaster
-
     room = build("office" if seed < HELD_OUT[len(HELD_OUT) // 2] else "room", seed)
     caster, K = RayCaster(room.soup.vertices, room.soup.triangles), intrinsics(width, height)
     shots = [photograph(room, caster, K, pose, width, height) for pose in walk(room.size, n_views, seed)]
@@ -55,8 +54,6 @@ def held_out_room(seed: int, n_views: int = VIEWS, width: int = WIDTH, height: i
 
 def house(folder: Path, names: list[str]) -> Iterator[View]:
     """All views of a house at half size; labels that the mapping leaves out are IGNORE."""
-    from PIL import Image
-
     mapping = tomllib.loads(MAPPING.read_text())
     listed = json.loads((folder / "scene.json").read_text())["labels"]
     table = np.full(256, IGNORE, np.int64)

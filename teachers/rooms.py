@@ -11,8 +11,11 @@ from pathlib import Path
 
 import numpy as np
 
+import chebsplat.stages.sources.generated as photographer
+from chebsplat.stages.sources.generated import photograph
 from chebsplat.synthetic import layout
 from chebsplat.synthetic.path import intrinsics, look_at
+from chebsplat.synthetic.rays import RayCaster
 from chebsplat.synthetic.rooms import build
 from chebsplat.synthetic.seeds import TRAINING
 from chebsplat.synthetic.shuffled import jitter
@@ -27,9 +30,6 @@ def training_views(seed: int, n_views: int) -> tuple[np.ndarray, np.ndarray]:
 
     Raises: ValueError if the seed is not one of TRAINING.
     """
-    from chebsplat.stages.sources.generated import photograph
-    from chebsplat.synthetic.rays import RayCaster
-
     if seed not in TRAINING:
         raise ValueError(f"seed {seed} is not one for training: {TRAINING}")
     kind, rng = KINDS[seed % len(KINDS)], np.random.default_rng([seed, 2])
@@ -46,8 +46,6 @@ def training_views(seed: int, n_views: int) -> tuple[np.ndarray, np.ndarray]:
 
 def generator_digest() -> str:
     """Of the code that rooms are made by: a folder of rendered rooms is known by it."""
-    import chebsplat.stages.sources.generated as photographer
-
     sources = sorted(Path(layout.__file__).parent.glob("*.py"))
     texts = [path.read_bytes() for path in (*sources, Path(photographer.__file__), Path(__file__))]
     return hashlib.sha256(b"".join(texts)).hexdigest()[:12]

@@ -6,6 +6,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
+from scipy.special import stdtrit
 
 Values = np.ndarray | Sequence[float]
 
@@ -79,8 +80,6 @@ def paired_difference(values: Values, baseline: Values, scenes: list[str], ratio
 
 def quantile(freedom: int) -> float:
     """Student's two-sided 95 % quantile."""
-    from scipy.special import stdtrit
-
     return float(stdtrit(freedom, 0.5 + CONFIDENCE / 2))
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import numpy as np
+from scipy.ndimage import gaussian_filter, label
 
 IGNORE = -1
 
@@ -48,8 +49,6 @@ def confuse_segments(
     Args: labels [h, w], IGNORE stays; probabilities [L, L] rows sum to 1, or to 0 for a class that is never taken
       for another.
     """
-    from scipy.ndimage import label
-
     confused = labels.copy()
     for value in np.unique(labels[labels != IGNORE]):
         segments, count = label(labels == value)
@@ -70,8 +69,6 @@ def noisy_features(
     Returns: zero at ignored pixels, which teach nothing.
     Choices: ignored pixels hold the zero vector before blur; normalised at the end.
     """
-    from scipy.ndimage import gaussian_filter
-
     features = np.where((labels != IGNORE)[..., None], class_codes[labels], 0.0)
     if blur > 0:
         features = gaussian_filter(features, (blur, blur, 0))

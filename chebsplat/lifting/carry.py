@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import numpy as np
+from scipy.spatial import cKDTree
 
 N_POINTS = 3
 NEAR = 0.01  # metres, within which a point is no nearer than another
@@ -25,8 +26,6 @@ def carry(
     Raises:  ValueError without points.
     Choices: weights max(|n·n'|, LEAST_COSINE)² / (d² + NEAR²).
     """
-    from scipy.spatial import cKDTree
-
     if len(points) == 0:
         raise ValueError("there are no points to carry from")
     k = min(N_POINTS, len(points))

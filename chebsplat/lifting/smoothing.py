@@ -8,6 +8,7 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import numpy as np
+from scipy.spatial import cKDTree
 
 N_NEIGHBORS = 24
 REACH = 0.3  # metres, of neighbours
@@ -47,8 +48,6 @@ def affinities(means: np.ndarray, normals: np.ndarray, colors: np.ndarray, unit:
     Choices: one-sided, the own normal decides where the plane is; a Gaussian as thick as it is wide has a normal by
       chance, and so a few neighbours.
     """
-    from scipy.spatial import cKDTree
-
     n = len(means)
     if not unit > 0 or not np.isfinite(unit) or any(a.shape != (n, 3) for a in (means, normals, colors)):
         raise ValueError("a positive unit and means, normals and colours of one shape [N, 3] are needed")

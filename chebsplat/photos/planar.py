@@ -6,6 +6,9 @@ Of one photo, reduced. The 1 / z of a plane is linear in its pixels, whatever it
 from __future__ import annotations
 
 import numpy as np
+from scipy.sparse import coo_matrix
+from scipy.sparse.csgraph import connected_components
+from scipy.spatial import cKDTree
 
 SAME = 0.012  # by which any channel, in [0, 1], of two pixels side by side may differ within a patch
 SMALLEST = 40  # pixels of a patch
@@ -22,8 +25,6 @@ def completed(depth: np.ndarray, colors: np.ndarray) -> np.ndarray:
       bound them, slow shades do not. A patch has up to PLANES planes, the one with most pixels first (RANSAC with a
       fixed seed, then least squares); an unknown pixel is of the plane whose own pixels are nearest in the photo.
     """
-    from scipy.spatial import cKDTree
-
     result, label = depth.astype(np.float32).copy(), patches(colors)
     known = depth > 0
     sizes, told = np.bincount(label.ravel()), np.bincount(label[known], minlength=label.max() + 1)
@@ -42,9 +43,6 @@ def completed(depth: np.ndarray, colors: np.ndarray) -> np.ndarray:
 
 def patches(colors: np.ndarray) -> np.ndarray:
     """A number i64 [h, w] of the patch that each pixel of [h, w, 3] is in."""
-    from scipy.sparse import coo_matrix
-    from scipy.sparse.csgraph import connected_components
-
     height, width = colors.shape[:2]
     place = np.arange(height * width).reshape(height, width)
     along, down = (np.abs(np.diff(colors, axis=axis)).max(-1) < SAME for axis in (1, 0))

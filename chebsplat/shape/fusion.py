@@ -6,6 +6,7 @@ import torch
 from torch import Tensor, nn
 
 from chebsplat.kernels.dispatch import is_compiled
+from chebsplat.shape import fusion_kernels
 from chebsplat.splats.rotations import rotation_matrices
 from chebsplat.splats.rows import take
 
@@ -93,8 +94,6 @@ def fuse_in_view(
       `propagation_weights`; backend: of `rasterize`.
     """
     if is_compiled(features, backend):
-        from chebsplat.shape import fusion_kernels
-
         return fusion_kernels.fuse_in_view(gate.linear, features, encodings, cover, weights, index)
     cache, fresh, chosen = encodings
     shape = propagate(cache.index_copy(0, chosen, fresh), cover[index], weights[index])

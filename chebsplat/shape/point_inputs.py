@@ -5,6 +5,8 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import numpy as np
+from scipy.spatial import cKDTree
+from scipy.spatial.transform import Rotation
 
 from chebsplat.cameras import upright
 from chebsplat.settings import DescribeSection
@@ -62,7 +64,6 @@ def point_inputs(
     """
     if not unit > 0 or not all(np.isfinite(v).all() for v in (means, normals, covariances, up)):
         raise ValueError("points, normals, covariances and up must be finite, and the unit positive")
-    from scipy.spatial.transform import Rotation
 
     turn = upright(up)
     where = ((means - means.mean(0)) @ turn.T) / unit
@@ -94,8 +95,6 @@ def _scale(
     n_neighbors: int,
 ) -> tuple[np.ndarray, np.ndarray]:
     """Neighbours i32 [N, K] and descriptors f32 [N, J P] at one radius."""
-    from scipy.spatial import cKDTree
-
     n = len(means)
     own = np.arange(n)[:, None]
     near = np.full((n, MEMBERS), -1, np.int64)

@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, NamedTuple
+from typing import NamedTuple
 
+import fpsample
 import numpy as np
+from scipy.spatial import cKDTree
 
 from chebsplat.settings import DescribeSection
-
-if TYPE_CHECKING:
-    from scipy.spatial import cKDTree
 
 SAMPLE = 65536  # points that stand for all where only a density is wanted
 
@@ -100,8 +99,6 @@ def farthest_points(means: np.ndarray, count: int, start: int) -> tuple[np.ndarr
     Choices: M < count where only coincident points are left. Exact in float32 around the centroid. `start` is an
     index in the library's own order of the points: it seeds the first pick without naming it.
     """
-    import fpsample
-
     n = len(means)
     if n == 1:
         return np.zeros(1, np.int64), 0.0
@@ -121,8 +118,6 @@ def farthest_points(means: np.ndarray, count: int, start: int) -> tuple[np.ndarr
 
 def covering(points: np.ndarray, centers: np.ndarray, radius: float, n_covers: int) -> np.ndarray:
     """The nearest regions whose ball holds each point: i64 [N, n_covers], -1 where fewer do."""
-    from scipy.spatial import cKDTree
-
     if len(centers) == 0 or len(points) == 0:
         return np.full((len(points), n_covers), -1, np.int64)
     distance, index = cKDTree(centers).query(points, n_covers, distance_upper_bound=radius, workers=-1)
@@ -171,8 +166,6 @@ def _neighbourhoods(
 
 
 def _tree(points: np.ndarray) -> cKDTree:
-    from scipy.spatial import cKDTree
-
     return cKDTree(points, balanced_tree=False, compact_nodes=False)
 
 

@@ -6,7 +6,11 @@ from collections.abc import Mapping
 
 import numpy as np
 import torch
+from scipy.spatial import cKDTree
+from scipy.spatial.transform import Rotation
 from torch import Tensor
+
+from chebsplat.splats.rotations import rotation_matrices, rotation_matrices_f64
 
 _C0 = 0.28209479177387814
 
@@ -23,8 +27,6 @@ def local_shape(means: np.ndarray, n_neighbors: int, floor: float = 0.05) -> tup
       spacing (rms distance of the three nearest); the normal one is the residual at that scale. Coincident points
       take the median spacing, so no scale is zero.
     """
-    from scipy.spatial import cKDTree
-
     k = min(n_neighbors, len(means) - 1)
     distances, index = cKDTree(means).query(means, k + 1, workers=-1)
     spacing = np.sqrt((distances[:, 1:4] ** 2).mean(1))
@@ -49,8 +51,6 @@ def initial_gaussians(
     Args: means [N, 3]; colors u8 [N, 3]; covariances [N, 3, 3] symmetric positive definite, scene units².
     Returns: `means`, `log_scales`, `quats` (wxyz, unit), `logit_opacities`, `sh0` [N,1,3].
     """
-    from scipy.spatial.transform import Rotation
-
     values, axes = np.linalg.eigh(np.asarray(covariances, np.float64))
     axes[np.linalg.det(axes) < 0, :, 0] *= -1
     quats = Rotation.from_matrix(axes).as_quat(scalar_first=True) if len(axes) else np.zeros((0, 4))
@@ -73,8 +73,6 @@ def activated(raw: Mapping[str, Tensor]) -> tuple[Tensor, Tensor, Tensor, Tensor
 
 def covariances(quats: Tensor, scales: Tensor) -> Tensor:
     """R diag(s²) Rᵀ, [N, 3, 3]."""
-    from chebsplat.splats.rotations import rotation_matrices
-
     factor = rotation_matrices(quats) * scales[:, None, :]
     return factor @ factor.transpose(1, 2)
 
@@ -84,8 +82,6 @@ def surface_of(parameters: Mapping[str, np.ndarray]) -> tuple[np.ndarray, np.nda
 
     Choices: the normal is the shortest axis, the first of equal ones; the colour that of SH degree 0.
     """
-    from chebsplat.splats.rotations import rotation_matrices_f64
-
     axes = rotation_matrices_f64(parameters["quats"])
     normals = axes[np.arange(len(axes)), :, parameters["log_scales"].argmin(1)]
     colors = np.clip(parameters["sh0"][:, 0] * _C0 + 0.5, 0, 1)

@@ -3,6 +3,9 @@
 from __future__ import annotations
 
 import numpy as np
+from scipy.sparse import coo_array
+from scipy.sparse.csgraph import connected_components
+from scipy.spatial import cKDTree
 
 NEIGHBORS = 16  # nearest of the chosen that a Gaussian is held against
 REACH = 2.0  # standard deviations along the longest axis
@@ -15,10 +18,6 @@ def parts(means: np.ndarray, scales: np.ndarray, chosen: np.ndarray) -> np.ndarr
     Choices: two touch if the spheres of two standard deviations along their longest axes do; each is held against its
       16 nearest, which is symmetrised by union. Parts of one size are in order of their first Gaussians.
     """
-    from scipy.sparse import coo_array
-    from scipy.sparse.csgraph import connected_components
-    from scipy.spatial import cKDTree
-
     found, rows = np.full(len(chosen), -1, np.int64), np.flatnonzero(chosen)
     n = len(rows)
     if n < 2:

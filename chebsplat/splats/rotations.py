@@ -2,12 +2,9 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
-
 import numpy as np
-
-if TYPE_CHECKING:
-    from torch import Tensor
+import torch
+from torch import Tensor
 
 
 def rotation_matrices(quats: Tensor) -> Tensor:
@@ -15,8 +12,6 @@ def rotation_matrices(quats: Tensor) -> Tensor:
 
     Choices: pre-scaled by the largest entry, so that neither 1e20 nor 1e-20 overflows or vanishes.
     """
-    import torch
-
     scaled = quats / quats.detach().abs().amax(-1, keepdim=True).clamp_min(1e-30)
     w, x, y, z = torch.nn.functional.normalize(scaled, dim=-1).unbind(-1)
     rows = [

@@ -8,6 +8,7 @@ import torch
 from torch import Tensor
 
 from chebsplat.kernels.dispatch import is_compiled
+from chebsplat.splats import sh_kernels
 from chebsplat.splats.rows import take
 from chebsplat.splats.sh import light
 
@@ -33,8 +34,6 @@ def colors_in_view(
     if not 0 <= degree <= 3:
         raise ValueError(f"degree {degree} is not within 0 and 3")
     if is_compiled(bands[0], backend):
-        from chebsplat.splats import sh_kernels
-
         return sh_kernels.colors_in_view(bands, masks, index, means, eye, degree)
     coefficients = _coefficients(bands[: degree + 1], masks, index)
     directions = means.detach().index_select(0, index) - eye

@@ -2,16 +2,14 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 import torch
+from scipy.spatial import cKDTree
 from torch import Tensor
 
 from chebsplat.splats.rotations import rotation_matrices
-
-if TYPE_CHECKING:
-    from scipy.spatial import cKDTree
 
 SHRINK = 1.6  # 3DGS's divisor of the scales of two Gaussians that replace one
 DENSITY = 0.05  # α of Eq 12: candidates per unit of a region's volume
@@ -70,7 +68,6 @@ def densify(
     """
     if not (threshold > 0 and 0 < nearest < farthest):
         raise ValueError(f"threshold {threshold} and 0 < nearest {nearest} < farthest {farthest} do not hold")
-    from scipy.spatial import cKDTree
 
     gradient, members, places = gradient.cpu(), members.cpu(), raw["means"].detach().cpu()
     alive = torch.isfinite(places).all(1).numpy()
@@ -132,8 +129,6 @@ def _in_unit_ball(rng: np.random.Generator, count: int) -> np.ndarray:
 
 def _apart(positions: np.ndarray, least: np.ndarray) -> np.ndarray:
     """Which positions [A] to keep, bool: those with no earlier one nearer than `least` [A]."""
-    from scipy.spatial import cKDTree
-
     keep = np.ones(len(positions), bool)
     if len(positions) > 1:
         pairs = cKDTree(positions).query_pairs(least.max(), output_type="ndarray")

@@ -10,20 +10,17 @@ import torch
 from torch import Tensor
 
 from chebsplat.kernels.dispatch import is_compiled
+from chebsplat.training.ssim import C1, C2, TAPS, WINDOW
 
 
 @cache
 def _taps(dtype: torch.dtype, device: torch.device) -> Tensor:
     """SSIM's window [11]; kept, so that no step copies it to a GPU."""
-    from chebsplat.training.ssim import TAPS
-
     return torch.as_tensor(TAPS, dtype=dtype).to(device)
 
 
 def _blur(images: Tensor) -> Tensor:
     """Window blur of [H, W, C] with zero padding, by plain convolutions."""
-    from chebsplat.training.ssim import WINDOW
-
     taps = _taps(images.dtype, images.device)
     planes = images.permute(2, 0, 1)[:, None]
     planes = torch.nn.functional.conv2d(planes, taps[None, None, :, None], padding=(WINDOW // 2, 0))
@@ -37,8 +34,6 @@ def ssim_map(a: Tensor, b: Tensor) -> Tensor:
 
     Choices: Gaussian window 11, σ 1.5, zero padding, biased variances, as 3DGS.
     """
-    from chebsplat.training.ssim import C1, C2
-
     blurred = _blur(torch.cat([a, b, a * a, b * b, a * b], -1))  # at once: a GPU waits for launches, not for sums
     mean_a, mean_b, square_a, square_b, product = blurred.split(a.shape[-1], -1)
     var_a, var_b, covariance = square_a - mean_a**2, square_b - mean_b**2, product - mean_a * mean_b

@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 import torch
+from scipy.spatial import cKDTree
 from torch import Tensor
 
 from chebsplat.settings import TrainSection
@@ -29,8 +30,6 @@ class Population:
     """
 
     def __init__(self, model: SceneModel, settings: TrainSection, extent: float, places: np.ndarray):
-        from scipy.spatial import cKDTree
-
         self.model, self.settings, self.extent = model, settings, extent
         self.cameras = cKDTree(places[np.isfinite(places).all(1)])
         self.n_grown = self.n_reset = self.n_added = self.n_removed = self.n_broken = 0

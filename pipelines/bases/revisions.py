@@ -18,6 +18,7 @@ from chebsplat.pipelines.running.run import HERE, entry, git_state, plan_of
 from chebsplat.pipelines.work import store
 from chebsplat.pipelines.work.scenes import names
 from chebsplat.stages.registry import STAGES
+from chebsplat.stages.runtime import config as configs
 from chebsplat.stages.runtime.device import resolve
 
 PREFIX = "basis-"  # of a HEAD's folder, whose links keep its artifacts
@@ -135,7 +136,6 @@ def extend(name: str, gaussians: Path, scene: str) -> list[Path]:
     """
     if is_sequence(name) or not store.is_name(name) or "@" in name:
         raise ConfigError(f"a HEAD cannot be called {name!r}: a sequence is, or it holds a / or @, or begins with a .")
-    from chebsplat.stages.runtime import config as configs
 
     manifest, planner = artifact.read_manifest(gaussians, STAGES["train"].schema), Planner()
     config = configs.build({"scene": {"name": scene}}, f"scene {scene}")

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from importlib import import_module
 from typing import Any, NoReturn
 
 import click
@@ -32,8 +33,6 @@ class Commands(Guarded):
             len(args) > 1 and not args[1].startswith("-")
         )
         if args[0] in STAGES and not (of_a_file and args[0] in self.commands):  # `lift` is of a file, too
-            from importlib import import_module
-
             from chebsplat.stages.runtime.command import command
 
             return args[0], command(args[0], import_module(f"chebsplat.stages.{args[0]}").run), args[1:]

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import sys
+from importlib import metadata
 from typing import Any
 
 import click
@@ -74,7 +75,6 @@ def version(context: click.Context, _: click.Parameter, wanted: bool) -> None:
     """Of chebsplat, of the packages that its kernels are compiled with, and the commit of a checkout."""
     if not wanted or context.resilient_parsing:
         return
-    from importlib import metadata
 
     from chebsplat.pipelines.running.run import HERE, git_state
 

@@ -141,8 +141,6 @@ def job(plan: Path, keys: tuple[str, ...], elsewhere: bool) -> int:
 @click.option("--semantic", is_flag=True)
 def rehearse(semantic: bool) -> int:
     """Compile what a training needs, as long as the run lasts that this is of."""
-    import os
-
     from chebsplat.pipelines.running.precompile import rehearsed
 
     os.nice(5)

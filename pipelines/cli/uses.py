@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import Any
 
 import click
+import numpy as np
 
 from chebsplat.errors import ConfigError
 from chebsplat.pipelines.cli.options import AGAINST, NewPath, Phrases
@@ -198,8 +199,6 @@ def calibrate(model: Path | None, rooms: int, force: bool) -> None:
 @click.option("--out", type=click.Path(path_type=Path), required=True, help="the .ply to write; an .npz beside it")
 def label(ply: Path, words: list[str] | None, up: str, unit: float | None, knowledge: Path | None, out: Path) -> None:
     """Name the Gaussians of any .PLY of a room by shape alone, with a confidence: no photo, no 2D teacher."""
-    import numpy as np
-
     from chebsplat.formats.knowledge import SHIPPED
     from chebsplat.stages.tools.lift_ply import label_ply
     from chebsplat.synthetic import CLASS_NAMES

@@ -22,6 +22,7 @@ from chebsplat.formats.videos import is_video, require_av
 from chebsplat.pipelines.work import store
 from chebsplat.pipelines.work.scenes import expanded
 from chebsplat.stages.sources.common import unread
+from chebsplat.stages.teacher_models.text_encoder import found
 
 if TYPE_CHECKING:
     from chebsplat.formats.teacher_model import TeacherModel
@@ -120,8 +121,6 @@ def text_packages(model: TeacherModel | None, labels: str | None) -> tuple[str, 
     Choices: what a capture calls its classes is not known before it is read. The sentence model of the extra `text` is
       pinned to one version, so that it is left out where only such names could need it; a model of the user's is not.
     """
-    from chebsplat.stages.teacher_models.text_encoder import found
-
     if model is None or model.text is None or model.output != "features":
         return ()
     if model.text != TEXT_PACKAGE:

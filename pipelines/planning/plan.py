@@ -8,6 +8,7 @@ import re
 import tomllib
 from collections.abc import Mapping
 from dataclasses import dataclass, field
+from importlib import import_module
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -17,6 +18,7 @@ from chebsplat.formats.teacher_model import EMBEDDED, read_teacher
 from chebsplat.pipelines.planning.code import PACKAGE, Code
 from chebsplat.pipelines.planning.keys import PLACES, step_key
 from chebsplat.pipelines.planning.needs import (
+    knowledge_given,
     left_out_channels,
     left_out_knowledge,
     left_out_stages,
@@ -30,6 +32,7 @@ from chebsplat.pipelines.planning.raw import Hashes, content_hash, hashes, raw_f
 from chebsplat.pipelines.work import folders, store
 from chebsplat.pipelines.work.scenes import absent, expanded, folder_of, is_source, read_toml, scene_values
 from chebsplat.stages.registry import STAGES, Stage
+from chebsplat.stages.runtime import config as configs
 from chebsplat.stages.sources.common import resolve_source
 
 if TYPE_CHECKING:
@@ -168,9 +171,6 @@ class Planner:
         Raises: ConfigError, InputError.
         Choices: a scene of a sequence, or on a basis, trains the encoder of regions, which a basis is of.
         """
-        from chebsplat.pipelines.planning.needs import knowledge_given
-        from chebsplat.stages.runtime import config as configs
-
         name, own = scene_values(scene)
         values, title = merged(own, values or {}), ""
         if basis is not None or keep_knowledge:
@@ -245,7 +245,6 @@ class Planner:
         """What the source has."""
         if source.kind == "generated":
             return {"poses": True, "depth": True, "labels": True}
-        from importlib import import_module
 
         folder = Path(source.path)
         if not is_source(folder):

@@ -11,6 +11,7 @@ from chebsplat.formats.teacher_model import EMBEDDED, read_teacher
 from chebsplat.pipelines.planning.plan import Overrides, Plan, Planner, merged, overrides, placed
 from chebsplat.pipelines.work.scenes import read_named
 from chebsplat.stages.registry import STAGES
+from chebsplat.stages.runtime import config as configs
 
 LONGEST = 1000  # scenes of a sequence
 
@@ -52,8 +53,6 @@ def teaching(planner: Planner, model: Path | None, settings: str = "") -> Plan:
 
     Raises: ConfigError on a closed-set teacher, whose classes no shape is taught.
     """
-    from chebsplat.stages.runtime import config as configs
-
     file = (model or EMBEDDED).expanduser().resolve()
     teacher = read_teacher(file)
     if teacher.output != "features":

@@ -16,6 +16,8 @@ from multiprocessing import get_context, parent_process
 from multiprocessing.process import BaseProcess
 from pathlib import Path
 
+import numpy as np
+
 N, WIDTH, HEIGHT, CHANNELS = 8, 32, 32, 32
 
 
@@ -33,8 +35,6 @@ def rasterizer() -> None:
 
 def adjoints() -> None:
     """The rasterizer's gradients, of a picture of one tile that shows nothing."""
-    import numpy as np
-
     from chebsplat.rasterize import ellipses, tiles_adjoint
     from chebsplat.rasterize.binning import TILE
 
@@ -74,8 +74,6 @@ def losses() -> None:
 
 def lifting() -> None:
     """A lift of features, which a training starts from and is followed by."""
-    import numpy as np
-
     from chebsplat.lifting.observations import estimate, gathered
     from chebsplat.rasterize.lift import lift
 
@@ -89,8 +87,6 @@ def lifting() -> None:
 
 def descriptors() -> None:
     """Descriptors of points, which follow a training."""
-    import numpy as np
-
     from chebsplat.shape.point_inputs import point_inputs
 
     means, shapes = np.random.default_rng(0).normal(0, 1, (4 * N, 3)), np.tile(np.eye(3), (4 * N, 1, 1))

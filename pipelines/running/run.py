@@ -25,6 +25,7 @@ from chebsplat.pipelines.work import leases, store, summary
 from chebsplat.pipelines.work.store import say
 from chebsplat.pipelines.work.summary import aligned
 from chebsplat.stages.registry import STAGES
+from chebsplat.stages.runtime.device import resolve
 
 HERE = Path(__file__).parents[1]  # of the Snakefile
 
@@ -41,8 +42,6 @@ def device_of(wanted: str, on: str = cluster.LOCAL) -> str:
     """What `--device` means to all jobs of a run; says once why it is not the GPU that is there. Whether a cluster's
     nodes have one is for them to say: a job that asks in vain ends with exit code 2.
     """
-    from chebsplat.stages.runtime.device import resolve
-
     if on != cluster.LOCAL and wanted == "cuda":
         return wanted
     device, why = resolve(wanted)

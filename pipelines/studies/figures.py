@@ -5,6 +5,8 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any
 
+import matplotlib
+import matplotlib.pyplot as plt
 import numpy as np
 
 from chebsplat.evaluation.statistics import summarize
@@ -19,10 +21,7 @@ def draw(path: Path, rows: list[Row], traces: Traces, settings: dict[str, float]
 
     Args: settings: the value of the horizontal axis by condition; None: run time. label: of that axis.
     """
-    import matplotlib
-
     matplotlib.use("Agg")
-    import matplotlib.pyplot as plt
 
     done = [row for row in counted(rows) if row["state"] == "done"]
     variants = list(dict.fromkeys(row["variant"] for row in rows))

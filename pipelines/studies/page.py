@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import base64
 import csv
+import platform
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -12,6 +13,7 @@ from chebsplat.errors import DataFailure
 from chebsplat.evaluation import protocols
 from chebsplat.formats import artifact
 from chebsplat.pipelines.studies import figures
+from chebsplat.pipelines.studies.pictures import gallery
 from chebsplat.pipelines.studies.results import COLUMNS, Row, compare, traces
 from chebsplat.pipelines.studies.study import Run, Study
 from chebsplat.pipelines.studies.tables import (
@@ -24,6 +26,8 @@ from chebsplat.pipelines.studies.tables import (
     table_row,
     tables,
 )
+from chebsplat.stages.pages.parts import rendered
+from chebsplat.stages.report import LARGEST
 
 PAGE = Path(__file__).with_name("page.html")  # a jinja2 template; it fetches nothing from anywhere
 NAME = "study.html"
@@ -60,9 +64,6 @@ def write(
         "left_out": left_out(rows),
     }
     (out / "results.md").write_text(markdown(parts))
-    from chebsplat.pipelines.studies.pictures import gallery
-    from chebsplat.stages.pages.parts import rendered
-    from chebsplat.stages.report import LARGEST
 
     drawing = base64.b64encode((out / PICTURE).read_bytes()).decode()
     page = rendered(
@@ -129,8 +130,6 @@ def facts(runs: list[Run], rows: list[Row], command: str) -> list[tuple[str, str
 
 def processor() -> str:
     """The processor's name, where the system tells it."""
-    import platform
-
     try:
         lines = Path("/proc/cpuinfo").read_text().splitlines()
     except OSError:

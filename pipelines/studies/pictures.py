@@ -6,6 +6,7 @@ from collections import Counter
 from typing import Any
 
 import numpy as np
+from PIL import Image
 
 from chebsplat.formats.evaluation import Evaluation
 from chebsplat.pipelines.studies.results import Row
@@ -94,8 +95,6 @@ def _images(
 
 def _small(image: np.ndarray) -> np.ndarray:
     """At a whole fraction of its size, so that no side exceeds LONGEST: mean colours, every k-th label."""
-    from PIL import Image
-
     step = -(-max(image.shape[:2]) // LONGEST)
     return np.asarray(Image.fromarray(image).reduce(step)) if image.ndim == 3 else image[::step, ::step]
 

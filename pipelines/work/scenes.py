@@ -13,6 +13,7 @@ from chebsplat.formats.files import parse_toml
 from chebsplat.formats.names import suggest
 from chebsplat.formats.videos import is_video
 from chebsplat.pipelines.work.store import is_name
+from chebsplat.stages.sources.common import detect
 
 CONFIGS = Path(__file__).parents[1] / "configs"
 ONE = {"scenes": "scene", "ablations": "ablation", "sequences": "sequence", "studies": "study"}
@@ -78,8 +79,6 @@ def scene_values(scene: str) -> tuple[str, dict[str, Any]]:
     """
     folder = folder_of(scene)
     if folder is not None:
-        from chebsplat.stages.sources.common import detect
-
         name = folder_name(folder)
         return name, {"scene": {"name": name}, "source": {"kind": detect(folder), "path": str(folder)}}
     values = read_toml("scenes", scene)

@@ -2,18 +2,24 @@
 
 from __future__ import annotations
 
+import pickle
 import time
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
+
+import numba
+import numpy as np
+import torch
+from safetensors import SafetensorError
+from safetensors.torch import load_file
 
 from chebsplat.errors import InputError
-
-if TYPE_CHECKING:
-    import numpy as np
-
-    from chebsplat.evaluation.lpips import Lpips
-    from chebsplat.render import SceneRenderer
-    from chebsplat.views import View
+from chebsplat.evaluation.frame_parts import PARTS, frame_parts
+from chebsplat.evaluation.lpips import Lpips
+from chebsplat.evaluation.metrics import color_fitted, psnr
+from chebsplat.render import SceneRenderer
+from chebsplat.training.losses import ssim
+from chebsplat.views import View
 
 LEAST_SIDE = 16  # pixels, of LPIPS
 
@@ -26,11 +32,6 @@ def image_figures(
     Choices: masked pixels do not count; for SSIM and LPIPS they take the true colour. `psnr_fit` is the PSNR after an
       affine fit of a render's colours to its photo: what exposure and white balance of the test photos do not spoil.
     """
-    import numpy as np
-
-    from chebsplat.evaluation.metrics import color_fitted, psnr
-    from chebsplat.training.losses import ssim
-
     names = ("psnr", "psnr_fit", "ssim", *(["lpips"] if lpips else []))
     per_view: dict[str, list[float]] = {name: [] for name in names}
     for k, (render, true) in enumerate(zip(renders, truth, strict=True)):
@@ -48,14 +49,6 @@ def image_figures(
 
 def perceptual(path: Path) -> Lpips:
     """LPIPS of a weights file, .safetensors or a .pth of tensors alone. Raises InputError naming file and remedy."""
-    import pickle
-
-    import torch
-    from safetensors import SafetensorError
-    from safetensors.torch import load_file
-
-    from chebsplat.evaluation.lpips import Lpips
-
     if not path.is_file():
         raise InputError(f"{path} is missing; correct evaluate.lpips_weights")
     help_ = "one file with VGG-16's features.N and LPIPS' linK.model.1.weight is needed"
@@ -85,10 +78,6 @@ def timing(renderer: SceneRenderer, cameras: list[View], repeats: int, semantic:
 
 def frame_split(renderer: SceneRenderer, cameras: list[View], repeats: int) -> dict[str, Any]:
     """Milliseconds of a frame in colour by part, the best sweep of `repeats` over all views, and under what."""
-    import numba
-
-    from chebsplat.evaluation.frame_parts import PARTS, frame_parts
-
     sweeps = []
     for _ in range(repeats):
         frames = [frame_parts(renderer, view)[0] for view in cameras]

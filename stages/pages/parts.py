@@ -4,18 +4,17 @@ from __future__ import annotations
 
 from collections import Counter
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
+
+import jinja2
+import numpy as np
 
 from chebsplat.errors import InputError
-
-if TYPE_CHECKING:
-    from pathlib import Path
-
-    import numpy as np
-
-    from chebsplat.formats.evaluation import Evaluation
-    from chebsplat.formats.gaussians import Gaussians
-
+from chebsplat.formats.artifact import read_manifest
+from chebsplat.formats.capture import Capture
+from chebsplat.formats.evaluation import Evaluation
+from chebsplat.formats.gaussians import Gaussians
+from chebsplat.formats.scene import read_label_names
 
 IN_LEGEND = 30  # labels; an open vocabulary has hundreds
 CAPTIONS = {
@@ -54,10 +53,6 @@ def modes(pictures: list[dict[str, Any]]) -> list[list[Any]]:
 
 def label_names(inputs: dict[str, Path], figures: dict[str, Any]) -> list[str]:
     """Names of the labels in the pictures: the capture's classes, or the scene's own labels where it has none."""
-    from chebsplat.formats.artifact import read_manifest
-    from chebsplat.formats.capture import Capture
-    from chebsplat.formats.scene import read_label_names
-
     classes = Capture.read(inputs["capture"]).class_names if "capture" in inputs else None
     classes = classes or (figures.get("segmentation") or {}).get("classes")
     if classes is None and "scene" in inputs:
@@ -108,8 +103,6 @@ def picture_rows(
 
     Raises: InputError if a picture holds a label that has no name.
     """
-    import numpy as np
-
     from chebsplat.stages.pages import pictures as draw
 
     views, pictures = evaluation.figures["names"], evaluation.pictures
@@ -141,8 +134,6 @@ def picture_rows(
 
 def counted(labels: np.ndarray) -> dict[int, int]:
     """Pixels of each label of a map; -1 is none."""
-    import numpy as np
-
     present, counts = np.unique(labels[labels >= 0], return_counts=True)
     return dict(zip(present.tolist(), counts.tolist(), strict=True))
 
@@ -153,8 +144,6 @@ REPORT = SHARED / "report.html"
 
 def rendered(template: Path, narrow: int = 700, **values: Any) -> str:
     """A page of its template. Raises jinja2's UndefinedError for a value that it wants and is not given."""
-    import jinja2
-
     loader = jinja2.FileSystemLoader([template.parent, SHARED])
     environment = jinja2.Environment(loader=loader, autoescape=True, undefined=jinja2.StrictUndefined)
     return environment.get_template(template.name).render(narrow=narrow, **values)

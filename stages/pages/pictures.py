@@ -7,7 +7,11 @@ import colorsys
 import io
 from typing import Any
 
+import matplotlib
+import matplotlib.pyplot as plt
 import numpy as np
+from matplotlib import colormaps
+from PIL import Image
 
 IGNORE = -1
 CURVES = (
@@ -39,15 +43,11 @@ def heat(image: np.ndarray, relevancy: np.ndarray) -> np.ndarray:
 
 def warm(warmth: np.ndarray) -> np.ndarray:
     """Colours [..., 3] up to 255 of warmth [..., 1] in [0, 1], from the warmer part of turbo."""
-    from matplotlib import colormaps
-
     return 255 * colormaps["turbo"](0.3 + 0.58 * warmth[..., 0])[..., :3]
 
 
 def error_map(image: np.ndarray, truth: np.ndarray, gain: float = 4.0) -> np.ndarray:
     """Mean absolute colour error of u8 images, `gain` times as strong, as an image."""
-    import matplotlib
-
     error = np.abs(image.astype(np.float32) - truth).mean(-1) * (gain / 255)
     return (matplotlib.colormaps["inferno"](error.clip(0, 1))[..., :3] * 255).astype(np.uint8)
 
@@ -60,8 +60,6 @@ def wrong_map(predicted: np.ndarray, truth: np.ndarray) -> np.ndarray:
 
 def data_uri(image: np.ndarray, photo: bool = False) -> str:
     """WebP for photos, lossless PNG for anything with sharp edges and few colours."""
-    from PIL import Image
-
     picture, buffer = Image.fromarray(image), io.BytesIO()
     if photo:
         picture.save(buffer, "WEBP", quality=90)
@@ -74,17 +72,12 @@ def data_uri(image: np.ndarray, photo: bool = False) -> str:
 
 def png(image: np.ndarray, path: Any) -> None:
     """Write an image u8 [H, W, 3] to a path or a file as PNG."""
-    from PIL import Image
-
     Image.fromarray(image).save(path, "PNG")
 
 
 def curves(trace: list[dict[str, float]], test_psnr: float) -> list[str]:
     """Error against run time as inline SVG: PSNR with the test views' at the end, losses, number of Gaussians."""
-    import matplotlib
-
     matplotlib.use("Agg")
-    import matplotlib.pyplot as plt
 
     seconds = [row["seconds"] for row in trace]
     drawn = []

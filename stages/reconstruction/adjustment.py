@@ -4,15 +4,15 @@ from __future__ import annotations
 
 import logging
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
+import pycolmap
+from scipy.optimize import least_squares
+from scipy.spatial.transform import Rotation
 
 from chebsplat.cameras import centers
 from chebsplat.stages.runtime.command import Job
-
-if TYPE_CHECKING:
-    import pycolmap
 
 log = logging.getLogger("chebsplat")
 
@@ -53,8 +53,6 @@ def adjust(
       they were given, and those that are so at the end are found among the points of the others (`localized`). Where
       too many views see few points, all keep their poses.
     """
-    import pycolmap
-
     focal, errors, as_given = _focals(model), [], model
     out = job.scratch / "adjusted"
     out.mkdir(exist_ok=True)
@@ -128,8 +126,6 @@ def frame(found: np.ndarray, given: np.ndarray, seen: np.ndarray) -> Frame:
 
 def differences(poses: np.ndarray, given: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """How far apart poses [V, 4, 4] are: of their centres, scene units [V], and of their rotations, radians [V]."""
-    from scipy.spatial.transform import Rotation
-
     turns = Rotation.from_matrix(np.einsum("vij,vkj->vik", poses[:, :3, :3], given[:, :3, :3]))
     return np.linalg.norm(centers(poses) - centers(given), axis=1), turns.magnitude()
 
@@ -149,10 +145,6 @@ def localized(
       change in units of `spread`: where there are no matches, or they lead astray, the pose is
       the given one.
     """
-    import pycolmap
-    from scipy.optimize import least_squares
-    from scipy.spatial.transform import Rotation
-
     points, pixels = [], []
     with pycolmap.Database.open(database) as opened:
         for other in others:
@@ -217,8 +209,6 @@ def _poses(images: list[pycolmap.Image]) -> np.ndarray:
 
 def _put(image: pycolmap.Image, pose: np.ndarray) -> None:
     """Set the pose [3, 4] of an image."""
-    import pycolmap
-
     assert image.frame is not None  # every image of a reconstruction has one
     image.frame.set_cam_from_world(image.camera_id, pycolmap.Rigid3d(pose))
 
@@ -231,8 +221,6 @@ def _bundle_near(
     spread: float,
 ) -> None:
     """Bundle adjustment in which the given centres have a say: each coordinate's standard deviation is `spread`."""
-    import pycolmap
-
     config, priors = pycolmap.BundleAdjustmentConfig(), []
     for image, place in zip(images, centers(given), strict=True):
         config.add_image(image.image_id)

@@ -3,16 +3,21 @@
 from __future__ import annotations
 
 import logging
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
+import numpy as np
+import torch
+
+from chebsplat.cameras import unproject
+from chebsplat.formats.capture import Capture
+from chebsplat.photos.consistency import agreed
+from chebsplat.photos.planar import completed
+from chebsplat.photos.plane_sweep import swept_depth
+from chebsplat.splats.cubes import cubes_of, means_of_each
+from chebsplat.stages.reconstruction.thinning import edge_of
 from chebsplat.stages.runtime.command import Job
-
-if TYPE_CHECKING:
-    import numpy as np
-
-    from chebsplat.formats.capture import Capture
-    from chebsplat.stages.runtime.progress import Progress
-    from chebsplat.stages.settings import SfmSection
+from chebsplat.stages.runtime.progress import Progress
+from chebsplat.stages.settings import SfmSection
 
 log = logging.getLogger("chebsplat")
 
@@ -29,8 +34,6 @@ COVERED = 0.8  # part of the cells under which matched points leave too much of 
 
 def covered(Ks: np.ndarray, poses: np.ndarray, means: np.ndarray, size: tuple[int, int]) -> float:
     """The share of the views' cells, CELLS along the longer side of `size`, in which a point [N, 3] lies."""
-    import numpy as np
-
     width, height = size
     edge = max(size) / CELLS
     columns, rows = int(np.ceil(width / edge)), int(np.ceil(height / edge))
@@ -43,8 +46,6 @@ def covered(Ks: np.ndarray, poses: np.ndarray, means: np.ndarray, size: tuple[in
 
 def in_photo(K: np.ndarray, pose: np.ndarray, means: np.ndarray, size: tuple[int, int]) -> np.ndarray:
     """Pixels and depth [M, 3] of those of the points [N, 3] that lie in a photo of `size` (width, height)."""
-    import numpy as np
-
     camera = means @ pose[:3, :3].T + pose[:3, 3]
     camera = camera[camera[:, 2] > 0]
     pixels = (camera @ K.T)[:, :2] / camera[:, 2:]
@@ -72,10 +73,6 @@ def swept(job: Job, capture: Capture, cloud: dict[str, Any]) -> dict[str, Any]:
     Choices: test views give no points, and have no depth. Depths that are tried begin before what is in the photo:
       points behind its edges, beside the camera, would have all of them end there.
     """
-    import numpy as np
-
-    from chebsplat.cameras import unproject
-
     row = {name: k for k, name in enumerate(capture.names)}
     rows = np.array([row[name] for name in cloud["names"]])
     used = np.flatnonzero(~capture.is_test[rows])
@@ -119,12 +116,6 @@ def depth_of_photos(
     Choices: a pixel counts where AGREE of the other views have its depth, and few see through it; so does what planes
       add to these.
     """
-    import numpy as np
-    import torch
-
-    from chebsplat.photos.consistency import agreed
-    from chebsplat.photos.planar import completed
-    from chebsplat.photos.plane_sweep import swept_depth
     from chebsplat.stages.reconstruction.matching import apart
 
     bounds = np.array([np.percentile(some, (1, 99)) if len(some) else (np.nan, np.nan) for some in z])
@@ -152,11 +143,6 @@ def fused(means: np.ndarray, colors: np.ndarray, seen_from: np.ndarray) -> dict[
 
     Choices: of twice as many cubes as points are wanted, since what lies off the surfaces fills half of them.
     """
-    import numpy as np
-
-    from chebsplat.splats.cubes import cubes_of, means_of_each
-    from chebsplat.stages.reconstruction.thinning import edge_of
-
     if len(means) == 0:
         return {"means": means, "colors": colors, "seen_from": seen_from}
     numbers = cubes_of(means, edge_of(means, 2 * MOST))
@@ -167,8 +153,6 @@ def fused(means: np.ndarray, colors: np.ndarray, seen_from: np.ndarray) -> dict[
 
 def reduced(image: np.ndarray, factor: int) -> np.ndarray:
     """Means of blocks of [H, W, C], f32."""
-    import numpy as np
-
     height, width = (side // factor for side in image.shape[:2])
     blocks = np.asarray(image[: height * factor, : width * factor], np.float32)
     return np.asarray(blocks.reshape(height, factor, width, factor, -1).mean((1, 3)))

@@ -4,19 +4,19 @@ from __future__ import annotations
 
 import logging
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
+
+import numpy as np
+import pycolmap
 
 from chebsplat.errors import ConfigError, DataFailure
+from chebsplat.formats.capture import Capture
 from chebsplat.stages.reconstruction import matching
+from chebsplat.stages.reconstruction.adjustment import adjust
 from chebsplat.stages.reconstruction.matching import file_of
 from chebsplat.stages.reconstruction.pose_check import wants_adjustment, wants_lines
 from chebsplat.stages.runtime.command import Job
-
-if TYPE_CHECKING:
-    import pycolmap
-
-    from chebsplat.formats.capture import Capture
-    from chebsplat.stages.settings import SfmSection
+from chebsplat.stages.settings import SfmSection
 
 log = logging.getLogger("chebsplat")
 
@@ -31,8 +31,6 @@ def reconstruct(job: Job, capture: Capture, settings: SfmSection, adjusted: bool
       triangulation reproducible; mapping is reproducible at one thread only, which it gets. Test views take part in
       posing, never in colouring. Where given poses fit the photos, matches are looked for along epipolar lines alone.
     """
-    import numpy as np
-
     posed = capture.cam_from_world is not None
     if settings.matching == "posed" and not posed:
         raise ConfigError("sfm.matching is posed, but the source has no poses; use sfm.matching=auto")
@@ -46,8 +44,6 @@ def reconstruct(job: Job, capture: Capture, settings: SfmSection, adjusted: bool
     model = _triangulate(job, capture, database) if posed else _map(job, len(capture.names), database, settings)
     moved: dict[str, Any] = {}
     if wants_adjustment(job, capture, settings, database) if adjusted is None else adjusted:
-        from chebsplat.stages.reconstruction.adjustment import adjust
-
         names = [file_of(view) for view in range(len(capture.names))]
         model, moved = adjust(job, model, database, names, np.asarray(capture.cam_from_world))
     elif posed:
@@ -71,8 +67,6 @@ def reconstruct(job: Job, capture: Capture, settings: SfmSection, adjusted: bool
 
 def _triangulate(job: Job, capture: Capture, database: Path) -> pycolmap.Reconstruction:
     """Points of known cameras; poses and intrinsics are kept as given."""
-    import pycolmap
-
     assert capture.cam_from_world is not None
     model = pycolmap.Reconstruction()
     width, height = capture.size
@@ -98,8 +92,6 @@ def _triangulate(job: Job, capture: Capture, database: Path) -> pycolmap.Reconst
 
 def _map(job: Job, n_views: int, database: Path, settings: SfmSection) -> pycolmap.Reconstruction:
     """The largest of the models that incremental mapping finds."""
-    import pycolmap
-
     options = pycolmap.IncrementalPipelineOptions()
     options.num_threads = 1
     options.random_seed = settings.seed
@@ -136,8 +128,6 @@ def _collect(
     Choices: points with a reprojection error above 4 px or seen only by test views are dropped; of too many, those
     with the longest tracks stay.
     """
-    import numpy as np
-
     images = [registered[file_of(view)] for view in views]
     row = {image.image_id: index for index, image in enumerate(images)}
     is_test = capture.is_test[views]

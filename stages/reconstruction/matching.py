@@ -7,19 +7,20 @@ capture's order, which is that of their names. Pairs are int [P, 2], smaller ind
 from __future__ import annotations
 
 import logging
+from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
+import pycolmap
+from PIL import Image
 
 from chebsplat.cameras import centers
+from chebsplat.formats.capture import Capture
+from chebsplat.photos.epipolar import fundamental
+from chebsplat.photos.guided import along_lines
 from chebsplat.stages.runtime.command import Job, n_threads
-
-if TYPE_CHECKING:
-    from collections.abc import Iterable, Iterator, Sequence
-
-    from chebsplat.formats.capture import Capture
-    from chebsplat.stages.settings import SfmSection
+from chebsplat.stages.settings import SfmSection
 
 log = logging.getLogger("chebsplat")
 PHOTOS, PAIRS = 8, 64  # a thread's share between two lines of progress; each such block of pairs indexes its views anew
@@ -44,8 +45,6 @@ def match(job: Job, capture: Capture, settings: SfmSection, pairs: np.ndarray) -
 
 def with_features(job: Job, capture: Capture, settings: SfmSection, views: Sequence[int]) -> Path:
     """A database of views with SIFT from the capture's own pixels."""
-    import pycolmap
-
     job.scratch.mkdir(parents=True, exist_ok=True)
     pycolmap.logging.minloglevel = pycolmap.logging.ERROR.value if hasattr(pycolmap.logging, "ERROR") else 2
     folder, database = _write_images(job, capture, views), job.scratch / "database.db"
@@ -72,8 +71,6 @@ def with_features(job: Job, capture: Capture, settings: SfmSection, views: Seque
 
 def match_freely(job: Job, database: Path, pairs: np.ndarray, settings: SfmSection) -> None:
     """Match pairs of views [P, 2] as if nothing were known of their poses; what RANSAC verifies is kept."""
-    import pycolmap
-
     matching, verification = pycolmap.FeatureMatchingOptions(), pycolmap.TwoViewGeometryOptions()
     matching.use_gpu, matching.num_threads = False, n_threads()
     verification.ransac.random_seed = settings.seed
@@ -91,12 +88,6 @@ def match_along_lines(job: Job, database: Path, pairs: np.ndarray, capture: Capt
     Choices: a pair of fewer than LEAST matches has none, as in a free search. Features of one block's views are in
       memory at once.
     """
-    import numpy as np
-    import pycolmap
-
-    from chebsplat.photos.epipolar import fundamental
-    from chebsplat.photos.guided import along_lines
-
     poses, Ks, n_matches = capture.cam_from_world, capture.Ks, 0
     assert poses is not None
     with pycolmap.Database.open(database) as opened:
@@ -138,9 +129,6 @@ def chosen_pairs(job: Job, database: Path, capture: Capture, settings: SfmSectio
 
 def _largest_descriptors(database: Path, n_views: int) -> list[np.ndarray]:
     """f32 [k, 128] of unit length per view, of its LARGEST features."""
-    import numpy as np
-    import pycolmap
-
     found = [np.zeros((0, 128), np.float32)] * n_views
     with pycolmap.Database.open(database) as opened:
         for image in opened.read_all_images():
@@ -153,9 +141,6 @@ def _largest_descriptors(database: Path, n_views: int) -> list[np.ndarray]:
 
 def _write_images(job: Job, capture: Capture, views: Iterable[int]) -> Path:
     """The images of some of the capture's views, and where it has them their masks, as pycolmap reads them."""
-    import numpy as np
-    from PIL import Image
-
     folder, masks = job.scratch / "images", job.scratch / "masks"
     folder.mkdir(exist_ok=True)
     masks.mkdir(exist_ok=True)
@@ -178,8 +163,6 @@ def _in_blocks(job: Job, items: list[Any], size: int, what: str) -> Iterator[lis
 
 
 def _cameras_differ(capture: Capture) -> bool:
-    import numpy as np
-
     return not np.allclose(capture.Ks, capture.Ks[:1])
 
 

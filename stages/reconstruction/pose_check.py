@@ -4,16 +4,16 @@ from __future__ import annotations
 
 import logging
 from pathlib import Path
-from typing import TYPE_CHECKING, NamedTuple
+from typing import NamedTuple
 
-from chebsplat.stages.reconstruction.matching import file_of, match, match_freely
+import numpy as np
+import pycolmap
+
+from chebsplat.formats.capture import Capture
+from chebsplat.photos.epipolar import fundamental, sampson_distance
+from chebsplat.stages.reconstruction.matching import file_of, match, match_freely, nearest_by_pose
 from chebsplat.stages.runtime.command import Job
-
-if TYPE_CHECKING:
-    import numpy as np
-
-    from chebsplat.formats.capture import Capture
-    from chebsplat.stages.settings import SfmSection
+from chebsplat.stages.settings import SfmSection
 
 log = logging.getLogger("chebsplat")
 
@@ -76,8 +76,6 @@ def _exact(capture: Capture) -> bool:
 
 def _some_of(pairs: np.ndarray) -> np.ndarray:
     """PROBED of the pairs [P, 2], evenly chosen."""
-    import numpy as np
-
     return np.asarray(pairs[np.unique(np.linspace(0, len(pairs) - 1, PROBED).round().astype(int))])
 
 
@@ -96,8 +94,6 @@ def measured(job: Job, capture: Capture, database: Path | None) -> Fit:
 
 def probed(job: Job, capture: Capture, settings: SfmSection) -> Path | None:
     """A database of PROBED pairs of neighbouring views, evenly chosen, and large features; None without pairs."""
-    from chebsplat.stages.reconstruction.matching import nearest_by_pose
-
     assert capture.cam_from_world is not None
     pairs = nearest_by_pose(capture.cam_from_world, settings.n_matched)
     if len(pairs) < LEAST:
@@ -108,11 +104,6 @@ def probed(job: Job, capture: Capture, settings: SfmSection) -> Path | None:
 
 def fit(database: Path, capture: Capture) -> Fit:
     """How well the capture's poses agree with the verified matches of a database of its views."""
-    import numpy as np
-    import pycolmap
-
-    from chebsplat.photos.epipolar import fundamental, sampson_distance
-
     poses, given, free = capture.cam_from_world, [], []
     assert poses is not None
     with pycolmap.Database.open(database) as opened:

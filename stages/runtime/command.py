@@ -9,6 +9,7 @@ import time
 from collections.abc import Callable
 from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass, field
+from importlib import metadata
 from pathlib import Path
 from typing import Any
 
@@ -143,8 +144,6 @@ def n_threads() -> int:
 
 def _versions() -> dict[str, str]:
     """Versions of the packages that the stage really loaded."""
-    from importlib import metadata
-
     names = {
         "torch",
         "numpy",

@@ -5,16 +5,24 @@ from __future__ import annotations
 import logging
 from collections.abc import Callable
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import Any, NamedTuple
 
+import numpy as np
+
+from chebsplat.cameras import common_up, resized
 from chebsplat.errors import DataFailure, InputError
-
-if TYPE_CHECKING:
-    import numpy as np
-
-    from chebsplat.formats.features import Features
-    from chebsplat.formats.knowledge import Knowledge
-    from chebsplat.formats.points import Points
+from chebsplat.formats.features import Features
+from chebsplat.formats.knowledge import Knowledge, read_knowledge
+from chebsplat.formats.points import Points
+from chebsplat.labels.decode import shares
+from chebsplat.lifting.surface import surface, swept_surface
+from chebsplat.settings import DescribeSection
+from chebsplat.shape.point_encoder import PointEncoder
+from chebsplat.shape.point_inputs import point_inputs
+from chebsplat.splats.gaussians import local_shape
+from chebsplat.stages.reconstruction.thinning import even
+from chebsplat.stages.runtime.config import checked
+from chebsplat.stages.teacher_models.text_encoder import found
 
 log = logging.getLogger("chebsplat")
 LEAST_SURE = 0.5  # of up, by the cameras
@@ -31,11 +39,6 @@ class Cloud(NamedTuple):
 
 def measured(points: Points) -> Cloud:
     """The surface that points of depth show, as evenly as knowledge was taught it."""
-    import numpy as np
-
-    from chebsplat.splats.gaussians import local_shape
-    from chebsplat.stages.reconstruction.thinning import even
-
     kept = even(points)
     if len(kept) == len(points.means):
         return Cloud(points.means, points.normals, points.covariances)
@@ -52,8 +55,6 @@ def shown(
 
     Raises: DataFailure where they show too little of one.
     """
-    from chebsplat.lifting.surface import surface
-
     means, eyes = surface(parameters, poses, Ks, size, unit)
     if len(means) <= N_NEIGHBORS:
         raise DataFailure(f"the Gaussians show {len(means)} points of a surface; shape cannot be told")
@@ -65,9 +66,6 @@ def swept(points: Points, width: int, unit: float) -> Cloud:
 
     Raises: DataFailure where that is too little of one.
     """
-    from chebsplat.cameras import resized
-    from chebsplat.lifting.surface import swept_surface
-
     assert points.depths is not None
     factor = width // points.depths.shape[2]  # of the blocks of pixels that a swept one stands for
     means, eyes = swept_surface(points.depths, resized(points.Ks, 1 / factor, 1 / factor), points.cam_from_world, unit)
@@ -78,10 +76,6 @@ def swept(points: Points, width: int, unit: float) -> Cloud:
 
 def facing(means: np.ndarray, eyes: np.ndarray) -> Cloud:
     """Points [P, 3] with the shape of their neighbours, and normals towards the cameras [P, 3] that saw them."""
-    import numpy as np
-
-    from chebsplat.splats.gaussians import local_shape
-
     covariances, normals = local_shape(means, N_NEIGHBORS)
     normals[np.einsum("ni,ni->n", normals, eyes - means) < 0] *= -1
     return Cloud(means, normals, covariances)
@@ -96,8 +90,6 @@ def known_shapes(
           unit: scene units of a metre.
     Raises: InputError where the knowledge is damaged or of another teacher; DataFailure where it lacks a label's word.
     """
-    from chebsplat.formats.knowledge import read_knowledge
-
     knowledge = read_knowledge(path)
     translated = into_channels(path, knowledge, features)
     up, sure = up_of(poses)
@@ -107,10 +99,6 @@ def known_shapes(
 
 def up_of(poses: np.ndarray) -> tuple[np.ndarray, float]:
     """Against gravity [3], and how sure that is. Choices: z, with a warning, where the cameras cannot tell."""
-    import numpy as np
-
-    from chebsplat.cameras import common_up
-
     up, sure = common_up(poses)
     if sure >= LEAST_SURE:
         return up, sure
@@ -120,11 +108,6 @@ def up_of(poses: np.ndarray) -> tuple[np.ndarray, float]:
 
 def answered(path: Path, knowledge: Knowledge, cloud: Cloud, up: np.ndarray, unit: float) -> np.ndarray:
     """What the encoder of the knowledge at `path` says of each point, in its own channels: f32 [P, d]."""
-    from chebsplat.settings import DescribeSection
-    from chebsplat.shape.point_encoder import PointEncoder
-    from chebsplat.shape.point_inputs import point_inputs
-    from chebsplat.stages.runtime.config import checked
-
     describe = checked(DescribeSection, knowledge.describe, f"{path / 'knowledge.json'}: describe", InputError)
     inputs = point_inputs(*cloud, up=up, unit=unit, describe=describe)
     return PointEncoder.restored(knowledge.encoder, knowledge.weights).predict(inputs)
@@ -138,11 +121,6 @@ def into_channels(path: Path, knowledge: Knowledge, features: Features) -> Calla
       codes of classes (noisy labels, labels of a source, segmenters), an answer becomes the mean of the codes, weighted
       by how near it is to the embeddings of their names.
     """
-    import numpy as np
-
-    from chebsplat.labels.decode import shares
-    from chebsplat.stages.teacher_models.text_encoder import found
-
     if features.convention["kind"] == "onnx" and features.convention["output"] == "features":
         if features.convention["teacher"] != knowledge.teacher:
             raise InputError(

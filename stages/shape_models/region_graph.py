@@ -7,16 +7,14 @@ with the modules at every export (`stages/onnx.py`).
 from __future__ import annotations
 
 import math
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
-from onnx import GraphProto, ModelProto, NodeProto, TensorProto, helper, numpy_helper
+from onnx import GraphProto, ModelProto, NodeProto, TensorProto, checker, helper, numpy_helper
+from torch import nn
 
-if TYPE_CHECKING:
-    from torch import nn
-
-    from chebsplat.shape.encoder import Attention, Block, RegionEncoder
-    from chebsplat.shape.fusion import Fusion
+from chebsplat.shape.encoder import N_FREQUENCIES, Attention, Block, RegionEncoder
+from chebsplat.shape.fusion import LEAST, Fusion
 
 OPSET = 18  # of the ONNX files
 Value = Any  # the name of what a node makes, a torch tensor, or a NumPy constant
@@ -66,8 +64,6 @@ class Graph:
 
     def model(self, name: str, **outputs: tuple[str, list[int | str]]) -> ModelProto:
         """outputs: by name, the float32 value that it is, and its shape. Raises onnx.checker.ValidationError."""
-        from onnx import checker
-
         for output, (value, _) in outputs.items():
             self.nodes.append(helper.make_node("Identity", [value], [output]))
         made = [helper.make_tensor_value_info(o, TensorProto.FLOAT, shape) for o, (_, shape) in outputs.items()]
@@ -91,8 +87,6 @@ def whole(*values: int) -> np.ndarray:
 
 def encoder_model(encoder: RegionEncoder) -> ModelProto:
     """`RegionEncoder.forward`: inputs [regions, members, n_inputs], positions, mask -> encodings [regions, C]."""
-    from chebsplat.shape.encoder import N_FREQUENCIES
-
     region: list[int | str] = ["regions", "members"]
     graph = Graph(
         inputs=(TensorProto.FLOAT, [*region, encoder.n_inputs]),
@@ -189,8 +183,6 @@ def fusion_model(fusion: Fusion) -> ModelProto:
 
 def _propagation_weights(graph: Graph, index: str, fusion: Fusion) -> str:
     """`fusion.propagation_weights` [gaussians, covers] (Eq 8)."""
-    from chebsplat.shape.fusion import LEAST
-
     away = graph.add("Sub", graph.add("Unsqueeze", "means", whole(1)), graph.add("Gather", "centers", index))
     away = graph.add("Unsqueeze", graph.add("Div", away, "radius"), whole(3))
     turned = graph.add("Mul", graph.add("Gather", _rotations(graph), index), away)

@@ -3,15 +3,27 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING, NamedTuple
+from typing import NamedTuple
 
-if TYPE_CHECKING:
-    import numpy as np
+import numpy as np
+from scipy.spatial import cKDTree
 
-    from chebsplat.lifting.surface import Surface
-    from chebsplat.shape.point_inputs import PointInputs
-    from chebsplat.stages.settings import KnowledgeSection
-    from chebsplat.stages.teacher_models.image_encoder import TeacherInference
+from chebsplat.cameras import centers, unproject
+from chebsplat.formats.files import atomic_path
+from chebsplat.formats.teacher_model import EMBEDDED, read_teacher
+from chebsplat.lifting.surface import Surface, swept_surface
+from chebsplat.shape.point_inputs import PointInputs, point_inputs
+from chebsplat.splats.gaussians import local_shape
+from chebsplat.stages.reconstruction.dense import SIDE, depth_of_photos, reduced
+from chebsplat.stages.reconstruction.thinning import thin
+from chebsplat.stages.settings import KnowledgeSection
+from chebsplat.stages.sources.generated import photograph
+from chebsplat.stages.teacher_models.image_encoder import TeacherInference
+from chebsplat.synthetic import layout
+from chebsplat.synthetic.path import intrinsics, walk
+from chebsplat.synthetic.rays import RayCaster
+from chebsplat.synthetic.seeds import KNOWLEDGE
+from chebsplat.synthetic.shuffled import jitter, shuffled
 
 KINDS = (  # taken in turn by seed
     "shuffled", "jittered office", "shuffled", "room", "shuffled", "jittered room", "shuffled", "office"
@@ -46,11 +58,6 @@ def rooms_of(seed: int, settings: KnowledgeSection, network: TeacherInference, m
       them. Every other room that few photos show has other proportions, too: worlds differ in these. A sweep that finds
       nothing leaves the room as depth has it once more.
     """
-    import numpy as np
-    from scipy.spatial import cKDTree
-
-    from chebsplat.synthetic.seeds import KNOWLEDGE
-
     if seed not in KNOWLEDGE:
         raise ValueError(f"seed {seed} is not one for knowledge: {KNOWLEDGE}")
     rng = np.random.default_rng([seed, 4])
@@ -79,11 +86,6 @@ def rooms_of(seed: int, settings: KnowledgeSection, network: TeacherInference, m
 
 def described(means: np.ndarray, eyes: np.ndarray) -> PointInputs:
     """Inputs of points [N, 3] seen from `eyes` [N, 3]."""
-    import numpy as np
-
-    from chebsplat.shape.point_inputs import point_inputs
-    from chebsplat.splats.gaussians import local_shape
-
     covariances, normals = local_shape(means, N_NEIGHBORS)
     normals[np.einsum("ni,ni->n", normals, eyes - means) < 0] *= -1
     return point_inputs(means, normals, covariances, up=np.array([0.0, 0.0, 1.0]))
@@ -95,8 +97,6 @@ def worn(means: np.ndarray, normals: np.ndarray, rng: np.random.Generator) -> tu
     Choices: a share of the points; they leave the surface along its normal, by offsets that change slowly over it (half
       a metre to a metre, and a few hands), and by noise; some float in front of it.
     """
-    import numpy as np
-
     kept = rng.permutation(len(means))[: int(rng.uniform(0.4, 1) * len(means))]
     normal = normals[kept]
     where = means[kept] + 0.3 * normal  # sides of a thing differ, too
@@ -116,11 +116,6 @@ def swept(images: np.ndarray, depth: np.ndarray, K: np.ndarray, poses: np.ndarra
 
     Args: depth [V, H, W]: true; 200 pixels of each photo bound what is tried, as matched points do.
     """
-    import numpy as np
-
-    from chebsplat.lifting.surface import swept_surface
-    from chebsplat.stages.reconstruction.dense import SIDE, depth_of_photos, reduced
-
     least = min(LEAST_SWEPT, len(poses))
     some = np.sort(rng.permutation(len(poses))[: round(np.exp(rng.uniform(*np.log((least, len(poses))))))])
     factor = max(round(max(images.shape[1:3]) / SIDE), 1)
@@ -133,14 +128,6 @@ def swept(images: np.ndarray, depth: np.ndarray, K: np.ndarray, poses: np.ndarra
 
 def photographed(seed: int, n_views: int) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
     """Images, depth and labels [V, H, W, ...] of a room, K [3, 3] and poses [V, 4, 4]."""
-    import numpy as np
-
-    from chebsplat.stages.sources.generated import photograph
-    from chebsplat.synthetic import layout
-    from chebsplat.synthetic.path import intrinsics, walk
-    from chebsplat.synthetic.rays import RayCaster
-    from chebsplat.synthetic.shuffled import jitter, shuffled
-
     kind = KINDS[seed % len(KINDS)]
     room = shuffled(seed) if kind == "shuffled" else layout.build(kind.split()[-1], seed)
     if kind.startswith(("jittered", "shuffled")):
@@ -156,11 +143,6 @@ def surface(
     depth: np.ndarray, labels: np.ndarray, K: np.ndarray, poses: np.ndarray, count: int, rng: np.random.Generator
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """About `count` points [N, 3] that views see, the cameras that saw them [N, 3], and their labels [N]."""
-    import numpy as np
-
-    from chebsplat.cameras import centers, unproject
-    from chebsplat.stages.reconstruction.thinning import thin
-
     means, eyes, named = [], [], []
     for view, eye in enumerate(centers(poses)):
         pixels = np.argwhere(np.isfinite(depth[view]))
@@ -185,8 +167,6 @@ def averaged(
 
     Args: within: metres, and share of the depth, by which a point may lie off what a view sees.
     """
-    import numpy as np
-
     (height, width), (rows, columns) = depth.shape[1:], features.shape[1:3]
     total, n_views = np.zeros((len(means), features.shape[-1]), np.float32), np.zeros(len(means), np.int64)
     for view, pose in enumerate(poses):
@@ -204,10 +184,6 @@ def averaged(
 
 def prepare(folder: Path, seed: int, settings: KnowledgeSection, matrix: np.ndarray) -> int:
     """Keep a room in the folder, unless it is there; returns the seed. Runs in a process of its own."""
-    import numpy as np
-
-    from chebsplat.formats.files import atomic_path
-    from chebsplat.formats.teacher_model import EMBEDDED, read_teacher
     from chebsplat.stages.teacher_models.image_encoder import TeacherInference
 
     path = kept_as(folder, seed)
@@ -230,10 +206,6 @@ def kept_as(folder: Path, seed: int) -> Path:
 
 def held(folder: Path, seed: int) -> list[Room]:
     """A room that `prepare` kept: clean, worn, half seen, and swept."""
-    import numpy as np
-
-    from chebsplat.shape.point_inputs import PointInputs
-
     with np.load(kept_as(folder, seed)) as stored:
         return [
             Room(

@@ -6,11 +6,14 @@ import functools
 import itertools
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
+from PIL import Image
+from scipy.ndimage import map_coordinates
 
 from chebsplat.errors import DataFailure, InputError
+from chebsplat.stages.settings import IngestSection
 from chebsplat.stages.sources.cameras import DISTORTED, Camera, undistorted
 from chebsplat.stages.sources.common import Frame, Listing, natural
 from chebsplat.stages.sources.pictures import (
@@ -23,9 +26,6 @@ from chebsplat.stages.sources.pictures import (
     nearest,
     open_photo,
 )
-
-if TYPE_CHECKING:
-    from chebsplat.stages.settings import IngestSection
 
 WORKERS = 4
 
@@ -202,8 +202,6 @@ def moved(at: np.ndarray, camera: Camera, other: Camera) -> tuple[np.ndarray, tu
 
 def resampled(image: Any, camera: Camera, view: Geometry, at: np.ndarray) -> np.ndarray:
     """The RGB photo as u8 [H, W, 3] of the view: area averages, then bilinear where the photo is distorted."""
-    from PIL import Image
-
     distorted = camera.model in DISTORTED
     size = (view.width, view.height)
     if distorted:
@@ -211,7 +209,6 @@ def resampled(image: Any, camera: Camera, view: Geometry, at: np.ndarray) -> np.
     small = np.asarray(image if size == image.size else image.resize(size, Image.Resampling.BOX))
     if not distorted:
         return small
-    from scipy.ndimage import map_coordinates
 
     x, y = at[0] * size[0] / camera.width - 0.5, at[1] * size[1] / camera.height - 0.5
     return np.stack([map_coordinates(small[..., c], [y, x], order=1, mode="nearest") for c in range(3)], -1)

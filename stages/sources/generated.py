@@ -2,13 +2,18 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any
+from concurrent.futures import ThreadPoolExecutor
+from typing import Any
 
 import numpy as np
 
-if TYPE_CHECKING:
-    from chebsplat.synthetic.layout import Room
-    from chebsplat.synthetic.rays import Hits, RayCaster
+from chebsplat.synthetic import CLASS_NAMES
+from chebsplat.synthetic.layout import Room
+from chebsplat.synthetic.light import dot, shade, tone_map
+from chebsplat.synthetic.path import intrinsics, walk
+from chebsplat.synthetic.rays import Hits, RayCaster
+from chebsplat.synthetic.rooms import build
+from chebsplat.synthetic.textures import colors
 
 SIZES = {  # views, width, height
     "office": (80, 320, 240), "room": (80, 320, 240), "shuffled": (80, 320, 240), "toy": (16, 96, 72),
@@ -18,13 +23,6 @@ EDGE_SAMPLES = 3  # rays along each side of a pixel on an edge
 
 def capture(name: str, seed: int, preset: str) -> dict[str, Any]:
     """The fields of a capture; see `formats.capture`."""
-    from concurrent.futures import ThreadPoolExecutor
-
-    from chebsplat.synthetic import CLASS_NAMES
-    from chebsplat.synthetic.path import intrinsics, walk
-    from chebsplat.synthetic.rays import RayCaster
-    from chebsplat.synthetic.rooms import build
-
     n_views, width, height = SIZES[preset]
     room = build(preset, seed)
     caster = RayCaster(room.soup.vertices, room.soup.triangles)
@@ -65,7 +63,6 @@ def photograph(
         fine_hits, fine_rays = trace(caster, K, pose, fine)
         fine_light = np.minimum(shaded(room, caster, pose, fine_rays, fine_hits), 1.2)
         image[rows, columns] = fine_light.reshape(len(rows), -1, 3).mean(1)
-    from chebsplat.synthetic.light import tone_map
 
     depth = np.where(hits.triangle >= 0, hits.distance, np.nan).astype(np.float32)
     labels = np.where(hits.triangle >= 0, room.soup.labels[hits.triangle], -1).astype(np.int16)
@@ -82,9 +79,6 @@ def trace(caster: RayCaster, K: np.ndarray, pose: np.ndarray, pixels: np.ndarray
 
 def shaded(room: Room, caster: RayCaster, pose: np.ndarray, rays: np.ndarray, hits: Hits) -> np.ndarray:
     """Linear light [N, 3] along rays; black where nothing is hit."""
-    from chebsplat.synthetic.light import dot, shade
-    from chebsplat.synthetic.textures import colors
-
     seen = hits.triangle >= 0
     triangle, rays, distance = hits.triangle[seen], rays[seen], hits.distance[seen]
     eye = (-pose[:3, :3].T @ pose[:3, 3]).astype(np.float32)

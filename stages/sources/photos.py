@@ -13,6 +13,8 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any, NamedTuple
 
+from PIL import Image
+
 from chebsplat.errors import InputError
 from chebsplat.formats.images import header, is_image
 from chebsplat.stages.runtime.command import n_threads
@@ -179,7 +181,5 @@ def _bent(camera: Camera, lens: Lens) -> Camera:
 
 
 def _reduced(frame: Frame, upright: bool, size: tuple[int, int], path: Path) -> None:
-    from PIL import Image
-
     with open_photo(frame.image, (frame.camera.width, frame.camera.height), upright) as (image, _):
         image.resize(size, Image.Resampling.BOX).save(path, compress_level=1)

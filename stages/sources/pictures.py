@@ -11,6 +11,7 @@ import numpy as np
 
 from chebsplat.errors import DataFailure, InputError
 from chebsplat.formats.images import opened, seen_size, turned
+from chebsplat.formats.npz import finite32, read_npz
 from chebsplat.stages.sources.common import Frame, Listing
 from chebsplat.stages.sources.texts import LONGEST, shortened, whole
 
@@ -77,8 +78,6 @@ def companion(
 
 def confidences(path: Path) -> np.ndarray:
     """The array `confidence` [h, w] of an .npz file, f32 in [0, 1]; nothing in it is unpickled. Raises InputError."""
-    from chebsplat.formats.npz import finite32, read_npz
-
     held = read_npz(path, ["confidence"], "copy it again", LARGEST).get("confidence")
     found = None if held is None else finite32(held)
     if found is None or found.ndim != 2 or not found.size or not ((found >= 0) & (found <= 1 + 1e-4)).all():

@@ -9,6 +9,7 @@ import numpy as np
 
 from chebsplat.errors import InputError
 from chebsplat.evaluation.protocols import scannet_closed, scannet_open
+from chebsplat.formats.clouds import read_cloud
 from chebsplat.formats.images import header
 from chebsplat.stages.sources import assembly, cameras, common, texts
 from chebsplat.stages.sources.cameras import Camera
@@ -40,8 +41,6 @@ def read(folder: Path, settings: Any, class_names: tuple[str, ...] | None = None
     if split is not None:
         assembly.give_split(fields, split[1], "splits.json")
     if not reduced:
-        from chebsplat.formats.clouds import read_cloud
-
         fields["points"], fields["point_colors"] = read_cloud(folder / POINTS)
     return fields
 

@@ -4,19 +4,18 @@ from __future__ import annotations
 
 import os
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
+from PIL import Image
 
 from chebsplat.errors import DataFailure, InputError
 from chebsplat.formats import videos
 from chebsplat.photos.frames import BLOCK, choose, progress, shifts
 from chebsplat.photos.sharpness import laplacian_variance
+from chebsplat.stages.runtime.progress import Progress
 from chebsplat.stages.sources import assembly, cameras
 from chebsplat.stages.sources.photos import GUESS
-
-if TYPE_CHECKING:
-    from chebsplat.stages.runtime.progress import Progress
 
 MOST = 150  # frames, where ingest.max_views says nothing
 SIDE, THUMBNAIL = 640, 192  # pixels of the longer side, on which sharpness and movement are measured
@@ -107,8 +106,6 @@ def _thumbnail(grey: np.ndarray) -> np.ndarray:
 
 def _taken(file: Path, wanted: set[int], camera: cameras.Camera, view: assembly.Geometry) -> np.ndarray:
     """The frames of these numbers, u8 [V, H, W, 3]."""
-    from PIL import Image
-
     at, images = assembly.positions(camera, view), []
     for k, frame in enumerate(videos.frames(file)):
         if k in wanted:

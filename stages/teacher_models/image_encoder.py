@@ -3,17 +3,16 @@
 from __future__ import annotations
 
 import math
-from typing import TYPE_CHECKING, Any
+from typing import Any
+
+import numpy as np
+import onnxruntime
+from PIL import Image
 
 from chebsplat.errors import DataFailure, InputError
-from chebsplat.formats.teacher_model import MAX_SIDE
-from chebsplat.labels.tiling import window_starts
+from chebsplat.formats.teacher_model import MAX_SIDE, TeacherModel
+from chebsplat.labels.tiling import blended, window_starts
 from chebsplat.stages.teacher_models.onnx_session import Model
-
-if TYPE_CHECKING:
-    import numpy as np
-
-    from chebsplat.formats.teacher_model import TeacherModel
 
 MAX_WINDOWS = 4096  # of a view
 MAX_SHARE = 0.5  # of the image's side that an entry of the map may be wide
@@ -27,8 +26,6 @@ class TeacherInference:
     """
 
     def __init__(self, teacher: TeacherModel, threads: int, device: str = "cpu"):
-        import onnxruntime
-
         teacher.verify()
         self.teacher = teacher
         options = onnxruntime.SessionOptions()
@@ -114,10 +111,6 @@ class TeacherInference:
         Choices: every window's entries are unit (or probabilities) before windows are blended; every scale's and flip's
           map counts the same in the mean, which is made unit again. Padding repeats the image's edge.
         """
-        import numpy as np
-
-        from chebsplat.labels.tiling import blended
-
         total = np.zeros(0)
         for scale in scales:
             size = self.scaled_size(image, scale)
@@ -142,8 +135,6 @@ class TeacherInference:
 
         Raises: InputError on a model that does not run or gives another rank; DataFailure on non-finite values.
         """
-        import numpy as np
-
         teacher = self.teacher
         mean, std = (np.array(v, np.float32)[:, None, None] for v in (teacher.mean, teacher.std))
         image = (window.transpose(2, 0, 1).astype(np.float32) / 255 - mean) / std
@@ -160,23 +151,16 @@ class TeacherInference:
 
 def unit(values: np.ndarray, axis: int) -> np.ndarray:
     """Unit vectors along an axis; a vector of length 0 stays."""
-    import numpy as np
-
     return values / np.linalg.norm(values, axis=axis, keepdims=True).clip(1e-6)
 
 
 def softmax(logits: np.ndarray) -> np.ndarray:
     """Probabilities [C, h, w] of logits [C, h, w]."""
-    import numpy as np
-
     weights = np.exp(logits - logits.max(0))
     return weights / weights.sum(0)
 
 
 def _resized(image: np.ndarray, size: tuple[int, int]) -> np.ndarray:
-    import numpy as np
-    from PIL import Image
-
     if image.shape[:2] == size:
         return image
     return np.asarray(Image.fromarray(image).resize((size[1], size[0]), Image.Resampling.BILINEAR))
@@ -184,7 +168,5 @@ def _resized(image: np.ndarray, size: tuple[int, int]) -> np.ndarray:
 
 def _padded(image: np.ndarray, side: tuple[int, int]) -> np.ndarray:
     """At least `side` large."""
-    import numpy as np
-
     below, right = (max(side[k] - image.shape[k], 0) for k in (0, 1))
     return np.pad(image, ((0, below), (0, right), (0, 0)), "edge")

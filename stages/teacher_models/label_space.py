@@ -7,7 +7,13 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+import numpy as np
+
 from chebsplat.errors import ConfigError, InputError
+from chebsplat.formats.teacher_model import read_label_set, read_label_table
+from chebsplat.labels.class_codes import class_codes
+from chebsplat.labels.decode import decode
+from chebsplat.stages.teacher_models.text_encoder import folded, text_embeddings
 
 if TYPE_CHECKING:
     import numpy as np
@@ -40,9 +46,6 @@ def label_set(teacher: TeacherModel, file: str | None, class_names: list[str] | 
 
     Choices: of IN_ROOMS those in the teacher's table, which may have thousands of nouns; all of a table with few.
     """
-    from chebsplat.formats.teacher_model import read_label_set, read_label_table
-    from chebsplat.stages.teacher_models.text_encoder import folded
-
     if file:
         return read_label_set(Path(file))
     if class_names:
@@ -67,11 +70,7 @@ def open_vocabulary(
     Choices: a label's vector is the mean of the unit embeddings of its words, made unit again. Labels and confidence
       are those of the teacher's own channels.
     """
-    import numpy as np
-
-    from chebsplat.labels.decode import decode
     from chebsplat.stages.teacher_models.image_encoder import unit
-    from chebsplat.stages.teacher_models.text_encoder import text_embeddings
 
     words = list(dict.fromkeys(word for group in labels.values() for word in group))
     known = dict(zip(words, unit(text_embeddings(words, teacher), -1), strict=True))
@@ -104,10 +103,6 @@ def closed_set(teacher: TeacherModel, labels: dict[str, list[str]] | None, n_cha
       probabilities, so that training is the same as for features; its label is the likeliest, its confidence that
       probability.
     """
-    import numpy as np
-
-    from chebsplat.formats.teacher_model import read_label_table
-    from chebsplat.labels.class_codes import class_codes
     from chebsplat.stages.teacher_models.image_encoder import unit
 
     assert teacher.labels is not None  # `read_teacher` has seen to it

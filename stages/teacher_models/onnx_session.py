@@ -13,6 +13,8 @@ from pathlib import Path
 from threading import Timer
 from typing import TYPE_CHECKING, Any
 
+import numpy as np
+
 from chebsplat.errors import InputError
 from chebsplat.formats.files import regular
 
@@ -58,7 +60,6 @@ class Model:
 
     def run(self, feeds: Mapping[str, np.ndarray]) -> list[np.ndarray]:
         """All outputs. Raises InputError if the model fails or is not done in its time."""
-        import numpy as np
         import onnxruntime
 
         options = onnxruntime.RunOptions()

@@ -4,11 +4,15 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Iterator
+from importlib import import_module
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+import numpy as np
+
 from chebsplat.errors import InputError
 from chebsplat.formats.names import suggest
+from chebsplat.formats.teacher_model import read_label_table
 from chebsplat.stages.teacher_models.onnx_session import Model
 
 if TYPE_CHECKING:
@@ -29,10 +33,6 @@ def text_embeddings(names: list[str], teacher: TeacherModel) -> np.ndarray:
     Choices: case, hyphens and underscores do not matter in the table; a plural that it lacks takes the row of its
       singular, which is logged; the prompt is for the encoder alone, since the table holds what its maker wanted.
     """
-    import numpy as np
-
-    from chebsplat.formats.teacher_model import read_label_table
-
     known, embeddings = ([], None) if teacher.labels is None else read_label_table(teacher.labels)
     if embeddings is None:
         known, embeddings = [], np.zeros((0, 0))
@@ -87,8 +87,6 @@ def _encoded(names: list[str], teacher: TeacherModel, known: list[str]) -> np.nd
 
 def sentence_embeddings(texts: list[str]) -> np.ndarray:
     """Unit rows f32 [L, 384] of the sentence model of the extra `text`. Raises ModuleNotFoundError without it."""
-    from importlib import import_module
-
     package = import_module(PACKAGE)
     from transformers.utils.logging import disable_progress_bar
 
@@ -102,8 +100,6 @@ def _by_model(texts: list[str], teacher: TeacherModel, lacking: str) -> np.ndarr
     Choices: inputs are known by name, as in ENTRIES; a graph with a single input of another name takes the ids.
       One text at a time, so that padding never counts.
     """
-    import numpy as np
-
     try:
         from tokenizers import Tokenizer
     except ModuleNotFoundError:

@@ -8,17 +8,20 @@ from __future__ import annotations
 import logging
 import tomllib
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import Any, NamedTuple
 
+import numpy as np
+
+import chebsplat
 from chebsplat.errors import ConfigError, DataFailure, InputError
-
-if TYPE_CHECKING:
-    import numpy as np
-
-    from chebsplat.formats.calibration import TeacherCalibration
-    from chebsplat.formats.teacher_model import TeacherModel
-    from chebsplat.labels.calibration import Calibration
-    from chebsplat.stages.runtime.progress import Progress
+from chebsplat.formats.artifact import sha256_file
+from chebsplat.formats.calibration import TeacherCalibration
+from chebsplat.formats.teacher_model import EMBEDDED, TeacherModel, read_teacher
+from chebsplat.labels.calibration import CUT, Calibration, evidence, fitted, frequent, presence, probable, strongest
+from chebsplat.stages.runtime.progress import Progress
+from chebsplat.stages.teacher_models.text_encoder import text_embeddings
+from chebsplat.stages.tools.page import table_words
+from chebsplat.synthetic import CLASS_NAMES
 
 log = logging.getLogger("chebsplat")
 
@@ -59,14 +62,7 @@ def calibrate(model: Path, n_rooms: int, progress: Progress) -> TeacherCalibrati
     Raises: ConfigError on a closed-set teacher or a number of rooms that cannot be; InputError where the teacher cannot
       be read or knows no class; DataFailure where rooms do not tell words apart.
     """
-    import chebsplat
-    from chebsplat.formats.artifact import sha256_file
-    from chebsplat.formats.calibration import TeacherCalibration
-    from chebsplat.formats.teacher_model import read_teacher
-    from chebsplat.labels.calibration import evidence, frequent
     from chebsplat.stages.teacher_models.image_encoder import TeacherInference
-    from chebsplat.stages.teacher_models.text_encoder import text_embeddings
-    from chebsplat.stages.tools.page import table_words
 
     teacher = read_teacher(model)
     if teacher.output != "features":
@@ -100,12 +96,6 @@ def rounded(of: Calibration) -> dict[str, float]:
 
 def asked_words(teacher: TeacherModel) -> Asked:
     """What classes are called, and words of things that no generated room has; those that the teacher knows."""
-    import numpy as np
-
-    from chebsplat.formats.teacher_model import EMBEDDED
-    from chebsplat.stages.teacher_models.text_encoder import text_embeddings
-    from chebsplat.synthetic import CLASS_NAMES
-
     listed = tomllib.loads(EMBEDDED.with_name("words.toml").read_text())
     pairs = [(word, k) for k, name in enumerate(CLASS_NAMES) for word in listed["training"][name]]
     pairs += [(word, -1) for word in listed["absent"]["calibration"]]
@@ -125,8 +115,6 @@ def asked_words(teacher: TeacherModel) -> Asked:
 
 def points(seed: int, network: Any) -> Points:
     """A room's points with what the teacher says of them, averaged over its views."""
-    import numpy as np
-
     from chebsplat.stages.shape_models.teaching_rooms import averaged, photographed, surface
 
     images, depth, labels, K, poses = photographed(seed, N_VIEWS)
@@ -144,10 +132,6 @@ def fit(rooms: list[Heard], asked: Asked) -> Calibration:
     Choices: points are asked only for words of classes, all pairs alike, so that a probability is that of one of 22
       classes; rooms are asked for all words, what they have and what they lack weighing alike.
     """
-    import numpy as np
-
-    from chebsplat.labels.calibration import Calibration, fitted, probable, strongest
-
     of_class = asked.classes >= 0
     inputs, truth = [], []
     for number, room in enumerate(rooms):
@@ -173,10 +157,6 @@ def fit(rooms: list[Heard], asked: Asked) -> Calibration:
 
 def figures(rooms: list[Heard], apart: list[Calibration], asked: Asked) -> dict[str, float]:
     """Of points by class words, at the cut, pooled; and of rooms: what they have found, what no room has refused."""
-    import numpy as np
-
-    from chebsplat.labels.calibration import CUT, presence, probable
-
     right = chosen = wanted = 0
     found: list[bool] = []
     refused: list[bool] = []

@@ -14,6 +14,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 from chebsplat.errors import ConfigError, InputError
 from chebsplat.formats.files import atomic_write, parse_json
@@ -159,7 +160,5 @@ def intrinsics(camera: Camera) -> tuple[float, float, float, float]:
 
 def quaternion(rotation: np.ndarray) -> np.ndarray:
     """(w, x, y, z) of a rotation [3, 3], w not negative."""
-    from scipy.spatial.transform import Rotation
-
     x, y, z, w = Rotation.from_matrix(rotation).as_quat(canonical=True)
     return np.array([w, x, y, z])

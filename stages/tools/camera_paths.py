@@ -6,9 +6,13 @@ from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
+from scipy.interpolate import PchipInterpolator
+from scipy.spatial.transform import Rotation, Slerp
 
 from chebsplat.cameras import centers, common_up, upright
 from chebsplat.errors import ConfigError
+from chebsplat.formats.images import MAX_PIXELS, MAX_SIDE
+from chebsplat.stages.tools.camera_files import read_cameras
 from chebsplat.stages.tools.scene import Camera, OpenedScene
 
 ROUND = 120  # frames of an orbit
@@ -21,8 +25,6 @@ def path_of(scene: OpenedScene, path: str, n_frames: int | None) -> list[Camera]
     Args:   n_frames: of the orbit (None: 120), or of a path through the cameras (None: no path).
     Raises: ConfigError if it is none of these; InputError if the file's cameras cannot be used.
     """
-    from chebsplat.stages.tools.camera_files import read_cameras
-
     if path == "orbit":
         return orbit(scene.cameras, n_frames or ROUND)
     if path == "capture":
@@ -69,9 +71,6 @@ def between(keys: list[Camera], n_frames: int) -> list[Camera]:
       (PCHIP), rotations turn by the shortest arc from key to key.
     Raises: ConfigError on fewer than two keys or frames, or keys of several sizes.
     """
-    from scipy.interpolate import PchipInterpolator
-    from scipy.spatial.transform import Rotation, Slerp
-
     if len(keys) < 2 or n_frames < 2:
         raise ConfigError("a path through cameras needs two of them, and --frames 2 at least")
     if len({(key.width, key.height) for key in keys}) > 1:
@@ -126,8 +125,6 @@ def fitted(camera: Camera, size: tuple[int, int] | None) -> Camera:
 
 def size_of(text: str | None) -> tuple[int, int] | None:
     """(width, height) of "1280x960". Raises ConfigError."""
-    from chebsplat.formats.images import MAX_PIXELS, MAX_SIDE
-
     if text is None:
         return None
     width, _, height = text.partition("x")

@@ -4,10 +4,16 @@ from __future__ import annotations
 
 import time
 from pathlib import Path
-from typing import TYPE_CHECKING
 
-if TYPE_CHECKING:
-    import numpy as np
+import numpy as np
+
+from chebsplat.formats.images import read_rgb
+from chebsplat.formats.teacher_model import read_teacher
+from chebsplat.labels.tiling import window_starts
+from chebsplat.stages.runtime.command import n_threads
+from chebsplat.stages.settings import TeacherSection
+from chebsplat.stages.teacher_models.label_space import MAX_CHANNELS, closed_set, label_set, open_vocabulary
+from chebsplat.synthetic.seeds import REFERENCE
 
 SHOWN = 8  # labels
 
@@ -17,13 +23,7 @@ def check(model: Path, photo: Path | None = None, labels: str | None = None) -> 
 
     Args: photo: None: a view of a generated room; labels: as teacher.labels, None: the teacher's own.
     """
-    import numpy as np
-
-    from chebsplat.formats.teacher_model import read_teacher
-    from chebsplat.stages.runtime.command import n_threads
-    from chebsplat.stages.settings import TeacherSection
     from chebsplat.stages.teacher_models.image_encoder import TeacherInference
-    from chebsplat.stages.teacher_models.label_space import MAX_CHANNELS, closed_set, label_set, open_vocabulary
 
     settings = TeacherSection()
     teacher = read_teacher(model)
@@ -60,17 +60,13 @@ def check(model: Path, photo: Path | None = None, labels: str | None = None) -> 
 
 def n_windows(size: tuple[int, int], window: tuple[int, int]) -> int:
     """How many windows (H, W) cover an image (H, W)."""
-    from chebsplat.labels.tiling import window_starts
-
     rows, columns = (window_starts(n, side) for n, side in zip(size, window, strict=True))
     return len(rows) * len(columns)
 
 
 def shown(photo: Path | None) -> tuple[str, np.ndarray]:
     """(name, image u8 [H, W, 3])."""
-    from chebsplat.formats.images import read_rgb
     from chebsplat.stages.channels import generated
-    from chebsplat.synthetic.seeds import REFERENCE
 
     if photo is None:
         return next(generated(REFERENCE[:1]))

@@ -4,18 +4,22 @@ from __future__ import annotations
 
 import time
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
+
+import numpy as np
 
 from chebsplat.errors import ConfigError, InputError
+from chebsplat.formats.encoder import DYNAMIC, FLOAT, FUSED, read_encoder
 from chebsplat.formats.files import atomic_path
 from chebsplat.formats.manifest import remedy_of
+from chebsplat.formats.npz import finite32, read_npy
+from chebsplat.formats.ply import read_ply
+from chebsplat.formats.scene import Scene
+from chebsplat.settings import DescribeSection
+from chebsplat.shape.region_inputs import RegionInputs, region_inputs
+from chebsplat.stages.runtime.command import n_threads
+from chebsplat.stages.runtime.config import checked
 from chebsplat.stages.teacher_models.onnx_session import CUDA, GPU_REMEDY, Model, providers
-
-if TYPE_CHECKING:
-    import numpy as np
-
-    from chebsplat.settings import DescribeSection
-    from chebsplat.shape.region_inputs import RegionInputs
 
 CHUNK = 256  # regions that the encoder sees at once
 
@@ -33,12 +37,6 @@ def encode(scene: Path, encoder: Path, features: Path | None, out: Path, device:
     Returns: counts, and seconds of each part.
     Raises:  ConfigError, InputError: arguments that do not fit one another, each named with the remedy.
     """
-    import numpy as np
-
-    from chebsplat.formats.encoder import DYNAMIC, FLOAT, FUSED, read_encoder
-    from chebsplat.settings import DescribeSection
-    from chebsplat.stages.runtime.config import checked
-
     if device == "cuda" and CUDA not in providers(device):
         raise ConfigError(f"onnxruntime here has no CUDA: {GPU_REMEDY}, or encode with --device cpu")
     name = FLOAT if encoder.is_dir() else encoder.name
@@ -85,8 +83,6 @@ def encode(scene: Path, encoder: Path, features: Path | None, out: Path, device:
 
 def inputs_of(p: dict[str, np.ndarray], describe: DescribeSection, settings: dict[str, Any]) -> RegionInputs:
     """What the models are fed with of raw parameters; settings: of the contract. Raises as `region_inputs`."""
-    from chebsplat.shape.region_inputs import region_inputs
-
     return region_inputs(
         p["means"],
         p["quats"],
@@ -102,11 +98,6 @@ def inputs_of(p: dict[str, np.ndarray], describe: DescribeSection, settings: dic
 
 def gaussians(scene: Path, features: Path | None, n_channels: int) -> tuple[dict[str, np.ndarray], np.ndarray]:
     """Raw parameters and `raw_features` in the order of training, and each one's row there by row in the file."""
-    import numpy as np
-
-    from chebsplat.formats.ply import read_ply
-    from chebsplat.formats.scene import Scene
-
     if scene.is_dir():
         if features is not None:
             raise ConfigError(f"{scene} holds its own features; --features is for a PLY")
@@ -129,8 +120,6 @@ def gaussians(scene: Path, features: Path | None, n_channels: int) -> tuple[dict
 
 def read_features(path: Path, n: int) -> np.ndarray:
     """Features f32 [N, C]. Raises InputError if the file holds anything else."""
-    from chebsplat.formats.npz import finite32, read_npy
-
     held = read_npy(path, f"save a float32 array [{n}, C]")
     values = finite32(held)
     if values is None or values.ndim != 2 or len(values) != n:
@@ -144,8 +133,6 @@ def opened(path: Path, device: str) -> Model:
     """A model; on the CPU on as many threads as the other kernels."""
     import onnxruntime
 
-    from chebsplat.stages.runtime.command import n_threads
-
     options = onnxruntime.SessionOptions()
     options.intra_op_num_threads = n_threads()
     return Model(path, remedy_of(path.parent), options, device)
@@ -153,8 +140,6 @@ def opened(path: Path, device: str) -> Model:
 
 def encoded(model: Path, inputs: RegionInputs, device: str = "cpu") -> np.ndarray:
     """Encodings f32 [M, C] of all regions."""
-    import numpy as np
-
     runner = opened(model, device)
     feed = {"inputs": inputs.inputs, "positions": inputs.positions, "mask": inputs.mask}
     starts = range(0, len(inputs.mask), CHUNK)
@@ -166,7 +151,5 @@ def encoded(model: Path, inputs: RegionInputs, device: str = "cpu") -> np.ndarra
 
 def write(out: Path, arrays: dict[str, Any]) -> None:
     """A .npz that is there whole or not at all."""
-    import numpy as np
-
     with atomic_path(out) as temporary:
         np.savez(temporary, **arrays)

@@ -2,20 +2,19 @@
 
 from __future__ import annotations
 
+import math
+from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING
+
+import numpy as np
+from scipy.special import expit
 
 from chebsplat.errors import ConfigError, DataFailure
 from chebsplat.formats.names import suggest
-
-if TYPE_CHECKING:
-    from collections.abc import Sequence
-
-    import numpy as np
-
-    from chebsplat.formats.scene import Scene
-    from chebsplat.stages.tools.query import Query
-    from chebsplat.stages.tools.scene import OpenedScene
+from chebsplat.formats.scene import Scene
+from chebsplat.splats.parts import substantial
+from chebsplat.stages.tools.query import Query
+from chebsplat.stages.tools.scene import OpenedScene
 
 CONVERT = "npx @playcanvas/splat-transform@2.7.1 scene.ply scene.compressed.ply"  # or scene.spz --spz-version 3
 
@@ -38,8 +37,6 @@ def extract(
     Returns: how many Gaussians were kept, and how many each filter alone would leave out.
     Raises:  ConfigError on a filter that the scene cannot answer, DataFailure if nothing is left.
     """
-    import numpy as np
-
     if out.suffix != ".ply" or out.name.endswith(".compressed.ply"):
         raise ConfigError(f"{out}: only a plain .ply is written; convert that, for instance: {CONVERT}")
     filters = passing(scene.exported, scene.source, labels, min_opacity, box)
@@ -59,9 +56,6 @@ def passing(
     scene: Scene, path: Path, labels: tuple[str, ...], min_opacity: float, box: Sequence[float] | None
 ) -> dict[str, np.ndarray]:
     """Which Gaussians pass each filter that is asked for, bool [N] by its name. Args and errors as of `extract`."""
-    import numpy as np
-    from scipy.special import expit
-
     filters: dict[str, np.ndarray] = {}
     if labels:
         filters["label"] = has_label(scene, path, labels)
@@ -75,10 +69,6 @@ def passing(
 
 def asked_for(scene: Scene, query: Query) -> np.ndarray:
     """Which Gaussians the query selects, bool [N], crumbs apart. Raises DataFailure where it is probably not here."""
-    import numpy as np
-
-    from chebsplat.splats.parts import substantial
-
     answer = query.answer(scene.parameters["features"])
     if answer.present is False or not answer.selected.any():
         raise DataFailure(f"{answer}; ask for something else, or name a label with --keep-label")
@@ -87,8 +77,6 @@ def asked_for(scene: Scene, query: Query) -> np.ndarray:
 
 def has_label(scene: Scene, path: Path, names: tuple[str, ...]) -> np.ndarray:
     """Which Gaussians bear one of the names. Raises ConfigError, with the nearest name, for one that is unknown."""
-    import numpy as np
-
     if scene.labels is None or scene.label_names is None:
         why = scene.summary.get("left_out", {}).get("labels", "it has no semantics")
         raise ConfigError(f"{path} has no labels: {why}")
@@ -102,8 +90,6 @@ def has_label(scene: Scene, path: Path, names: tuple[str, ...]) -> np.ndarray:
 
 def corners(text: str | None) -> tuple[float, ...] | None:
     """Six numbers from "x0,y0,z0,x1,y1,z1". Raises ConfigError if they are no box."""
-    import math
-
     if text is None:
         return None
     try:

@@ -13,20 +13,19 @@ import shutil
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
+from PIL import Image
 
 from chebsplat.errors import ConfigError, InputError
 from chebsplat.formats.files import atomic_path, atomic_write, parse_json
+from chebsplat.formats.images import opened, read_rgb
+from chebsplat.labels.decode import decode_labels
+from chebsplat.stages.runtime.progress import Progress
+from chebsplat.stages.tools.camera_files import gs_cameras
+from chebsplat.stages.tools.query import Query
 from chebsplat.stages.tools.scene import COVERED, Camera, OpenedScene
-
-if TYPE_CHECKING:
-    import numpy as np
-
-    from chebsplat.stages.runtime.progress import Progress
-    from chebsplat.stages.tools.query import Query
-    from chebsplat.stages.tools.scene import Camera, OpenedScene
 
 log = logging.getLogger("chebsplat")
 
@@ -113,8 +112,6 @@ def ending(kind: str) -> str:
 
 def claim(out: Path, cameras: Sequence[Camera], shot: Shot, scene: OpenedScene) -> None:
     """Write down what the frames of `out` are of, or check that those that are there are of the same."""
-    from chebsplat.stages.tools.camera_files import gs_cameras
-
     request = {"scene": shot.identity, "labels": scene.label_names, "cameras": gs_cameras(cameras)}
     request |= {"query": None if shot.query is None else [shot.query.text, *shot.query.phrases]}
     path = out / REQUEST
@@ -129,8 +126,6 @@ def claim(out: Path, cameras: Sequence[Camera], shot: Shot, scene: OpenedScene) 
 
 def whole(path: Path, camera: Camera) -> bool:
     """Whether a frame is there, readable to its last byte, and of the camera's size."""
-    from chebsplat.formats.images import opened
-
     if not path.is_file():
         return False
     size = camera.width, camera.height
@@ -146,7 +141,6 @@ def whole(path: Path, camera: Camera) -> bool:
 
 def pictures(scene: OpenedScene, camera: Camera, shot: Shot, kinds: Sequence[str]) -> dict[str, np.ndarray]:
     """The arrays of these kinds: color and relevancy u8 [H, W, 3], labels i32 [H, W], depth f32 [H, W]."""
-    from chebsplat.labels.decode import decode_labels
     from chebsplat.stages.pages.pictures import heat
 
     view, renderer = camera.view(), scene.renderer
@@ -165,8 +159,6 @@ def pictures(scene: OpenedScene, camera: Camera, shot: Shot, kinds: Sequence[str
 
 def save(kind: str, values: np.ndarray, path: Path, n_labels: int) -> None:
     """Write one frame in its kind's form."""
-    from PIL import Image
-
     from chebsplat.stages.pages.pictures import palette, png
 
     if kind == "depth":
@@ -185,8 +177,6 @@ def save(kind: str, values: np.ndarray, path: Path, n_labels: int) -> None:
 
 def shown(kind: str, path: Path, far: float) -> np.ndarray:
     """A frame as a picture u8 [H, W, 3] for people; far: scene units, where depth is darkest."""
-    from chebsplat.formats.images import read_rgb
-
     return read_rgb(path) if kind != "depth" else depth_colors(np.load(path), far)
 
 
@@ -218,8 +208,6 @@ def render_video(
 
     Raises: ConfigError where `out` exists, on two kinds, and on sizes that no video has.
     """
-    import numpy as np
-
     library()
     if out.exists():
         raise ConfigError(f"{out} exists; remove it, or choose another --out")

@@ -13,6 +13,7 @@ from chebsplat.errors import ChebsplatError, ConfigError, InputError
 from chebsplat.formats.artifact import sha256_file
 from chebsplat.formats.files import parse_json
 from chebsplat.formats.teacher_model import read_teacher
+from chebsplat.stages.tools.check_teacher import check
 
 TEACHERS = {"segformer-b0-ade": "Xenova/segformer-b0-finetuned-ade-512-512"}  # ours: the hub's
 REPOSITORY = re.compile(r"hf:([\w.-]+/[\w.-]+?)(?:@([\w./-]+))?")
@@ -30,8 +31,6 @@ def get_teacher(name: str, out: Path | None = None, graph: str = GRAPH) -> tuple
     Raises: ConfigError on a name or folder that cannot be; InputError naming what is missing,
             damaged or not reached.
     """
-    from chebsplat.stages.tools.check_teacher import check
-
     repository, revision, short = parsed(name)
     folder = out or Path(short)
     model = folder / f"{short}.onnx"

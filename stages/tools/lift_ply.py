@@ -7,16 +7,34 @@ from __future__ import annotations
 import json
 import logging
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
+
+import numpy as np
+from scipy.special import expit
 
 from chebsplat.errors import ConfigError, InputError
 from chebsplat.formats import artifact
+from chebsplat.formats.cameras import Cameras
+from chebsplat.formats.capture import Capture
+from chebsplat.formats.features import Features
+from chebsplat.formats.files import atomic_path
+from chebsplat.formats.gaussians import Gaussians
+from chebsplat.formats.knowledge import read_knowledge
+from chebsplat.formats.manifest import Manifest
+from chebsplat.formats.names import suggest
+from chebsplat.formats.ply import read_ply, write_ply
+from chebsplat.formats.points import Points
+from chebsplat.formats.teacher_model import EMBEDDED, read_teacher
+from chebsplat.labels.decode import decode
+from chebsplat.lifting.carry import carry
+from chebsplat.lifting.smoothing import room_unit
+from chebsplat.lifting.surface import LOOKOUT_SIZE, lookouts
+from chebsplat.splats.gaussians import surface_of
+from chebsplat.stages import export, lift
 from chebsplat.stages.runtime.command import publish
-
-if TYPE_CHECKING:
-    import numpy as np
-
-    from chebsplat.formats.cameras import Cameras
+from chebsplat.stages.shape_models.predictions import answered, shown
+from chebsplat.stages.teacher_models.text_encoder import found
+from chebsplat.stages.tools.page import foreign
 
 
 def lift_ply(
@@ -33,10 +51,6 @@ def lift_ply(
     Returns: counts.
     Raises:  InputError on what cannot be read, DataFailure if no view sees a Gaussian.
     """
-    from chebsplat.formats.features import Features
-    from chebsplat.stages import export, lift
-    from chebsplat.stages.tools.page import foreign
-
     taken_over(ply, foreign(ply).parameters, cameras_of(capture, points), out)
     config = out / "settings.json"
     config.write_text(json.dumps({"train": {"features": "lifted"}}))
@@ -59,9 +73,6 @@ def import_ply(ply: Path, out: Path) -> dict[str, Any]:
 
     Returns: counts. Raises: InputError on what cannot be read.
     """
-    from chebsplat.stages import export
-    from chebsplat.stages.tools.page import foreign
-
     scene = foreign(ply)
     taken_over(ply, scene.parameters, scene.cameras, out)
     publish("export", export.run, out / "export", {"gaussians": out / "gaussians"})
@@ -70,9 +81,6 @@ def import_ply(ply: Path, out: Path) -> dict[str, Any]:
 
 def taken_over(ply: Path, parameters: dict[str, np.ndarray], cameras: Cameras, out: Path) -> None:
     """Make the folder `out`, and in it `gaussians` of what a PLY holds."""
-    from chebsplat.formats.gaussians import Gaussians
-    from chebsplat.formats.manifest import Manifest
-
     out.mkdir(parents=True)
     given = {"path": ply.name, "sha256": artifact.sha256_file(ply)}
     manifest = Manifest(Gaussians.SCHEMA, artifact.digest(given), "train", facts={"source": given})
@@ -82,10 +90,6 @@ def taken_over(ply: Path, parameters: dict[str, np.ndarray], cameras: Cameras, o
 
 def cameras_of(capture: Path, points: Path | None) -> Cameras:
     """The cameras of a capture, or of the points that were reconstructed from it. Raises InputError without poses."""
-    from chebsplat.formats.cameras import Cameras
-    from chebsplat.formats.capture import Capture
-    from chebsplat.formats.points import Points
-
     held = Capture.read(capture)
     if points is not None:
         found = Points.read(points)
@@ -97,7 +101,6 @@ def cameras_of(capture: Path, points: Path | None) -> Cameras:
 
 def taught(capture: Path, model: Path | None, out: Path) -> Path:
     """Features of a capture by an ONNX teacher, in the channels that a run would give a scene; below `out`."""
-    from chebsplat.formats.teacher_model import EMBEDDED, read_teacher
     from chebsplat.stages import channels, teacher
 
     used = str((model or EMBEDDED).absolute())
@@ -128,21 +131,6 @@ def label_ply(
       confidence is that of the label among the words, times the length of the answer: how alike a teacher's views were
       where shapes were like this one.
     """
-    import numpy as np
-    from scipy.special import expit
-
-    from chebsplat.formats.files import atomic_path
-    from chebsplat.formats.knowledge import read_knowledge
-    from chebsplat.formats.names import suggest
-    from chebsplat.formats.ply import read_ply, write_ply
-    from chebsplat.labels.decode import decode
-    from chebsplat.lifting.carry import carry
-    from chebsplat.lifting.smoothing import room_unit
-    from chebsplat.lifting.surface import LOOKOUT_SIZE, lookouts
-    from chebsplat.splats.gaussians import surface_of
-    from chebsplat.stages.shape_models.predictions import answered, shown
-    from chebsplat.stages.teacher_models.text_encoder import found
-
     beside = out.with_suffix(".npz")
     for path in (out, beside):
         if path.exists():

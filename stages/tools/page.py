@@ -5,19 +5,25 @@ from __future__ import annotations
 import base64
 import gzip
 import logging
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
+
+import numpy as np
 
 from chebsplat.errors import ConfigError, InputError
-
-if TYPE_CHECKING:
-    from collections.abc import Sequence
-
-    import numpy as np
-
-    from chebsplat.formats.scene import Scene
-    from chebsplat.labels.calibration import Calibration
+from chebsplat.formats.calibration import calibration_of
+from chebsplat.formats.cameras import Cameras
+from chebsplat.formats.files import atomic_path
+from chebsplat.formats.packed import pack, signed, to_bytes
+from chebsplat.formats.ply import read_ply
+from chebsplat.formats.scene import Scene
+from chebsplat.formats.teacher_model import EMBEDDED, read_label_set, read_label_table, read_teacher
+from chebsplat.labels.calibration import Calibration
+from chebsplat.stages.pages.parts import rendered
+from chebsplat.stages.teacher_models.text_encoder import folded
+from chebsplat.stages.tools.query import are_words, embedded, is_closed, taught, teacher_of, understood
 
 log = logging.getLogger("chebsplat")
 
@@ -56,11 +62,6 @@ def write_page(
     Returns: counts: Gaussians, views, labels, words, bytes.
     Raises:  InputError where the teacher is not the scene's or does not know a word.
     """
-    import numpy as np
-
-    from chebsplat.formats.files import atomic_path
-    from chebsplat.formats.packed import pack, signed, to_bytes
-    from chebsplat.stages.pages.parts import rendered
     from chebsplat.stages.pages.pictures import palette, warm
 
     means = scene.parameters["means"].astype(np.float64)
@@ -115,12 +116,6 @@ def foreign(ply: Path) -> Scene:
 
     Raises: InputError naming the file. Choices: up is -y, as in COLMAP's and 3DGS' own frames.
     """
-    import numpy as np
-
-    from chebsplat.formats.cameras import Cameras
-    from chebsplat.formats.ply import read_ply
-    from chebsplat.formats.scene import Scene
-
     parameters, degree, _ = read_ply(ply)
     if not len(parameters["means"]):
         raise InputError(f"{ply} holds no Gaussians; choose another")
@@ -137,8 +132,6 @@ def foreign(ply: Path) -> Scene:
 
 def camera_rows(scene: Scene, center: np.ndarray) -> np.ndarray:
     """f32 [V, 16]: cam_from_world's three rows of a frame whose origin is `center`, then fx, fy, cx, cy."""
-    import numpy as np
-
     poses = scene.cameras.cam_from_world[:, :3].copy()
     poses[:, :, 3] += poses[:, :, :3] @ center
     Ks = scene.cameras.Ks
@@ -148,8 +141,6 @@ def camera_rows(scene: Scene, center: np.ndarray) -> np.ndarray:
 
 def up_and_extent(scene: Scene) -> tuple[np.ndarray, float]:
     """Up, unit [3]: the mean of the views' own; and the longest side of the box of 90 % of the centres by each axis."""
-    import numpy as np
-
     up = -scene.cameras.cam_from_world[:, 1, :3].mean(0)
     length = np.linalg.norm(up)
     up = up / length if length > 0.1 else -scene.cameras.cam_from_world[0, 1, :3]
@@ -162,13 +153,6 @@ def vocabulary(scene: Scene, teacher: Path | None, phrases: list[str], more: lis
 
     Raises: as `query.understood`; ConfigError on phrases or more where a scene knows its labels alone.
     """
-    import numpy as np
-
-    from chebsplat.formats.calibration import calibration_of
-    from chebsplat.labels.calibration import Calibration
-    from chebsplat.stages.teacher_models.text_encoder import folded
-    from chebsplat.stages.tools.query import are_words, embedded, is_closed, taught, teacher_of, understood
-
     names, rows = scene.label_names, scene.label_embeddings
     assert names is not None and rows is not None  # the caller's
     features, model = (None, None) if teacher is None else taught(teacher)
@@ -206,8 +190,6 @@ def weighed(words: Words | None) -> str:
 
 def table_words(model: str | None) -> list[str]:
     """The words that a teacher knows as they are; indoor nouns where it has a text encoder and no table."""
-    from chebsplat.formats.teacher_model import EMBEDDED, read_label_set, read_label_table, read_teacher
-
     teacher = read_teacher(Path(model) if model else EMBEDDED)
     if teacher.labels is not None:
         names, embeddings = read_label_table(teacher.labels)

@@ -5,16 +5,18 @@ from __future__ import annotations
 import logging
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING
+
+import numpy as np
 
 from chebsplat.errors import ConfigError, InputError
-
-if TYPE_CHECKING:
-    import numpy as np
-
-    from chebsplat.formats.features import Features
-    from chebsplat.formats.teacher_model import TeacherModel
-    from chebsplat.labels.calibration import Calibration
+from chebsplat.formats.artifact import read_manifest, sha256_file
+from chebsplat.formats.calibration import calibration_of
+from chebsplat.formats.features import Features
+from chebsplat.formats.names import suggest
+from chebsplat.formats.teacher_model import EMBEDDED, TeacherModel, read_label_table, read_teacher
+from chebsplat.labels.calibration import CUT, Calibration, presence, probability
+from chebsplat.labels.relevancy import relevancy
+from chebsplat.stages.teacher_models.text_encoder import folded, found, text_embeddings
 
 log = logging.getLogger("chebsplat")
 
@@ -39,17 +41,12 @@ class Query:
 
     def scores(self, features: np.ndarray) -> np.ndarray:
         """f32 [...] in [0, 1] of features [..., C]: how likely each is what the words mean, or its relevancy."""
-        from chebsplat.labels.calibration import probability
-        from chebsplat.labels.relevancy import relevancy
-
         if self.calibration is None or self.rivals is None:
             return relevancy(features, self.embedding, self.against)
         return probability(features, self.embedding, self.rivals, self.calibration)
 
     def answer(self, features: np.ndarray) -> Relevancy:
         """What a whole scene's features [N, C] say."""
-        from chebsplat.labels.calibration import CUT, presence
-
         scores = self.scores(features)
         if self.calibration is not None:
             return Relevancy(self.text, scores, True, presence(scores, self.calibration))
@@ -74,8 +71,6 @@ class Relevancy:
     @property
     def cut(self) -> float:
         """The suggested one: what scores above it is selected."""
-        from chebsplat.labels.calibration import CUT
-
         return CUT
 
     @property
@@ -100,9 +95,6 @@ class Relevancy:
 
 def taught(path: Path) -> tuple[Features, str | None]:
     """A scene's `features` artifact, and the model that it was made with; None: the embedded one."""
-    from chebsplat.formats.artifact import read_manifest
-    from chebsplat.formats.features import Features
-
     return Features.read(path), read_manifest(path).config["teacher"]["model"]
 
 
@@ -118,9 +110,6 @@ def understood(path: Path, text: str, phrases: list[str], calibrated: bool = Tru
     Choices: what `phrases` say is weighed against these, by LERF's relevancy; so is a phrase that is no word of the
       teacher's table, for which no calibration speaks, against LERF's phrases.
     """
-    from chebsplat.formats.calibration import calibration_of
-    from chebsplat.labels.calibration import Calibration
-
     features, model = taught(path)
     if is_closed(features):
         return among_labels(features, text, phrases)
@@ -140,9 +129,6 @@ def understood(path: Path, text: str, phrases: list[str], calibrated: bool = Tru
 
 def teacher_of(features: Features, model: str | None) -> TeacherModel:
     """The ONNX teacher of a scene's features. Raises InputError if it is no longer the same."""
-    from chebsplat.formats.artifact import sha256_file
-    from chebsplat.formats.teacher_model import EMBEDDED, read_teacher
-
     teacher = read_teacher(Path(model) if model else EMBEDDED)
     if sha256_file(teacher.path) != features.convention["sha256"]:
         raise InputError(f"{teacher.path} is not the model that this scene was trained from; run the scene again")
@@ -151,9 +137,6 @@ def teacher_of(features: Features, model: str | None) -> TeacherModel:
 
 def are_words(texts: list[str], teacher: TeacherModel) -> list[bool]:
     """Whether each is one of the words that a calibration speaks for: those of the teacher's table, if it has one."""
-    from chebsplat.formats.teacher_model import read_label_table
-    from chebsplat.stages.teacher_models.text_encoder import found
-
     if teacher.labels is None:
         return [True] * len(texts)
     return [row >= 0 for row in found(texts, read_label_table(teacher.labels)[0])]
@@ -161,10 +144,6 @@ def are_words(texts: list[str], teacher: TeacherModel) -> list[bool]:
 
 def embedded(words: list[str], features: Features, model: str | None) -> np.ndarray:
     """Words [L] -> f32 [L, C] by the text space of the ONNX teacher. Raises InputError if it is no longer the same."""
-    import numpy as np
-
-    from chebsplat.stages.teacher_models.text_encoder import text_embeddings
-
     vectors = text_embeddings(words, teacher_of(features, model))
     if features.channels is not None:
         vectors = features.channels.embed(vectors)
@@ -175,9 +154,6 @@ def embedded(words: list[str], features: Features, model: str | None) -> np.ndar
 
 def among_labels(features: Features, text: str, phrases: list[str]) -> Query:
     """A query of a scene whose teacher knows its labels and no other words."""
-    from chebsplat.formats.names import suggest
-    from chebsplat.stages.teacher_models.text_encoder import folded, found
-
     names = features.label_names
     rows = found([text, *phrases], names)
     target, others = rows[0], rows[1:]
@@ -198,8 +174,6 @@ def among_labels(features: Features, text: str, phrases: list[str]) -> Query:
 
 def table(answer: Relevancy, labels: np.ndarray, names: list[str], n_rows: int) -> list[str]:
     """Lines: the labels of the highest mean score."""
-    import numpy as np
-
     rows = [(float(answer.scores[labels == k].mean()), k) for k in np.unique(labels) if k >= 0]
     width = max([len(name) for name in names] + [5])
     mean = "mean probability" if answer.calibrated else "mean relevancy"

@@ -2,22 +2,24 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
-from typing import TYPE_CHECKING
+
+import numpy as np
+import torch
 
 from chebsplat.errors import ConfigError
-
-if TYPE_CHECKING:
-    from collections.abc import Sequence
-
-    import numpy as np
-
-    from chebsplat.formats.scene import Scene
-    from chebsplat.render import SceneRenderer
-    from chebsplat.stages.tools.query import Query, Relevancy
-    from chebsplat.views import View
+from chebsplat.formats.files import atomic_path
+from chebsplat.formats.names import suggest
+from chebsplat.formats.ply import write_ply
+from chebsplat.formats.scene import Scene
+from chebsplat.labels.decode import decode_labels
+from chebsplat.render import SceneRenderer
+from chebsplat.splats.gaussians import surface_of
+from chebsplat.stages.tools.query import Query, Relevancy, understood
+from chebsplat.views import View
 
 COVERED = 0.5  # of a pixel, below which it has no label
 
@@ -47,10 +49,6 @@ class Camera:
 
     def view(self) -> View:
         """For `render.SceneRenderer`."""
-        import torch
-
-        from chebsplat.views import View
-
         K, pose = (torch.from_numpy(matrix).float() for matrix in (self.K, self.cam_from_world))
         return View(K, pose, self.width, self.height)
 
@@ -97,14 +95,10 @@ class OpenedScene:
     @cached_property
     def renderer(self) -> SceneRenderer:
         """Renders all Gaussians; made on first use."""
-        from chebsplat.render import SceneRenderer
-
         return SceneRenderer(self.parameters)
 
     def camera(self, name: str) -> Camera:
         """The capture's view of this name. Raises ConfigError, with the nearest names."""
-        from chebsplat.formats.names import suggest
-
         found = [camera for camera in self.cameras if camera.name == name]
         if not found:
             near = ", ".join(suggest(name, [camera.name for camera in self.cameras]))
@@ -113,10 +107,6 @@ class OpenedScene:
 
     def render(self, camera: Camera) -> Picture:
         """Colour, depth and, where there are semantics, features and labels from `camera`."""
-        import numpy as np
-
-        from chebsplat.labels.decode import decode_labels
-
         view = camera.view()
         depth, alpha = self.renderer.render_depth(view)
         color, features = self.renderer.render(view, with_features=True)
@@ -142,8 +132,6 @@ class OpenedScene:
 
     def understood(self, text: str, against: Sequence[str] = ()) -> Query:
         """Words in the scene's own channels. Args and errors as of `query`."""
-        from chebsplat.stages.tools.query import understood
-
         if self.features is None:
             raise ConfigError(f"{self.source} has no semantics; train the scene with a teacher")
         if self._teacher is None:
@@ -165,8 +153,6 @@ class OpenedScene:
         Args: mask: bool [N]; label: names to keep; min_opacity: in [0, 1]; box: x0, y0, z0, x1, y1, z1 of centres.
         Raises: ConfigError on a label that is not there, a mask of another shape, or where nothing is left.
         """
-        import numpy as np
-
         from chebsplat.stages.tools.extract import passing
 
         names = () if label is None else (label,) if isinstance(label, str) else tuple(label)
@@ -187,17 +173,10 @@ class OpenedScene:
 
     def points(self) -> tuple[np.ndarray, np.ndarray]:
         """Centres f32 [N, 3], scene units, and colours u8 [N, 3] of SH degree 0."""
-        import numpy as np
-
-        from chebsplat.splats.gaussians import surface_of
-
         return self.parameters["means"], np.round(surface_of(self.parameters)[1] * 255).astype(np.uint8)
 
     def to_ply(self, path: str | Path) -> Path:
         """Write a 3DGS PLY with labels, trimmed to the highest SH degree in use; raises ConfigError if it exists."""
-        from chebsplat.formats.files import atomic_path
-        from chebsplat.formats.ply import write_ply
-
         path = Path(path)
         if path.exists():
             raise ConfigError(f"{path} exists; remove it, or choose another path")

@@ -4,20 +4,22 @@ from __future__ import annotations
 
 import logging
 import time
+from importlib.metadata import version
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor
 
 from chebsplat.errors import InputError
 from chebsplat.formats.artifact import digest, read_manifest
 from chebsplat.formats.files import atomic_path
+from chebsplat.formats.gaussians import Gaussians
+from chebsplat.settings import DescribeSection, TrainSection
+from chebsplat.shape.encoder import RegionEncoder
 from chebsplat.stages.runtime.command import Job, n_threads
-
-if TYPE_CHECKING:
-    import numpy as np
-    from torch import Tensor
-
-    from chebsplat.formats.gaussians import Gaussians
-    from chebsplat.shape.encoder import RegionEncoder
+from chebsplat.stages.runtime.config import checked
 
 log = logging.getLogger("chebsplat")
 SECONDS = 30.0  # between two saves
@@ -31,8 +33,6 @@ class Saves:
     """
 
     def __init__(self, job: Job):
-        from importlib.metadata import version
-
         inputs = {role: read_manifest(path).key for role, path in job.inputs.items()}
         settings = job.config.sections(("describe", "train"))
         versions = {name: version(name) for name in ("torch", "numba")}
@@ -44,8 +44,6 @@ class Saves:
 
     def load(self) -> dict[str, Any] | None:
         """The last state, or None."""
-        import torch
-
         if not self.file.is_file():
             return None
         try:
@@ -62,7 +60,6 @@ class Saves:
         """Save what `state()` returns if the last save is long ago, or `now`: whole or not at all."""
         if not now and time.monotonic() - self.saved < SECONDS:
             return
-        import torch
 
         self.saved, held = time.monotonic(), {"identity": self.identity, "state": state()}
         try:
@@ -74,10 +71,6 @@ class Saves:
 
 def trained_with(path: Path) -> dict[str, Any]:
     """The sections `describe` and `train` that the checkpoint was made with. Raises InputError if it names none."""
-    from chebsplat.formats.artifact import read_manifest
-    from chebsplat.settings import DescribeSection, TrainSection
-    from chebsplat.stages.runtime.config import checked
-
     config, file = read_manifest(path).config, path / "artifact.json"
     if not {"describe", "train"} <= set(config):
         raise InputError(f"{file} does not say how the scene was trained; train it again")
@@ -89,8 +82,6 @@ def trained_with(path: Path) -> dict[str, Any]:
 
 def restored_encoder(gaussians: Gaussians) -> RegionEncoder:
     """The local encoder of a checkpoint. Raises InputError if the scene was trained without one."""
-    from chebsplat.shape.encoder import RegionEncoder
-
     return RegionEncoder.restored(*gaussians.encoder())
 
 
