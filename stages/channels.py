@@ -27,10 +27,8 @@ from chebsplat.stages.runtime.command import Job, n_threads
 from chebsplat.stages.settings import ChannelsSection
 from chebsplat.stages.sources.generated import SIZES, photograph
 from chebsplat.stages.teacher_models.image_encoder import TeacherInference
-from chebsplat.synthetic.layout import build
-from chebsplat.synthetic.path import intrinsics, walk
-from chebsplat.synthetic.rays import RayCaster
-from chebsplat.synthetic.seeds import REFERENCE
+from chebsplat.synthetic.layout import REFERENCE, build
+from chebsplat.synthetic.rays import RayCaster, intrinsics, walk
 
 ENTRY = 4  # pixels of an image that an entry of its map is wide, at least
 VIEWS = 4  # of a generated room

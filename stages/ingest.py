@@ -10,9 +10,9 @@ import numpy as np
 
 from chebsplat.errors import ConfigError, DataFailure, InputError
 from chebsplat.evaluation import protocols
-from chebsplat.evaluation.protocols.split import every
+from chebsplat.evaluation.protocols.task import every
 from chebsplat.formats.capture import MAPS, Capture
-from chebsplat.photos.sharpness import blurred, detail
+from chebsplat.photos.frames import blurred, detail
 from chebsplat.stages.runtime.command import Job
 from chebsplat.stages.runtime.progress import Progress
 from chebsplat.stages.settings import IngestSection, SourceSection

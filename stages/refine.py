@@ -15,7 +15,7 @@ from chebsplat.formats.points import Points
 from chebsplat.formats.refined import Refined
 from chebsplat.labels.decode import decode_labels
 from chebsplat.lifting.blend import blend, calibrate, confidence, effective, familiar, reliable, start, trusted
-from chebsplat.lifting.carry import carry
+from chebsplat.lifting.observations import carry
 from chebsplat.lifting.smoothing import affinities, room_unit, smooth
 from chebsplat.splats.gaussians import surface_of
 from chebsplat.stages.runtime.command import Job

@@ -22,16 +22,15 @@ from chebsplat.formats.knowledge import ENCODER, Knowledge, write_knowledge
 from chebsplat.formats.teacher_model import EMBEDDED, TeacherModel, read_label_table, read_teacher
 from chebsplat.labels.decode import decode_labels
 from chebsplat.settings import DescribeSection
-from chebsplat.shape import teach
-from chebsplat.shape.point_encoder import PointEncoder, cloud_of
+from chebsplat.shape import point_encoder
+from chebsplat.shape.point_encoder import LEAST_VIEWS, Lesson, PointEncoder, cloud_of
 from chebsplat.shape.point_inputs import PointInputs
-from chebsplat.shape.teach import LEAST_VIEWS, Lesson
 from chebsplat.stages.runtime.command import Job, n_threads
 from chebsplat.stages.settings import KnowledgeSection
 from chebsplat.stages.shape_models.teaching_rooms import Room
 from chebsplat.stages.teacher_models.text_encoder import found, text_embeddings
 from chebsplat.synthetic import CLASS_NAMES
-from chebsplat.synthetic.seeds import KNOWLEDGE
+from chebsplat.synthetic.layout import KNOWLEDGE
 
 log = logging.getLogger("chebsplat")
 
@@ -131,9 +130,9 @@ def taught(job: Job, settings: KnowledgeSection, lessons: list[Lesson]) -> Point
     clouds = [lesson.cloud for lesson in lessons]
     encoder = PointEncoder(lessons[0].features.shape[1], clouds[0].descriptors.shape[1])
     encoder.set_inputs(clouds)
-    course = teach.Course(steps=settings.steps, seed=settings.seed)
+    course = point_encoder.Course(steps=settings.steps, seed=settings.seed)
     losses: deque[float] = deque(maxlen=100)
-    steps = teach.taught(encoder, lessons, course)
+    steps = point_encoder.taught(encoder, lessons, course)
     for loss, status in job.progress.track(steps, settings.steps, "teach"):
         losses.append(loss)
         status["mean loss"] = f"{sum(losses) / len(losses):.4f}"

@@ -15,9 +15,7 @@ from chebsplat.formats.channels import ChannelMap
 from chebsplat.formats.features import Features, FeatureWriter
 from chebsplat.formats.teacher_model import EMBEDDED, read_teacher
 from chebsplat.labels import noisy_teacher as model
-from chebsplat.labels.class_codes import class_codes
-from chebsplat.labels.decode import decode
-from chebsplat.labels.pseudo_labels import voted
+from chebsplat.labels.decode import class_codes, decode, voted
 from chebsplat.stages.runtime.command import Job, n_threads
 from chebsplat.stages.settings import TeacherSection
 from chebsplat.stages.teacher_models.image_encoder import TeacherInference

@@ -26,10 +26,8 @@ from chebsplat.stages.sources.generated import photograph
 from chebsplat.stages.teacher_models.image_encoder import TeacherInference
 from chebsplat.stages.teacher_models.text_encoder import text_embeddings
 from chebsplat.synthetic import CLASS_NAMES
-from chebsplat.synthetic.layout import build
-from chebsplat.synthetic.path import intrinsics, walk
-from chebsplat.synthetic.rays import RayCaster
-from chebsplat.synthetic.seeds import HELD_OUT
+from chebsplat.synthetic.layout import HELD_OUT, build
+from chebsplat.synthetic.rays import RayCaster, intrinsics, walk
 from chebsplat.teachers.words import words
 
 VIEWS, WIDTH, HEIGHT = 8, 320, 240  # of each held-out room, along its path

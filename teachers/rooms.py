@@ -14,11 +14,9 @@ import numpy as np
 import chebsplat.stages.sources.generated as photographer
 from chebsplat.stages.sources.generated import photograph
 from chebsplat.synthetic import layout
-from chebsplat.synthetic.path import intrinsics, look_at
-from chebsplat.synthetic.rays import RayCaster
-from chebsplat.synthetic.rooms import build
-from chebsplat.synthetic.seeds import TRAINING
-from chebsplat.synthetic.shuffled import jitter
+from chebsplat.synthetic.layout import TRAINING
+from chebsplat.synthetic.rays import RayCaster, intrinsics, look_at
+from chebsplat.synthetic.shuffled import build, jitter
 
 Generator = np.random.Generator
 WIDTH, HEIGHT = 320, 240

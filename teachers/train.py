@@ -24,7 +24,7 @@ from chebsplat.evaluation.metrics import confusion, segmentation
 from chebsplat.formats.teacher_model import EMBEDDED
 from chebsplat.stages.runtime.progress import Progress
 from chebsplat.synthetic import CLASS_NAMES
-from chebsplat.synthetic.seeds import TRAINING
+from chebsplat.synthetic.layout import TRAINING
 from chebsplat.teachers.augment import crops, recolored
 from chebsplat.teachers.dataset import rendered
 from chebsplat.teachers.network import Encoder, Trunk, span

@@ -23,7 +23,7 @@ from chebsplat.formats.capture import Capture
 from chebsplat.formats.gaussians import Gaussians
 from chebsplat.formats.knowledge import SHIPPED
 from chebsplat.formats.ply import write_ply
-from chebsplat.lifting.cell_maps import to_cells
+from chebsplat.lifting.observations import to_cells
 from chebsplat.rasterize.lift import lift
 from chebsplat.splats.gaussians import activated
 from chebsplat.stages.shape_models.predictions import up_of

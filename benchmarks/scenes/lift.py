@@ -17,8 +17,7 @@ from benchmarks import shared
 from chebsplat.formats.capture import Capture
 from chebsplat.formats.features import Features
 from chebsplat.formats.gaussians import Gaussians
-from chebsplat.lifting.cell_maps import to_cells
-from chebsplat.lifting.observations import Observations, estimate, gathered
+from chebsplat.lifting.observations import Observations, estimate, gathered, to_cells
 from chebsplat.rasterize.lift import lift
 from chebsplat.splats.gaussians import activated
 

@@ -20,7 +20,7 @@ from chebsplat.cameras import unproject
 from chebsplat.formats.capture import Capture
 from chebsplat.formats.scene import Scene
 from chebsplat.formats.teacher_model import EMBEDDED
-from chebsplat.labels.relevancy import relevancy
+from chebsplat.labels.calibration import relevancy
 from chebsplat.pipelines.work import store
 from chebsplat.stages.tools.query import CANONICAL, understood
 from chebsplat.synthetic import CLASS_NAMES

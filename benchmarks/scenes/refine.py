@@ -24,7 +24,7 @@ from chebsplat.formats.knowledge import SHIPPED, read_knowledge
 from chebsplat.formats.points import Points
 from chebsplat.labels.decode import decode_labels
 from chebsplat.lifting.blend import blend, calibrate, effective, familiar, reliable, trusted
-from chebsplat.lifting.carry import carry
+from chebsplat.lifting.observations import carry
 from chebsplat.lifting.smoothing import affinities, smooth
 from chebsplat.render import SceneRenderer
 from chebsplat.shape.point_encoder import PointEncoder
@@ -37,7 +37,7 @@ from chebsplat.stages.shape_models.predictions import into_channels, up_of
 from chebsplat.stages.teacher_models.text_encoder import found
 from chebsplat.stages.training.lifting import lifted_from
 from chebsplat.synthetic import CLASS_NAMES
-from chebsplat.synthetic.seeds import KNOWLEDGE
+from chebsplat.synthetic.layout import KNOWLEDGE
 
 SIZES: dict[str, dict[str, Any]] = {
     "1 radius": {"n_scales": 1},

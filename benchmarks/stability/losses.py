@@ -13,8 +13,7 @@ import torch
 from torch import Tensor
 
 from benchmarks.stability.case import Outcome, case, relative
-from chebsplat.training.losses import feature_distance, feature_distance_reference
-from chebsplat.training.semantic_loss import label_entropy
+from chebsplat.training.losses import feature_distance, feature_distance_reference, label_entropy
 from chebsplat.views import TaughtLabels
 
 HEIGHT, WIDTH, CHANNELS, CLASSES = 8, 12, 5, 4

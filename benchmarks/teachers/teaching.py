@@ -26,7 +26,7 @@ from chebsplat.evaluation.statistics import paired_difference
 from chebsplat.formats.knowledge import SHIPPED, read_knowledge
 from chebsplat.labels.decode import decode_labels
 from chebsplat.lifting.blend import blend, effective
-from chebsplat.shape import teach
+from chebsplat.shape import point_encoder
 from chebsplat.shape.point_encoder import PointEncoder
 from chebsplat.shape.point_inputs import PointInputs
 from chebsplat.stages.settings import KnowledgeSection
@@ -34,7 +34,7 @@ from chebsplat.stages.shape_models.teaching_rooms import Room, held, prepare
 from chebsplat.stages.teach import lesson_of
 from chebsplat.stages.teacher_models.text_encoder import found
 from chebsplat.synthetic import CLASS_NAMES
-from chebsplat.synthetic.seeds import KNOWLEDGE
+from chebsplat.synthetic.layout import KNOWLEDGE
 
 K = 2.0  # views that knowledge counts for
 KINDS = {"depth": 0, "few photos": 2, "swept": 3}  # of `rooms_of` that are measured
@@ -153,6 +153,6 @@ def taught(
     encoder = PointEncoder(embeddings.shape[1], width, n_scales=n_scales, hidden=variant.get("hidden", 64))
     encoder.set_inputs([lesson.cloud for lesson in lessons])
     began = time.perf_counter()
-    for _ in teach.taught(encoder, lessons, teach.Course(steps=steps, seed=seed)):
+    for _ in point_encoder.taught(encoder, lessons, point_encoder.Course(steps=steps, seed=seed)):
         pass
     return encoder.eval(), time.perf_counter() - began

@@ -1,4 +1,8 @@
-"""What the views say of each Gaussian, and what is made of it without looking at a view again."""
+"""What the views say of each Gaussian, and what is made of it without looking at a view again.
+
+A teacher's map of a view becomes a value for each cell of 4×4 pixels; what is known at points goes to Gaussians beside
+them.
+"""
 
 from __future__ import annotations
 
@@ -6,8 +10,10 @@ from collections.abc import Iterable
 from dataclasses import dataclass
 
 import numpy as np
+from scipy.spatial import cKDTree
 
 from chebsplat.lifting import kernels
+from chebsplat.rasterize import CELL
 from chebsplat.rasterize.lift import Lifted
 
 N_BLOCKS = 8  # of views in order, taken in turn by the halves
@@ -93,3 +99,77 @@ def halves_of(n_views: int) -> np.ndarray:
       of every other view would agree on what is wrong.
     """
     return (np.arange(n_views) // max(n_views // N_BLOCKS, 1) % 2).astype(np.int8)
+
+
+N_POINTS = 3
+NEAR = 0.01  # metres, within which a point is no nearer than another
+LEAST_COSINE = 0.1  # of the angle between normals, so that a Gaussian of chance orientation still has an answer
+
+
+def carry(
+    values: np.ndarray,
+    points: np.ndarray,
+    point_normals: np.ndarray,
+    means: np.ndarray,
+    normals: np.ndarray,
+    unit: float = 1.0,
+) -> tuple[np.ndarray, np.ndarray]:
+    """What is known at points, for Gaussians: the mean of the N_POINTS nearest, by distance and normal.
+
+    Args: values [P, C] at points [P, 3], scene units, with point_normals [P, 3]; means [N, 3] with normals [N, 3]; all
+          normals unit, of any sign; unit: scene units of a metre, > 0.
+    Returns: f32 [N, C], and the distance to the nearest point in scene units, f32 [N], for who trusts near points only.
+    Raises:  ValueError without points.
+    Choices: weights max(|n·n'|, LEAST_COSINE)² / (d² + NEAR²).
+    """
+    if len(points) == 0:
+        raise ValueError("there are no points to carry from")
+    k = min(N_POINTS, len(points))
+    distances, index = cKDTree(points).query(means, np.arange(1, k + 1), workers=-1)
+    facing = np.abs(np.einsum("nkd,nd->nk", point_normals[index], normals)).clip(LEAST_COSINE, 1)
+    weights = facing**2 / ((distances / unit) ** 2 + NEAR**2)
+    weights /= weights.sum(1, keepdims=True)
+    carried = (weights[:, None].astype(np.float32) @ values[index].astype(np.float32))[:, 0]
+    return carried, distances[:, 0].astype(np.float32)
+
+
+def overlaps(n_entries: int, n_pixels: int) -> np.ndarray:
+    """Part of each cell that each of n entries, spread evenly over the pixels, covers: [⌈pixels/4⌉, n], rows sum to 1.
+
+    A last cell that the image cuts off is its part inside.
+    """
+    edges = np.minimum(np.arange(-(-n_pixels // CELL) + 1) * CELL, n_pixels)[:, None].astype(np.float64)
+    marks = np.arange(n_entries + 1) * (n_pixels / n_entries)
+    covered = np.minimum(edges[1:], marks[1:]) - np.maximum(edges[:-1], marks[:-1])
+    return covered.clip(0) / (edges[1:] - edges[:-1])  # type: ignore[no-any-return]
+
+
+def to_cells(
+    features: np.ndarray, counts: np.ndarray, size: tuple[int, int], mask: np.ndarray | None = None
+) -> tuple[np.ndarray, np.ndarray]:
+    """What each cell of a view says, and what it counts.
+
+    Args:
+      features: [h, w, C] of the teacher; an entry that is zero in all channels, or not finite, says nothing.
+      counts:   [h, w] >= 0, what an entry counts.
+      size:     width and height of the view, pixels; mask [H, W] true where a pixel counts, or None.
+    Returns: values f32 [⌈H/4⌉, ⌈W/4⌉, C], counts f32 [⌈H/4⌉, ⌈W/4⌉], 0 where nothing is said.
+    Choices: a cell is the mean of the entries that it lies in, by the area that each covers of it: exact on a grid of
+      cells, an average of a finer one, a copy of a coarser one. A cell counts if all its pixels do, as the reduced
+      pixels that a training looks at.
+    """
+    said = features.astype(np.float32)
+    usable = np.isfinite(said).all(-1) & said.any(-1)
+    share = np.where(usable, counts, 0).astype(np.float32)
+    said[~usable] = 0
+    width, height = size
+    shape = (-(-height // CELL), -(-width // CELL))
+    if share.shape != shape or height % CELL or width % CELL:
+        down, across = overlaps(share.shape[0], height), overlaps(share.shape[1], width)
+        sums = np.einsum("yh,hwc,xw->yxc", down, said * share[..., None], across, optimize=True)
+        share = (down @ share @ across.T).astype(np.float32)
+        said = (sums / np.where(share > 0, share, 1)[..., None]).astype(np.float32)
+    if mask is not None:
+        padded = np.pad(mask, ((0, -height % CELL), (0, -width % CELL)), constant_values=True)
+        share = share * padded.reshape(shape[0], CELL, shape[1], CELL).all((1, 3))
+    return said, share

@@ -15,7 +15,7 @@ from torch import Tensor
 
 from chebsplat.settings import DescribeSection
 from chebsplat.shape import descriptor_kernel
-from chebsplat.splats.rotations import rotation_matrices, rotation_matrices_f64
+from chebsplat.splats.gaussians import rotation_matrices, rotation_matrices_f64
 
 Spectrum = Literal["full", "taper", "hard"]
 Metric = Literal["relative", "printed"]

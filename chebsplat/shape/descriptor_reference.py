@@ -6,9 +6,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from chebsplat.shape.albo import canonicalize, metric_factors, rotations_about, similarity, tangent_axis
+from chebsplat.shape.albo import canonicalize, cut_spectrum, metric_factors, rotations_about, similarity, tangent_axis
 from chebsplat.shape.descriptor import Axis, Described, Metric, Spectrum
-from chebsplat.shape.spectra import cut_spectrum
 
 
 def chebyshev_diagonals(S: Tensor, max_degree: int) -> Tensor:

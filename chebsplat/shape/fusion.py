@@ -7,8 +7,7 @@ from torch import Tensor, nn
 
 from chebsplat.kernels.dispatch import is_compiled
 from chebsplat.shape import fusion_kernels
-from chebsplat.splats.rotations import rotation_matrices
-from chebsplat.splats.rows import take
+from chebsplat.splats.gaussians import rotation_matrices, take
 
 LEAST = 1e-30  # of a squared scale in radii: where the print divides by 0
 

@@ -152,3 +152,8 @@ PIECES = (
     (_cabinet, 1.2), (_tall_cabinet, 0.9), (_desk, 1.4), (_table, 1.0), (_sofa, 1.9), (_shelf, 0.95), (_window, 1.3),
     (_window, 1.7), (_door, 1.1), (_small, 0.5), (_small, 0.5), (_small, 0.5),
 )  # fmt: skip
+
+
+def build(preset: str, seed: int) -> layout.Room:
+    """The room of a preset (`office`, `room`, `toy`, `shuffled`) and a seed. Raises KeyError on another preset."""
+    return shuffled(seed) if preset == "shuffled" else layout.build(preset, seed)

@@ -1,4 +1,4 @@
-"""Training losses: photometric (L1 and SSIM) and feature distance."""
+"""Training losses: photometric (L1 and SSIM); of features, distance or cross-entropy."""
 
 from __future__ import annotations
 
@@ -10,7 +10,9 @@ import torch
 from torch import Tensor
 
 from chebsplat.kernels.dispatch import is_compiled
-from chebsplat.training.ssim import C1, C2, TAPS, WINDOW
+from chebsplat.settings import TrainSection
+from chebsplat.training.loss_kernels import C1, C2, TAPS, WINDOW
+from chebsplat.views import TaughtLabels
 
 
 @cache
@@ -54,7 +56,7 @@ class _Photometric(torch.autograd.Function):
 
     @staticmethod
     def forward(ctx: Any, render: Tensor, target: Tensor, weight: Tensor, weight_ssim: float) -> Tensor:
-        from chebsplat.training.ssim import photometric
+        from chebsplat.training.loss_kernels import photometric
 
         a, b, w = (t.detach().numpy() for t in (render, target, weight))
         loss, gradient = photometric(a, b, w, weight_ssim)
@@ -117,7 +119,7 @@ class _FeatureDistance(torch.autograd.Function):
 
     @staticmethod
     def forward(ctx: Any, render: Tensor, target: Tensor, share: Tensor, by_channel: bool) -> Tensor:
-        from chebsplat.training.pooling import feature_distance
+        from chebsplat.training.loss_kernels import feature_distance
 
         arrays = (t.detach().contiguous().numpy() for t in (render, target, share))
         values, gradient = feature_distance(*arrays, by_channel)
@@ -181,3 +183,46 @@ def feature_distance_reference(
     difference = torch.where(share[..., None] != 0, pooled - target, 0.0)  # what does not count may be anything
     distance = difference.abs().mean(-1) if kind == "l1" else difference.square().mean(-1).clamp_min(1e-30).sqrt()
     return (distance * share).sum()
+
+
+TEMPERATURE = 0.1  # of the logits that cross-entropy is of
+
+
+def semantic_loss(
+    render: Tensor,
+    features: Tensor,
+    labels: TaughtLabels | None,
+    mask: Tensor | None,
+    settings: TrainSection,
+    backend: str = "auto",
+) -> Tensor:
+    """What a view's rendered features [H, W, C] cost, by `train.feature_loss`; cells without a label cost nothing.
+
+    Args: features [h, w, C] and labels of the teacher; mask [H, W], true where a pixel counts, or None;
+      backend: of `rasterize`.
+    Raises: ValueError where cross-entropy is asked for without labels.
+    """
+    if settings.feature_loss == "cross-entropy":
+        if labels is None:
+            raise ValueError("cross-entropy needs labels with a confidence")
+        return label_entropy(render, labels, mask, TEMPERATURE)
+    counted = None if labels is None or labels.complete else labels.classes >= 0
+    return feature_distance(render, features, mask, settings.feature_loss or "length", counted, backend)
+
+
+def label_entropy(render: Tensor, labels: TaughtLabels, mask: Tensor | None, temperature: float) -> Tensor:
+    """Cross-entropy of labels on the logits render · class codes / temperature, weighted by confidence.
+
+    Args: render [H, W, C], as accumulated: a pixel that little covers has logits near 0; labels of h × w cells, h ≤ H;
+      mask [H, W], as of `feature_distance`.
+    Returns: the mean over cells that have a label, 0 where none has one.
+    Choices: the render is averaged over each cell, as in `feature_distance`. The mean is over cells, not over
+      confidences: a view of which the teacher is unsure teaches less than another, as in Panoptic Lifting.
+    """
+    size = (labels.classes.shape[0], labels.classes.shape[1])
+    pooled = torch.nn.functional.adaptive_avg_pool2d(render.permute(2, 0, 1), size).permute(1, 2, 0)
+    logits = pooled @ labels.class_codes.to(render.dtype).T / temperature
+    log_likelihood = logits.log_softmax(-1).gather(-1, labels.classes.clamp_min(0)[..., None])[..., 0]
+    counted = labels.classes >= 0
+    share = cell_shares(mask, size, render, counted) * labels.confidence.to(render.dtype)
+    return -torch.where(counted & (share > 0), share * log_likelihood, 0.0).sum()

@@ -13,9 +13,9 @@ from chebsplat.rasterize import CELL, rasterize
 from chebsplat.settings import DescribeSection, TrainSection
 from chebsplat.shape.branch import FreshEncodings, ShapeBranch
 from chebsplat.shape.regions import Regions, covering
+from chebsplat.splats.gaussians import take
 from chebsplat.splats.planes import at_pixels, planes_in_view
-from chebsplat.splats.rows import take
-from chebsplat.splats.sh_colors import colors_in_view
+from chebsplat.splats.sh import colors_in_view
 from chebsplat.training import prune, sh_mask_network, sh_prune
 from chebsplat.training.sh_mask_network import BandMaskNetwork
 from chebsplat.views import View, in_frustum

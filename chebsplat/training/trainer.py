@@ -16,12 +16,10 @@ from chebsplat.evaluation.metrics import psnr
 from chebsplat.settings import TrainSection
 from chebsplat.shape.regions import Regions, regions_of
 from chebsplat.training import sh_mask_network, sh_prune
-from chebsplat.training.laps import Laps
-from chebsplat.training.losses import depth_distance, photometric
+from chebsplat.training.losses import depth_distance, photometric, semantic_loss
 from chebsplat.training.model import Rendered, SceneModel
 from chebsplat.training.population import Population, broken
 from chebsplat.training.schedule import Schedule, adam
-from chebsplat.training.semantic_loss import semantic_loss
 from chebsplat.views import Views
 
 PROGRESS = ("step", "seconds", "order", "members", "guidance")
@@ -306,3 +304,21 @@ class Trainer:
             parameters["degrees"][: len(band)] += 1
         fused = self.model.fused_features()
         return parameters if fused is None else parameters | {"fused": fused}
+
+
+class Laps:
+    """Seconds by part of the work: each `mark` books the time since the mark or the start before it."""
+
+    def __init__(self) -> None:
+        self.seconds: dict[str, float] = {}
+        self.start()
+
+    def start(self) -> None:
+        """Begin to measure, or go on after a pause that belongs to no part."""
+        self.last = time.perf_counter()
+
+    def mark(self, part: str) -> None:
+        """Book the seconds since the last mark or start under `part`."""
+        now = time.perf_counter()
+        self.seconds[part] = self.seconds.get(part, 0.0) + now - self.last
+        self.last = now

@@ -14,10 +14,9 @@ from safetensors import SafetensorError
 from safetensors.torch import load_file
 
 from chebsplat.errors import InputError
-from chebsplat.evaluation.frame_parts import PARTS, frame_parts
 from chebsplat.evaluation.lpips import Lpips
 from chebsplat.evaluation.metrics import color_fitted, psnr
-from chebsplat.render import SceneRenderer
+from chebsplat.render import PARTS, SceneRenderer, frame_parts
 from chebsplat.training.losses import ssim
 from chebsplat.views import View
 

@@ -17,8 +17,7 @@ from PIL import Image
 
 from chebsplat.cameras import centers
 from chebsplat.formats.capture import Capture
-from chebsplat.photos.epipolar import fundamental
-from chebsplat.photos.guided import along_lines
+from chebsplat.photos.guided import along_lines, fundamental
 from chebsplat.stages.runtime.command import Job, n_threads
 from chebsplat.stages.settings import SfmSection
 

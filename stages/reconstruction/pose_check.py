@@ -10,7 +10,7 @@ import numpy as np
 import pycolmap
 
 from chebsplat.formats.capture import Capture
-from chebsplat.photos.epipolar import fundamental, sampson_distance
+from chebsplat.photos.guided import fundamental, sampson_distance
 from chebsplat.stages.reconstruction.matching import file_of, match, match_freely, nearest_by_pose
 from chebsplat.stages.runtime.command import Job
 from chebsplat.stages.settings import SfmSection

@@ -20,9 +20,8 @@ from chebsplat.stages.settings import KnowledgeSection
 from chebsplat.stages.sources.generated import photograph
 from chebsplat.stages.teacher_models.image_encoder import TeacherInference
 from chebsplat.synthetic import layout
-from chebsplat.synthetic.path import intrinsics, walk
-from chebsplat.synthetic.rays import RayCaster
-from chebsplat.synthetic.seeds import KNOWLEDGE
+from chebsplat.synthetic.layout import KNOWLEDGE
+from chebsplat.synthetic.rays import RayCaster, intrinsics, walk
 from chebsplat.synthetic.shuffled import jitter, shuffled
 
 KINDS = (  # taken in turn by seed

@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 
 from chebsplat.errors import ConfigError, InputError
-from chebsplat.evaluation.protocols.split import natural
+from chebsplat.evaluation.protocols.task import natural
 from chebsplat.formats.images import SUFFIXES, is_image
 from chebsplat.formats.names import unprintable
 from chebsplat.formats.videos import SUFFIXES as VIDEOS

@@ -9,11 +9,9 @@ import numpy as np
 
 from chebsplat.synthetic import CLASS_NAMES
 from chebsplat.synthetic.layout import Room
-from chebsplat.synthetic.light import dot, shade, tone_map
-from chebsplat.synthetic.path import intrinsics, walk
-from chebsplat.synthetic.rays import Hits, RayCaster
-from chebsplat.synthetic.rooms import build
-from chebsplat.synthetic.textures import colors
+from chebsplat.synthetic.rays import Hits, RayCaster, intrinsics, walk
+from chebsplat.synthetic.shuffled import build
+from chebsplat.synthetic.textures import colors, dot, shade, tone_map
 
 SIZES = {  # views, width, height
     "office": (80, 320, 240), "room": (80, 320, 240), "shuffled": (80, 320, 240), "toy": (16, 96, 72),

@@ -11,8 +11,7 @@ from PIL import Image
 
 from chebsplat.errors import DataFailure, InputError
 from chebsplat.formats import videos
-from chebsplat.photos.frames import BLOCK, choose, progress, shifts
-from chebsplat.photos.sharpness import laplacian_variance
+from chebsplat.photos.frames import BLOCK, choose, laplacian_variance, progress, shifts
 from chebsplat.stages.runtime.progress import Progress
 from chebsplat.stages.sources import assembly, cameras
 from chebsplat.stages.sources.photos import GUESS

@@ -11,8 +11,7 @@ import numpy as np
 
 from chebsplat.errors import ConfigError, InputError
 from chebsplat.formats.teacher_model import read_label_set, read_label_table
-from chebsplat.labels.class_codes import class_codes
-from chebsplat.labels.decode import decode
+from chebsplat.labels.decode import class_codes, decode
 from chebsplat.stages.teacher_models.text_encoder import folded, text_embeddings
 
 if TYPE_CHECKING:
@@ -99,7 +98,7 @@ def closed_set(teacher: TeacherModel, labels: dict[str, list[str]] | None, n_cha
     Args: labels: where a file was asked for: classes that are words of one label become that label; the others keep
       their own names.
     Raises: InputError where names and channels differ in number, or a label has no class.
-    Choices: a pixel's feature is the unit mean of the class codes (`chebsplat.labels.class_codes`), weighted by its
+    Choices: a pixel's feature is the unit mean of the class codes (`chebsplat.labels.decode`), weighted by its
       probabilities, so that training is the same as for features; its label is the likeliest, its confidence that
       probability.
     """

@@ -13,7 +13,7 @@ from chebsplat.labels.tiling import window_starts
 from chebsplat.stages.runtime.command import n_threads
 from chebsplat.stages.settings import TeacherSection
 from chebsplat.stages.teacher_models.label_space import MAX_CHANNELS, closed_set, label_set, open_vocabulary
-from chebsplat.synthetic.seeds import REFERENCE
+from chebsplat.synthetic.layout import REFERENCE
 
 SHOWN = 8  # labels
 

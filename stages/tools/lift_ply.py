@@ -26,7 +26,7 @@ from chebsplat.formats.ply import read_ply, write_ply
 from chebsplat.formats.points import Points
 from chebsplat.formats.teacher_model import EMBEDDED, read_teacher
 from chebsplat.labels.decode import decode
-from chebsplat.lifting.carry import carry
+from chebsplat.lifting.observations import carry
 from chebsplat.lifting.smoothing import room_unit
 from chebsplat.lifting.surface import LOOKOUT_SIZE, lookouts
 from chebsplat.splats.gaussians import surface_of

@@ -14,8 +14,7 @@ from chebsplat.formats.calibration import calibration_of
 from chebsplat.formats.features import Features
 from chebsplat.formats.names import suggest
 from chebsplat.formats.teacher_model import EMBEDDED, TeacherModel, read_label_table, read_teacher
-from chebsplat.labels.calibration import CUT, Calibration, presence, probability
-from chebsplat.labels.relevancy import relevancy
+from chebsplat.labels.calibration import CUT, Calibration, presence, probability, relevancy
 from chebsplat.stages.teacher_models.text_encoder import folded, found, text_embeddings
 
 log = logging.getLogger("chebsplat")

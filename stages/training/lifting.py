@@ -12,8 +12,7 @@ from chebsplat.formats import lifted as lifted_format
 from chebsplat.formats.cameras import Cameras
 from chebsplat.formats.capture import Capture
 from chebsplat.formats.features import Features
-from chebsplat.lifting.cell_maps import to_cells
-from chebsplat.lifting.observations import estimate, gathered
+from chebsplat.lifting.observations import estimate, gathered, to_cells
 from chebsplat.rasterize.lift import Lifted, lift
 from chebsplat.stages.runtime.progress import Progress
 

@@ -10,7 +10,7 @@ import pytest
 from chebsplat.errors import ConfigError
 from chebsplat.formats.meshes import Frame, Mesh, cleaned, fused, write_mesh
 from chebsplat.stages.tools.mesh import STEP, without_edges
-from chebsplat.synthetic.path import intrinsics, look_at
+from chebsplat.synthetic.rays import intrinsics, look_at
 
 SIZE = 96, 72
 K = intrinsics(*SIZE)

@@ -9,7 +9,6 @@ from shared import INPUTS, published, run_stage
 
 from chebsplat.cameras import unproject
 from chebsplat.errors import InputError
-from chebsplat.evaluation.frame_parts import frame_parts
 from chebsplat.evaluation.lpips import BLOCKS, SCALE, SHIFT, Lpips
 from chebsplat.evaluation.protocols import scannet_closed, scannet_open
 from chebsplat.formats import artifact
@@ -18,7 +17,7 @@ from chebsplat.formats.evaluation import Evaluation
 from chebsplat.formats.features import Features
 from chebsplat.formats.scene import Scene
 from chebsplat.pipelines.planning.plan import Planner
-from chebsplat.render import SceneRenderer
+from chebsplat.render import SceneRenderer, frame_parts
 from chebsplat.stages.evaluate import camera
 from chebsplat.stages.measuring.image_quality import image_figures, perceptual
 from chebsplat.stages.sources import generated

@@ -30,7 +30,7 @@ from chebsplat.stages.shape_models import teaching_rooms
 from chebsplat.stages.shape_models.predictions import into_channels
 from chebsplat.stages.teacher_models.image_encoder import TeacherInference
 from chebsplat.synthetic import CLASS_NAMES
-from chebsplat.synthetic.seeds import HELD_OUT, KNOWLEDGE, REFERENCE, SCENES, TRAINING
+from chebsplat.synthetic.layout import HELD_OUT, KNOWLEDGE, REFERENCE, SCENES, TRAINING
 
 
 @pytest.fixture

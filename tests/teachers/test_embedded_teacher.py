@@ -10,7 +10,7 @@ from shared import ROOT
 
 from chebsplat.formats.teacher_model import EMBEDDED, read_teacher
 from chebsplat.stages.teacher_models.image_encoder import TeacherInference
-from chebsplat.synthetic import CLASS_NAMES, seeds
+from chebsplat.synthetic import CLASS_NAMES, layout
 
 
 @pytest.fixture(scope="module")
@@ -44,7 +44,7 @@ def test_a_held_out_room_is_told_about_as_well_as_the_published_figures_say():
     encode, n = runner(EMBEDDED, 1), len(CLASS_NAMES)
     texts = text_embeddings(list(CLASS_NAMES), read_teacher(EMBEDDED))
     matrix = np.zeros((n, n), np.int64)
-    for image, truth in held_out_room(seeds.HELD_OUT[0], n_views=4):
+    for image, truth in held_out_room(layout.HELD_OUT[0], n_views=4):
         matrix += confusion(labelled(encode(image), texts, *truth.shape), truth, n)
     assert published["miou"] >= 0.55
     assert segmentation(matrix).miou == pytest.approx(published["miou"], abs=0.15)  # one room of twenty, four views
@@ -52,12 +52,12 @@ def test_a_held_out_room_is_told_about_as_well_as_the_published_figures_say():
 
 
 def test_no_seed_serves_two_ends():
-    ranges = [seeds.SCENES, seeds.REFERENCE, seeds.HELD_OUT, seeds.TRAINING, seeds.KNOWLEDGE]
-    assert ranges == sorted((r for r in vars(seeds).values() if isinstance(r, range)), key=lambda r: r.start)
+    ranges = [layout.SCENES, layout.REFERENCE, layout.HELD_OUT, layout.TRAINING, layout.KNOWLEDGE]
+    assert ranges == sorted((r for r in vars(layout).values() if isinstance(r, range)), key=lambda r: r.start)
     assert all(a.stop <= b.start for a, b in pairwise(ranges))
     for path in (ROOT / "pipelines/configs/scenes").glob("*.toml"):
         source = tomllib.loads(path.read_text())["source"]
-        assert "seed" not in source or source["seed"] in seeds.SCENES, path
+        assert "seed" not in source or source["seed"] in layout.SCENES, path
 
 
 def test_training_takes_no_other_seeds_and_its_validation_none_of_its_own():
@@ -65,8 +65,8 @@ def test_training_takes_no_other_seeds_and_its_validation_none_of_its_own():
     from chebsplat.teachers.train import ROOMS, VALIDATION
 
     assert not set(ROOMS) & set(VALIDATION)
-    assert {*ROOMS, *VALIDATION} <= set(seeds.TRAINING)
-    for seed in (seeds.SCENES[0], seeds.HELD_OUT[0], seeds.REFERENCE[0]):
+    assert {*ROOMS, *VALIDATION} <= set(layout.TRAINING)
+    for seed in (layout.SCENES[0], layout.HELD_OUT[0], layout.REFERENCE[0]):
         with pytest.raises(ValueError, match="not one for training"):
             training_views(seed, 1)
 

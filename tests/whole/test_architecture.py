@@ -32,7 +32,7 @@ PACKAGES = {
     "render": {"rasterize", "splats", "views"},
     "shape": {"cameras", "kernels", "settings", "splats"},
     "lifting": {"cameras", "kernels", "labels", "rasterize", "render", "splats", "views"},
-    "evaluation": {"labels", "rasterize", "render", "splats", "views"},
+    "evaluation": {"labels", "splats"},
     "training": {"cameras", "evaluation", "kernels", "rasterize", "settings", "shape", "splats", "views"},
 }
 SOURCES = [p for layer in LAYERS for p in sorted((ROOT / layer).rglob("*.py"))]

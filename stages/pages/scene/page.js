@@ -57,7 +57,7 @@ function legend() {
   }
 }
 
-// -- words: probabilities, as chebsplat/labels/calibration.py computes them, LERF's relevancy, as chebsplat/labels/relevancy.py
+// -- words: probabilities, as chebsplat/labels/calibration.py computes them, LERF's relevancy, as chebsplat/labels/calibration.py
 // does, for words without a calibration, and labels, as chebsplat/labels/decode.py
 function unit_features(arrays) {
   const { n } = splats, C = about.ranges.features.step.length, rows = new Float32Array(n * C), lengths = new Float32Array(n);

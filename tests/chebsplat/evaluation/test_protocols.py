@@ -18,8 +18,7 @@ from chebsplat.evaluation.protocols import (
     scannet_closed,
     scannet_open,
 )
-from chebsplat.evaluation.protocols.split import every
-from chebsplat.evaluation.protocols.task import EvaluatedView, MapsByName, Task, bilinear, resized
+from chebsplat.evaluation.protocols.task import EvaluatedView, MapsByName, Task, bilinear, every, resized
 from chebsplat.stages.ingest import renamed, split, thinned
 from chebsplat.stages.settings import IngestSection
 

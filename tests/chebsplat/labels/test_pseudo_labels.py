@@ -11,7 +11,7 @@ from chebsplat.formats.artifact import publish
 from chebsplat.formats.capture import Capture
 from chebsplat.formats.features import Features
 from chebsplat.formats.manifest import Manifest
-from chebsplat.labels.pseudo_labels import voted
+from chebsplat.labels.decode import voted
 
 CODES = np.eye(3, dtype=np.float32)
 

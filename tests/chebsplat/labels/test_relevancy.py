@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from chebsplat.labels.relevancy import relevancy
+from chebsplat.labels.calibration import relevancy
 
 
 def unit(rows):

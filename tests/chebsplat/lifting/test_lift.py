@@ -5,9 +5,8 @@ import pytest
 from raster import camera, scene
 from thread_counts import assert_same_bits
 
-from chebsplat.lifting.cell_maps import to_cells
-from chebsplat.lifting.observations import Observations, estimate, gathered, halves_of
-from chebsplat.rasterize import lift_reference
+from chebsplat.lifting.observations import Observations, estimate, gathered, halves_of, to_cells
+from chebsplat.rasterize import reference
 from chebsplat.rasterize.lift import Lifted, lift
 
 N, CHANNELS, SIZE = 300, 19, (83, 61)  # cells are cut off on both sides
@@ -26,7 +25,7 @@ def arguments(seed=0, gate=0.1):
 @pytest.mark.parametrize("gate", [0.0, 0.1, 0.5, 1.0])
 def test_the_lift_of_a_view_equals_the_transcription(gate):
     given = arguments(gate=gate)
-    found, (weights, sums) = lift(*given), lift_reference.lift(*given)
+    found, (weights, sums) = lift(*given), reference.lift(*given)
     np.testing.assert_array_equal(found.ids, np.flatnonzero(weights))
     scale = weights.max()
     np.testing.assert_allclose(found.weights / scale, weights[found.ids] / scale, atol=1e-6)
@@ -47,7 +46,7 @@ def test_the_lift_is_the_same_bits_for_any_number_of_threads():
 
 def test_a_gate_leaves_each_pixel_to_those_that_make_it_up():
     given = arguments(gate=0.0)
-    weights = lift_reference.pixel_weights(*given[:4])
+    weights = reference.pixel_weights(*given[:4])
     sums = [lift(*given[:6], gate).weights.sum() for gate in (0.0, 0.3, 1.0)]
     assert sums[0] > sums[1] > sums[2] > 0
     whole = (*given[:4], np.ones((16, 21, 1), np.float32), np.ones((16, 21), np.float32))

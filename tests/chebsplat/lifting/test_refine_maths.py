@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from chebsplat.lifting.blend import LEAST, STRENGTHS, blend, calibrate, confidence, effective, familiar, reliable, start
-from chebsplat.lifting.carry import carry
+from chebsplat.lifting.observations import carry
 from chebsplat.lifting.smoothing import N_NEIGHBORS, REACH, Affinities, affinities, room_unit, smooth
 
 
@@ -223,7 +223,7 @@ def test_few_or_coincident_points_are_carried_over(n_points):
 
 
 def test_a_room_has_about_its_own_unit():
-    from chebsplat.synthetic.rooms import build
+    from chebsplat.synthetic.shuffled import build
 
     rng = np.random.default_rng(0)
     for preset, seed in (("office", 100), ("room", 200), ("shuffled", 301)):

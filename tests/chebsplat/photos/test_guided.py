@@ -4,8 +4,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from chebsplat.photos.epipolar import fundamental, sampson_distance
-from chebsplat.photos.guided import ALIKE, BAND, RATIO, along_lines
+from chebsplat.photos.guided import ALIKE, BAND, RATIO, along_lines, fundamental, sampson_distance
 from tests.stages.reconstruction.test_adjustment import poses_of
 
 K = np.array([[500.0, 0, 320], [0, 500, 240], [0, 0, 1]])

@@ -5,7 +5,7 @@ import pytest
 from raster import camera, scene
 from thread_counts import assert_same_bits
 
-from chebsplat.rasterize import lift_reference
+from chebsplat.rasterize import reference
 from chebsplat.rasterize.depths import depths
 
 N, SIZE = 300, (83, 61)
@@ -27,7 +27,7 @@ def ordered(gaussians, viewmat):
 def test_the_depth_of_a_view_equals_the_transcription(part):
     gaussians, viewmat, K, size, planes = arguments()
     found, covered = depths(gaussians, viewmat, K, size, planes, part)
-    weights = lift_reference.pixel_weights(gaussians, viewmat, K, size)
+    weights = reference.pixel_weights(gaussians, viewmat, K, size)
     order = ordered(gaussians, viewmat)
     passed = weights[..., order].cumsum(-1)
     low, high = (bound * passed[..., -1:] for bound in part)

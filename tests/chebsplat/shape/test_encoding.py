@@ -4,8 +4,7 @@ import numpy as np
 import pytest
 import torch
 
-from chebsplat.labels.class_codes import VOCABULARY, class_codes
-from chebsplat.labels.decode import decode, decode_labels
+from chebsplat.labels.decode import VOCABULARY, class_codes, decode, decode_labels
 from chebsplat.labels.noisy_teacher import confusable, confuse_segments, noisy_features, reduced
 from chebsplat.shape.encoder import RegionEncoder, Standardize
 from chebsplat.shape.regions import build_regions

@@ -8,11 +8,11 @@ import pytest
 import torch
 
 from chebsplat.cameras import common_up, upright
-from chebsplat.shape import point_encoder, teach
+from chebsplat.shape import point_encoder
 from chebsplat.shape.point_encoder import PointEncoder, cloud_of
 from chebsplat.shape.point_inputs import RADII, REACH, point_inputs
 from chebsplat.splats.gaussians import local_shape
-from chebsplat.synthetic.path import look_at, walk
+from chebsplat.synthetic.rays import look_at, walk
 
 UP = np.array([0.0, 0.0, 1.0])
 
@@ -121,13 +121,15 @@ def test_it_learns_what_shape_tells(seen):
         means, normals, covariances = corner(seed=seed)
         labels = np.where(np.abs(normals[:, 2]) < 0.5, 0, np.where(means[:, 2] > 0.2, 1, 2))
         inputs = point_inputs(means, normals, covariances, up=UP)
-        return teach.Lesson(cloud_of(inputs), torch.from_numpy(codes[labels]), np.full(len(means), 3), labels), inputs
+        return point_encoder.Lesson(
+            cloud_of(inputs), torch.from_numpy(codes[labels]), np.full(len(means), 3), labels
+        ), inputs
 
     (first, _), (second, inputs) = lesson(1), lesson(2)
     torch.manual_seed(0)
     encoder = PointEncoder(5, first.cloud.descriptors.shape[1])
     encoder.set_inputs([first.cloud], sample=1)
-    losses = list(teach.taught(encoder, [first], teach.Course(steps=120, batch=128)))
+    losses = list(point_encoder.taught(encoder, [first], point_encoder.Course(steps=120, batch=128)))
     assert np.mean(losses[-10:]) < 0.5 * np.mean(losses[:3])
     found = (encoder.predict(inputs)[:, :3]).argmax(1)
     assert (found == second.labels).mean() > 0.9
@@ -136,7 +138,7 @@ def test_it_learns_what_shape_tells(seen):
 
 
 def test_rare_things_are_drawn_more_often_and_what_no_view_saw_never():
-    lesson = teach.Lesson(None, None, np.array([3] * 90 + [3] * 9 + [1]), np.array([0] * 90 + [1] * 9 + [2]))
+    lesson = point_encoder.Lesson(None, None, np.array([3] * 90 + [3] * 9 + [1]), np.array([0] * 90 + [1] * 9 + [2]))
     odds = lesson.odds()
     assert odds.sum() == pytest.approx(1)
     assert odds[-1] == 0

@@ -4,9 +4,8 @@ import pytest
 import torch
 from shared_regions import REGIONS, extreme, region
 
-from chebsplat.shape.albo import canonicalize, metric_factors, similarity
+from chebsplat.shape.albo import canonicalize, cut_spectrum, metric_factors, similarity
 from chebsplat.shape.descriptor import describe
-from chebsplat.shape.spectra import cut_spectrum
 
 
 def described(given, spectrum, **options):

@@ -4,8 +4,7 @@ import chebsplat  # noqa: F401  # isort: skip
 import pytest
 import torch
 
-from chebsplat.splats.sh import eval_sh, n_coefficients
-from chebsplat.splats.sh_colors import colors_in_view
+from chebsplat.splats.sh import colors_in_view, eval_sh, n_coefficients
 from chebsplat.training.sh_prune import dense, masked_sh
 
 

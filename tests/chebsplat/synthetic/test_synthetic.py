@@ -6,10 +6,9 @@ import pytest
 from chebsplat.cameras import centers, unproject
 from chebsplat.stages.sources import generated
 from chebsplat.synthetic import CLASS_NAMES
-from chebsplat.synthetic.light import shade
-from chebsplat.synthetic.path import intrinsics, walk
-from chebsplat.synthetic.rays import RayCaster
-from chebsplat.synthetic.rooms import build
+from chebsplat.synthetic.rays import RayCaster, intrinsics, walk
+from chebsplat.synthetic.shuffled import build
+from chebsplat.synthetic.textures import shade
 
 SCENES = [
     *(("office", seed) for seed in range(100, 105)),

@@ -13,7 +13,7 @@ from chebsplat.formats.features import Features
 from chebsplat.labels.noisy_teacher import IGNORE, noisy_features
 from chebsplat.settings import TrainSection
 from chebsplat.stages.training.defaults import evidence_of, resolved
-from chebsplat.training.semantic_loss import label_entropy, semantic_loss
+from chebsplat.training.losses import label_entropy, semantic_loss
 from chebsplat.views import TaughtLabels
 
 H, W, C, L = 8, 12, 5, 3

@@ -34,13 +34,13 @@ def no_kernels(monkeypatch):
         from chebsplat.rasterize import cpu
         from chebsplat.shape import fusion_kernels
         from chebsplat.splats import sh_kernels
-        from chebsplat.training import pooling, ssim
+        from chebsplat.training import loss_kernels
 
         monkeypatch.setattr(cpu, "rasterize", refuse)
         monkeypatch.setattr(fusion_kernels, "fuse_in_view", refuse)
         monkeypatch.setattr(sh_kernels, "colors_in_view", refuse)
-        monkeypatch.setattr(pooling, "feature_distance", refuse)
-        monkeypatch.setattr(ssim, "photometric", refuse)
+        monkeypatch.setattr(loss_kernels, "feature_distance", refuse)
+        monkeypatch.setattr(loss_kernels, "photometric", refuse)
 
     return forbid
 

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import torch
 
-from chebsplat.photos import consistency, plane_sweep
+from chebsplat.photos import plane_sweep
 from chebsplat.stages.reconstruction import dense
 from chebsplat.stages.runtime.command import Job
 from chebsplat.stages.runtime.config import Config
@@ -82,15 +82,15 @@ def test_a_sweep_finds_depth_between_its_steps(wall):
 def test_views_confirm_true_depth_and_deny_another(wall):
     _, Ks, poses, depths = wall
     true = depths.astype(np.float32)
-    agree = consistency.agreed(true, Ks, poses, OTHERS, 2)
+    agree = plane_sweep.agreed(true, Ks, poses, OTHERS, 2)
     np.testing.assert_allclose(agree[2][agree[2] > 0], true[2][agree[2] > 0], rtol=1e-6)
     assert (agree[2] > 0).mean() > 0.95
     wrong = true.copy()
     wrong[2] *= 1.2
-    assert (consistency.agreed(wrong, Ks, poses, OTHERS, 2)[2] > 0).mean() < 0.05
+    assert (plane_sweep.agreed(wrong, Ks, poses, OTHERS, 2)[2] > 0).mean() < 0.05
     noisy = true.copy()
     noisy[2] *= 1.01
-    mean = consistency.agreed(noisy, Ks, poses, OTHERS, 2)[2]
+    mean = plane_sweep.agreed(noisy, Ks, poses, OTHERS, 2)[2]
     assert (np.abs(mean / true[2] - 1) < 0.004).mean() > 0.8  # four right ones, and its own
 
 
@@ -99,7 +99,7 @@ def test_what_other_views_see_through_goes_however_many_share_it(wall):
     floating = depths.astype(np.float32)
     corner = np.s_[5:20, 60:90]  # of the wall
     floating[:2][:, *corner] = 1.6  # two views share a thing in the air; three see the wall behind it
-    kept = consistency.agreed(floating, Ks, poses, OTHERS, 1)
+    kept = plane_sweep.agreed(floating, Ks, poses, OTHERS, 1)
     assert (kept[0][corner] > 0).mean() < 0.3
     assert (kept[4][corner] > 0).mean() > 0.9  # which hides nothing from these, and denies nothing
 
@@ -107,10 +107,10 @@ def test_what_other_views_see_through_goes_however_many_share_it(wall):
 def test_unknown_depth_and_views_that_compare_with_none_stay_unknown(wall):
     _, Ks, poses, depths = wall
     nobody = np.full((5, 1), -1)
-    assert not consistency.agreed(depths.astype(np.float32), Ks, poses, nobody, 1).any()
+    assert not plane_sweep.agreed(depths.astype(np.float32), Ks, poses, nobody, 1).any()
     holes = depths.astype(np.float32)
     holes[:, :60] = 0
-    assert not consistency.agreed(holes, Ks, poses, OTHERS, 1)[:, :60].any()
+    assert not plane_sweep.agreed(holes, Ks, poses, OTHERS, 1)[:, :60].any()
 
 
 def test_points_beside_the_cameras_leave_a_sweep_where_it_looks(wall, job):

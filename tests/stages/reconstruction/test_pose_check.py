@@ -7,7 +7,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from chebsplat.cameras import centers
-from chebsplat.photos.epipolar import fundamental, sampson_distance
+from chebsplat.photos.guided import fundamental, sampson_distance
 from chebsplat.stages.reconstruction import pose_check
 from chebsplat.stages.settings import SfmSection
 from tests.stages.reconstruction.test_adjustment import poses_of, synthetic  # noqa: F401 the fixture

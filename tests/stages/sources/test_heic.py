@@ -11,7 +11,7 @@ from source_folders import SETTINGS, image
 
 from chebsplat.errors import InputError
 from chebsplat.formats import images
-from chebsplat.photos.sharpness import blurred, detail
+from chebsplat.photos.frames import blurred, detail
 from chebsplat.pipelines.planning.needs import media_packages
 from chebsplat.stages import ingest
 from chebsplat.stages.settings import IngestSection, SourceSection

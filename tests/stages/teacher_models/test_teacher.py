@@ -13,7 +13,7 @@ from chebsplat.formats.capture import Capture
 from chebsplat.formats.channels import ChannelMap
 from chebsplat.formats.features import Features
 from chebsplat.formats.teacher_model import read_label_set, read_teacher
-from chebsplat.labels.class_codes import class_codes
+from chebsplat.labels.decode import class_codes
 from chebsplat.pipelines.cli import main
 from chebsplat.stages import teacher
 from chebsplat.stages.runtime import config as configs

@@ -10,7 +10,7 @@ from shared import ROOT
 
 from chebsplat.errors import InputError
 from chebsplat.formats.teacher_model import EMBEDDED, TeacherModel, read_label_set, read_label_table, read_teacher
-from chebsplat.labels.class_codes import VOCABULARY
+from chebsplat.labels.decode import VOCABULARY
 from chebsplat.stages.teacher_models import text_encoder
 from chebsplat.stages.teacher_models.label_space import IN_ROOMS, label_set
 from chebsplat.stages.teacher_models.text_encoder import folded, text_embeddings

@@ -27,7 +27,6 @@ from chebsplat.labels.calibration import (
 )  # fmt: skip
 from chebsplat.pipelines.cli import main
 from chebsplat.stages.tools import calibrate
-from chebsplat.synthetic import seeds
 from tests.stages.tools.test_query import EMBEDDINGS, N, asked, write_toy
 
 OF = Calibration(margin=14.0, cosine=9.0, bias=-4.0, strength=1.0, offset=2.0)
@@ -106,7 +105,7 @@ def test_the_embedded_teacher_ships_with_its_calibration_on_rooms_of_its_own():
     assert held.teacher == read_teacher(EMBEDDED).name
     assert set(held.rivals) <= set(read_label_table(EMBEDDED.with_name("embedded.npz"))[0])
     assert held.made["first_seed"] == calibrate.SEEDS[0]
-    ranges = [value for value in vars(seeds).values() if isinstance(value, range)]
+    ranges = [value for value in vars(layout).values() if isinstance(value, range)]
     assert not any({calibrate.SEEDS[0], calibrate.SEEDS[-1]} & set(other) for other in ranges)
     listed = tomllib.loads((ROOT / "teachers/words.toml").read_text())["absent"]
     assert not set(listed["calibration"]) & set(listed["measured"])

@@ -18,8 +18,8 @@ from shared import ROOT
 
 from chebsplat.errors import ConfigError
 from chebsplat.formats.packed import BYTES, C0, from_bytes, pack, to_bytes, unpack
+from chebsplat.labels.calibration import relevancy
 from chebsplat.labels.decode import decode, decode_labels
-from chebsplat.labels.relevancy import relevancy
 from chebsplat.pipelines.api import load
 from chebsplat.pipelines.cli import main
 from chebsplat.render import SceneRenderer

@@ -15,7 +15,7 @@ from chebsplat.formats.capture import Capture
 from chebsplat.formats.channels import ChannelMap
 from chebsplat.formats.features import Features
 from chebsplat.formats.scene import Scene
-from chebsplat.labels.relevancy import relevancy
+from chebsplat.labels.calibration import relevancy
 from chebsplat.pipelines.api import load
 from chebsplat.pipelines.cli import main
 

@@ -1,10 +1,12 @@
-"""The photometric loss and its gradient in one sweep over the image: L1 and SSIM, in numba, float32.
+"""Losses and their gradients in one sweep over the image, in numba, float32: L1 and SSIM; distance of features.
 
 Images are [H, W, 3] seen as rows of W · 3 values, so a tap of the horizontal window is a shift by 3. Rows are
 independent in each of four passes; no pass writes what another thread writes, so the thread count changes no bit.
 """
 
 from __future__ import annotations
+
+import math
 
 import numpy as np
 
@@ -127,3 +129,67 @@ def photometric(a: np.ndarray, b: np.ndarray, weight: np.ndarray, weight_ssim: f
     gradient, distance = _gather(_blur_rows(slopes), a, b, weight, np.float32(weight_ssim))
     loss = (1 - weight_ssim) * distance.sum() + weight_ssim * (weight.sum(dtype=np.float64) - values.sum())
     return float(loss), gradient.reshape(shape)
+
+
+TINY = np.float32(1e-12)
+
+
+@inline
+def _span(i, n, size):
+    """Pixels [start, stop) of cell i of n, as adaptive pooling cuts them: neighbours may share one."""
+    return i * size // n, ((i + 1) * size + n - 1) // n
+
+
+@kernel
+def feature_distance(render, target, share, by_channel):
+    """Σ share · distance of pooled to target, by row of cells, and its gradient to `render`.
+
+    The distance is mean_c |pooled − target| by channel, else √(mean_c (pooled − target)²).
+
+    Args: render [H, W, C], target [h, w, C], share [h, w] what each cell counts, float32; by_channel bool.
+    Returns: values [h] float64; gradient [H, W, C].
+    """
+    height, width, channels = render.shape
+    rows, columns = share.shape
+    slopes, values = np.empty((rows, columns, channels), np.float32), np.zeros(rows)
+    for i in prange(rows):
+        top, bottom = _span(i, rows, height)
+        mean = np.empty(channels, np.float32)
+        for j in range(columns):
+            left, right = _span(j, columns, width)
+            for c in range(channels):
+                mean[c] = np.float32(0)
+            for y in range(top, bottom):
+                for x in range(left, right):
+                    for c in range(channels):
+                        mean[c] += render[y, x, c]
+            area = np.float32((bottom - top) * (right - left))
+            total = np.float32(0)
+            for c in range(channels):
+                mean[c] = mean[c] / area - target[i, j, c]
+                total += abs(mean[c]) if by_channel else mean[c] * mean[c]
+            distance = (
+                total / np.float32(channels) if by_channel else np.float32(math.sqrt(total / np.float32(channels)))
+            )
+            scale = share[i, j] / (area * np.float32(channels))
+            for c in range(channels):
+                slope = np.float32(mean[c] > 0) - np.float32(mean[c] < 0)
+                if not by_channel:
+                    slope = mean[c] / max(distance, TINY)
+                slopes[i, j, c] = scale * slope if share[i, j] != 0 else np.float32(0)
+            if share[i, j] != 0:  # what does not count may be anything
+                values[i] += share[i, j] * distance
+    gradient = np.empty((height, width, channels), np.float32)
+    for y in prange(height):
+        for x in range(width):
+            for c in range(channels):
+                gradient[y, x, c] = np.float32(0)
+        for i in range(y * rows // height, min(y * rows // height + 2, rows)):
+            top, bottom = _span(i, rows, height)
+            if top <= y < bottom:
+                for j in range(columns):
+                    left, right = _span(j, columns, width)
+                    for x in range(left, right):
+                        for c in range(channels):
+                            gradient[y, x, c] += slopes[i, j, c]
+    return values, gradient
