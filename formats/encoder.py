@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Any
 
 from chebsplat.formats import artifact
-from chebsplat.formats.documents import read_document, write_document
+from chebsplat.formats.artifact import read_document, write_document
 
 SCHEMA = "chebsplat.encoder/2"
 FLOAT, DYNAMIC, FUSED = "encoder.onnx", "encoder.int8.onnx", "fusion.onnx"

@@ -1,4 +1,6 @@
-"""`evaluation/2`: figures per view and per class, rendered pictures, timings."""
+"""`evaluation/2`: figures per view and per class, rendered pictures, timings;
+`agreement/2`: how far the views of a capture agree on what the same points are, by their 2D teacher.
+"""
 
 from __future__ import annotations
 
@@ -7,7 +9,7 @@ from pathlib import Path
 from typing import Annotated, Any, ClassVar, Self
 
 from chebsplat.formats import artifact
-from chebsplat.formats.documents import read_document, write_document
+from chebsplat.formats.artifact import read_document, write_document
 from chebsplat.formats.manifest import Manifest
 from chebsplat.formats.record import Array, Record, Stack, layout_of
 
@@ -59,3 +61,19 @@ def read_figures(path: Path, manifest: Manifest) -> dict[str, Any]:
     """The figures alone. Raises InputError naming file and remedy."""
     figures: dict[str, Any] = read_document(path, manifest, FIGURES)
     return figures
+
+
+@dataclass
+class ViewAgreement(Record):
+    """agreement: 1 if views always agree, 0 if by chance alone, None where no point was seen twice.
+
+    n_points: that two of the `n_views` training views see.
+    labels:   by name, of those that are said at all: `share` of what views say, and the `agreement` of the views on
+              this label.
+    """
+
+    SCHEMA: ClassVar[str] = "chebsplat.agreement/2"
+    agreement: float | None
+    n_points: int
+    n_views: int
+    labels: dict[str, dict[str, float]]

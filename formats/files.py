@@ -1,5 +1,5 @@
 """Files one by one. Reading what people or other programs wrote: regular, of bounded size, UTF-8, and parsed or named
-in a clear error. Writing a file whole or not at all.
+in a clear error. Writing a file whole or not at all; a disk that is full, over quota or read-only said in one line.
 
 Every reader of such a file goes through here, so that a pipe, a device, a folder, a file of gigabytes, bytes that are
 no text and a document nested a thousand levels deep are each refused at once, in the same words everywhere.
@@ -7,10 +7,12 @@ no text and a document nested a thousand levels deep are each refused at once, i
 
 from __future__ import annotations
 
+import errno
 import json
 import math
 import os
 import re
+import shutil
 import stat
 import tomllib
 from collections import Counter
@@ -19,7 +21,7 @@ from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any
 
-from chebsplat.errors import ChebsplatError, InputError
+from chebsplat.errors import ChebsplatError, DiskFailure, InputError
 
 LARGEST = 32 << 20  # bytes of text: a transforms.json of 20,000 frames; as JSON it takes up to 25 times as much memory
 LARGEST_TOML = 1 << 20  # tomllib reads about 2 MB a second
@@ -134,3 +136,42 @@ def sync(path: Path) -> None:
         os.fsync(handle)
     finally:
         os.close(handle)
+
+
+CLOSED = {errno.EROFS, errno.EACCES, errno.EPERM}
+REFUSALS = {errno.ENOSPC, errno.EDQUOT} | CLOSED
+
+
+@contextmanager
+def explained(folder: Path, scratch: bool = False) -> Iterator[None]:
+    """Turn refusals of the disk within into a DiskFailure that names the error's file, or `folder`.
+
+    Args: scratch: `folder` holds what is being written and nothing else; the message has its bytes.
+    Raises: DiskFailure; InputError naming a file that may not be read.
+    """
+    try:
+        yield
+    except ChebsplatError:
+        raise
+    except Exception as error:
+        fault: BaseException | None = error
+        while fault is not None and not (isinstance(fault, OSError) and fault.errno in REFUSALS):
+            fault = fault.__cause__
+        if fault is None:
+            raise
+        raise _failure(fault, folder, scratch) from error
+
+
+def _failure(fault: OSError, folder: Path, scratch: bool) -> ChebsplatError:
+    file = Path(os.fsdecode(fault.filename)) if isinstance(fault.filename, str | bytes) else folder
+    if fault.errno in CLOSED:
+        if file.exists() and not os.access(file, os.R_OK):
+            return InputError(f"{file} cannot be read ({fault.strerror}); allow it, or name another")
+        return DiskFailure(f"{file} cannot be written ({fault.strerror}); make it writable, or choose another folder")
+    there = next(parent for parent in (folder, *folder.parents) if parent.is_dir())
+    written = sum(path.stat().st_size for path in folder.rglob("*") if path.is_file()) if scratch else 0
+    needed = f"more than {written:,} bytes are needed in {folder.parent}, " if scratch else ""
+    free = f"{shutil.disk_usage(there).free:,} are free{' beside those' if scratch else ''}"
+    return DiskFailure(
+        f"{file} cannot be written ({fault.strerror}): {needed}{free}; make room and give the same command again"
+    )

@@ -1,4 +1,6 @@
-"""`lifted/2`: features that were lifted to the Gaussians of a checkpoint, and the evidence for them."""
+"""`lifted/2`: features that were lifted to the Gaussians of a checkpoint, and the evidence for them;
+`refined/2`: the features after smoothing and knowledge, and how both were chosen.
+"""
 
 from __future__ import annotations
 
@@ -29,4 +31,21 @@ class Lifted(Record):
     agreement: Annotated[np.ndarray, Array("float32", ("gaussian",))]
     halves: Annotated[np.ndarray, Array("float32", (2, "gaussian", "channel"))]
     half_views: Annotated[np.ndarray, Array("int32", (2, "gaussian"), "views")]
+    notes: dict[str, Any] = field(default_factory=dict)
+
+
+@dataclass
+class Refined(Record):
+    """N Gaussians in the order of their checkpoint, C channels of the teacher.
+
+    features:   f32 [N, C].
+    confidence: f32 [N] in [0, 1]: how many votes there are and how far they agree; 0 where nothing is known.
+    notes:      what it started from, whether it was smoothed, views that knowledge counts for, what a view counts for
+                where the teacher is unsure of the scene, and by smoothing and strength the agreement of half the
+                training views with the other half.
+    """
+
+    SCHEMA: ClassVar[str] = "chebsplat.refined/2"
+    features: Annotated[np.ndarray, Array("float32", ("gaussian", "channel"))]
+    confidence: Annotated[np.ndarray, Array("float32", ("gaussian",))]
     notes: dict[str, Any] = field(default_factory=dict)

@@ -1,14 +1,19 @@
-"""3DGS PLY files: the 62-float layout that viewers load, trimmed to the SH bands in use."""
+"""3DGS PLY files: the 62-float layout that viewers load, trimmed to the SH bands in use.
+
+`read_vertices` is the one door to reading PLY: what a header declares is held against the file's size.
+"""
 
 from __future__ import annotations
 
+import re
 from pathlib import Path
+from typing import Any
 
 import numpy as np
-from plyfile import PlyData, PlyElement
+from plyfile import PlyData, PlyElement, PlyListProperty, PlyParseError
 
 from chebsplat.errors import InputError
-from chebsplat.formats.vertices import read_vertices
+from chebsplat.formats.files import regular
 
 REST = {0: 0, 1: 3, 2: 8, 3: 15}  # coefficients beyond band 0, by degree
 _FIXED = ["x", "y", "z", "nx", "ny", "nz", "f_dc_0", "f_dc_1", "f_dc_2"]
@@ -108,3 +113,42 @@ def read_ply(path: Path) -> tuple[dict[str, np.ndarray], int, np.ndarray | None]
         parameters["degrees"] = whole("sh_degree", 0, degree).astype(np.uint8)
     labels = whole("label", -1, 2**24).astype(np.int32) if "label" in names else None
     return parameters, degree, labels
+
+
+HEADER = 1 << 20  # bytes that a header may take
+_PART = re.compile(rb"^[ \t]*(?:element[ \t]+\S+[ \t]+(\d{1,30})|(property))\b", re.MULTILINE)
+
+
+def read_vertices(path: Path, remedy: str) -> Any:
+    """plyfile's element `vertex`, of scalar properties. Raises InputError naming the file and the remedy.
+
+    Choices: a value takes a byte at least, in text and in binary; a header that declares more values than the file has
+      bytes lies, and is refused before anything is allocated.
+    """
+    size = regular(path, remedy).st_size
+    try:
+        with path.open("rb") as handle:
+            header, end, _ = handle.read(HEADER).partition(b"end_header")
+        if not header.startswith(b"ply") or not end:
+            raise ValueError("it has no PLY header")
+        if (declared := _values(header)) > size:
+            raise ValueError(f"it declares {declared:,} values and has {size:,} bytes")
+        vertex = PlyData.read(str(path))["vertex"]
+    except (PlyParseError, OSError, LookupError, TypeError, ValueError, MemoryError, OverflowError) as error:
+        line = " ".join(str(error).split())[:200]
+        raise InputError(f"{path} is not a readable PLY ({line}); {remedy}") from None
+    lists = [part.name for part in vertex.properties if isinstance(part, PlyListProperty)]
+    if lists:
+        raise InputError(f"{path}: {lists[0][:60]} holds lists, one number a vertex is needed; {remedy}")
+    return vertex
+
+
+def _values(header: bytes) -> int:
+    """Values that a header declares, a list counted as one."""
+    total = count = 0
+    for number, is_property in _PART.findall(header):
+        if is_property:
+            total += count
+        else:
+            count = int(number)
+    return total

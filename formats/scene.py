@@ -9,8 +9,8 @@ from typing import Annotated, Any, ClassVar, Self
 import numpy as np
 
 from chebsplat.formats import artifact
+from chebsplat.formats.artifact import read_document, write_document
 from chebsplat.formats.cameras import Cameras
-from chebsplat.formats.documents import read_document, write_document
 from chebsplat.formats.manifest import Manifest
 from chebsplat.formats.ply import REST, write_ply
 from chebsplat.formats.record import Array, Record

@@ -11,7 +11,7 @@ from chebsplat.errors import InputError
 from chebsplat.formats.artifact import sha256_file
 from chebsplat.formats.files import parse_toml, read_text
 from chebsplat.formats.names import check_names, suggest, unprintable
-from chebsplat.formats.npz import finite32, read_npz
+from chebsplat.formats.tensors import finite32, read_npz
 
 if TYPE_CHECKING:
     import numpy as np

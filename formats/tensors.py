@@ -1,10 +1,20 @@
-"""Named arrays in one safetensors file: no pickle, every array checked for dtype and shape on reading."""
+"""Named arrays in files: safetensors of ours, checked for dtype and shape on reading; .npy and .npz of users.
+
+What .npy and .npz declare is held against their bytes before anything is allocated. Measured traps this closes: a
+header of 100 bytes that declares terabytes, a zip of 400 KB that unpacks to 3 GB, a FIFO.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+import lzma
+import math
+import tokenize
+import zipfile
+import zlib
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from pathlib import Path
-from typing import Any
+from typing import IO, Any
 
 import numpy as np
 from safetensors import SafetensorError
@@ -12,6 +22,7 @@ from safetensors.numpy import load_file, save
 
 from chebsplat.errors import InputError
 from chebsplat.formats import artifact
+from chebsplat.formats.files import regular
 from chebsplat.formats.manifest import Manifest, remedy_of
 
 Spec = tuple[Any, ...]  # of an array: its dtype, then its sizes
@@ -53,3 +64,63 @@ def read_tensors(
         if not fits:
             raise InputError(f"{path}: {key} has shape {stored}, expected {tuple(shape)}; {remedy_of(root)}")
     return arrays
+
+
+LARGEST = 256 << 20  # bytes that the arrays asked for may take in all, unpacked
+# what numpy and zipfile raise, of which a RuntimeError is an unknown compression
+_BROKEN = (OSError, ValueError, EOFError, RuntimeError, MemoryError, KeyError, TypeError,
+           zipfile.BadZipFile, zlib.error, lzma.LZMAError, tokenize.TokenError)  # fmt: skip
+
+
+def read_npy(path: Path, remedy: str, largest: int = LARGEST) -> np.ndarray:
+    """The array of a .npy file. Raises InputError naming the file, what is wrong and the remedy."""
+    with _readable(path, ".npy", remedy), path.open("rb") as handle:
+        return _array(handle, path.stat().st_size, largest)
+
+
+def read_npz(path: Path, wanted: Sequence[str], remedy: str, largest: int = LARGEST) -> dict[str, np.ndarray]:
+    """Those of the wanted arrays that an .npz file holds; the others stay packed. Raises as `read_npy`."""
+    arrays: dict[str, np.ndarray] = {}
+    with _readable(path, ".npz", remedy), zipfile.ZipFile(path) as archive:
+        members = {entry.filename.removesuffix(".npy"): entry for entry in archive.infolist()}
+        for name in wanted:
+            if name in members:
+                with archive.open(members[name]) as handle:
+                    arrays[name] = _array(handle, members[name].file_size, largest)
+                largest -= arrays[name].nbytes
+    return arrays
+
+
+def finite32(values: np.ndarray) -> np.ndarray | None:
+    """Numbers as f32, None where they are no numbers or not finite in f32."""
+    if values.dtype.kind not in "fiu":
+        return None
+    with np.errstate(over="ignore"):
+        values = values.astype(np.float32)
+    return values if np.isfinite(values).all() else None
+
+
+@contextmanager
+def _readable(path: Path, kind: str, remedy: str) -> Iterator[None]:
+    regular(path, remedy)
+    try:
+        yield
+    except _BROKEN as error:
+        line = " ".join(str(error).split())[:200] or type(error).__name__
+        raise InputError(f"{path} is not a readable {kind} ({line}); {remedy}") from None
+
+
+def _array(handle: IO[bytes], size: int, largest: int) -> np.ndarray:
+    """The array that begins here, in a file (or a member of one) of `size` bytes. Raises ValueError."""
+    version = np.lib.format.read_magic(handle)
+    read_header: Any = np.lib.format.read_array_header_1_0 if version == (1, 0) else np.lib.format.read_array_header_2_0
+    shape, _, dtype = read_header(handle)
+    if dtype.hasobject:
+        raise ValueError("it holds pickled objects, which are not read")
+    declared = math.prod(shape) * dtype.itemsize
+    if handle.tell() + declared != size:
+        raise ValueError(f"it declares {declared:,} bytes and holds {max(size - handle.tell(), 0):,}")
+    if declared > largest:
+        raise ValueError(f"it holds {declared:,} bytes, at most {largest:,} are read")
+    handle.seek(0)
+    return np.lib.format.read_array(handle, allow_pickle=False)

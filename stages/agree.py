@@ -8,8 +8,8 @@ import numpy as np
 
 from chebsplat.cameras import centers
 from chebsplat.errors import DataFailure, InputError
-from chebsplat.formats.agreement import ViewAgreement
 from chebsplat.formats.capture import Capture
+from chebsplat.formats.evaluation import ViewAgreement
 from chebsplat.formats.features import Features
 from chebsplat.formats.points import Points
 from chebsplat.labels.agreement import UNSEEN, between, far_pairs, project, unhidden

@@ -13,8 +13,8 @@ from chebsplat.cameras import unproject
 from chebsplat.errors import ConfigError, DataFailure, InputError
 from chebsplat.evaluation import protocols
 from chebsplat.evaluation.lpips import NET, NORMALIZE
+from chebsplat.evaluation.metrics import features_at
 from chebsplat.evaluation.protocols.task import EvaluatedView, MapsByName, Task, resized, translated
-from chebsplat.evaluation.surface import features_at
 from chebsplat.formats.capture import Capture
 from chebsplat.formats.evaluation import Evaluation
 from chebsplat.formats.features import Features

@@ -9,8 +9,7 @@ import numpy as np
 from chebsplat.errors import DataFailure, InputError
 from chebsplat.formats.features import Features
 from chebsplat.formats.gaussians import Gaussians
-from chebsplat.formats.lifted import Lifted
-from chebsplat.formats.refined import Refined
+from chebsplat.formats.lifted import Lifted, Refined
 from chebsplat.formats.scene import Scene
 from chebsplat.labels.decode import decode_labels
 from chebsplat.stages.runtime.command import Job

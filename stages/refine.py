@@ -10,9 +10,8 @@ from chebsplat.errors import ConfigError, DataFailure, InputError
 from chebsplat.formats.capture import Capture
 from chebsplat.formats.features import Features
 from chebsplat.formats.gaussians import Gaussians
-from chebsplat.formats.lifted import Lifted
+from chebsplat.formats.lifted import Lifted, Refined
 from chebsplat.formats.points import Points
-from chebsplat.formats.refined import Refined
 from chebsplat.labels.decode import decode_labels
 from chebsplat.lifting.blend import blend, calibrate, confidence, effective, familiar, reliable, start, trusted
 from chebsplat.lifting.observations import carry

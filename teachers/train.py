@@ -25,10 +25,8 @@ from chebsplat.formats.teacher_model import EMBEDDED
 from chebsplat.stages.runtime.progress import Progress
 from chebsplat.synthetic import CLASS_NAMES
 from chebsplat.synthetic.layout import TRAINING
-from chebsplat.teachers.augment import crops, recolored
-from chebsplat.teachers.dataset import rendered
 from chebsplat.teachers.network import Encoder, Trunk, span
-from chebsplat.teachers.rooms import KINDS
+from chebsplat.teachers.rooms import KINDS, crops, recolored, rendered
 from chebsplat.teachers.words import embedded, words
 
 ROOMS, VALIDATION, VIEWS = TRAINING[:480], TRAINING[-12:], 8  # rooms, and views of each
@@ -168,7 +166,7 @@ def average_in(average: Trunk, trunk: Trunk, kept: float) -> None:
 @click.option("--out", type=click.Path(path_type=Path), default=EMBEDDED.parent, help="the model goes here")
 def main(steps: int, threads: int, cache: Path, out: Path) -> None:
     """Render the rooms, train, and export the embedded teacher."""
-    from chebsplat.teachers.export import export
+    from chebsplat.teachers.network import export
 
     logging.basicConfig(level=logging.INFO, format="%(message)s")
     torch.set_num_threads(threads)

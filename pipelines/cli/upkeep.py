@@ -116,11 +116,11 @@ def clean_stale(yes: bool, keep_newer: float, older_than: float | None) -> None:
 @click.command()
 def status() -> None:
     """Say what runs, waits and has failed, with seconds and the end of the log, here and on a cluster."""
-    from chebsplat.pipelines.work import status as runs
     from chebsplat.pipelines.work import store
+    from chebsplat.pipelines.work.summary import lines
 
     said = False
-    for line in runs.lines():
+    for line in lines():
         print(line)
         said = True
     if not said:

@@ -14,7 +14,7 @@ import click
 import numpy as np
 
 from chebsplat.errors import ConfigError
-from chebsplat.pipelines.cli.options import AGAINST, NewPath, Phrases
+from chebsplat.pipelines.cli.group import AGAINST, NewPath, Phrases
 
 
 def told(figures: Mapping[str, Any], out: Path) -> None:
@@ -45,7 +45,7 @@ def query(scene: str, text: str, against: list[str], top: int) -> None:
 @click.option("--labels", help="text file of labels; default: the teacher's own")
 def check_teacher(model: Path, photo: Path | None, labels: str | None) -> None:
     """Run one image through a teacher MODEL (.onnx): what it is, what it costs, what it sees."""
-    from chebsplat.stages.tools.check_teacher import check
+    from chebsplat.stages.tools.get_teacher import check
 
     for what, finding in check(model, photo, labels):
         print(f"{what:9s}{finding}")

@@ -1,14 +1,16 @@
-"""Identity of the code behind a stage: what it computes with, not how it is written down.
+"""Identity of a step: one digest of all that its result depends on, its code among it, and of nothing else.
 
-The hash covers the syntax trees, without comments and docstrings, of the stage's module and of every module of ours
-it imports, however deep, the templates of pages beside them, and the versions of the packages these import. Plumbing
-that cannot change a result is left out, so that a better progress bar makes nothing stale.
+The hash of the code behind a stage covers the syntax trees, without comments and docstrings, of the stage's module
+and of every module of ours it imports, however deep, the templates of pages beside them, and the versions of the
+packages these import. Plumbing that cannot change a result is left out, so that a better progress bar makes nothing
+stale.
 """
 
 from __future__ import annotations
 
 import ast
 import hashlib
+import json
 import sys
 from collections.abc import Iterable
 from importlib import metadata
@@ -16,6 +18,7 @@ from pathlib import Path
 from typing import Any
 
 import chebsplat
+from chebsplat.stages.registry import Stage
 
 PACKAGE = Path(chebsplat.__file__).parent
 PLUMBING = tuple(f"chebsplat.{name}." for name in ("settings", "stages.settings", "stages.registry", "stages.runtime"))
@@ -130,3 +133,52 @@ def parsed(text: str, name: str) -> tuple[str, list[str]]:
             ):
                 node.body = node.body[1:] or [ast.Pass()]
     return hashlib.sha256(ast.dump(tree).encode()).hexdigest()[:16], sorted(imports)
+
+
+# Settings that say where raw files lie. Their content is hashed instead: where it lies is no matter.
+PLACES = (
+    ("source", "path"),
+    ("channels", "model"),
+    ("channels", "reference"),
+    ("teacher", "model"),
+    ("teacher", "labels"),
+    ("train", "start"),
+    ("knowledge", "model"),
+    ("evaluate", "lpips_weights"),
+)
+
+
+def step_key(
+    stage: Stage,
+    sections: dict[str, Any],
+    inputs: dict[str, str],
+    code: dict[str, Any],
+    raw: str | None = None,
+    device: str = "cpu",
+) -> str:
+    """Key of a stage's artifact, 16 hex digits.
+
+    Args: sections: the config that the stage reads; inputs: keys of artifacts by role;
+          code: of `Code.stage`; raw: `raw.content_hash` of the files outside the store that the stage reads;
+          device: that computes it. The CPU's keys do not name it.
+    """
+    identity = {
+        "stage": stage.name,
+        "schema": stage.schema,
+        "config": placeless(sections),
+        "inputs": inputs,
+        "code": code,
+    } | ({} if raw is None else {"raw": raw})
+    if device != "cpu":
+        identity["device"] = device
+    text = json.dumps(identity, sort_keys=True, separators=(",", ":"), allow_nan=False)
+    return hashlib.sha256(text.encode()).hexdigest()[:16]
+
+
+def placeless(sections: dict[str, Any]) -> dict[str, Any]:
+    """Sections that name raw files by their last part only."""
+    kept = {name: dict(section) for name, section in sections.items()}
+    for section, key in PLACES:
+        if kept.get(section, {}).get(key):
+            kept[section][key] = Path(kept[section][key]).name
+    return kept

@@ -15,8 +15,7 @@ from typing import TYPE_CHECKING, Any
 from chebsplat.errors import ConfigError
 from chebsplat.formats.names import unprintable
 from chebsplat.formats.teacher_model import EMBEDDED, read_teacher
-from chebsplat.pipelines.planning.code import PACKAGE, Code
-from chebsplat.pipelines.planning.keys import PLACES, step_key
+from chebsplat.pipelines.planning.code import PACKAGE, PLACES, Code, step_key
 from chebsplat.pipelines.planning.needs import (
     knowledge_given,
     left_out_channels,

@@ -16,8 +16,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from chebsplat.formats import disk
-from chebsplat.formats.files import atomic_write
+from chebsplat.formats.files import atomic_write, explained
 from chebsplat.pipelines.planning.plan import Plan, Step
 from chebsplat.pipelines.running import cluster, job
 from chebsplat.pipelines.running import processes as children
@@ -171,7 +170,7 @@ def failures(steps: list[Step], folder: Path, words: Path) -> Outcome:
             failed[step.key], killed = (1, "killed before it could report", log), True
             say(f"{step.stage} was killed before it could report; log: {log}")
     if killed or not failed:
-        with disk.explained(store.work()):  # whoever failed could not say whether the disk is full
+        with explained(store.work()):  # whoever failed could not say whether the disk is full
             atomic_write(folder / "room", bytes(1 << 20))
             (folder / "room").unlink()
     if not failed:

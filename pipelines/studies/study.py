@@ -1,21 +1,23 @@
-"""Studies: scenes (or sequences) × conditions × variants × budgets × seeds, through the planner and the store."""
+"""Studies: scenes (or sequences) × conditions × variants × budgets × seeds, planned and stored; their progress."""
 
 from __future__ import annotations
 
 import itertools
-from collections.abc import Callable, Iterator
+import threading
+import time
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Annotated, Any
 
 from pydantic import AfterValidator, Field, model_validator
 
-from chebsplat.errors import ConfigError
+from chebsplat.errors import ChebsplatError, ConfigError
 from chebsplat.pipelines.planning.plan import Plan, Planner, Step, merged, suffix
 from chebsplat.pipelines.planning.sequences import scenes_of
 from chebsplat.pipelines.running.cluster import LOCAL
 from chebsplat.pipelines.running.run import Outcome, say, snakemake, wanted_steps
-from chebsplat.pipelines.studies.progress import reported
 from chebsplat.pipelines.work import store
 from chebsplat.pipelines.work.scenes import read_named, read_toml, scene_values
 from chebsplat.stages.runtime.config import checked
@@ -254,3 +256,45 @@ def describe(steps: list[Step]) -> str:
     for step in steps:
         counts[step.stage] = counts.get(step.stage, 0) + 1
     return "to run: " + ", ".join(f"{n} {stage}" for stage, n in counts.items()) if counts else "nothing to run"
+
+
+EVERY = 1.0  # seconds between looks at what is finished
+REFRESH = 300.0  # seconds at least between two writings of a study's page while it runs
+
+
+@contextmanager
+def reported(
+    runs: Sequence[Run], say: Callable[[str], None], refresh: Callable[[], object] = lambda: None
+) -> Iterator[None]:
+    """Say `n of m done` of every run that is finished while the block runs, and `refresh` what
+    shows them now and then.
+    """
+    waiting = {run.name: run.steps[-1] for run in runs if not run.steps[-1].fresh}
+    over = threading.Event()
+
+    def look() -> bool:
+        finished = [name for name, last in waiting.items() if last.fresh]
+        for name in finished:
+            del waiting[name]
+            say(f"  {len(runs) - len(waiting)} of {len(runs)} done: {name}")
+        return bool(finished)
+
+    def watch() -> None:
+        written_at, is_new = time.monotonic(), False
+        while not over.wait(EVERY):
+            is_new |= look()
+            if is_new and time.monotonic() - written_at >= REFRESH:
+                try:
+                    refresh()
+                except (ChebsplatError, OSError) as error:
+                    say(f"  the page could not be written: {error}")
+                written_at, is_new = time.monotonic(), False
+
+    thread = threading.Thread(target=watch, daemon=True)
+    thread.start()
+    try:
+        yield
+    finally:
+        over.set()
+        thread.join()
+        look()

@@ -22,7 +22,7 @@ from typing import Any
 import click
 
 from chebsplat.errors import ChebsplatError, Stopped
-from chebsplat.formats import disk
+from chebsplat.formats.files import explained
 
 log = logging.getLogger("chebsplat")
 SIGNALS = signal.SIGINT, signal.SIGTERM, signal.SIGHUP
@@ -42,7 +42,7 @@ def exit_code(
       to the caller, beside click's own.
     """
     try:
-        with heeded(), disk.explained(folder):
+        with heeded(), explained(folder):
             return action() or 0
     except (ChebsplatError, Stopped) as error:
         tell(str(error))

@@ -11,7 +11,7 @@ import numpy as np
 
 from chebsplat.errors import DataFailure, InputError
 from chebsplat.formats.images import opened, seen_size, turned
-from chebsplat.formats.npz import finite32, read_npz
+from chebsplat.formats.tensors import finite32, read_npz
 from chebsplat.stages.sources.common import Frame, Listing
 from chebsplat.stages.sources.texts import LONGEST, shortened, whole
 

@@ -9,8 +9,8 @@ import numpy as np
 
 from chebsplat.errors import InputError
 from chebsplat.evaluation.protocols import scannet_closed, scannet_open
-from chebsplat.formats.clouds import read_cloud
 from chebsplat.formats.images import header
+from chebsplat.formats.points import read_cloud
 from chebsplat.stages.sources import assembly, cameras, common, texts
 from chebsplat.stages.sources.cameras import Camera
 from chebsplat.stages.sources.common import Frame, Listing, present

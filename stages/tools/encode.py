@@ -12,9 +12,9 @@ from chebsplat.errors import ConfigError, InputError
 from chebsplat.formats.encoder import DYNAMIC, FLOAT, FUSED, read_encoder
 from chebsplat.formats.files import atomic_path
 from chebsplat.formats.manifest import remedy_of
-from chebsplat.formats.npz import finite32, read_npy
 from chebsplat.formats.ply import read_ply
 from chebsplat.formats.scene import Scene
+from chebsplat.formats.tensors import finite32, read_npy
 from chebsplat.settings import DescribeSection
 from chebsplat.shape.region_inputs import RegionInputs, region_inputs
 from chebsplat.stages.runtime.command import n_threads

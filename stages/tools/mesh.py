@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from chebsplat.errors import ConfigError, DataFailure
-from chebsplat.evaluation.surface import features_at
+from chebsplat.evaluation.metrics import features_at
 from chebsplat.formats.meshes import Frame, Mesh, cleaned, fused, meshlab
 from chebsplat.labels.decode import decode_labels
 from chebsplat.stages.runtime.progress import Progress

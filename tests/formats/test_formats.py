@@ -12,7 +12,6 @@ from shared import KEY, data, gaussian_parameters, published
 
 from chebsplat.errors import InputError
 from chebsplat.formats import (
-    agreement,
     artifact,
     capture,
     descriptors,
@@ -22,7 +21,6 @@ from chebsplat.formats import (
     lifted,
     ply,
     points,
-    refined,
     scene,
 )
 from chebsplat.formats.cameras import Cameras
@@ -128,7 +126,7 @@ def make_evaluation():
 
 def make_agreement():
     labels = {"wall": {"share": 0.75, "agreement": 0.5}, "floor": {"share": 0.25, "agreement": 0.25}}
-    return agreement.ViewAgreement(0.375, 40, 2, labels)
+    return evaluation.ViewAgreement(0.375, 40, 2, labels)
 
 
 def make_lifted():
@@ -147,7 +145,7 @@ def make_lifted():
 def make_refined():
     rng = np.random.default_rng(8)
     notes = {"start": "trained", "smooth": True, "strength": 2.0, "curve": {"off": {"0": 0.9}, "on": {"0": 0.95}}}
-    return refined.Refined(rng.normal(size=(6, 4)).astype(np.float32), rng.random(6, dtype=np.float32), notes)
+    return lifted.Refined(rng.normal(size=(6, 4)).astype(np.float32), rng.random(6, dtype=np.float32), notes)
 
 
 def make_knowledge():

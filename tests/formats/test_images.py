@@ -16,7 +16,7 @@ from chebsplat.formats import images
 from chebsplat.formats.images import header, opened, read_rgb, seen_size, turned
 from chebsplat.stages import channels
 from chebsplat.stages.sources import photos
-from chebsplat.stages.tools import check_teacher
+from chebsplat.stages.tools import get_teacher
 
 
 @pytest.mark.parametrize("how", ["ingest", "channels", "check-teacher"])
@@ -33,7 +33,7 @@ def test_an_image_that_is_a_program_is_never_run(tmp_path, monkeypatch, how):
     read = {
         "ingest": lambda: photos.read(folder, SETTINGS),
         "channels": lambda: list(channels.photos([folder / "b.png"])),
-        "check-teacher": lambda: check_teacher.shown(folder / "b.png"),
+        "check-teacher": lambda: get_teacher.shown(folder / "b.png"),
     }[how]
     with pytest.raises(InputError, match=r"b\.png is no PNG, JPEG or HEIC"):
         read()

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from chebsplat.errors import InputError
-from chebsplat.formats.npz import read_npy, read_npz
+from chebsplat.formats.tensors import read_npy, read_npz
 
 
 def npy(array, **header):

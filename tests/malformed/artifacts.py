@@ -17,20 +17,18 @@ from typing import Any
 import numpy as np
 
 from chebsplat.formats import artifact
-from chebsplat.formats.agreement import ViewAgreement
 from chebsplat.formats.basis import Basis, write_basis
 from chebsplat.formats.cameras import Cameras
 from chebsplat.formats.capture import Capture
 from chebsplat.formats.descriptors import Descriptors, write_descriptors
 from chebsplat.formats.encoder import DYNAMIC, FLOAT, FUSED, write_encoder
-from chebsplat.formats.evaluation import Evaluation
+from chebsplat.formats.evaluation import Evaluation, ViewAgreement
 from chebsplat.formats.features import Features
 from chebsplat.formats.gaussians import Gaussians
 from chebsplat.formats.knowledge import Knowledge, write_knowledge
-from chebsplat.formats.lifted import Lifted
+from chebsplat.formats.lifted import Lifted, Refined
 from chebsplat.formats.manifest import Manifest
 from chebsplat.formats.points import Points
-from chebsplat.formats.refined import Refined
 from chebsplat.formats.scene import Scene
 from chebsplat.settings import DescribeSection
 from chebsplat.stages.registry import STAGES

@@ -7,9 +7,9 @@ import pytest
 from malformed.artifacts import LABELS, N, artifacts
 from shared import published, run_stage
 
-from chebsplat.formats.agreement import ViewAgreement
 from chebsplat.formats.artifact import read_manifest
 from chebsplat.formats.capture import Capture
+from chebsplat.formats.evaluation import ViewAgreement
 from chebsplat.formats.points import Points
 from chebsplat.labels.agreement import between, far_pairs, project, unhidden
 

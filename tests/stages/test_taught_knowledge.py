@@ -16,7 +16,7 @@ from chebsplat.formats.capture import Capture
 from chebsplat.formats.features import Features
 from chebsplat.formats.gaussians import Gaussians
 from chebsplat.formats.knowledge import ENCODER, SHIPPED, read_knowledge
-from chebsplat.formats.refined import Refined
+from chebsplat.formats.lifted import Refined
 from chebsplat.formats.teacher_model import read_teacher
 from chebsplat.lifting.surface import Surface
 from chebsplat.pipelines.planning.plan import Planner

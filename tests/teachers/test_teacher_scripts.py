@@ -10,7 +10,7 @@ import pytest
 import torch
 from shared import ROOT
 
-from chebsplat.stages.tools.check_teacher import check
+from chebsplat.stages.tools.get_teacher import check
 
 TEXT = (ROOT / "docs/teachers.md").read_text()
 SCRIPTS = {name: "# " + body for name, body in re.findall(r"```python\n# (?=(\w+)\.py)(.*?)```", TEXT, re.DOTALL)}

@@ -10,7 +10,7 @@ from shared import ROOT
 from soak.disk import namespace
 
 from chebsplat.errors import DiskFailure, InputError
-from chebsplat.formats import artifact, disk
+from chebsplat.formats import artifact, files
 from chebsplat.formats.manifest import Manifest
 from chebsplat.pipelines.running.run import failures
 from chebsplat.stages.training.saves import Saves
@@ -71,7 +71,7 @@ def test_a_full_disk_is_recognised_behind_a_library_s_own_error(tmp_path):
 
 
 def test_a_crash_that_is_not_the_disk_s_stays_one(tmp_path):
-    with pytest.raises(ZeroDivisionError), disk.explained(tmp_path):
+    with pytest.raises(ZeroDivisionError), files.explained(tmp_path):
         1 / 0  # noqa: B018
     assert not list(tmp_path.iterdir())
 
@@ -79,7 +79,7 @@ def test_a_crash_that_is_not_the_disk_s_stays_one(tmp_path):
 def test_a_file_that_may_not_be_read_is_an_input_s_fault(tmp_path, monkeypatch):
     monkeypatch.setattr(os, "access", lambda path, mode: False)
     (tmp_path / "photo.jpg").touch()
-    with pytest.raises(InputError, match=r"photo\.jpg cannot be read"), disk.explained(tmp_path):
+    with pytest.raises(InputError, match=r"photo\.jpg cannot be read"), files.explained(tmp_path):
         raise PermissionError(errno.EACCES, os.strerror(errno.EACCES), str(tmp_path / "photo.jpg"))
 
 

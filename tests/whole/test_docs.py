@@ -7,17 +7,15 @@ import re
 import pytest
 from shared import ROOT
 
-from chebsplat.formats.agreement import ViewAgreement
 from chebsplat.formats.capture import Capture
 from chebsplat.formats.channels import ChannelMap
-from chebsplat.formats.evaluation import Pictures
+from chebsplat.formats.evaluation import Pictures, ViewAgreement
 from chebsplat.formats.features import Features
 from chebsplat.formats.gaussians import Checkpoint
-from chebsplat.formats.lifted import Lifted
+from chebsplat.formats.lifted import Lifted, Refined
 from chebsplat.formats.ply import read_ply
 from chebsplat.formats.points import Points
 from chebsplat.formats.record import layout_of
-from chebsplat.formats.refined import Refined
 from chebsplat.formats.scene import RaggedScene, Scene
 from chebsplat.settings import TrainSection
 from chebsplat.stages.registry import STAGES

@@ -16,9 +16,8 @@ from typing import Any
 
 import numpy as np
 
-from chebsplat.evaluation.metrics import IGNORE, boundary_band, confusion, segmentation
+from chebsplat.evaluation.metrics import IGNORE, boundary_band, confusion, segmentation, thinned
 from chebsplat.evaluation.protocols.task import EvaluatedView, Task, predicted
-from chebsplat.evaluation.surface import thinned
 from chebsplat.labels.decode import decode_labels
 
 NAME = "labels"

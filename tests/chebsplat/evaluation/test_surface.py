@@ -3,7 +3,7 @@
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from chebsplat.evaluation.surface import CELLS, REACH, features_at, thinned
+from chebsplat.evaluation.metrics import CELLS, REACH, features_at, thinned
 
 
 def gaussians(n, seed=0):

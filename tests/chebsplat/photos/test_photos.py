@@ -15,9 +15,9 @@ from chebsplat.formats.points import Points
 from chebsplat.photos import exposures as measuring
 from chebsplat.photos.exposures import measured_exposures, own_part, relit
 from chebsplat.settings import TrainSection
+from chebsplat.stages.ingest import displaced, recolored
 from chebsplat.stages.runtime import config
 from chebsplat.stages.runtime.command import Job
-from chebsplat.stages.sources.disturbed import displaced, recolored
 from chebsplat.stages.training.assembly import Inputs, assemble
 from chebsplat.stages.training.defaults import DEPTH_WEIGHT, evidence_of, resolved
 from chebsplat.stages.training.photos import own_exposures

@@ -6,8 +6,8 @@ from types import SimpleNamespace
 import pytest
 
 from chebsplat.errors import DataFailure
-from chebsplat.pipelines.studies import progress
-from chebsplat.pipelines.studies.progress import reported
+from chebsplat.pipelines.studies import study
+from chebsplat.pipelines.studies.study import reported
 
 
 @pytest.fixture
@@ -30,8 +30,8 @@ def test_every_run_is_told_once_when_it_is_done(runs):
 
 
 def test_what_shows_the_runs_is_written_while_they_go_on_and_a_failure_of_that_is_told(runs, monkeypatch):
-    monkeypatch.setattr(progress, "EVERY", 0.01)
-    monkeypatch.setattr(progress, "REFRESH", 0.02)
+    monkeypatch.setattr(study, "EVERY", 0.01)
+    monkeypatch.setattr(study, "REFRESH", 0.02)
     told, written = [], threading.Event()
 
     def refresh():

@@ -15,7 +15,7 @@ from chebsplat.stages.teacher_models import text_encoder
 from chebsplat.stages.teacher_models.label_space import IN_ROOMS, label_set
 from chebsplat.stages.teacher_models.text_encoder import folded, text_embeddings
 from chebsplat.synthetic import CLASS_NAMES
-from chebsplat.teachers.nouns import NOUNS, TABLE
+from chebsplat.teachers.words import NOUNS, TABLE
 
 NAMES = ["chair", "tv-screen", "battery", "Box", "glass"]
 

@@ -27,6 +27,7 @@ from chebsplat.labels.calibration import (
 )  # fmt: skip
 from chebsplat.pipelines.cli import main
 from chebsplat.stages.tools import calibrate
+from chebsplat.synthetic import layout
 from tests.stages.tools.test_query import EMBEDDINGS, N, asked, write_toy
 
 OF = Calibration(margin=14.0, cosine=9.0, bias=-4.0, strength=1.0, offset=2.0)

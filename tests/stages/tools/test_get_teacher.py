@@ -17,8 +17,7 @@ from tiny_teachers import write_model
 
 from chebsplat.errors import ConfigError, InputError
 from chebsplat.formats.teacher_model import read_teacher
-from chebsplat.stages.tools import check_teacher
-from chebsplat.stages.tools.get_teacher import get_teacher, parsed
+from chebsplat.stages.tools.get_teacher import check, get_teacher, parsed
 
 REPOSITORY, COMMIT, CLASSES = "some/Segmenter-B0", "c" * 40, ["wall", "floor", "sofa: a seat", "wall"]
 NAME, SHORT = f"hf:{REPOSITORY}", "segmenter-b0"
@@ -94,7 +93,7 @@ def constants():
 def hub(constants, tmp_path, monkeypatch):
     """A hub that answers, an empty cache, and a small photo for the check."""
     photo = np.random.default_rng(0).integers(0, 255, (48, 64, 3), np.uint8)
-    monkeypatch.setattr(check_teacher, "shown", lambda _: ("photo", photo))
+    monkeypatch.setattr("chebsplat.stages.tools.get_teacher.shown", lambda _: ("photo", photo))
     monkeypatch.setattr(constants, "HF_HUB_CACHE", str(tmp_path / "cache"))
     monkeypatch.setattr("time.sleep", lambda _: None)  # where the client waits, and tries again
     monkeypatch.chdir(tmp_path)
@@ -169,7 +168,7 @@ def test_an_encoder_that_was_replaced_later_is_refused(hub):
     with model.open("ab") as handle:
         handle.write(b"\0")
     with pytest.raises(InputError, match="damaged or replaced"):
-        check_teacher.check(model)
+        check(model)
     with pytest.raises(InputError, match="damaged or replaced"):
         get_teacher(NAME)
     assert model.is_file()
