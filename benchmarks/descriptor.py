@@ -16,7 +16,8 @@ from benchmarks import shared
 from benchmarks.stability import oracle
 from chebsplat.shape.descriptor import describe
 from chebsplat.shape.regions import build_regions
-from chebsplat.splats.gaussians import activated, initial_gaussians, local_shape, rotation_matrices
+from chebsplat.splats.gaussians import activated, initial_gaussians, local_shape
+from chebsplat.splats.rotations import rotation_matrices
 from chebsplat.synthetic import layout
 
 N, SETTINGS = 64, {"n_angles": 4, "max_degree": 8, "anisotropy": 30.0, "bandwidth": 0.7}

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import difflib
+import re
 import unicodedata
 from collections import Counter
 from collections.abc import Iterable
@@ -36,3 +37,9 @@ def check_names(names: Any, what: str, where: object, remedy: str) -> None:
 def suggest(word: str, known: Iterable[str], n: int = 3) -> list[str]:
     """At most `n` of the known names that look most like a word, the most alike first; none if none is like it."""
     return difflib.get_close_matches(word[:LONGEST], list(known), n)
+
+
+def natural(name: str) -> tuple[Any, ...]:
+    """Sort key under which frame_2 precedes frame_10; equal numbers are told apart by their spelling."""
+    parts = re.split(r"(\d+)", name)
+    return tuple(int(part) if k % 2 else part for k, part in enumerate(parts)), name

@@ -12,8 +12,8 @@ from scipy.spatial.transform import Rotation
 from chebsplat.cameras import centers
 from chebsplat.errors import ConfigError, DataFailure, InputError
 from chebsplat.evaluation import protocols
-from chebsplat.evaluation.protocols.task import every
 from chebsplat.formats.capture import MAPS, Capture
+from chebsplat.formats.names import natural
 from chebsplat.photos.exposures import relit
 from chebsplat.photos.frames import blurred, detail
 from chebsplat.stages.runtime.command import Job
@@ -71,6 +71,17 @@ def blur_note(fields: dict[str, Any]) -> str:
     more = f" and {len(names) - NAMED} more" if len(names) > NAMED else ""
     shown = ", ".join(names[:NAMED])
     return f"{len(names)} of {len(images)} views look blurred: {shown}{more}; they are used as they are."
+
+
+def every(names: list[str], step: int, offset: int) -> np.ndarray:
+    """bool [V]: names whose index in natural order is `offset` modulo `step`, whatever order they are given in.
+
+    Choices: natural order, which is that of text where numbers are padded; of unpadded names text makes another split.
+    """
+    order = sorted(range(len(names)), key=lambda k: natural(names[k]))
+    chosen = np.zeros(len(names), bool)
+    chosen[order[offset % step :: step]] = True
+    return chosen
 
 
 def split(names: list[str], own: Any, settings: IngestSection) -> tuple[Any, dict[str, Any]]:

@@ -17,7 +17,7 @@ from chebsplat.formats.encoder import DYNAMIC, FLOAT, FUSED, write_encoder
 from chebsplat.formats.gaussians import Gaussians
 from chebsplat.shape.fusion import Fusion, Gate
 from chebsplat.stages.runtime.command import Job
-from chebsplat.stages.shape_models.contract import contract
+from chebsplat.stages.shape_models.point_graph import contract
 from chebsplat.stages.shape_models.region_graph import encoder_model, fusion_model
 from chebsplat.stages.training.saves import restored_encoder, trained_with
 

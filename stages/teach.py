@@ -25,9 +25,10 @@ from chebsplat.settings import DescribeSection
 from chebsplat.shape import point_encoder
 from chebsplat.shape.point_encoder import LEAST_VIEWS, Lesson, PointEncoder, cloud_of
 from chebsplat.shape.point_inputs import PointInputs
+from chebsplat.stages.channels import digest
 from chebsplat.stages.runtime.command import Job, n_threads
 from chebsplat.stages.settings import KnowledgeSection
-from chebsplat.stages.shape_models.teaching_rooms import Room
+from chebsplat.stages.shape_models.teaching_rooms import Room, held, kept_as, prepare
 from chebsplat.stages.teacher_models.text_encoder import found, text_embeddings
 from chebsplat.synthetic import CLASS_NAMES
 from chebsplat.synthetic.layout import KNOWLEDGE
@@ -40,8 +41,6 @@ def run(job: Job) -> None:
 
     Reads `channels`. Writes `knowledge`. Rooms that are finished survive a kill.
     """
-    from chebsplat.stages.channels import digest
-
     settings, channels = job.config.knowledge, ChannelMap.read(job.inputs["channels"])
     teacher = read_teacher(Path(settings.model) if settings.model else EMBEDDED)
     if teacher.output != "features":
@@ -100,8 +99,6 @@ def vocabulary(teacher: TeacherModel, names: list[str], matrix: np.ndarray) -> t
 
 def prepared(job: Job, settings: KnowledgeSection, matrix: np.ndarray) -> list[list[Room]]:
     """The rooms to teach on, then those held out: clean, worn, half seen, swept; a process for each thread."""
-    from chebsplat.stages.shape_models.teaching_rooms import held, kept_as, prepare
-
     seeds = [*KNOWLEDGE[: settings.n_rooms], *KNOWLEDGE[-settings.n_held_out :]]
     folder = job.scratch / "rooms"
     folder.mkdir(parents=True, exist_ok=True)

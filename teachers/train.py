@@ -25,7 +25,7 @@ from chebsplat.formats.teacher_model import EMBEDDED
 from chebsplat.stages.runtime.progress import Progress
 from chebsplat.synthetic import CLASS_NAMES
 from chebsplat.synthetic.layout import TRAINING
-from chebsplat.teachers.network import Encoder, Trunk, span
+from chebsplat.teachers.network import Encoder, Trunk, export, span
 from chebsplat.teachers.rooms import KINDS, crops, recolored, rendered
 from chebsplat.teachers.words import embedded, words
 
@@ -166,8 +166,6 @@ def average_in(average: Trunk, trunk: Trunk, kept: float) -> None:
 @click.option("--out", type=click.Path(path_type=Path), default=EMBEDDED.parent, help="the model goes here")
 def main(steps: int, threads: int, cache: Path, out: Path) -> None:
     """Render the rooms, train, and export the embedded teacher."""
-    from chebsplat.teachers.network import export
-
     logging.basicConfig(level=logging.INFO, format="%(message)s")
     torch.set_num_threads(threads)
     out.mkdir(parents=True, exist_ok=True)

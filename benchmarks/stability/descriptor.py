@@ -15,7 +15,7 @@ import torch
 from benchmarks.stability import oracle
 from benchmarks.stability.case import Outcome, case, relative
 from chebsplat.shape.descriptor import describe
-from chebsplat.splats.gaussians import rotation_matrices
+from chebsplat.splats.rotations import rotation_matrices
 
 TOLERANCE = 5e-6  # the worst that any case may reach in float32
 TOLERANCE_64 = 1e-12  # the same in float64, unless a case says why not

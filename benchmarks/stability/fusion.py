@@ -14,7 +14,7 @@ from torch import Tensor
 
 from benchmarks.stability.case import Outcome, case, relative
 from chebsplat.shape.fusion import LEAST, propagation_weights, share_undefined
-from chebsplat.splats.gaussians import rotation_matrices
+from chebsplat.splats.rotations import rotation_matrices
 
 TOLERANCE = 1e-5  # logits reach 16, and float32 rounds each to 1e-6; where they are larger one region takes all
 UNDERFLOWS = 87.0, 104.0  # -logits between which exp in float32 goes to 0, by the processor's mode

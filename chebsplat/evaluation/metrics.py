@@ -5,6 +5,10 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import numpy as np
+from scipy.ndimage import binary_dilation
+from scipy.sparse import coo_matrix
+from scipy.spatial import cKDTree
+from scipy.spatial.transform import Rotation
 
 from chebsplat.splats.cubes import first_of_each
 
@@ -73,8 +77,6 @@ def segmentation(matrix: np.ndarray) -> Segmentation:
 
 def boundary_band(truth: np.ndarray, half_width: int) -> np.ndarray:
     """Pixels [H, W] within `half_width` pixels (chessboard) of a pixel with another label, IGNORE edges not counted."""
-    from scipy.ndimage import binary_dilation
-
     edge = np.zeros(truth.shape, bool)
     for axis in (0, 1):
         ahead, behind = np.moveaxis(truth, axis, 0)[1:], np.moveaxis(truth, axis, 0)[:-1]
@@ -108,10 +110,6 @@ def features_at(
     Choices: a Gaussian ends at 3 standard deviations. Nothing occludes anything: what lies in front of a point or
       behind it by more than that has no say.
     """
-    from scipy.sparse import coo_matrix
-    from scipy.spatial import cKDTree
-    from scipy.spatial.transform import Rotation
-
     sums, weights = np.zeros((len(points), features.shape[1])), np.zeros(len(points))
     if not len(points) or not len(means):
         return sums.astype(np.float32), weights.astype(np.float32)

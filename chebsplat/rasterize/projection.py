@@ -7,7 +7,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from chebsplat.splats.gaussians import rotation_matrices
+from chebsplat.splats.rotations import rotation_matrices
 
 EXTENT = 3.33  # in σ: there even a Gaussian of opacity 1 has fallen to 1/255, √(2 ln 255)
 LARGEST = 1e30  # of a projected variance, pixels²: more is culled, so that float32 can hold what is made of it

@@ -16,7 +16,7 @@ from chebsplat.shape.fusion import Gate, fuse_in_view, propagate, propagation_we
 from chebsplat.shape.refresh import Descriptors, GaussianIds
 from chebsplat.shape.region_inputs import placed
 from chebsplat.shape.regions import Regions, regions_of
-from chebsplat.splats.gaussians import rotation_matrices
+from chebsplat.splats.rotations import rotation_matrices
 
 CHUNK = 256  # regions that are encoded at once
 OF_REGIONS = ("members", "centers", "descriptors", "positions", "cover", "weights", "cache")

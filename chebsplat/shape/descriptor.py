@@ -7,15 +7,17 @@ without it.
 
 from __future__ import annotations
 
-from typing import Any, Generic, Literal, NamedTuple, TypeVar
+from typing import TYPE_CHECKING, Any, Generic, Literal, NamedTuple, TypeVar
 
 import numpy as np
-import torch
-from torch import Tensor
 
 from chebsplat.settings import DescribeSection
 from chebsplat.shape import descriptor_kernel
-from chebsplat.splats.gaussians import rotation_matrices, rotation_matrices_f64
+from chebsplat.splats.rotations import rotation_matrices, rotation_matrices_f64
+
+if TYPE_CHECKING:
+    import torch
+    from torch import Tensor
 
 Spectrum = Literal["full", "taper", "hard"]
 Metric = Literal["relative", "printed"]
@@ -83,6 +85,8 @@ def describe(
       the full spectrum it is the printed formula with K = n and λ_max = 2, without degrees 0 and 1, which vanish.
     Raises: ValueError on sizes or parameters that make no sense, or that the backend does not take.
     """
+    import torch
+
     if n_angles < 1 or max_degree < 2 or n_eigs < 1 or not bandwidth > 0 or not anisotropy >= 0:
         raise ValueError("n_angles >= 1, max_degree >= 2, n_eigs >= 1, bandwidth > 0 and anisotropy >= 0 are needed")
     if means.shape != scales.shape or rotmats.shape != (*means.shape, 3) or mask.shape != means.shape[:2]:
@@ -150,6 +154,8 @@ def _full(
 def _reference(
     means: np.ndarray, quats: np.ndarray, scales: np.ndarray, mask: np.ndarray, settings: DescribeSection
 ) -> Described[np.ndarray]:
+    import torch
+
     rotmats = rotation_matrices(torch.from_numpy(quats).reshape(-1, 4)).reshape(*mask.shape, 3, 3)
     regions = torch.from_numpy(means), torch.from_numpy(scales), rotmats, torch.from_numpy(mask)
     parameters = settings.model_dump(exclude=OF_REGIONS)

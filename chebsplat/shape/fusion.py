@@ -7,7 +7,8 @@ from torch import Tensor, nn
 
 from chebsplat.kernels.dispatch import is_compiled
 from chebsplat.shape import fusion_kernels
-from chebsplat.splats.gaussians import rotation_matrices, take
+from chebsplat.splats.gaussians import take
+from chebsplat.splats.rotations import rotation_matrices
 
 LEAST = 1e-30  # of a squared scale in radii: where the print divides by 0
 

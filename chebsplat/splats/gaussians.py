@@ -1,7 +1,6 @@
 """Gaussian parameters: from points with local shape to raw parameters, and from raw to activated values.
 
-Rotations are quaternions wxyz of any length, once for torch and once for kernels; rows chosen by an index have a cheap
-gradient.
+Rows chosen by an index have a cheap gradient.
 """
 
 from __future__ import annotations
@@ -14,6 +13,8 @@ import torch
 from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 from torch import Tensor
+
+from chebsplat.splats.rotations import rotation_matrices, rotation_matrices_f64
 
 _C0 = 0.28209479177387814
 
@@ -89,34 +90,6 @@ def surface_of(parameters: Mapping[str, np.ndarray]) -> tuple[np.ndarray, np.nda
     normals = axes[np.arange(len(axes)), :, parameters["log_scales"].argmin(1)]
     colors = np.clip(parameters["sh0"][:, 0] * _C0 + 0.5, 0, 1)
     return normals.astype(np.float32), colors.astype(np.float32)
-
-
-def rotation_matrices(quats: Tensor) -> Tensor:
-    """Rotation matrices [N, 3, 3] of quaternions [N, 4]; identity for a zero one.
-
-    Choices: pre-scaled by the largest entry, so that neither 1e20 nor 1e-20 overflows or vanishes.
-    """
-    scaled = quats / quats.detach().abs().amax(-1, keepdim=True).clamp_min(1e-30)
-    w, x, y, z = torch.nn.functional.normalize(scaled, dim=-1).unbind(-1)
-    rows = [
-        torch.stack([1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)], -1),
-        torch.stack([2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)], -1),
-        torch.stack([2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)], -1),
-    ]
-    return torch.stack(rows, -2)
-
-
-def rotation_matrices_f64(quats: np.ndarray) -> np.ndarray:
-    """As `rotation_matrices` in numpy, [..., 3, 3] f64 of quaternions [..., 4]: what kernels are fed with."""
-    q = np.asarray(quats, np.float64)
-    q = q / np.abs(q).max(-1, keepdims=True).clip(1e-30)
-    w, x, y, z = np.moveaxis(q / np.linalg.norm(q, axis=-1, keepdims=True).clip(1e-12), -1, 0)
-    rows = [
-        [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
-        [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
-        [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
-    ]
-    return np.stack([np.stack(row, -1) for row in rows], -2)
 
 
 class _Take(torch.autograd.Function):

@@ -9,7 +9,7 @@ import torch
 from scipy.spatial import cKDTree
 from torch import Tensor
 
-from chebsplat.splats.gaussians import rotation_matrices
+from chebsplat.splats.rotations import rotation_matrices
 
 SHRINK = 1.6  # 3DGS's divisor of the scales of two Gaussians that replace one
 DENSITY = 0.05  # α of Eq 12: candidates per unit of a region's volume

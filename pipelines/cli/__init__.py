@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from functools import partial
 from importlib import import_module
 from typing import Any, NoReturn
 
@@ -35,8 +36,13 @@ class Commands(Guarded):
         if args[0] in STAGES and not (of_a_file and args[0] in self.commands):  # `lift` is of a file, too
             from chebsplat.stages.runtime.command import command
 
-            return args[0], command(args[0], import_module(f"chebsplat.stages.{args[0]}").run), args[1:]
+            return args[0], command(args[0], partial(run_stage, args[0])), args[1:]
         return super().resolve_command(context, args)
+
+
+def run_stage(name: str, job: Any) -> None:
+    """Run a stage, whose module is loaded by then, with all that it computes with."""
+    import_module(f"chebsplat.stages.{name}").run(job)
 
 
 @click.group(cls=Commands, params=[about.VERSION])

@@ -183,8 +183,6 @@ def averaged(
 
 def prepare(folder: Path, seed: int, settings: KnowledgeSection, matrix: np.ndarray) -> int:
     """Keep a room in the folder, unless it is there; returns the seed. Runs in a process of its own."""
-    from chebsplat.stages.teacher_models.image_encoder import TeacherInference
-
     path = kept_as(folder, seed)
     if path.is_file():
         return seed

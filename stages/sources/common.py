@@ -11,9 +11,8 @@ from pathlib import Path
 import numpy as np
 
 from chebsplat.errors import ConfigError, InputError
-from chebsplat.evaluation.protocols.task import natural
 from chebsplat.formats.images import SUFFIXES, is_image
-from chebsplat.formats.names import unprintable
+from chebsplat.formats.names import natural, unprintable
 from chebsplat.formats.videos import SUFFIXES as VIDEOS
 from chebsplat.formats.videos import is_video
 from chebsplat.stages.settings import SourceSection

@@ -9,7 +9,6 @@ from chebsplat.formats.capture import Capture
 from chebsplat.formats.ply import read_ply
 from chebsplat.formats.scene import Scene
 from chebsplat.pipelines.planning.plan import overrides, suffix
-from chebsplat.pipelines.running import run
 from chebsplat.render import SceneRenderer
 from chebsplat.stages.evaluate import camera
 
@@ -109,7 +108,8 @@ def test_one_stage_runs_alone(toy, tmp_path):
 
 def test_a_scene_is_brought_up_to_date_and_opened(quick_plans, monkeypatch):
     asked = []
-    monkeypatch.setattr(run, "execute", lambda plans, stage, cores, device: asked.append(plans[0].title) or 4)
+    execute = lambda plans, stage, cores, device: asked.append(plans[0].title) or 4  # noqa: E731
+    monkeypatch.setattr("chebsplat.pipelines.api.execute", execute)
     with pytest.raises(ChebsplatError, match="could not be finished"):
         chebsplat.train("toy", train={"steps": 7})
     assert asked == ["toy@train.steps=7"]

@@ -3,7 +3,7 @@
 import torch
 
 from benchmarks.stability.descriptor import REGIONS
-from chebsplat.splats.gaussians import rotation_matrices
+from chebsplat.splats.rotations import rotation_matrices
 
 
 def region(n=24, seed=0, m=3):

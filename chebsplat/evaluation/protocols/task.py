@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import re
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field
 from typing import Any
@@ -106,20 +105,3 @@ def bilinear(features: np.ndarray, size: tuple[int, int]) -> np.ndarray:
         below, above = np.take(features, low, axis), np.take(features, np.minimum(low + 1, m - 1), axis)
         features = below * (1 - share) + above * share
     return features
-
-
-def natural(name: str) -> tuple[Any, ...]:
-    """Sort key under which frame_2 precedes frame_10; equal numbers are told apart by their spelling."""
-    parts = re.split(r"(\d+)", name)
-    return tuple(int(part) if k % 2 else part for k, part in enumerate(parts)), name
-
-
-def every(names: list[str], step: int, offset: int) -> np.ndarray:
-    """bool [V]: names whose index in natural order is `offset` modulo `step`, whatever order they are given in.
-
-    Choices: natural order, which is that of text where numbers are padded; of unpadded names text makes another split.
-    """
-    order = sorted(range(len(names)), key=lambda k: natural(names[k]))
-    chosen = np.zeros(len(names), bool)
-    chosen[order[offset % step :: step]] = True
-    return chosen

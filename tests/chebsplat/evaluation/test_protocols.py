@@ -18,8 +18,8 @@ from chebsplat.evaluation.protocols import (
     scannet_closed,
     scannet_open,
 )
-from chebsplat.evaluation.protocols.task import EvaluatedView, MapsByName, Task, bilinear, every, resized
-from chebsplat.stages.ingest import renamed, split, thinned
+from chebsplat.evaluation.protocols.task import EvaluatedView, MapsByName, Task, bilinear, resized
+from chebsplat.stages.ingest import every, renamed, split, thinned
 from chebsplat.stages.settings import IngestSection
 
 ADE = [replica_f3.SPELT.get(k, f"label_{k}") for k in range(1, 151)]

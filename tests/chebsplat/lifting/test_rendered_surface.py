@@ -6,8 +6,8 @@ import torch
 
 from chebsplat.cameras import centers, common_up, upright
 from chebsplat.lifting.surface import EDGE, EDGE_SWEPT, fused, lookouts, surface, swept_surface
-from chebsplat.splats.gaussians import rotation_matrices
 from chebsplat.splats.planes import inverse_depths, planes_in_view
+from chebsplat.splats.rotations import rotation_matrices
 from chebsplat.synthetic.rays import intrinsics, look_at
 
 SIZE = 96, 72

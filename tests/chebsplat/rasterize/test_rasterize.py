@@ -10,7 +10,7 @@ from shared import DATA
 
 from chebsplat.rasterize import rasterize
 from chebsplat.splats import sh
-from chebsplat.splats.gaussians import rotation_matrices
+from chebsplat.splats.rotations import rotation_matrices
 
 
 def tiny_case():

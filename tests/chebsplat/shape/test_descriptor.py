@@ -13,7 +13,7 @@ from thread_counts import assert_same_bits
 from chebsplat.settings import DescribeSection
 from chebsplat.shape.descriptor import describe, describe_members
 from chebsplat.shape.descriptor_reference import chebyshev_diagonals
-from chebsplat.splats.gaussians import rotation_matrices
+from chebsplat.splats.rotations import rotation_matrices
 
 WORST, MEDIAN = 5e-6, 5e-7  # issue bars, relative to the region's maximum
 FLOAT64 = {"dtype": torch.float64, "backend": "reference"}

@@ -10,7 +10,7 @@ from chebsplat.settings import TrainSection
 from chebsplat.shape.descriptor import describe, n_degrees
 from chebsplat.shape.fusion import Fusion, Gate
 from chebsplat.shape.regions import build_regions
-from chebsplat.splats.gaussians import rotation_matrices
+from chebsplat.splats.rotations import rotation_matrices
 
 SIZES = {"n_angles": 3, "max_degree": 5, "backend": "reference", "dtype": torch.float64}
 

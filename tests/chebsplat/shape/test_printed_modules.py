@@ -11,7 +11,7 @@ from chebsplat.shape.cks import update
 from chebsplat.shape.encoder import N_FREQUENCIES, RegionEncoder, positional_encoding
 from chebsplat.shape.fusion import Fusion, Gate, propagate, propagation_weights
 from chebsplat.shape.region_inputs import in_scene
-from chebsplat.splats.gaussians import rotation_matrices
+from chebsplat.splats.rotations import rotation_matrices
 from chebsplat.training.densify import densify, region_gradients
 from chebsplat.training.losses import feature_distance, feature_distance_reference
 from tests.chebsplat.training.test_printed_gates import randomized

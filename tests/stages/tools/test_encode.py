@@ -22,7 +22,7 @@ from chebsplat.shape.encoder import RegionEncoder
 from chebsplat.shape.region_inputs import region_inputs
 from chebsplat.stages.onnx import compare, example, fusion_example, quantize, restored_fusion
 from chebsplat.stages.runtime.config import Config
-from chebsplat.stages.shape_models.contract import contract
+from chebsplat.stages.shape_models.point_graph import contract
 from chebsplat.stages.shape_models.region_graph import encoder_model
 from chebsplat.stages.training.saves import trained_with
 
