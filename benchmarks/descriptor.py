@@ -14,7 +14,7 @@ import torch
 
 from benchmarks import shared
 from benchmarks.stability import oracle
-from chebsplat.shape.descriptor import describe
+from chebsplat.shape.descriptor import Descriptor, describe
 from chebsplat.shape.regions import build_regions
 from chebsplat.splats.gaussians import activated, initial_gaussians, local_shape
 from chebsplat.splats.rotations import rotation_matrices
@@ -50,7 +50,7 @@ def room(m: int, n: int) -> Regions:
 
 def described(regions: Regions) -> torch.Tensor:
     mask = torch.ones(regions[0].shape[:2], dtype=torch.bool)
-    return describe(*regions, mask, **SETTINGS, backend="numba").values  # type: ignore[arg-type]
+    return describe(*regions, mask, Descriptor(**SETTINGS), backend="numba").values  # type: ignore[arg-type]
 
 
 def error(regions: Regions) -> float:

@@ -175,7 +175,9 @@ class TrainSection(Section):
         None, "of features; default: 10 / steps that teach them, at most 5e-2; more fits each view's errors", 0, 10
     )
     lr_masks: float = number(5e-2, "learning rate of pruning masks, in up to 3000 steps; lower in more", 0, 10)
-    lr_sh_masks: float = number(0.4, "learning rate of SH masks; fast, under a weak penalty: docs/results.md", 0, 10)
+    lr_sh_masks: float = number(
+        0.4, "learning rate of SH masks; fast, under a weak penalty: docs/results/paper.md", 0, 10
+    )
     # weights
     feature_loss: Literal["length", "l1", "cross-entropy"] | None = setting(
         None,

@@ -11,7 +11,7 @@ from chebsplat.formats.artifact import read_manifest
 from chebsplat.formats.basis import Basis, read_basis, write_basis
 from chebsplat.formats.gaussians import Gaussians
 from chebsplat.settings import DescribeSection
-from chebsplat.shape.cks import spread, update
+from chebsplat.shape.cks import Growth, spread, update
 from chebsplat.shape.refresh import Descriptors
 from chebsplat.shape.regions import regions_of
 from chebsplat.stages.runtime.command import Job
@@ -48,14 +48,16 @@ def run(job: Job) -> None:
         grown, reports[name] = update(
             torch.from_numpy(old.bases[name]) if name in old.bases else None,
             W.detach(),
-            energy=settings.energy,
-            tolerance=settings.tolerance,
-            max_rank=settings.max_rank,
-            max_added=settings.max_added,
-            n_scenes=settings.n_scenes,
-            rule=settings.energy_rule,
-            novelty=1 + KAPPA * sigma,
-            update_rule=settings.update_rule,
+            Growth(
+                energy=settings.energy,
+                tolerance=settings.tolerance,
+                max_rank=settings.max_rank,
+                max_added=settings.max_added,
+                n_scenes=settings.n_scenes,
+                rule=settings.energy_rule,
+                novelty=1 + KAPPA * sigma,
+                update_rule=settings.update_rule,
+            ),
         )
         bases[name] = grown.numpy()
     weights = {name: value.numpy() for name, value in encoder.state_dict().items()}

@@ -20,7 +20,7 @@ from chebsplat.cameras import unproject
 from chebsplat.formats.capture import Capture
 from chebsplat.formats.meshes import Mesh, cleaned, fused
 from chebsplat.pipelines.api import load
-from chebsplat.splats.cubes import first_of_each
+from chebsplat.splats.parts import first_of_each
 from chebsplat.stages.runtime.progress import Progress
 from chebsplat.stages.tools.mesh import LEAST_PART, LONGEST_HOLE, frames, labels_at
 

@@ -14,7 +14,7 @@ import torch
 
 from benchmarks.stability import oracle
 from benchmarks.stability.case import Outcome, case, relative
-from chebsplat.shape.descriptor import describe
+from chebsplat.shape.descriptor import Descriptor, describe
 from chebsplat.splats.rotations import rotation_matrices
 
 TOLERANCE = 5e-6  # the worst that any case may reach in float32
@@ -50,7 +50,7 @@ def ours(region: Region, dtype: torch.dtype = torch.float32, pad: int = 0, **opt
     n = len(region.means)
     padded = [torch.from_numpy(np.concatenate([v, np.full((pad, *v.shape[1:]), 7.0)]))[None] for v in region]
     mask = torch.arange(n + pad)[None] < n
-    found, again = (describe(*padded, mask, dtype=dtype, **options).values[0] for _ in range(2))
+    found, again = (describe(*padded, mask, Descriptor(**options), dtype=dtype).values[0] for _ in range(2))
     if not torch.equal(found, again):
         raise ValueError("a second run gives other bits, or NaN")
     if not (found[n:] == 0).all():

@@ -12,7 +12,7 @@ from typing import NamedTuple
 import torch
 
 from benchmarks.stability.case import Outcome, case
-from chebsplat.training.densify import densify
+from chebsplat.training.densify import Candidates, densify
 
 N, MOST = 120, 32
 
@@ -50,7 +50,7 @@ def printed_count(name: str) -> Outcome:
     raw |= {"log_scales": torch.full((N, 3), size), "logit_opacities": torch.zeros(N)}
     members, gradient = torch.arange(N).reshape(2, -1), torch.tensor([region.gradient, 0.5])
     options = {"density": 10, "max_candidates": MOST, "nearest": 1e-3, "farthest": 1e3, "printed": True}
-    added = densify(raw, members, gradient, 1.0, 10_000, torch.Generator().manual_seed(1), **options)
+    added = densify(raw, members, gradient, 1.0, 10_000, torch.Generator().manual_seed(1), Candidates(**options))
     if bool(len(added.parents)) != region.grows:
         raise ValueError(f"{len(added.parents)} new Gaussians")
     inside = raw["means"][members[0]].double()

@@ -14,7 +14,7 @@ import torch
 from torch import Tensor
 
 from benchmarks.stability.case import Outcome, case, relative
-from chebsplat.shape.cks import Modulation, regularizer, spread, update
+from chebsplat.shape.cks import Growth, Modulation, regularizer, spread, update
 
 ORTHONORMAL = 3e-8
 Q = 32
@@ -60,7 +60,7 @@ def sequence(name: str, rule: str) -> Outcome:
     """Raises ValueError on an impossible report."""
     basis, error = None, 0.0
     for W in SEQUENCES[name]():
-        basis, report = update(basis, W, rule=rule)
+        basis, report = update(basis, W, Growth(rule=rule))
         if not (0 <= report["rho"] <= 1 and 0 <= report["energy"] <= 1 and report["rank_after"] < Q):
             raise ValueError(f"impossible report {report}")
         error = max(error, off_orthonormal(basis))
@@ -127,7 +127,7 @@ def spread_of_descriptors(name: str) -> Outcome:
     found = spread(values * mask[..., None], mask)
     exact = float((values.double() / size).var(1, unbiased=False).mean(-1).sqrt().mean()) if size != 1 else 0.0
     basis, _ = update(None, weights(rank=4))
-    _, report = update(basis, weights(seed=1), novelty=1 + found, update_rule="printed")
+    _, report = update(basis, weights(seed=1), Growth(novelty=1 + found, update_rule="printed"))
     if not (math.isfinite(report["rho_printed"]) and report["rho_printed"] >= report["rho"]):
         raise ValueError(f"impossible report {report}")
     return Outcome(abs(found / size - exact), 1e-6)
@@ -152,7 +152,7 @@ def modulation(size: float) -> Outcome:
 @case("the size of a residual of {size:.0e}", size=[1e-3, 1e-6, 1e-12])
 def residual_size(size: float) -> Outcome:
     """ρ against 60 digits, relative to itself."""
-    basis, _ = update(None, weights(rank=4), energy=0.999999)
+    basis, _ = update(None, weights(rank=4), Growth(energy=0.999999))
     inside = torch.linalg.qr(basis.double())[0] @ weights(basis.shape[1], Q, seed=1).double()
     W = inside + size * weights(seed=8).double()
     with mpmath.workdps(60):

@@ -10,7 +10,7 @@ from scipy.sparse import coo_matrix
 from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 
-from chebsplat.splats.cubes import first_of_each
+from chebsplat.splats.parts import first_of_each
 
 IGNORE = -1
 

@@ -14,7 +14,7 @@ import torch
 
 from chebsplat.cameras import centers, unproject, upright
 from chebsplat.render import SceneRenderer
-from chebsplat.splats.cubes import cubes_of, means_of_each
+from chebsplat.splats.parts import cubes_of, means_of_each
 from chebsplat.views import View
 
 OPAQUE = 0.9  # least coverage of a pixel whose depth counts

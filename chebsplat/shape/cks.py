@@ -6,6 +6,7 @@ A map takes z to z W, W [q, p]: the transpose of `nn.Linear.weight`. Its basis [
 from __future__ import annotations
 
 import math
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -45,45 +46,65 @@ def spread(descriptors: Tensor, mask: Tensor) -> float:
     return float(deviations.mean()) if deviations.numel() else 0.0
 
 
-def update(
-    basis: Tensor | None,
-    W: Tensor,
-    *,
-    energy: float = 0.96,
-    tolerance: float = 0.2,
-    max_rank: float = 0.875,
-    max_added: float = 0.25,
-    n_scenes: int = 20,
-    rule: str = "total",
-    novelty: float = 1.0,
-    update_rule: str = "residual",
-) -> tuple[Tensor, dict[str, Any]]:
+@dataclass(frozen=True)
+class Growth:
+    """How a basis grows.
+
+    energy:    fraction of energy to reach: of captured + residual (`total`), or of the residual alone (the printed
+               rule, which always adds a vector).
+    tolerance: ρ or ρ′ below which the scene is no news and nothing is added (ε = 0.2).
+    max_rank:  ceiling of r as a fraction of q, below 1: at r = q the regulariser would vanish for ever.
+    max_added: columns that a scene may add, as a fraction of those left below the ceiling; one at least.
+    n_scenes:  the first so many scenes can each add a column where the ceiling is as high: of more than n_scenes - 1
+               columns left, a scene leaves n_scenes - 1.
+    novelty:   1 + κ σ_f of the scene: ρ′ = ρ × novelty.
+    update_rule: what is compared with the tolerance: ρ (`residual`), or ρ′ (`printed`).
+    Raises: ValueError on a rule or a fraction that does not exist.
+    """
+
+    energy: float = 0.96
+    tolerance: float = 0.2
+    max_rank: float = 0.875
+    max_added: float = 0.25
+    n_scenes: int = 20
+    rule: str = "total"
+    novelty: float = 1.0
+    update_rule: str = "residual"
+
+    def __post_init__(self) -> None:
+        if not (0 < self.energy <= 1 and 0 < self.max_rank < 1 and 0 < self.max_added <= 1):
+            raise ValueError(
+                f"energy {self.energy}, max_added {self.max_added} or max_rank {self.max_rank} is not within (0, 1], "
+                "or is 1"
+            )
+        if self.n_scenes < 1:
+            raise ValueError(f"n_scenes {self.n_scenes} is below 1")
+        if not 1 <= self.novelty < math.inf:
+            raise ValueError(f"novelty {self.novelty} is below 1, or not finite")
+        if self.rule not in ("total", "residual") or self.update_rule not in ("residual", "printed"):
+            raise ValueError(
+                f"rule {self.rule!r} is neither 'total' nor 'residual', or {self.update_rule!r} not 'printed' either"
+            )
+
+
+DEFAULT = Growth()
+
+
+def update(basis: Tensor | None, W: Tensor, growth: Growth = DEFAULT) -> tuple[Tensor, dict[str, Any]]:
     """Extend a basis by what it misses of W (Eq 15).
 
     Args:
       basis:     [q, r] orthonormal to 1e-4, or None before the first scene.
       W:         [q, p] linear map of the new scene.
-      energy:    fraction of energy to reach: of captured + residual (`total`), or of the residual alone (the
-                 printed rule, which always adds a vector).
-      tolerance: ρ or ρ′ below which the scene is no news and nothing is added (ε = 0.2).
-      max_rank:  ceiling of r as a fraction of q, below 1: at r = q the regulariser would vanish for ever.
-      max_added: columns that a scene may add, as a fraction of those left below the ceiling; one at least.
-      n_scenes:  the first so many scenes can each add a column where the ceiling is as high: of more than n_scenes - 1
-                 columns left, a scene leaves n_scenes - 1.
-      novelty:   1 + κ σ_f of the scene: ρ′ = ρ × novelty.
-      update_rule: what is compared with the tolerance: ρ (`residual`), or ρ′ (`printed`).
     Returns: basis [q, r'] float32 with BᵀB = I to 3e-8 (dense columns, q ≥ 32; one ulp else); the given columns
       come first, untouched. Report: `rank_before`, `rank_after`, `added`; `rho` and `rho_after`, the residual
       relative to W, before and after; `rho_printed`, ρ′; `energy`, the fraction of ‖W‖² captured after.
-    Raises:  ValueError on values that are not finite, shapes that disagree, a basis that is not orthonormal, or a
-      rule or fraction that does not exist.
+    Raises:  ValueError on values that are not finite, shapes that disagree, or a basis that is not orthonormal.
     Choices: scaled by max|W|. No update if the residual is rounding, ρ ≤ 10 eps √q, nor, by `total`, if W is captured
       to `energy` already. New columns are orthogonalised twice. The first basis comes from the SVD of W. A basis beyond
       the ceiling is kept, never cut.
     """
-    _check(basis, W, energy, max_rank, max_added, n_scenes, novelty)
-    if rule not in ("total", "residual") or update_rule not in ("residual", "printed"):
-        raise ValueError(f"rule {rule!r} is neither 'total' nor 'residual', or {update_rule!r} not 'printed' either")
+    _check(basis, W)
     q = W.shape[0]
     given = torch.zeros(q, 0) if basis is None else basis.float()
     rank = given.shape[1]
@@ -96,16 +117,16 @@ def update(
     _, residual = project(scaled, old)
     total, missed = float((scaled**2).sum()), float((residual**2).sum())
     rho = min((missed / total) ** 0.5, 1.0)
-    report |= {"rho": rho, "rho_after": rho, "rho_printed": rho * novelty, "energy": 1 - rho**2}
-    room = int(max_rank * q) - rank
-    news = rho * novelty if update_rule == "printed" else rho
-    if rho <= 10 * EPS * q**0.5 or (rank and news <= tolerance) or room <= 0:
+    report |= {"rho": rho, "rho_after": rho, "rho_printed": rho * growth.novelty, "energy": 1 - rho**2}
+    room = int(growth.max_rank * q) - rank
+    news = rho * growth.novelty if growth.update_rule == "printed" else rho
+    if rho <= 10 * EPS * q**0.5 or (rank and news <= growth.tolerance) or room <= 0:
         return given, report
     vectors, values, _ = torch.linalg.svd(residual, full_matrices=False)
     gained = torch.nn.functional.pad(torch.cumsum(values**2, 0), (1, 0))  # by 0, 1, 2, ... of the vectors
-    reached = (total - missed + gained) / total if rule == "total" else gained / missed
-    most = max(min(int(max_added * room), room - n_scenes + 1), 1)
-    count = min(int((reached < energy).sum()), most, len(values))
+    reached = (total - missed + gained) / total if growth.rule == "total" else gained / missed
+    most = max(min(int(growth.max_added * room), room - growth.n_scenes + 1), 1)
+    count = min(int((reached < growth.energy).sum()), most, len(values))
     if count == 0:
         return given, report
     grown = _orthonormal(torch.cat([old, vectors[:, :count]], 1))
@@ -115,17 +136,9 @@ def update(
     return _rounded(grown, given), report
 
 
-def _check(
-    basis: Tensor | None, W: Tensor, energy: float, max_rank: float, max_added: float, n_scenes: int, novelty: float
-) -> None:
+def _check(basis: Tensor | None, W: Tensor) -> None:
     if W.ndim != 2 or not torch.isfinite(W).all():
         raise ValueError(f"W {tuple(W.shape)} is not finite, or not a matrix")
-    if not (0 < energy <= 1 and 0 < max_rank < 1 and 0 < max_added <= 1):
-        raise ValueError(f"energy {energy}, max_added {max_added} or max_rank {max_rank} is not within (0, 1], or is 1")
-    if n_scenes < 1:
-        raise ValueError(f"n_scenes {n_scenes} is below 1")
-    if not 1 <= novelty < math.inf:
-        raise ValueError(f"novelty {novelty} is below 1, or not finite")
     if basis is None:
         return
     if basis.ndim != 2 or basis.shape[0] != W.shape[0]:

@@ -7,50 +7,21 @@ without it.
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any, Generic, Literal, NamedTuple, TypeVar
+from typing import TYPE_CHECKING, Literal
 
 import numpy as np
 
 from chebsplat.settings import DescribeSection
 from chebsplat.shape import descriptor_kernel
+from chebsplat.shape.described import Described, Descriptor, compiles, n_degrees
 from chebsplat.splats.rotations import rotation_matrices, rotation_matrices_f64
 
 if TYPE_CHECKING:
     import torch
     from torch import Tensor
 
-Spectrum = Literal["full", "taper", "hard"]
-Metric = Literal["relative", "printed"]
-Axis = Literal["tangent", "world"]
+DEFAULT = Descriptor()
 OF_REGIONS = {"n_regions", "region_size", "seed", "region_radius", "overlap", "thinning"}  # not of values
-Values = TypeVar("Values")  # Tensor or np.ndarray
-
-
-class Described(NamedTuple, Generic[Values]):
-    """values [M, n, J, P]; of the n_cuts cuts of the spectrum (region and angle), n_clustered fell into a cluster of
-    eigenvalues; n_exact regions took the float64 operator; of n_guarded (region and angle, too) the kept eigenvalues
-    are all but 0, where the print divides by them. All counts are 0 where they do not apply.
-    """
-
-    values: Values
-    n_cuts: int = 0
-    n_clustered: int = 0
-    n_exact: int = 0
-    n_guarded: int = 0
-
-
-def n_degrees(spectrum: Spectrum, max_degree: int, from_degree: int | None = None) -> int:
-    """P, values of one angle: degrees 2...D of the full spectrum, whose first two vanish, and 0...D of a cut one,
-    unless `from_degree` says where to begin.
-    """
-    if from_degree is None:
-        from_degree = 2 if spectrum == "full" else 0
-    return max_degree + 1 - from_degree
-
-
-def compiles(spectrum: Spectrum, metric: Metric, axis: Axis) -> bool:
-    """Does the numba backend, and so a machine without torch, know this descriptor?"""
-    return spectrum == "full" and metric == "relative" and axis == "tangent"
 
 
 def describe(
@@ -58,16 +29,8 @@ def describe(
     scales: Tensor,
     rotmats: Tensor,
     mask: Tensor,
+    wanted: Descriptor = DEFAULT,
     *,
-    n_angles: int = 8,
-    max_degree: int = 8,
-    anisotropy: float = 10.0,
-    bandwidth: float = 0.7,
-    spectrum: Spectrum = "full",
-    n_eigs: int = 16,
-    metric: Metric = "relative",
-    axis: Axis = "tangent",
-    from_degree: int | None = None,
     dtype: torch.dtype | None = None,
     backend: Literal["auto", "numba", "reference"] = "auto",
 ) -> Described[Tensor]:
@@ -75,9 +38,6 @@ def describe(
 
     Args:
       means, scales, rotmats, mask: [M, n, ...], as `albo.canonicalize`.
-      n_angles, max_degree, anisotropy, bandwidth: J, D, a and the width, as in `settings.DescribeSection`.
-      spectrum, n_eigs: `full`, or what `spectra.cut_spectrum` leaves of it, with K = n_eigs.
-      metric, axis, from_degree: the printed ones, as in `settings.DescribeSection`.
       dtype:   of the result, float32 if None; float64 by the reference only.
       backend: `numba` (what `compiles`, float32, no gradient; the same bits for any number of threads), `reference`, or
         `auto`: numba where it can.
@@ -87,20 +47,18 @@ def describe(
     """
     import torch
 
-    if n_angles < 1 or max_degree < 2 or n_eigs < 1 or not bandwidth > 0 or not anisotropy >= 0:
+    w = wanted
+    if w.n_angles < 1 or w.max_degree < 2 or w.n_eigs < 1 or not w.bandwidth > 0 or not w.anisotropy >= 0:
         raise ValueError("n_angles >= 1, max_degree >= 2, n_eigs >= 1, bandwidth > 0 and anisotropy >= 0 are needed")
     if means.shape != scales.shape or rotmats.shape != (*means.shape, 3) or mask.shape != means.shape[:2]:
         raise ValueError(f"shapes disagree: {means.shape}, {scales.shape}, {rotmats.shape}, {mask.shape}")
     regions, dtype = (means, scales, rotmats, mask), dtype or torch.float32
     differentiable = any(v.requires_grad for v in regions)
-    can_compile = compiles(spectrum, metric, axis) and dtype == torch.float32 and not differentiable
-    sizes: dict[str, Any] = {"n_angles": n_angles, "max_degree": max_degree}
-    sizes |= {"anisotropy": anisotropy, "bandwidth": bandwidth}
+    can_compile = compiles(w.spectrum, w.metric, w.axis) and dtype == torch.float32 and not differentiable
     if backend == "reference" or (backend == "auto" and not can_compile):
         from chebsplat.shape import descriptor_reference
 
-        sizes |= {"spectrum": spectrum, "n_eigs": n_eigs, "metric": metric, "axis": axis}
-        found = descriptor_reference.describe(*regions, **sizes, dtype=dtype)
+        found = descriptor_reference.describe(*regions, wanted, dtype=dtype)
     elif backend not in ("auto", "numba"):
         raise ValueError(f"backend {backend!r} is none of auto, numba, reference")
     elif not can_compile:
@@ -108,10 +66,11 @@ def describe(
             "the numba backend takes no cut spectrum, printed metric or axis, only float32 and no gradients"
         )
     else:
-        values, n_exact = _compiled(means.numpy(), scales.numpy(), rotmats.numpy(), mask.numpy(), **sizes)
+        sizes = w.n_angles, w.max_degree, w.anisotropy, w.bandwidth
+        values, n_exact = _compiled(means.numpy(), scales.numpy(), rotmats.numpy(), mask.numpy(), *sizes)
         found = Described(torch.from_numpy(values), n_exact=n_exact)
-    wanted = n_degrees(spectrum, max_degree, from_degree)  # what is missing in front vanishes identically
-    return found._replace(values=torch.nn.functional.pad(found.values, (wanted - found.values.shape[-1], 0)))
+    n = n_degrees(w.spectrum, w.max_degree, w.from_degree)  # what is missing in front vanishes identically
+    return found._replace(values=torch.nn.functional.pad(found.values, (n - found.values.shape[-1], 0)))
 
 
 def describe_members(
@@ -159,7 +118,7 @@ def _reference(
     rotmats = rotation_matrices(torch.from_numpy(quats).reshape(-1, 4)).reshape(*mask.shape, 3, 3)
     regions = torch.from_numpy(means), torch.from_numpy(scales), rotmats, torch.from_numpy(mask)
     parameters = settings.model_dump(exclude=OF_REGIONS)
-    described = describe(*regions, **parameters, dtype=torch.float64, backend="reference")
+    described = describe(*regions, Descriptor(**parameters), dtype=torch.float64, backend="reference")
     return Described(described.values.float().numpy(), *described[1:])
 
 

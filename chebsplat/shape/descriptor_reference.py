@@ -7,7 +7,7 @@ import torch
 from torch import Tensor
 
 from chebsplat.shape.albo import canonicalize, cut_spectrum, metric_factors, rotations_about, similarity, tangent_axis
-from chebsplat.shape.descriptor import Axis, Described, Metric, Spectrum
+from chebsplat.shape.described import Described, Descriptor
 
 
 def chebyshev_diagonals(S: Tensor, max_degree: int) -> Tensor:
@@ -38,15 +38,8 @@ def describe(
     scales: Tensor,
     rotmats: Tensor,
     mask: Tensor,
+    wanted: Descriptor,
     *,
-    n_angles: int,
-    max_degree: int,
-    anisotropy: float,
-    bandwidth: float,
-    spectrum: Spectrum,
-    n_eigs: int,
-    metric: Metric,
-    axis: Axis,
     dtype: torch.dtype,
 ) -> Described[Tensor]:
     """As `descriptor.describe`; `dtype` is that of the recurrence, all before it is float64.
@@ -55,19 +48,19 @@ def describe(
     the axis does not matter; angles j > 0 fade to angle 0 where the axis is ill-defined; the axis has no gradient. The
     world's axis has a sign and is defined everywhere: its angles are as printed.
     """
-    region = canonicalize(means, scales, rotmats, mask)
-    factors = metric_factors(region, anisotropy, printed=metric == "printed")
+    region, n_angles, axis = canonicalize(means, scales, rotmats, mask), wanted.n_angles, wanted.axis
+    factors = metric_factors(region, wanted.anisotropy, printed=wanted.metric == "printed")
     around, certainty = tangent_axis(region)
     if axis == "world":
         around = around.new_tensor([0.0, 0.0, 1.0]).expand_as(around)
     count = region.mask.sum(1)[:, None, None]
     angles, counts = [], np.zeros(3, np.int64)
     for rotation in rotations_about(around, n_angles):
-        S = similarity(region, factors, rotation, bandwidth)
-        if spectrum == "full":
-            angles.append(chebyshev_diagonals(S.to(dtype), max_degree) * count)
+        S = similarity(region, factors, rotation, wanted.bandwidth)
+        if wanted.spectrum == "full":
+            angles.append(chebyshev_diagonals(S.to(dtype), wanted.max_degree) * count)
         else:
-            cut = cut_spectrum(S, region.mask, n_eigs, max_degree, hard=spectrum == "hard")
+            cut = cut_spectrum(S, region.mask, wanted.n_eigs, wanted.max_degree, hard=wanted.spectrum == "hard")
             angles.append(cut.values.to(dtype))
             counts += cut[1:]
     certainty = certainty.to(dtype)[:, None, None]

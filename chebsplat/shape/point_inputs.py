@@ -11,7 +11,7 @@ from scipy.spatial.transform import Rotation
 from chebsplat.cameras import upright
 from chebsplat.settings import DescribeSection
 from chebsplat.shape.descriptor import describe_members
-from chebsplat.splats.cubes import first_of_each
+from chebsplat.splats.parts import first_of_each
 
 RADII = (0.12, 0.3, 0.7, 1.6)  # metres
 N_OWN = 6

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
@@ -12,9 +13,6 @@ from torch import Tensor
 from chebsplat.splats.rotations import rotation_matrices
 
 SHRINK = 1.6  # 3DGS's divisor of the scales of two Gaussians that replace one
-DENSITY = 0.05  # α of Eq 12: candidates per unit of a region's volume
-MOST_CANDIDATES = 32  # of a region
-NEAREST, FARTHEST = 0.5, 1.5  # from a new Gaussian to the nearest one, in local spacings
 LARGEST = 1e300  # of the excess: no volume grows nothing, however steep
 
 
@@ -37,6 +35,29 @@ def region_gradients(gradients: Tensor, members: Tensor) -> Tensor:
     return values.sum(1) / present.sum(1).clamp_min(1)
 
 
+@dataclass(frozen=True)
+class Candidates:
+    """How many places for new Gaussians are drawn, and which are good.
+
+    density:  a local spacing³ (α of Eq 12; printed: a cubic scene unit); max_candidates: of a region.
+    nearest, farthest: bounds of the distance to the nearest Gaussian, in local spacings.
+    Raises: ValueError on bounds that are not positive and in order.
+    """
+
+    density: float = 0.05
+    max_candidates: int = 32
+    nearest: float = 0.5
+    farthest: float = 1.5
+    printed: bool = False
+
+    def __post_init__(self) -> None:
+        if not 0 < self.nearest < self.farthest:
+            raise ValueError(f"0 < nearest {self.nearest} < farthest {self.farthest} does not hold")
+
+
+DEFAULT = Candidates()
+
+
 def densify(
     raw: dict[str, Tensor],
     members: Tensor,
@@ -44,21 +65,14 @@ def densify(
     threshold: float,
     budget: int,
     generator: torch.Generator,
-    *,
-    density: float = DENSITY,
-    max_candidates: int = MOST_CANDIDATES,
-    nearest: float = NEAREST,
-    farthest: float = FARTHEST,
-    printed: bool = False,
+    candidates: Candidates = DEFAULT,
 ) -> Additions:
     """New Gaussians in the regions whose mean gradient exceeds the threshold (Eq 12).
 
     Args:
       raw:      raw parameters [N, ...] by name; members i64 [M, n]; gradient [M] of `region_gradients`.
       budget:   at most so many are added; the steepest regions come first.
-      density:  candidates per local spacing³ (printed: per cubic scene unit); max_candidates: a region's most.
-      nearest, farthest: bounds of a candidate's distance to the nearest Gaussian, in local spacings.
-    Raises:  ValueError on a threshold or bounds that are not positive and in order.
+    Raises:  ValueError on a threshold that is not positive.
     Choices: local spacing is the median over the members of the mean distance to the three nearest Gaussians, members
       or not. A region of radius ρ gets density · 4/3 π (ρ / spacing)³ · min(gradient / threshold − 1, 1) candidates,
       rounded up (printed: density · 4/3 π ρ³ · (gradient / threshold − 1)), uniform in the ball about its members'
@@ -66,9 +80,8 @@ def densify(
       once at most, and both change so that the two render like the one (`shared_opacity`, `shared_scales`). Gaussians
       with non-finite means are left out. Neighbours are searched for on the CPU, wherever the Gaussians are.
     """
-    if not (threshold > 0 and 0 < nearest < farthest):
-        raise ValueError(f"threshold {threshold} and 0 < nearest {nearest} < farthest {farthest} do not hold")
-
+    if not threshold > 0:
+        raise ValueError(f"threshold {threshold} is not positive")
     gradient, members, places = gradient.cpu(), members.cpu(), raw["means"].detach().cpu()
     alive = torch.isfinite(places).all(1).numpy()
     order = torch.argsort(gradient, descending=True, stable=True)
@@ -76,23 +89,12 @@ def densify(
     positions, index = np.zeros((0, 3)), np.zeros(0, np.int64)
     if budget > 0 and len(steep) and alive.sum() > 3:
         means, ids = places.double().numpy()[alive], np.flatnonzero(alive)
-        tree = cKDTree(means)
-        excess = (gradient[steep].double() / threshold - 1).clamp_max(LARGEST if printed else 1).numpy()
+        excess = (gradient[steep].double() / threshold - 1).numpy()
         inside = np.where(alive, np.cumsum(alive) - 1, -1)[members[steep].clamp_min(0).numpy()]
         inside[members[steep].numpy() < 0] = -1
-        centers, radii, spacings = _balls(tree, means, inside)
-        volume = 4 / 3 * np.pi * (radii if printed else radii / np.where(spacings > 0, spacings, np.inf)) ** 3
-        counts = np.ceil(np.minimum(density * volume * excess, max_candidates)).astype(np.int64)
-        counts[np.cumsum(counts) - counts >= 16 * budget] = 0
-        region = np.repeat(np.arange(len(counts)), counts)
-        rng = np.random.default_rng(int(torch.randint(2**62, (1,), generator=generator)))
-        positions = centers[region] + radii[region, None] * _in_unit_ball(rng, len(region))
-        distance, parents = tree.query(positions)
-        spacing = spacings[region]
-        kept = np.flatnonzero((distance >= nearest * spacing) & (distance <= farthest * spacing))
-        kept = kept[np.sort(np.unique(parents[kept], return_index=True)[1])]
-        kept = kept[_apart(positions[kept], nearest * spacing[kept])][:budget]
-        positions, index = positions[kept], ids[parents[kept]]
+        seed = int(torch.randint(2**62, (1,), generator=generator))
+        positions, parents = _places(means, inside, excess, budget, np.random.default_rng(seed), candidates)
+        index = ids[parents]
     parent = torch.from_numpy(index).to(raw["means"].device)
     rows = {name: value.detach()[parent] for name, value in raw.items()}
     offsets = torch.from_numpy(positions).to(rows["means"]) - rows["means"]
@@ -101,6 +103,34 @@ def densify(
         "log_scales": shared_scales(rows["log_scales"], rows["quats"], offsets),
     }
     return Additions(parent, rows | changed | {"means": rows["means"] + offsets}, changed)
+
+
+def _places(
+    means: np.ndarray,
+    inside: np.ndarray,
+    excess: np.ndarray,
+    budget: int,
+    rng: np.random.Generator,
+    candidates: Candidates,
+) -> tuple[np.ndarray, np.ndarray]:
+    """Places [A, 3] of new Gaussians in regions of members [R, n] (-1 where padded), steepest first, and the Gaussians
+    [A] that they come from. Args: excess [R]: of the gradient over the threshold.
+    """
+    tree, wanted = cKDTree(means), candidates
+    centers, radii, spacings = _balls(tree, means, inside)
+    printed = wanted.printed
+    volume = 4 / 3 * np.pi * (radii if printed else radii / np.where(spacings > 0, spacings, np.inf)) ** 3
+    excess = np.minimum(excess, LARGEST if printed else 1)
+    counts = np.ceil(np.minimum(wanted.density * volume * excess, wanted.max_candidates)).astype(np.int64)
+    counts[np.cumsum(counts) - counts >= 16 * budget] = 0
+    region = np.repeat(np.arange(len(counts)), counts)
+    positions = centers[region] + radii[region, None] * _in_unit_ball(rng, len(region))
+    distance, parents = tree.query(positions)
+    spacing = spacings[region]
+    kept = np.flatnonzero((distance >= wanted.nearest * spacing) & (distance <= wanted.farthest * spacing))
+    kept = kept[np.sort(np.unique(parents[kept], return_index=True)[1])]
+    kept = kept[_apart(positions[kept], wanted.nearest * spacing[kept])][:budget]
+    return positions[kept], parents[kept]
 
 
 def _balls(tree: cKDTree, means: np.ndarray, inside: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:

@@ -95,8 +95,8 @@ class Population:
             additions = densify.clone_or_split(raw, gradient, threshold, 0.01 * self.extent, budget, generator)
         else:
             mean = densify.region_gradients(gradient, members)
-            printed = settings.grow_rule == "printed"
-            additions = densify.densify(raw, members, mean, threshold, budget, generator, printed=printed)
+            candidates = densify.Candidates(printed=settings.grow_rule == "printed")
+            additions = densify.densify(raw, members, mean, threshold, budget, generator, candidates)
         self.n_added += len(additions.parents)
         optimizer_rows.apply_additions(optimizer, self.model.raw, additions)
 

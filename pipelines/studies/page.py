@@ -139,7 +139,7 @@ def processor() -> str:
 
 
 def markdown(parts: dict[str, Any]) -> str:
-    """The study's section of docs/results.md."""
+    """The study's section of docs/results/."""
     study = parts["study"]
     text = [f"## {study.title}", "", study.about, "", *(f"- {what}: {value}" for what, value in parts["facts"])]
     text += ["", f"![error against run time]({PICTURE})", "", parts["note"], ""]

@@ -12,7 +12,7 @@ from chebsplat.cameras import unproject
 from chebsplat.formats.capture import Capture
 from chebsplat.photos.planar import completed
 from chebsplat.photos.plane_sweep import agreed, swept_depth
-from chebsplat.splats.cubes import cubes_of, means_of_each
+from chebsplat.splats.parts import cubes_of, means_of_each
 from chebsplat.stages.reconstruction.thinning import edge_of
 from chebsplat.stages.runtime.command import Job
 from chebsplat.stages.runtime.progress import Progress

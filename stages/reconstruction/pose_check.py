@@ -61,7 +61,8 @@ def wants_lines(job: Job, capture: Capture, settings: SfmSection, database: Path
 
     Args:    database: with features of all views; PROBED of the pairs [P, 2] are matched in it to find that out.
     Choices: stricter than what asks for adjustment, for it also says no where too few pairs match, and where features
-      are coarse. Generated rooms lost by it (docs/results.md, "At equal seconds"), and are matched by a free search.
+      are coarse. Generated rooms lost by it (docs/results/photographs.md, "At equal seconds"), and are matched by a
+      free search.
     """
     if capture.cam_from_world is None or settings.poses == "adjusted" or _exact(capture) or len(pairs) < LEAST:
         return False

@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from chebsplat.splats.cubes import cubes_of, first_of_each
+from chebsplat.splats.parts import cubes_of, first_of_each
 
 if TYPE_CHECKING:
     from chebsplat.formats.points import Points

@@ -51,9 +51,9 @@ class Default:
 
 
 def _steps(_: TrainSection, evidence: Evidence) -> int:
-    """By held-out training views (docs/results.md, "How many steps"): the more there is to see, the longer a training
-    gains. 70 photos of 320×240 pixels are best served by 1500 steps, and with 3000 lose 0.5 dB again; 43 of 360×640
-    gain until 3000.
+    """By held-out training views (docs/results/training.md, "How many steps"): the more there is to see, the longer a
+    training gains. 70 photos of 320×240 pixels are best served by 1500 steps, and with 3000 lose 0.5 dB again; 43 of
+    360×640 gain until 3000.
     """
     return min(max(100 * round(2.8 * evidence.n_pixels / 1e6), FEWEST), MOST_STEPS)
 

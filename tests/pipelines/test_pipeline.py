@@ -74,7 +74,7 @@ def trainer_code(tree):
 
 
 def deep_code(tree):
-    edit(tree / "synthetic/light.py", "0.95 * light", "0.96 * light")
+    edit(tree / "synthetic/textures.py", "0.95 * light", "0.96 * light")
 
 
 def report_code(tree):

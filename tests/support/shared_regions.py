@@ -3,6 +3,7 @@
 import torch
 
 from benchmarks.stability.descriptor import REGIONS
+from chebsplat.shape.descriptor import Descriptor, describe
 from chebsplat.splats.rotations import rotation_matrices
 
 
@@ -25,3 +26,8 @@ def turned(seed):
     """A random rotation [3, 3]."""
     g = torch.Generator().manual_seed(seed)
     return rotation_matrices(torch.randn(1, 4, generator=g, dtype=torch.float64))[0]
+
+
+def descriptor_of(*regions, dtype=None, backend="auto", **numbers):
+    """`describe` with the numbers of its `Descriptor` by name."""
+    return describe(*regions, Descriptor(**numbers), dtype=dtype, backend=backend)

@@ -22,7 +22,7 @@ from chebsplat.stages.registry import STAGES
 from chebsplat.stages.runtime.config import known_keys
 from chebsplat.stages.training.defaults import DEFAULTS, OPEN
 
-PAGES = [ROOT / name for name in ("README.md", "CONTRIBUTING.md")] + sorted((ROOT / "docs").glob("*.md"))
+PAGES = [ROOT / name for name in ("README.md", "CONTRIBUTING.md")] + sorted((ROOT / "docs").rglob("*.md"))
 CODE = re.compile(r"`([\w/]+\.py)(?::([\w.]+))?`|\b((?:chebsplat|formats|stages|pipelines)/[\w/]+\.py):(\w+)")
 LINK = re.compile(r"\]\(([^)#:]+)\)")
 RECORDS = (Capture, Points, ChannelMap, Features, ViewAgreement, Checkpoint, Lifted, Refined, RaggedScene, Pictures)
@@ -39,7 +39,7 @@ def defined(path):
     return found
 
 
-@pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)
+@pytest.mark.parametrize("page", PAGES, ids=lambda page: str(page.relative_to(ROOT)))
 def test_every_file_function_and_page_that_is_named_exists(page):
     text = page.read_text()
     for match in CODE.finditer(text):

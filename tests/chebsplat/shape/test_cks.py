@@ -7,7 +7,7 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from chebsplat.shape.cks import Modulation, basis_loss, project, regularizer, spread, update
+from chebsplat.shape.cks import Growth, Modulation, basis_loss, project, regularizer, spread, update
 from chebsplat.shape.encoder import RegionEncoder
 
 ORTHONORMAL = 3e-8  # docs/method.md, section 7: for float32 columns measured in float64
@@ -50,7 +50,7 @@ def test_any_sequence_keeps_rank_bounded_and_columns_orthonormal(q, p, rank, log
     for scene in range(3):
         W = weights(q, p, rank, seed + scene) * 10.0**log_size
         earlier = basis
-        basis, report = update(basis, W, energy=energy, max_rank=fraction, rule=rule)
+        basis, report = update(basis, W, Growth(energy=energy, max_rank=fraction, rule=rule))
         assert before <= basis.shape[1] <= fraction * q
         assert earlier is None or torch.equal(basis[:, :before], earlier)
         assert report["added"] == basis.shape[1] - before == report["rank_after"] - report["rank_before"]
@@ -73,18 +73,18 @@ def test_zero_and_empty_weights_change_nothing():
 
 @pytest.mark.parametrize("rule", ["total", "residual"])
 def test_what_is_already_inside_adds_no_column_and_changes_no_bit(rule):
-    basis, _ = update(None, weights(rank=4), energy=0.999999)
-    again, report = update(basis, weights(rank=4), rule=rule)
+    basis, _ = update(None, weights(rank=4), Growth(energy=0.999999))
+    again, report = update(basis, weights(rank=4), Growth(rule=rule))
     assert report["rho"] < 1e-5
     assert report["added"] == 0
     assert torch.equal(again, basis)
 
 
 def test_only_the_printed_rule_adds_noise_when_relevance_is_not_asked_for():
-    basis, _ = update(None, weights(rank=4), energy=0.999999)
+    basis, _ = update(None, weights(rank=4), Growth(energy=0.999999))
     noisy = weights(rank=4) + 1e-4 * weights(seed=8)
-    assert update(basis, noisy, rule="residual", tolerance=1e-9, max_added=0.5, n_scenes=1)[1]["added"] == 12
-    assert update(basis, noisy, rule="total", tolerance=1e-9, max_added=0.5, n_scenes=1)[1]["added"] == 0
+    assert update(basis, noisy, Growth(rule="residual", tolerance=1e-9, max_added=0.5, n_scenes=1))[1]["added"] == 12
+    assert update(basis, noisy, Growth(rule="total", tolerance=1e-9, max_added=0.5, n_scenes=1))[1]["added"] == 0
 
 
 def test_an_exactly_captured_scene_is_no_update_even_without_tolerance():
@@ -92,7 +92,7 @@ def test_an_exactly_captured_scene_is_no_update_even_without_tolerance():
     W = torch.zeros(32, 7, dtype=torch.float64)
     W[:5] = weights(5, 7).double()
     for rule in ("total", "residual"):
-        same, report = update(basis, W, tolerance=0.0, rule=rule)
+        same, report = update(basis, W, Growth(tolerance=0.0, rule=rule))
         assert report["rho"] <= 10 * 2.3e-16 * math.sqrt(32)
         assert torch.equal(same, basis)
 
@@ -100,7 +100,7 @@ def test_an_exactly_captured_scene_is_no_update_even_without_tolerance():
 @pytest.mark.parametrize("energy", [0.5, 0.9, 0.96])
 def test_total_rule_reaches_its_energy_with_as_few_columns_as_it_can(energy):
     W = weights(64, 64, rank=20)
-    basis, report = update(None, W, energy=energy, max_rank=0.9, max_added=1.0, n_scenes=1)
+    basis, report = update(None, W, Growth(energy=energy, max_rank=0.9, max_added=1.0, n_scenes=1))
     captured = (project(W, basis)[0] ** 2).sum() / (W.double() ** 2).sum()
     assert report["energy"] == pytest.approx(captured.item(), abs=1e-6)
     assert captured >= energy - 1e-6
@@ -114,13 +114,13 @@ def test_a_residual_of_a_millionth_that_is_asked_for_is_found_exactly():
     W = torch.zeros(32, 9, dtype=torch.float64)
     W[:4] = weights(4, 9).double()
     W[4:] = 1e-6 * hidden[:, None] * weights(1, 9, seed=2).double()
-    grown, report = update(basis, W, tolerance=1e-9, energy=1 - 1e-15)
+    grown, report = update(basis, W, Growth(tolerance=1e-9, energy=1 - 1e-15))
     assert report["added"] == 1
     assert abs(grown[4:, 4].double() @ hidden) == pytest.approx(1, abs=1e-6)
 
 
 def test_relevance_does_not_depend_on_size_or_shape():
-    basis, _ = update(None, weights(rank=4), energy=0.999999)
+    basis, _ = update(None, weights(rank=4), Growth(energy=0.999999))
     W = weights(rank=4) + 0.2 * weights(seed=9)
     rho = update(basis, W)[1]["rho"]
     for other in (W * 1e20, W * 1e-20, torch.cat([W, W], 1), torch.cat([W, torch.zeros(32, 99)], 1)):
@@ -129,7 +129,7 @@ def test_relevance_does_not_depend_on_size_or_shape():
 
 def test_a_basis_beyond_the_ceiling_is_kept():
     basis = torch.eye(8)[:, :6]
-    same, report = update(basis, weights(8, 8), max_rank=0.5)
+    same, report = update(basis, weights(8, 8), Growth(max_rank=0.5))
     assert torch.equal(same, basis)
     assert report["added"] == 0
 
@@ -164,7 +164,7 @@ def test_a_basis_spans_the_inputs_that_a_map_reads():
         for W in encoder.linear_maps().values():
             W[3:] = 0
     for name, W in encoder.linear_maps().items():
-        basis, report = update(None, W.detach(), energy=0.999999, max_added=1.0, n_scenes=1)
+        basis, report = update(None, W.detach(), Growth(energy=0.999999, max_added=1.0, n_scenes=1))
         assert basis.shape == (W.shape[0], 3), name
         assert basis[3:].abs().max() == 0
         assert torch.linalg.matrix_rank(W) == 3 and report["energy"] == pytest.approx(1)
@@ -234,7 +234,7 @@ def test_the_spread_of_shape_is_the_printed_formula_over_members_that_exist():
 def test_a_scene_takes_a_share_of_the_room_and_leaves_some_to_those_after_it():
     ranks, basis = [], None
     for seed in range(8):
-        basis, report = update(basis, weights(seed=seed), max_rank=0.875, max_added=0.25, n_scenes=1)
+        basis, report = update(basis, weights(seed=seed), Growth(max_rank=0.875, max_added=0.25, n_scenes=1))
         ranks.append(report["rank_after"])
     assert ranks == [7, 12, 16, 19, 21, 22, 23, 24]
 
@@ -277,4 +277,4 @@ def test_regulariser_is_nothing_before_there_is_knowledge():
 def test_what_cannot_be_used_is_refused(arguments, words):
     call = {"basis": None, "W": torch.ones(4, 4)} | arguments
     with pytest.raises(ValueError, match=words):
-        update(call.pop("basis"), call.pop("W"), **call)
+        update(call.pop("basis"), call.pop("W"), Growth(**call))

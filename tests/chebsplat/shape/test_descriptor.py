@@ -7,11 +7,11 @@ import pytest
 import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from shared_regions import REGIONS, extreme, region, turned
+from shared_regions import REGIONS, descriptor_of, extreme, region, turned
 from thread_counts import assert_same_bits
 
 from chebsplat.settings import DescribeSection
-from chebsplat.shape.descriptor import describe, describe_members
+from chebsplat.shape.descriptor import describe_members
 from chebsplat.shape.descriptor_reference import chebyshev_diagonals
 from chebsplat.splats.rotations import rotation_matrices
 
@@ -26,7 +26,7 @@ ROUTES = {  # options, and what a motion may change: cut spectra divide by the g
 
 
 def described(route, given, **options):
-    return describe(*given, **ROUTES[route][0], **options).values
+    return descriptor_of(*given, **ROUTES[route][0], **options).values
 
 
 def errors(found, expected):
@@ -143,7 +143,7 @@ def test_gathered_members_are_described_like_their_regions(chosen):
     arrays = (v.numpy() for v in (means, quats, scales.exp(), members))
     found = describe_members(*arrays, DescribeSection(**options), chunk=4)
     regions = means[index], scales.exp()[index], rotation_matrices(quats)[index], members >= 0
-    wanted = describe(*regions, **options, dtype=torch.float64)
+    wanted = descriptor_of(*regions, **options, dtype=torch.float64)
     error = (torch.from_numpy(found.values) - wanted.values).abs().max()
     assert error <= 1e-6 * wanted.values.abs().max()  # float32, the rounding of the rotations
     assert found.n_cuts == wanted.n_cuts == (36 if "hard" in chosen.values() else 0)
@@ -162,4 +162,4 @@ def test_a_backend_refuses_what_it_does_not_compute(beyond):
     means, *rest = region(4)
     means = means.clone().requires_grad_(beyond.pop("gradient", False))
     with pytest.raises(ValueError, match="backend"):
-        describe(means, *rest, **({"backend": "numba"} | beyond))
+        descriptor_of(means, *rest, **({"backend": "numba"} | beyond))

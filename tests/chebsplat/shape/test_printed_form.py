@@ -5,9 +5,10 @@ import math
 import numpy as np
 import pytest
 import torch
+from shared_regions import descriptor_of
 
 from chebsplat.settings import TrainSection
-from chebsplat.shape.descriptor import describe, n_degrees
+from chebsplat.shape.descriptor import n_degrees
 from chebsplat.shape.fusion import Fusion, Gate
 from chebsplat.shape.regions import build_regions
 from chebsplat.splats.rotations import rotation_matrices
@@ -61,7 +62,7 @@ def test_the_printed_metric_axis_and_spectrum_are_the_printed_formula(n_eigs):
     means, scales, rotmats, mask = regions()
     options = {"metric": "printed", "axis": "world", "from_degree": 0, "anisotropy": 10.0, "bandwidth": 0.7}
     options |= {"spectrum": "hard", "n_eigs": n_eigs} if n_eigs else {}
-    found = describe(means, scales, rotmats, mask, **SIZES, **options).values
+    found = descriptor_of(means, scales, rotmats, mask, **SIZES, **options).values
     for m in range(len(means)):
         given = (v[m].numpy() for v in (means, scales, rotmats))
         wanted = printed(*given, beta=10.0, bandwidth=0.7, n_angles=3, max_degree=5, n_eigs=n_eigs)
@@ -74,7 +75,7 @@ def test_the_printed_metric_has_a_finite_gradient_that_finite_differences_confir
     *given, mask = regions(1, 5)
 
     def described(*given):
-        return describe(*given, mask, **SIZES, metric="printed", axis="world").values
+        return descriptor_of(*given, mask, **SIZES, metric="printed", axis="world").values
 
     leaves = [value.requires_grad_(True) for value in given]
     assert torch.autograd.gradcheck(described, leaves, rtol=1e-5, atol=1e-7)
@@ -84,13 +85,13 @@ def test_the_printed_metric_has_a_finite_gradient_that_finite_differences_confir
 def test_the_first_degree_is_chosen_and_what_is_added_vanishes(spectrum):
     given = regions()
     options = SIZES | {"spectrum": spectrum, "n_eigs": 4}
-    every, rest = (describe(*given, **options, from_degree=first).values for first in (0, 2))
+    every, rest = (descriptor_of(*given, **options, from_degree=first).values for first in (0, 2))
     assert torch.equal(every[..., 2:], rest)
     assert every.shape[-1] == n_degrees(spectrum, 5, 0) == 6
     assert (every[..., :2] == 0).all() == (spectrum == "full")
-    default = describe(*given, **options).values
+    default = descriptor_of(*given, **options).values
     assert torch.equal(default, rest if spectrum == "full" else every)
-    compiled = describe(*(v.float() for v in given[:3]), given[3], n_angles=3, max_degree=5, from_degree=0)
+    compiled = descriptor_of(*(v.float() for v in given[:3]), given[3], n_angles=3, max_degree=5, from_degree=0)
     assert compiled.values.shape[-1] == 6
     assert (compiled.values[..., :2] == 0).all()
 
@@ -99,10 +100,10 @@ def test_a_spectrum_of_zeros_is_guarded_and_counted():
     far = torch.tensor([[[1e3 * k, 0.0, 0.0] for k in (0, 1e-3, 1, 1.001, 2, 2.001)]], dtype=torch.float64)
     scales, rotmats = torch.full_like(far, 1e-3), torch.eye(3, dtype=torch.float64).expand(1, 6, 3, 3)
     options = SIZES | {"spectrum": "hard", "n_eigs": 2, "bandwidth": 1e-3}
-    found = describe(far, scales, rotmats, torch.ones(1, 6, dtype=torch.bool), **options)
+    found = descriptor_of(far, scales, rotmats, torch.ones(1, 6, dtype=torch.bool), **options)
     assert found.values.isfinite().all()
     assert found.n_guarded == SIZES["n_angles"]
-    assert describe(*regions(), **(SIZES | {"spectrum": "hard", "n_eigs": 4})).n_guarded == 0
+    assert descriptor_of(*regions(), **(SIZES | {"spectrum": "hard", "n_eigs": 4})).n_guarded == 0
 
 
 def test_regions_of_a_given_radius_and_overlap_and_without_thinning():

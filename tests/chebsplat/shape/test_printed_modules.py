@@ -7,12 +7,12 @@ import pytest
 import torch
 from scipy.special import erf
 
-from chebsplat.shape.cks import update
+from chebsplat.shape.cks import Growth, update
 from chebsplat.shape.encoder import N_FREQUENCIES, RegionEncoder, positional_encoding
 from chebsplat.shape.fusion import Fusion, Gate, propagate, propagation_weights
 from chebsplat.shape.region_inputs import in_scene
 from chebsplat.splats.rotations import rotation_matrices
-from chebsplat.training.densify import densify, region_gradients
+from chebsplat.training.densify import Candidates, densify, region_gradients
 from chebsplat.training.losses import feature_distance, feature_distance_reference
 from tests.chebsplat.training.test_printed_gates import randomized
 from tests.chebsplat.training.test_printed_gates import weights as arrays
@@ -183,7 +183,7 @@ def test_the_printed_growth_is_density_times_volume_times_excess_within_the_ball
     raw["logit_opacities"], gradient = torch.zeros(6000), torch.tensor([2 * (1 + excess)], dtype=torch.float64)
     bounds = {"nearest": 1e-6, "farthest": 1e6, "max_candidates": 1000}
     generator = torch.Generator().manual_seed(3)
-    added = densify(raw, members, gradient, 2.0, 10_000, generator, density=density, printed=True, **bounds)
+    added = densify(raw, members, gradient, 2.0, 10_000, generator, Candidates(density=density, printed=True, **bounds))
     assert len(added.parents) == math.ceil(6.1 * excess)
     assert ((added.rows["means"].double() - centre).norm(dim=1) <= radius * (1 + 1e-5)).all()
 
@@ -201,7 +201,7 @@ def test_the_printed_update_of_knowledge_is_its_formula(novelty, grows):
     count = 1 + int((np.cumsum(values**2) / (residual**2).sum() < 0.96).sum())
     options = {"rule": "residual", "update_rule": "printed", "tolerance": 1.2 * rho, "novelty": novelty}
     free = {"max_rank": 0.999, "max_added": 1.0, "n_scenes": 1}
-    grown, report = update(torch.from_numpy(basis), torch.from_numpy(W), **options, **free)
+    grown, report = update(torch.from_numpy(basis), torch.from_numpy(W), Growth(**options, **free))
     assert abs(report["rho"] - rho) < 1e-12 and abs(report["rho_printed"] - rho * novelty) < 1e-12
     assert report["added"] == (count if grows else 0)
     if grows:

@@ -5,11 +5,11 @@ import torch
 from shared_regions import REGIONS, extreme, region
 
 from chebsplat.shape.albo import canonicalize, cut_spectrum, metric_factors, similarity
-from chebsplat.shape.descriptor import describe
+from chebsplat.shape.descriptor import Descriptor, describe
 
 
 def described(given, spectrum, **options):
-    return describe(*given, spectrum=spectrum, dtype=torch.float64, backend="reference", **options)
+    return describe(*given, Descriptor(spectrum=spectrum, **options), dtype=torch.float64, backend="reference")
 
 
 def operator(given, bandwidth=0.7):

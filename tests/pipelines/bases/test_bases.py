@@ -15,7 +15,7 @@ from chebsplat.pipelines.bases import revisions
 from chebsplat.pipelines.cli.basis import basis as command
 from chebsplat.pipelines.selection import plans
 from chebsplat.pipelines.work import store
-from chebsplat.shape.cks import update
+from chebsplat.shape.cks import Growth, update
 
 NAMES = ("blocks.0.query", "blocks.0.key")
 SCENES = ("office0", "room0", "office1")
@@ -48,7 +48,7 @@ def chain():
         for name in NAMES:
             W = torch.randn(16, 2, generator=g) @ torch.randn(2, 16, generator=g)
             before = torch.from_numpy(grown[name]) if name in grown else None
-            held, reports[name] = update(before, W, energy=0.9999, n_scenes=1)
+            held, reports[name] = update(before, W, Growth(energy=0.9999, n_scenes=1))
             grown[name], weights[f"{name}.weight"] = held.numpy(), W.numpy()
         lineage.append({"scene": scene, "gaussians": f"g{number}", "spread": 1.0, "maps": reports})
         earlier = key_of(number - 1) if number > 1 else None

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from chebsplat.formats.points import Points
-from chebsplat.splats.cubes import cubes_of, first_of_each, means_of_each
+from chebsplat.splats.parts import cubes_of, first_of_each, means_of_each
 from chebsplat.stages.reconstruction.thinning import LEVELS, by_color, edge_of, even, thin
 from chebsplat.stages.runtime.config import Config
 from chebsplat.stages.sfm import reduced
