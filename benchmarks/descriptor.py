@@ -14,8 +14,10 @@ import torch
 
 from benchmarks import shared
 from benchmarks.stability import oracle
-from chebsplat.shape.descriptor import Descriptor, describe
-from chebsplat.shape.regions import build_regions
+from chebsplat.settings import DescribeSection
+from chebsplat.shape.described import Descriptor
+from chebsplat.shape.descriptor import describe
+from chebsplat.shape.regions import regions_of
 from chebsplat.splats.gaussians import activated, initial_gaussians, local_shape
 from chebsplat.splats.rotations import rotation_matrices
 from chebsplat.synthetic import layout
@@ -43,7 +45,7 @@ def room(m: int, n: int) -> Regions:
     points += 0.005 * rng.standard_normal(points.shape)
     raw = initial_gaussians(points, np.full(points.shape, 128, np.uint8), local_shape(points, 16)[0])
     _, quats, scales, _ = activated(raw)
-    members = torch.as_tensor(build_regions(points, 4 * m, n).members)
+    members = torch.as_tensor(regions_of(points, DescribeSection(n_regions=4 * m, region_size=n)).members)
     members = members[(members >= 0).all(1)][:m]
     return torch.as_tensor(points)[members], scales[members].double(), rotation_matrices(quats[members]).double()
 
@@ -90,7 +92,7 @@ def main(arguments: Sequence[str]) -> int:
     rows.append({"what": "of batched eigh in float32 alone, 1 thread", "value": rate})
     for n in (10_000, 100_000, 1_000_000):
         points = np.random.default_rng(0).random((n, 3)) * [5.0, 4.0, 0.3]
-        seconds = best(lambda points=points: build_regions(points, 2048, N), 2)  # type: ignore[misc]
+        seconds = best(lambda points=points: regions_of(points, DescribeSection(n_regions=2048, region_size=N)), 2)  # type: ignore[misc]
         rows.append({"what": f"milliseconds of sampling 2048 regions of {n} points", "value": 1e3 * seconds})
     rows += [{"what": f"largest error, {name}", "value": value} for name, value in errors.items()]
     for row in rows:

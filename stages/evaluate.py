@@ -69,15 +69,7 @@ def run(job: Job) -> None:
     figures["image"] = image_figures(pictures["renders"], pictures["truth"], masks, lpips)
     figures["n_gaussians"] = len(scene.parameters["means"])
     figures["bytes"] = scene.summary["bytes"]
-    figures |= {"frames_per_second": {}, "milliseconds": {}}
-    if settings.timing_repeats:
-        figures["frames_per_second"] = timing(renderer, cameras, settings.timing_repeats, scene.labels is not None)
-        if job.device == "cpu":
-            figures["milliseconds"] = frame_split(renderer, cameras, settings.timing_repeats)
-        else:
-            job.left_out("milliseconds of a frame by part", "gsplat renders a frame on the GPU in one go")
-    else:
-        job.left_out("frames a second", "evaluate.timing_repeats is 0")
+    figures |= timings(job, renderer, cameras, scene.labels is not None)
     figures["lpips"] = figures["image"]["lpips"]
     if lpips is None:
         job.left_out("LPIPS", "evaluate.lpips_weights names no file: not measured")
@@ -90,6 +82,20 @@ def run(job: Job) -> None:
     if segmentation:
         job.facts["miou"] = segmentation["scene"]["miou"]
     Evaluation(figures, pictures).write(job.out)
+
+
+def timings(job: Job, renderer: SceneRenderer, cameras: list[View], semantic: bool) -> dict[str, Any]:
+    """Frames a second, and on the CPU milliseconds of a frame by part."""
+    repeats, split = job.config.evaluate.timing_repeats, {}
+    if not repeats:
+        job.left_out("frames a second", "evaluate.timing_repeats is 0")
+        return {"frames_per_second": {}, "milliseconds": {}}
+    per_second = timing(renderer, cameras, repeats, semantic)
+    if job.device == "cpu":
+        split = frame_split(renderer, cameras, repeats)
+    else:
+        job.left_out("milliseconds of a frame by part", "gsplat renders a frame on the GPU in one go")
+    return {"frames_per_second": per_second, "milliseconds": split}
 
 
 def camera(scene: Scene, index: int) -> View:

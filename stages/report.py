@@ -56,8 +56,7 @@ def run(job: Job) -> None:
     if not gaussians.trace:
         raise DataFailure("the training left no trace of error against run time; train the scene again")
     manifests = {role: read_manifest(job.inputs[role]) for role in STAGE_OF if role in job.inputs}
-    facts = {role: manifest.facts for role, manifest in manifests.items()}
-    figures = evaluation.figures
+    facts, figures = {role: manifest.facts for role, manifest in manifests.items()}, evaluation.figures
     left_out = absent_stages(job, gaussians) | figures["left_out"]
     for of_input in facts.values():
         left_out |= of_input.get("left_out", {})

@@ -14,7 +14,8 @@ import torch
 
 from benchmarks.stability import oracle
 from benchmarks.stability.case import Outcome, case, relative
-from chebsplat.shape.descriptor import Descriptor, describe
+from chebsplat.shape.described import Descriptor
+from chebsplat.shape.descriptor import describe
 from chebsplat.splats.rotations import rotation_matrices
 
 TOLERANCE = 5e-6  # the worst that any case may reach in float32

@@ -12,7 +12,8 @@ from typing import Any
 import numpy as np
 
 from benchmarks.stability.case import Outcome, case
-from chebsplat.shape.regions import build_regions
+from chebsplat.settings import DescribeSection
+from chebsplat.shape.regions import regions_of
 
 N_REGIONS, SIZE = 24, 16
 TOLERANCE = 0.25
@@ -66,7 +67,7 @@ def reach(means: np.ndarray, centers: Any) -> float:
 def points(name: str) -> Outcome:
     """Raises ValueError if members are not unique, not within the radius, or not led by their centre."""
     means = POINTS[name]()
-    found = build_regions(means, N_REGIONS, SIZE)
+    found = regions_of(means, DescribeSection(n_regions=N_REGIONS, region_size=SIZE))
     present = found.members >= 0
     distance = np.linalg.norm(means[found.members] - means[found.centers][:, None], axis=-1)
     unique = all(len(np.unique(row[here])) == here.sum() for row, here in zip(found.members, present, strict=True))

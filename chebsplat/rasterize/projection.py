@@ -44,18 +44,17 @@ def project(
     scales: Tensor,
     viewmat: Tensor,
     K: Tensor,
-    width: int,
-    height: int,
-    near_plane: float,
-    far_plane: float,
+    size: tuple[int, int],
+    bounds: tuple[float, float],
     eps2d: float,
 ) -> Projected:
     """Project Gaussians into one camera.
 
-    Args: see `rasterize`; `viewmat` [4, 4], `K` [3, 3].
+    Args: see `rasterize`; `viewmat` [4, 4], `K` [3, 3]; size: width and height; bounds: near and far plane.
     Choices: culled by `not (near < z < far)`, which rejects NaN too; the view ray's slope is clamped to 1.3 times the
     field of view in the Jacobian, as gsplat does; a zero quaternion or a non-finite result is culled, never repaired.
     """
+    (width, height), (near_plane, far_plane) = size, bounds
     camera = means @ viewmat[:3, :3].T + viewmat[:3, 3]
     usable = (camera[:, 2] > near_plane) & (camera[:, 2] < far_plane)
     usable &= torch.isfinite(camera).all(-1) & torch.isfinite(scales).all(-1) & torch.isfinite(quats).all(-1)

@@ -72,7 +72,7 @@ def rasterize(
     """
     antialiased = is_antialiased(rasterize_mode)
     n_colors, colors = colors.shape[-1], with_cells(colors, cell_colors)
-    views = [project(means, quats, scales, v, k, width, height, near_plane, far_plane, eps2d)
+    views = [project(means, quats, scales, v, k, (width, height), (near_plane, far_plane), eps2d)
              for v, k in zip(viewmats, Ks, strict=True)]  # fmt: skip
     means2d = torch.stack([view.means2d for view in views])
     if means2d.requires_grad:
@@ -264,7 +264,7 @@ def pixel_weights(
     means, quats, scales, opacities = (torch.from_numpy(np.asarray(a, np.float64)) for a in gaussians)
     width, height = size
     pose, intrinsics = (torch.from_numpy(np.asarray(matrix, np.float64)) for matrix in (viewmat, K))
-    view = project(means, quats, scales, pose, intrinsics, width, height, 0.01, 1e10, 0.3)
+    view = project(means, quats, scales, pose, intrinsics, (width, height), (0.01, 1e10), 0.3)
     order = torch.argsort(view.depths, stable=True).numpy()
     whitening, centers = view.whitening.numpy(), view.means2d.numpy()
     opacity = np.where(view.visible.numpy() & (opacities.numpy() >= ALPHA_MIN), opacities.numpy(), 0.0)

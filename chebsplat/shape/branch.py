@@ -10,7 +10,7 @@ from torch import Tensor, nn
 
 from chebsplat.settings import DescribeSection, TrainSection
 from chebsplat.shape import cks
-from chebsplat.shape.descriptor import n_degrees
+from chebsplat.shape.described import n_degrees
 from chebsplat.shape.encoder import RegionEncoder
 from chebsplat.shape.fusion import Gate, fuse_in_view, propagate, propagation_weights, share_undefined
 from chebsplat.shape.refresh import Descriptors, GaussianIds

@@ -9,7 +9,8 @@ import torch
 from torch import Tensor
 
 from chebsplat.settings import DescribeSection
-from chebsplat.shape.descriptor import describe_members, n_degrees
+from chebsplat.shape.described import n_degrees
+from chebsplat.shape.descriptor import describe_members
 
 
 class GaussianIds:

@@ -7,7 +7,8 @@ from typing import Literal, NamedTuple
 import numpy as np
 
 from chebsplat.settings import DescribeSection
-from chebsplat.shape.descriptor import compiles, describe_members
+from chebsplat.shape.described import compiles
+from chebsplat.shape.descriptor import describe_members
 from chebsplat.shape.regions import Regions, covering, regions_of
 
 Position = Literal["region", "center", "both"]
@@ -58,24 +59,30 @@ def in_scene(means: np.ndarray) -> np.ndarray:
     return scaled.clip(-FARTHEST, FARTHEST)
 
 
+class Tokens(NamedTuple):
+    """What an encoder is fed with: how many regions reach a Gaussian at most, whether tokens hold descriptors, and
+    features, and where they lie (see `placed`).
+    """
+
+    n_covers: int
+    described: bool
+    context: bool
+    position: Position = "region"
+
+
 def region_inputs(
     means: np.ndarray,
     quats: np.ndarray,
     log_scales: np.ndarray,
     features: np.ndarray,
     describe: DescribeSection,
-    *,
-    n_covers: int,
-    described: bool,
-    context: bool,
-    position: Position = "region",
+    tokens: Tokens,
 ) -> RegionInputs:
     """Regions of a finished scene, their descriptors, and which regions cover a Gaussian.
 
     Args:
       means [N, 3] scene units, quats [N, 4] wxyz, log_scales [N, 3], features [N, C] before fusion: float32, in the
       order that the scene was trained in (the regions depend on it).
-      described, context: whether tokens hold descriptors, and features; position: see `placed`.
     Raises: ValueError if there are no Gaussians, or its descriptor has no route without torch.
     """
     if len(means) == 0:
@@ -83,14 +90,14 @@ def region_inputs(
     regions = regions_of(means.astype(np.float64), describe)
     mask = regions.members >= 0
     parts = []
-    if described:
+    if tokens.described:
         if not compiles(describe.spectrum, describe.metric, describe.axis):
             asked = ", ".join(f"describe.{name} = {getattr(describe, name)}" for name in ("spectrum", "metric", "axis"))
             raise ValueError(f"{asked} is computed by torch only")
         values = describe_members(means, quats, np.exp(log_scales), regions.members, describe).values
         parts.append(values.reshape(*mask.shape, -1))
-    if context:
+    if tokens.context:
         parts.append(features[np.maximum(regions.members, 0)])
     inputs = np.concatenate(parts, -1) if parts else np.zeros((*mask.shape, 0), np.float32)
-    positions, cover = placed(means, regions, n_covers, position)
+    positions, cover = placed(means, regions, tokens.n_covers, tokens.position)
     return RegionInputs(regions, inputs, positions, mask, cover)

@@ -28,66 +28,38 @@ class Regions(NamedTuple):
 def regions_of(
     means: np.ndarray, settings: DescribeSection, *, ids: np.ndarray | None = None, earlier: Regions | None = None
 ) -> Regions:
-    """`build_regions` as the settings ask for."""
-    return build_regions(
-        means,
-        settings.n_regions,
-        settings.region_size,
-        settings.seed,
-        ids=ids,
-        earlier=earlier,
-        overlap=settings.overlap,
-        radius=settings.region_radius,
-        thinning=settings.thinning,
-    )
-
-
-def build_regions(
-    means: np.ndarray,
-    n_regions: int,
-    region_size: int,
-    seed: int = 0,
-    *,
-    ids: np.ndarray | None = None,
-    earlier: Regions | None = None,
-    overlap: float = 1.5,
-    radius: float | None = None,
-    thinning: bool = True,
-) -> Regions:
     """Cover points with regions (docs/method.md, section 2).
 
     Args:
       means:       [N, 3] scene units; float64 where the scene is far from the origin.
-      n_regions:   how many, at most; region_size: how many members, at most.
-      seed:        of the first centre and of the thinning.
+      settings:    how many regions and members at most; the seed of the first centre and of the thinning; the radius
+        over the covering radius, or in scene units: regions need not cover the points then, and centres are found anew
+        at every call; without thinning, members are the nearest points, however many a ball holds (printed).
       ids:         i64 [N], what a point is called while others come and go; its index otherwise.
       earlier:     regions whose centres, radius and share are kept if they still fit (their members are not read).
-      overlap:     the radius over the covering radius; radius: scene units, instead: regions need not cover the
-        points then, and centres are found anew at every call.
-      thinning:    false: members are the nearest points, however many a ball holds (printed).
     Returns: regions; zero of them for N = 0, fewer than n_regions where points coincide.
-    Raises:  ValueError on sizes below 1 or non-finite means.
+    Raises:  ValueError on non-finite means.
     Choices: centres by farthest-point sampling; the radius is `overlap` times the covering radius, so that regions
       overlap. Neighbours come from a thinned set of about `region_size` points a ball, else a region of the nearest
       ones would shrink to a speck inside a dense ball; the centre itself is always a member. A point is thinned away
       by a hash of its id, so that a point that comes, goes or moves changes the regions around it and no others.
     """
-    if n_regions < 1 or region_size < 1:
-        raise ValueError("n_regions and region_size must be at least 1")
+    region_size, radius = settings.region_size, settings.region_radius
     if not np.isfinite(means).all():
         raise ValueError("means are not finite")
     n = len(means)
+    n_regions = min(settings.n_regions, n)
     if n == 0:
         return Regions(np.zeros(0, np.int64), np.zeros((0, region_size), np.int64), 0.0)
-    keys = _uniform(np.arange(n) if ids is None else ids, seed)
+    keys = _uniform(np.arange(n) if ids is None else ids, settings.seed)
     still_covering = None
     if earlier is not None and radius is None:
-        still_covering = _hold(means, earlier, min(n_regions, n), overlap)
+        still_covering = _hold(means, earlier, n_regions, settings.overlap)
     if still_covering is None:
-        start = int(np.random.default_rng(seed).integers(n))
-        centers, reach = farthest_points(means, min(n_regions, n), start)
-        radius = radius or overlap * reach or 1.0
-        share = _share(means, centers, radius, region_size, keys) if thinning else 1.0
+        start = int(np.random.default_rng(settings.seed).integers(n))
+        centers, reach = farthest_points(means, n_regions, start)
+        radius = radius or settings.overlap * reach or 1.0
+        share = _share(means, centers, radius, region_size, keys) if settings.thinning else 1.0
     else:
         centers, radius, share = still_covering
     return Regions(centers, _neighbourhoods(means, centers, radius, share, region_size, keys), radius, share)

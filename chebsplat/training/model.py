@@ -223,15 +223,7 @@ class SceneModel:
         means, quats = take(raw["means"], index), take(raw["quats"], index)
         scales, opacities = take(raw["log_scales"], index).exp(), take(raw["logit_opacities"], index).sigmoid()
         auxiliary = Auxiliary()
-        features = None
-        if fused and self.shape is not None and self.shape.regions is not None:
-            fresh = None if generator is None else self.shape.sample(raw["features"], index, generator)
-            features = self.shape.fuse(raw["features"], index, fresh)
-            if fresh is not None and len(fresh.regions):
-                auxiliary.fresh = fresh
-                auxiliary.shape_distance = self.shape.distance(raw["features"], fresh)
-        elif "features" in raw:
-            features = take(raw["features"], index)
+        features = self._features(index, fused, generator, auxiliary)
         if masked and (soft := self.soft_mask(index, features)) is not None:
             auxiliary.soft_mask = soft
             scales, opacities = prune.apply_mask(prune.hard_mask(soft), scales, opacities)
@@ -263,6 +255,20 @@ class SceneModel:
         parts = render[0].split(sizes, -1)  # one gradient, where slices would make one each
         inverse_depth = at_pixels(parts[1]) if depth else None
         return Rendered(parts[0], alpha[0], parts[2], meta, index, auxiliary, inverse_depth)
+
+    def _features(
+        self, index: Tensor, fused: bool, generator: torch.Generator | None, auxiliary: Auxiliary
+    ) -> Tensor | None:
+        """Features [V, C] of these Gaussians, fused or raw, None without; some encodings anew, noted in `auxiliary`."""
+        raw = self.raw
+        if not fused or self.shape is None or self.shape.regions is None:
+            return take(raw["features"], index) if "features" in raw else None
+        fresh = None if generator is None else self.shape.sample(raw["features"], index, generator)
+        features = self.shape.fuse(raw["features"], index, fresh)
+        if fresh is not None and len(fresh.regions):
+            auxiliary.fresh = fresh
+            auxiliary.shape_distance = self.shape.distance(raw["features"], fresh)
+        return features
 
     @torch.no_grad()
     def fused_features(self) -> np.ndarray | None:

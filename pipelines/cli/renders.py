@@ -7,6 +7,7 @@ import sys
 import webbrowser
 from contextlib import suppress
 from pathlib import Path
+from typing import Any
 
 import click
 
@@ -47,15 +48,7 @@ WORDS = click.option(
 @click.option("--fps", type=click.IntRange(1, 240), default=24, show_default=True, help="of a video")
 @click.option("--out", type=click.Path(path_type=Path), required=True, help="a folder of frames, or a .mp4")
 def render(
-    scene: str,
-    path: str,
-    frames: int | None,
-    what: str,
-    query: str | None,
-    against: list[str],
-    size: str | None,
-    fps: int,
-    out: Path,
+    scene: str, path: str, frames: int | None, what: str, size: str | None, fps: int, out: Path, **asked: Any
 ) -> None:
     """Render a finished SCENE along a path of cameras, as frames or a video; frames that are there are kept."""
     from chebsplat.formats.artifact import read_manifest
@@ -65,9 +58,9 @@ def render(
     from chebsplat.stages.tools.camera_paths import fitted, path_of, size_of
     from chebsplat.stages.tools.frames import Shot, kinds_of, render_frames, render_video
 
-    opened, pixels = load(scene), size_of(size)
+    opened, pixels, query = load(scene), size_of(size), asked["query"]
     kinds = kinds_of(what, opened, query is not None)
-    query_vectors = None if query is None else opened.understood(query, against)
+    query_vectors = None if query is None else opened.understood(query, asked["against"])
     shot = Shot(kinds, read_manifest(artifact_of(scene, "export")).key, query_vectors)
     cameras = [fitted(camera, pixels) for camera in path_of(opened, path, frames)]
     if out.suffix == ".mp4":

@@ -32,6 +32,7 @@ from chebsplat.pipelines.work import folders, store
 from chebsplat.pipelines.work.scenes import absent, expanded, folder_of, is_source, read_toml, scene_values
 from chebsplat.stages.registry import STAGES, Stage
 from chebsplat.stages.runtime import config as configs
+from chebsplat.stages.settings import SourceSection
 from chebsplat.stages.sources.common import resolve_source
 
 if TYPE_CHECKING:
@@ -86,6 +87,13 @@ def placed(config: Config) -> Config:
             absolute = os.path.realpath(os.path.expanduser(expanded(path)))
             config = config.model_copy(update={section: values.model_copy(update={key: absolute})})
     return config
+
+
+def located(source: SourceSection) -> SourceSection:
+    """A source with an absolute path, if it has one: REPLICA_ROOT may be relative."""
+    if not source.path:
+        return source
+    return source.model_copy(update={"path": str(Path(source.path).expanduser().resolve())})
 
 
 def suffix(settings: Overrides) -> str:
@@ -182,9 +190,7 @@ class Planner:
             title += ("+" if ablation else "@") + suffix(settings)
         config = placed(configs.build(values, f"scene {scene}"))
         asked = config.source
-        source = resolve_source(name, asked)
-        if source.path:  # REPLICA_ROOT may be relative
-            source = source.model_copy(update={"path": str(Path(source.path).expanduser().resolve())})
+        source = located(resolve_source(name, asked))
         probe = self._probe(source, scene)
         kind, why = teacher_kind(config, source.kind, probe)
         teacher = config.teacher.model_copy(update={"kind": kind})

@@ -16,7 +16,7 @@ from chebsplat.pipelines.planning.raw import unchanged
 from chebsplat.pipelines.running.precompile import rehearsed
 from chebsplat.pipelines.work import leases, store
 from chebsplat.pipelines.work.store import say
-from chebsplat.stages.runtime.command import n_threads, publish
+from chebsplat.stages.runtime.command import Planned, n_threads, publish
 from chebsplat.stages.runtime.stopping import exit_code
 
 FINAL = {error.exit_code for error in (ConfigError, InputError, DataFailure)}
@@ -74,8 +74,8 @@ def make(plan: Path, key: str) -> None:
         store.remove_half(out)
         config, hashes = Path(f"{files}.json"), json.loads(Path(f"{files}.raw.json").read_text())
         module = import_module(f"chebsplat.stages.{stage}")
-        publish(stage, module.run, out, inputs, config, key=key, code=step["code"], device=step["device"],
-                within=prepared(step, hashes))  # fmt: skip
+        planned = Planned(key, step["code"], prepared(step, hashes))
+        publish(stage, module.run, out, inputs, config, planned=planned, device=step["device"])
 
 
 @contextmanager

@@ -58,13 +58,10 @@ def adjust(
     out.mkdir(exist_ok=True)
     framed: Frame | None = None
     for allowed, status in job.progress.track(ROUNDS, len(ROUNDS), "adjusting"):
-        options = pycolmap.IncrementalPipelineOptions()
-        options.mapper.filter_max_reproj_error = allowed
-        options.triangulation.create_max_angle_error = options.triangulation.continue_max_angle_error = allowed / 4 + 1
-        options.triangulation.complete_max_reproj_error = options.triangulation.merge_max_reproj_error = allowed
         model = pycolmap.triangulate_points(
-            model, database, job.scratch / "images", out, clear_points=True, options=options, refine_intrinsics=False
-        )
+            model, database, job.scratch / "images", out, clear_points=True, options=_triangulation(allowed),
+            refine_intrinsics=False,
+        )  # fmt: skip
         errors.append(float(model.compute_mean_reprojection_error()))
         status["error"] = f"{errors[-1]:.2f} px"
         bundle = pycolmap.BundleAdjustmentOptions()
@@ -88,21 +85,38 @@ def adjust(
     for row in np.flatnonzero(~framed.led):
         _put(images[row], localized(model, database, images[row], given[row], framed.spread, others))
     model.update_point_3d_errors()
-    moved, turned = (values[framed.led] for values in differences(_poses(images), given))
+    notes = _notes(model, framed, differences(_poses(images), given), focal, errors[0])
+    return model, notes
+
+
+def _notes(
+    model: pycolmap.Reconstruction, framed: Frame, found: tuple[np.ndarray, ...], focal: float, error: float
+) -> dict[str, Any]:
+    """What the adjustment has changed. found: how far each view moved and turned; focal, error: before, in pixels."""
+    moved, turned = (values[framed.led] for values in found)
     notes = {
         "poses_moved": float(np.median(moved)),
         "poses_turned_degrees": float(np.degrees(np.median(turned))),
         "poses_kept": int((~framed.led).sum()),
         "focal_px": [focal, _focals(model)],
-        "reprojection_error_given_px": errors[0],
+        "reprojection_error_given_px": error,
     }
     log.info(
         "poses adjusted to the photos: moved by %.3g scene units and %.2g° (medians), %d of %d held near the given; "
         "focal length %.1f -> %.1f px; reprojection error %.2f -> %.2f px",
-        *(notes[name] for name in ("poses_moved", "poses_turned_degrees", "poses_kept")), len(names),
-        focal, _focals(model), errors[0], model.compute_mean_reprojection_error(),
+        *(notes[name] for name in ("poses_moved", "poses_turned_degrees", "poses_kept")), len(framed.led),
+        focal, _focals(model), error, model.compute_mean_reprojection_error(),
     )  # fmt: skip
-    return model, notes
+    return notes
+
+
+def _triangulation(allowed: float) -> pycolmap.IncrementalPipelineOptions:
+    """Options under which a point may miss its features by so many pixels."""
+    options = pycolmap.IncrementalPipelineOptions()
+    options.mapper.filter_max_reproj_error = allowed
+    options.triangulation.create_max_angle_error = options.triangulation.continue_max_angle_error = allowed / 4 + 1
+    options.triangulation.complete_max_reproj_error = options.triangulation.merge_max_reproj_error = allowed
+    return options
 
 
 def frame(found: np.ndarray, given: np.ndarray, seen: np.ndarray) -> Frame:

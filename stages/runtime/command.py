@@ -78,6 +78,17 @@ def command(name: str, run: Callable[[Job], None]) -> click.Command:
     return click.Command(name, params=params, callback=invoke, help=stage.help)
 
 
+@dataclass
+class Planned:
+    """What the planner knows of a step: its key (None: of settings and inputs alone), the identity of its code, and
+    what it reads and computes within, which at its end can keep the artifact from being published.
+    """
+
+    key: str | None = None
+    code: dict[str, Any] = field(default_factory=dict)
+    within: AbstractContextManager[Any] = field(default_factory=nullcontext)
+
+
 def publish(
     name: str,
     run: Callable[[Job], None],
@@ -85,17 +96,13 @@ def publish(
     inputs: dict[str, Path],
     config: Path | None = None,
     *,
-    key: str | None = None,
-    code: dict[str, Any] | None = None,
+    planned: Planned | None = None,
     device: str = "auto",
     force: bool = False,
-    within: AbstractContextManager[Any] | None = None,
 ) -> None:
     """Run one stage in this process and publish its artifact; nothing if it is there, unless by `force`.
 
-    Args: inputs: artifacts by role; config: TOML or JSON, otherwise defaults; key, code: identities given by the
-          planner; within: what the stage reads and computes within; what it raises at its end keeps the artifact from
-          being published.
+    Args: inputs: artifacts by role; config: TOML or JSON, otherwise defaults; planned: by the planner, if it asks.
     Raises: ChebsplatError.
     """
     line = f"%(asctime)s {name}: %(message)s"
@@ -114,17 +121,18 @@ def publish(
     device, why = resolve(device)
     device = stage.device(device, settings)
     computed = {} if device == "cpu" else {"device": device}
-    key = key or artifact.digest({"stage": name, "config": settings, "inputs": sources} | computed)
+    planned = planned or Planned()
+    key = planned.key or artifact.digest({"stage": name, "config": settings, "inputs": sources} | computed)
     artifact.check_place(out, stage.schema, key, force)
     seed = next((settings[s]["seed"] for s in reversed(stage.sections) if "seed" in settings[s]), None)
     if why:
         log.info("%s", why)
     manifest = Manifest(
-        stage.schema, key, name, sources, settings, seed, device=device, threads=n_threads(), code=code or {}
+        stage.schema, key, name, sources, settings, seed, device=device, threads=n_threads(), code=planned.code
     )
     scratch = out.parent / f".part-{out.name}"
     began = time.perf_counter()
-    with artifact.publish(out, manifest, force) as tmp, within or nullcontext():
+    with artifact.publish(out, manifest, force) as tmp, planned.within:
         job = Job(inputs, chosen, tmp, scratch, device, shown, manifest.facts)
         with shown.log_to(tmp / "log.jsonl"):
             run(job)

@@ -144,16 +144,6 @@ def contract(encoder: Any, config: dict[str, Any]) -> dict[str, Any]:
         ),
     }
     c = encoder.n_channels
-    fusion = {
-        "features": array("float32", ["gaussians", c], "none", "semantic features before fusion"),
-        "encodings": array("float32", ["regions", c], "none", "the encoder's output"),
-        "cover": array("int64", ["gaussians", "covers"], "", "regions that reach a Gaussian, nearest first; -1: none"),
-        "means": array("float32", ["gaussians", 3], "scene units", "centres of the Gaussians"),
-        "centers": array("float32", ["regions", 3], "scene units", "centre of the Gaussian that a region is built on"),
-        "quats": array("float32", ["regions", 4], "none", "its rotation, wxyz, of any length"),
-        "scales": array("float32", ["regions", 3], "scene units", "its standard deviations, not their logarithms"),
-        "radius": array("float32", [], "scene units", "of all regions"),
-    }
     return {
         "encoder": {
             "files": ["encoder.onnx", "encoder.int8.onnx"],
@@ -161,15 +151,7 @@ def contract(encoder: Any, config: dict[str, Any]) -> dict[str, Any]:
             "outputs": {"encodings": array("float32", ["regions", c], "none", "one semantic vector a region (Eq 7)")},
             "normalization": "none outside the graph: it begins by standardising each input with constants of its own",
         },
-        "fusion": {
-            "files": ["fusion.onnx"],
-            "inputs": fusion,
-            "outputs": {
-                "fused": array("float32", ["gaussians", c], "none", "features after propagation and gate (Eqs 8-10)"),
-                "gate": array("float32", ["gaussians", c], "none", "the share of `features`; 1 where nothing covers"),
-            },
-            "normalization": "none",
-        },
+        "fusion": _fusion(c),
         "settings": {
             "describe": describe,
             "n_covers": train["n_covers"],
@@ -180,6 +162,29 @@ def contract(encoder: Any, config: dict[str, Any]) -> dict[str, Any]:
             "n_channels": c,
         }
         | encoder.settings,
+    }
+
+
+def _fusion(c: int) -> dict[str, Any]:
+    """The part of the contract on the fusion of features of c channels."""
+    inputs = {
+        "features": array("float32", ["gaussians", c], "none", "semantic features before fusion"),
+        "encodings": array("float32", ["regions", c], "none", "the encoder's output"),
+        "cover": array("int64", ["gaussians", "covers"], "", "regions that reach a Gaussian, nearest first; -1: none"),
+        "means": array("float32", ["gaussians", 3], "scene units", "centres of the Gaussians"),
+        "centers": array("float32", ["regions", 3], "scene units", "centre of the Gaussian that a region is built on"),
+        "quats": array("float32", ["regions", 4], "none", "its rotation, wxyz, of any length"),
+        "scales": array("float32", ["regions", 3], "scene units", "its standard deviations, not their logarithms"),
+        "radius": array("float32", [], "scene units", "of all regions"),
+    }
+    return {
+        "files": ["fusion.onnx"],
+        "inputs": inputs,
+        "outputs": {
+            "fused": array("float32", ["gaussians", c], "none", "features after propagation and gate (Eqs 8-10)"),
+            "gate": array("float32", ["gaussians", c], "none", "the share of `features`; 1 where nothing covers"),
+        },
+        "normalization": "none",
     }
 
 

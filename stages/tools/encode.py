@@ -16,7 +16,7 @@ from chebsplat.formats.ply import read_ply
 from chebsplat.formats.scene import Scene
 from chebsplat.formats.tensors import finite32, read_npy
 from chebsplat.settings import DescribeSection
-from chebsplat.shape.region_inputs import RegionInputs, region_inputs
+from chebsplat.shape.region_inputs import RegionInputs, Tokens, region_inputs
 from chebsplat.stages.runtime.command import n_threads
 from chebsplat.stages.runtime.config import checked
 from chebsplat.stages.teacher_models.onnx_session import CUDA, GPU_REMEDY, Model, providers
@@ -89,10 +89,7 @@ def inputs_of(p: dict[str, np.ndarray], describe: DescribeSection, settings: dic
         p["log_scales"],
         p["raw_features"],
         describe,
-        n_covers=settings["n_covers"],
-        described=settings["described"],
-        context=settings["context"],
-        position=settings.get("position", "region"),
+        Tokens(settings["n_covers"], settings["described"], settings["context"], settings.get("position", "region")),
     )
 
 

@@ -9,7 +9,7 @@ from shared import KEY
 
 from chebsplat.errors import DataFailure
 from chebsplat.formats import artifact
-from chebsplat.stages.runtime.command import command, publish
+from chebsplat.stages.runtime.command import Planned, command, publish
 
 
 @pytest.fixture(autouse=True)
@@ -36,7 +36,7 @@ def test_artifact_is_published_and_its_path_printed(tmp_path):
 
 
 def test_called_from_python_a_stage_prints_nothing_and_raises_typed_errors(tmp_path, capsys):
-    publish("ingest", good, tmp_path / "x", {}, key=KEY)
+    publish("ingest", good, tmp_path / "x", {}, planned=Planned(KEY))
     assert artifact.verify(tmp_path / "x", "chebsplat.capture/2").key == KEY
     with pytest.raises(DataFailure):
         publish("ingest", fail_data, tmp_path / "y", {})

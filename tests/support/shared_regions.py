@@ -3,7 +3,8 @@
 import torch
 
 from benchmarks.stability.descriptor import REGIONS
-from chebsplat.shape.descriptor import Descriptor, describe
+from chebsplat.shape.described import Descriptor
+from chebsplat.shape.descriptor import describe
 from chebsplat.splats.rotations import rotation_matrices
 
 

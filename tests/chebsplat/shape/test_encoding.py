@@ -6,8 +6,9 @@ import torch
 
 from chebsplat.labels.decode import VOCABULARY, class_codes, decode, decode_labels
 from chebsplat.labels.noisy_teacher import confusable, confuse_segments, noisy_features, reduced
+from chebsplat.settings import DescribeSection
 from chebsplat.shape.encoder import RegionEncoder, Standardize
-from chebsplat.shape.regions import build_regions
+from chebsplat.shape.regions import regions_of
 from chebsplat.splats.gaussians import activated, covariances, initial_gaussians, local_shape
 from chebsplat.stages.runtime.config import Config
 from chebsplat.stages.training.facts import agreement
@@ -20,7 +21,7 @@ def cloud(n=600, seed=0):
 
 def test_non_finite_points_are_refused():
     with pytest.raises(ValueError, match="finite"):
-        build_regions(np.full((3, 3), np.nan), 2, 2)
+        regions_of(np.full((3, 3), np.nan), DescribeSection(n_regions=2, region_size=2))
 
 
 @pytest.mark.parametrize("n_layers", [0, 2])

@@ -7,10 +7,10 @@ import pytest
 import torch
 from shared_regions import descriptor_of
 
-from chebsplat.settings import TrainSection
-from chebsplat.shape.descriptor import n_degrees
+from chebsplat.settings import DescribeSection, TrainSection
+from chebsplat.shape.described import n_degrees
 from chebsplat.shape.fusion import Fusion, Gate
-from chebsplat.shape.regions import build_regions
+from chebsplat.shape.regions import regions_of
 from chebsplat.splats.rotations import rotation_matrices
 
 SIZES = {"n_angles": 3, "max_degree": 5, "backend": "reference", "dtype": torch.float64}
@@ -108,18 +108,21 @@ def test_a_spectrum_of_zeros_is_guarded_and_counted():
 
 def test_regions_of_a_given_radius_and_overlap_and_without_thinning():
     points = np.random.default_rng(0).random((3000, 3))
-    ours = build_regions(points, 40, 16)
-    tight = build_regions(points, 40, 16, overlap=1.0)
+    ours = regions_of(points, DescribeSection(n_regions=40, region_size=16))
+    tight = regions_of(points, DescribeSection(n_regions=40, region_size=16, overlap=1.0))
     assert tight.radius == pytest.approx(ours.radius / 1.5)
-    fixed = build_regions(points, 40, 16, radius=0.07)
+    fixed = regions_of(points, DescribeSection(n_regions=40, region_size=16, region_radius=0.07))
     assert fixed.radius == 0.07
-    assert np.array_equal(build_regions(points, 40, 16, radius=0.07, earlier=fixed).members, fixed.members)
-    nearest = build_regions(points, 40, 16, thinning=False)
+    assert np.array_equal(
+        regions_of(points, DescribeSection(n_regions=40, region_size=16, region_radius=0.07), earlier=fixed).members,
+        fixed.members,
+    )
+    nearest = regions_of(points, DescribeSection(n_regions=40, region_size=16, thinning=False))
     assert nearest.share == 1.0
     for center, members in zip(nearest.centers, nearest.members, strict=True):
         wanted = np.argsort(np.linalg.norm(points - points[center], axis=1))[:16]
         assert set(members) == set(wanted)
-    held = build_regions(points, 40, 16, overlap=1.0, earlier=tight)
+    held = regions_of(points, DescribeSection(n_regions=40, region_size=16, overlap=1.0), earlier=tight)
     assert np.array_equal(held.centers, tight.centers)
     assert held.radius == tight.radius
 

@@ -5,7 +5,8 @@ import itertools
 import numpy as np
 import pytest
 
-from chebsplat.shape.regions import build_regions, covering, farthest_points
+from chebsplat.settings import DescribeSection
+from chebsplat.shape.regions import covering, farthest_points, regions_of
 
 
 def cloud(n=4000, seed=0):
@@ -31,7 +32,8 @@ def test_seed_decides_the_start():
 @pytest.mark.parametrize("unit", [1e-30, 1.0, 1e30])
 def test_units_and_a_far_origin_change_no_region(unit):
     grid = np.round(cloud() * 1024) / 1024  # sums with the offset are exact
-    near, far = build_regions(grid, 50, 16), build_regions((grid + 2.0**22) * unit, 50, 16)
+    few = DescribeSection(n_regions=50, region_size=16)
+    near, far = regions_of(grid, few), regions_of((grid + 2.0**22) * unit, few)
     assert np.array_equal(near.centers, far.centers)
     assert np.array_equal(near.members, far.members)
     assert far.radius == pytest.approx(near.radius * unit, rel=1e-6)
@@ -39,7 +41,7 @@ def test_units_and_a_far_origin_change_no_region(unit):
 
 @pytest.mark.parametrize("n", [1, 2, 3, 30])
 def test_coincident_points_make_one_region(n):
-    regions = build_regions(np.ones((n, 3)), 8, 4)
+    regions = regions_of(np.ones((n, 3)), DescribeSection(n_regions=8, region_size=4))
     assert len(regions.centers) == 1
     assert regions.radius > 0
     assert (regions.members >= 0).sum() == min(n, 4)
@@ -55,13 +57,13 @@ def test_duplicates_are_not_picked_twice():
 
 @pytest.mark.parametrize("n", [0, 1, 9])
 def test_more_regions_than_points_make_every_point_a_centre(n):
-    regions = build_regions(cloud(n), 20, 4)
+    regions = regions_of(cloud(n), DescribeSection(n_regions=20, region_size=4))
     assert sorted(regions.centers) == list(range(n))
 
 
 def test_members_are_spread_over_the_ball():
     points = cloud(20_000)
-    regions = build_regions(points, 40, 32)
+    regions = regions_of(points, DescribeSection(n_regions=40, region_size=32))
     offsets = np.linalg.norm(points[regions.members] - points[regions.centers][:, None], axis=-1)
     offsets = np.where(regions.members >= 0, offsets, np.nan)
     assert np.median(np.nanmax(offsets, axis=1)) > 0.7 * regions.radius  # thinned: not a speck of nearest ones
@@ -70,7 +72,7 @@ def test_members_are_spread_over_the_ball():
 
 def test_points_are_covered_by_the_nearest_regions_that_reach_them():
     points = cloud(600)
-    regions = build_regions(points, 40, 16)
+    regions = regions_of(points, DescribeSection(n_regions=40, region_size=16))
     found = covering(points, points[regions.centers], regions.radius, 3)
     distance = np.linalg.norm(points[:, None] - points[regions.centers], axis=-1)
     nearest = distance.argsort(1)[:, :3]
@@ -81,12 +83,12 @@ def test_points_are_covered_by_the_nearest_regions_that_reach_them():
 
 def test_a_point_that_moves_changes_only_the_regions_that_hold_it():
     points = cloud()
-    first = build_regions(points, 60, 16)
-    again = build_regions(points, 60, 16, earlier=first)
+    first = regions_of(points, DescribeSection(n_regions=60, region_size=16))
+    again = regions_of(points, DescribeSection(n_regions=60, region_size=16), earlier=first)
     assert np.array_equal(first.members, again.members)
     moved = int(np.setdiff1d(first.members[5], first.centers)[-1])
     points[moved] += 1e-3
-    after = build_regions(points, 60, 16, earlier=first)
+    after = regions_of(points, DescribeSection(n_regions=60, region_size=16), earlier=first)
     assert np.array_equal(after.centers, first.centers)
     changed = np.flatnonzero((after.members != first.members).any(1))
     assert set(changed) <= set(np.flatnonzero((first.members == moved).any(1) | (after.members == moved).any(1)))
@@ -94,13 +96,13 @@ def test_a_point_that_moves_changes_only_the_regions_that_hold_it():
 
 def test_a_removed_point_leaves_the_other_regions_as_they_are():
     points = cloud()
-    first = build_regions(points, 60, 16)
+    first = regions_of(points, DescribeSection(n_regions=60, region_size=16))
     gone = int(np.setdiff1d(first.members[5], first.centers)[-1])
     ids = np.delete(np.arange(len(points)), gone)
     place = np.full(len(points), -1)
     place[ids] = np.arange(len(ids))
     held = first._replace(centers=place[first.centers])
-    after = build_regions(points[ids], 60, 16, ids=ids, earlier=held)
+    after = regions_of(points[ids], DescribeSection(n_regions=60, region_size=16), ids=ids, earlier=held)
     named = np.where(after.members >= 0, ids[after.members], -1)
     changed = np.flatnonzero((named != first.members).any(1))
     assert len(changed)
@@ -109,8 +111,8 @@ def test_a_removed_point_leaves_the_other_regions_as_they_are():
 
 def test_centres_that_no_longer_cover_the_scene_are_sampled_anew():
     points = cloud()
-    first = build_regions(points, 60, 16)
+    first = regions_of(points, DescribeSection(n_regions=60, region_size=16))
     grown = np.concatenate([points, [[50.0, 0, 0]]])
-    after = build_regions(grown, 60, 16, earlier=first)
+    after = regions_of(grown, DescribeSection(n_regions=60, region_size=16), earlier=first)
     assert len(grown) - 1 in after.centers
-    assert np.array_equal(after.members, build_regions(grown, 60, 16).members)
+    assert np.array_equal(after.members, regions_of(grown, DescribeSection(n_regions=60, region_size=16)).members)

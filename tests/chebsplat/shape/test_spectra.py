@@ -5,7 +5,8 @@ import torch
 from shared_regions import REGIONS, extreme, region
 
 from chebsplat.shape.albo import canonicalize, cut_spectrum, metric_factors, similarity
-from chebsplat.shape.descriptor import Descriptor, describe
+from chebsplat.shape.described import Descriptor
+from chebsplat.shape.descriptor import describe
 
 
 def described(given, spectrum, **options):

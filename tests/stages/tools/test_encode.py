@@ -19,7 +19,7 @@ from chebsplat.formats.scene import Scene
 from chebsplat.pipelines.cli import main
 from chebsplat.settings import DescribeSection
 from chebsplat.shape.encoder import RegionEncoder
-from chebsplat.shape.region_inputs import region_inputs
+from chebsplat.shape.region_inputs import Tokens, region_inputs
 from chebsplat.stages.onnx import compare, example, fusion_example, quantize, restored_fusion
 from chebsplat.stages.runtime.config import Config
 from chebsplat.stages.shape_models.point_graph import contract
@@ -182,12 +182,12 @@ def test_arguments_that_do_not_fit_are_errors_that_name_the_remedy(toy, tmp_path
 
 def test_a_cut_spectrum_and_an_empty_scene_are_refused_by_name():
     describe = DescribeSection(n_regions=2, region_size=4, spectrum="taper")
-    tokens = {"described": True, "context": False, "n_covers": 2}
+    tokens = Tokens(2, described=True, context=False)
     rows = [np.ones((3, k), np.float32) for k in (3, 4, 3, 2)]
     with pytest.raises(ValueError, match=r"spectrum = taper, .* computed by torch only"):
-        region_inputs(*rows, describe, **tokens)
+        region_inputs(*rows, describe, tokens)
     with pytest.raises(ValueError, match="no Gaussians"):
-        region_inputs(*(row[:0] for row in rows), describe, **tokens)
+        region_inputs(*(row[:0] for row in rows), describe, tokens)
 
 
 VARIANTS = [{"n_layers": 0}, {"n_inputs": 0}, {"n_inputs": 5, "n_layers": 1}, {"n_positions": 6}]
