@@ -44,25 +44,24 @@ class Frame(NamedTuple):
     pose: np.ndarray
 
 
-def fused(frames: Iterable[Frame], voxel: float, farthest: float) -> Mesh:
+def fused(open3d: Any, frames: Iterable[Frame], voxel: float, farthest: float) -> Mesh:
     """The surface that depth images show, by a truncated signed distance on voxels of this edge, scene units.
 
-    Args: farthest: depth beyond it is not looked at.
+    Args: open3d: the module; farthest: depth beyond it is not looked at.
     Choices: truncated at four voxels; a voxel counts that LEAST_WEIGHT views saw. open3d takes the pixel that a point
       falls into, so that the centre of the first one is at 0.5, as ours is.
     """
-    import open3d as o3d
-
-    core: Any = o3d.core  # its stubs know no NumPy
-    new_grid: Any = o3d.t.geometry.VoxelBlockGrid
+    core, image = open3d.core, open3d.t.geometry.Image
     names, widths = ("tsdf", "weight", "color"), ((1,), (1,), (3,))
-    grid = new_grid(names, (core.float32,) * 3, widths, voxel, BLOCK, N_BLOCKS, core.Device("CPU:0"))
+    grid = open3d.t.geometry.VoxelBlockGrid(
+        names, (core.float32,) * 3, widths, voxel, BLOCK, N_BLOCKS, core.Device("CPU:0")
+    )
     n_seen = 0
     for frame in frames:
         if not (frame.depth > 0).any():
             continue
-        depth = o3d.t.geometry.Image(core.Tensor(np.ascontiguousarray(frame.depth, np.float32)))
-        color = o3d.t.geometry.Image(core.Tensor(np.ascontiguousarray(frame.color, np.float32) / 255))
+        depth = image(core.Tensor(np.ascontiguousarray(frame.depth, np.float32)))
+        color = image(core.Tensor(np.ascontiguousarray(frame.color, np.float32) / 255))
         K, pose = (core.Tensor(np.ascontiguousarray(matrix, np.float64)) for matrix in (frame.K, frame.pose))
         blocks = grid.compute_unique_block_coordinates(depth, K, pose, 1.0, farthest, TRUNCATED)
         grid.integrate(blocks, depth, color, K, pose, 1.0, farthest, TRUNCATED)

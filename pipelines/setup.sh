@@ -69,13 +69,9 @@ $py -m uv pip install --quiet --python $py -r requirements.lock "${options[@]}"
 $py -m uv pip install --quiet --python $py --no-deps --editable .
 [ "$device" != cuda ] || $py -m uv pip install --quiet --python $py --constraint requirements.lock --editable '.[cuda]'
 
-# open3d wants libusb-1.0.so.0; libusb-package ships it, and a link beside libOpen3D lets the loader find it.
-site=$($py -c 'import sysconfig; print(sysconfig.get_path("purelib"))')
-ln -sfn ../libusb_package/libusb-1.0.so "$site/open3d/libusb-1.0.so.0"
-
 # What a bare system lacks is named now, not by the first stage.
-if ! why=$($py -c 'import open3d' 2>&1); then
-  echo "setup: open3d cannot be imported: ${why##*$'\n'} (Debian, Ubuntu: apt install libegl1 libgl1 libgomp1)" >&2
+if ! why=$($py -c 'from chebsplat.synthetic.rays import open3d; open3d()' 2>&1); then
+  echo "setup: ${why##*$'\n'}" >&2
   exit 2
 fi
 

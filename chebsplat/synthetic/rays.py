@@ -2,9 +2,29 @@
 
 from __future__ import annotations
 
+import ctypes
 from typing import Any, NamedTuple
 
 import numpy as np
+
+from chebsplat.errors import ConfigError
+
+
+def open3d() -> Any:
+    """The module, loaded when it is first asked for.
+
+    Raises: ConfigError, with the remedy, where it or a library that it is linked to is missing.
+    Choices: it wants libusb, which few machines have and libusb-package brings: what is loaded is found by its name.
+    """
+    try:
+        import libusb_package
+
+        ctypes.CDLL(str(libusb_package.get_library_path()), ctypes.RTLD_GLOBAL)
+        import open3d as module
+    except (ImportError, OSError) as error:
+        remedy = "pip install open3d-cpu libusb-package; Debian, Ubuntu: apt install libegl1 libgl1 libgomp1"
+        raise ConfigError(f"open3d cannot be imported: {error} ({remedy})") from error
+    return module
 
 
 class Hits(NamedTuple):
@@ -19,10 +39,8 @@ class RayCaster:
     """Casts rays at a triangle soup: vertices f32 [N, 3], triangles u32 [T, 3]."""
 
     def __init__(self, vertices: np.ndarray, triangles: np.ndarray):
-        import open3d as o3d
-
-        self._open3d: Any = o3d
-        self._scene: Any = o3d.t.geometry.RaycastingScene()
+        self._open3d = open3d()
+        self._scene: Any = self._open3d.t.geometry.RaycastingScene()
         self._scene.add_triangles(self._tensor(vertices, np.float32), self._tensor(triangles, np.uint32))
         self._none = self._scene.INVALID_ID
 

@@ -13,6 +13,7 @@ from chebsplat.formats.meshes import Frame, Mesh, cleaned, fused, meshlab
 from chebsplat.labels.decode import decode_labels
 from chebsplat.stages.runtime.progress import Progress
 from chebsplat.stages.tools.scene import OpenedScene
+from chebsplat.synthetic.rays import open3d
 
 N_VOXELS = 250  # along the longest side of the room, where no voxel is asked for
 OPAQUE = 0.6  # least coverage of a pixel whose depth counts
@@ -37,7 +38,7 @@ def mesh_of(
         meshlab()  # a missing extra is said before minutes are spent
     extent = room_extent(scene)
     edge = extent / N_VOXELS if voxel is None else voxel
-    made = fused(frames(scene, progress), edge, 2 * extent)
+    made = fused(open3d(), frames(scene, progress), edge, 2 * extent)
     if not len(made.triangles):
         raise DataFailure(f"{scene.source} shows no surface of voxels of {edge:.3g}; choose larger ones: --voxel")
     facts = {"voxel": float(f"{edge:.3g}"), "triangles fused": len(made.triangles)}

@@ -10,7 +10,7 @@ import pytest
 from chebsplat.errors import ConfigError
 from chebsplat.formats.meshes import Frame, Mesh, cleaned, fused, write_mesh
 from chebsplat.stages.tools.mesh import STEP, without_edges
-from chebsplat.synthetic.rays import intrinsics, look_at
+from chebsplat.synthetic.rays import intrinsics, look_at, open3d
 
 SIZE = 96, 72
 K = intrinsics(*SIZE)
@@ -32,7 +32,7 @@ def of_a_ball(radius=0.5):
 
 @pytest.fixture(scope="module")
 def ball():
-    return fused(of_a_ball(), 0.02, 5.0)
+    return fused(open3d(), of_a_ball(), 0.02, 5.0)
 
 
 def test_a_fused_mesh_lies_on_the_surface_in_the_cameras_world_and_bears_its_colour(ball):
@@ -45,7 +45,7 @@ def test_a_fused_mesh_lies_on_the_surface_in_the_cameras_world_and_bears_its_col
 
 def test_views_without_depth_make_an_empty_mesh():
     frame = next(of_a_ball())
-    empty = fused([frame._replace(depth=np.zeros_like(frame.depth))], 0.02, 5.0)
+    empty = fused(open3d(), [frame._replace(depth=np.zeros_like(frame.depth))], 0.02, 5.0)
     assert [len(part) for part in (empty.vertices, empty.triangles, empty.colors)] == [0, 0, 0]
 
 
@@ -71,7 +71,7 @@ def test_cleaning_removes_what_floats_closes_holes_and_keeps_to_the_number_of_tr
 def test_clustering_leaves_what_is_wanted_and_keeps_the_surface(monkeypatch):
     pytest.importorskip("pymeshlab", reason="the extra mesh is not installed")
     monkeypatch.setattr("chebsplat.formats.meshes.EASY", 1)  # nothing is left to the collapse but the excess
-    fine = fused(of_a_ball(), 0.01, 5.0)
+    fine = fused(open3d(), of_a_ball(), 0.01, 5.0)
     for wanted in (len(fine.triangles) // 2, len(fine.triangles) // 8):
         found = cleaned(fine, wanted, 0.2, 100, 0.01)
         assert 0.6 * wanted < len(found.triangles) <= wanted
