@@ -11,7 +11,8 @@ from pydantic import AfterValidator, Field
 
 from chebsplat.formats.names import unprintable
 from chebsplat.settings import Section, number, seed, setting
-from chebsplat.stages.teacher_models.label_space import MAX_CHANNELS
+
+MAX_CHANNELS = 64  # that can be rendered
 
 
 def printable(text: str) -> str:

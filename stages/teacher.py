@@ -17,9 +17,9 @@ from chebsplat.formats.teacher_model import EMBEDDED, read_teacher
 from chebsplat.labels import noisy_teacher as model
 from chebsplat.labels.decode import class_codes, decode, voted
 from chebsplat.stages.runtime.command import Job, n_threads
-from chebsplat.stages.settings import TeacherSection
+from chebsplat.stages.settings import MAX_CHANNELS, TeacherSection
 from chebsplat.stages.teacher_models.image_encoder import TeacherInference
-from chebsplat.stages.teacher_models.label_space import MAX_CHANNELS, closed_set, label_set, open_vocabulary
+from chebsplat.stages.teacher_models.label_space import closed_set, label_set, open_vocabulary
 from chebsplat.stages.teacher_models.onnx_session import CUDA, GPU_REMEDY, providers
 
 log = logging.getLogger("chebsplat")

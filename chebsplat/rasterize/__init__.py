@@ -11,7 +11,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-CELL = 4  # pixels, the side of a cell of `cell_colors`
+from chebsplat.rasterize.projection import CELL
 
 
 def rasterize(

@@ -10,6 +10,7 @@ from torch import Tensor
 from chebsplat.splats.rotations import rotation_matrices
 
 EXTENT = 3.33  # in σ: there even a Gaussian of opacity 1 has fallen to 1/255, √(2 ln 255)
+CELL = 4  # pixels, the side of a cell of `cell_colors`
 LARGEST = 1e30  # of a projected variance, pixels²: more is culled, so that float32 can hold what is made of it
 
 

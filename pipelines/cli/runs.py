@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+from importlib import import_module
 from pathlib import Path
 from typing import Any
 
@@ -149,10 +150,8 @@ def rehearse(semantic: bool) -> int:
 
 
 def _main(arguments: list[str]) -> None:
-    """Our command in a process that was forked for it."""
-    from chebsplat.pipelines.cli import main
-
-    main(arguments, prog_name="chebsplat")
+    """Our command in a process that was forked for it; by name, since it is the command that holds those of here."""
+    import_module("chebsplat.pipelines.cli").main(arguments, prog_name="chebsplat")
 
 
 COMMANDS = (run, plan, study, job, rehearse)

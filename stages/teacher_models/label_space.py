@@ -20,7 +20,6 @@ if TYPE_CHECKING:
     from chebsplat.formats.channels import ChannelMap
     from chebsplat.formats.teacher_model import TeacherModel
 
-MAX_CHANNELS = 64  # that can be rendered
 IN_ROOMS = (  # what rooms commonly hold: asked for where neither the source nor the user names classes
     "wall", "floor", "ceiling", "window", "door", "curtain", "blind", "rug", "table", "desk", "chair", "armchair",
     "sofa", "stool", "bed", "cabinet", "wardrobe", "chest of drawers", "shelf", "bookcase", "counter", "lamp",

@@ -3,18 +3,15 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
-from scipy.special import expit
 
 from chebsplat.errors import ConfigError, DataFailure
-from chebsplat.formats.names import suggest
 from chebsplat.formats.scene import Scene
 from chebsplat.splats.parts import substantial
 from chebsplat.stages.tools.query import Query
-from chebsplat.stages.tools.scene import OpenedScene
+from chebsplat.stages.tools.scene import OpenedScene, passing
 
 CONVERT = "npx @playcanvas/splat-transform@2.7.1 scene.ply scene.compressed.ply"  # or scene.spz --spz-version 3
 
@@ -52,40 +49,12 @@ def extract(
     return {"kept": int(kept.sum()), "of": n} | {f"left out by {name}": number for name, number in left_out.items()}
 
 
-def passing(
-    scene: Scene, path: Path, labels: tuple[str, ...], min_opacity: float, box: Sequence[float] | None
-) -> dict[str, np.ndarray]:
-    """Which Gaussians pass each filter that is asked for, bool [N] by its name. Args and errors as of `extract`."""
-    filters: dict[str, np.ndarray] = {}
-    if labels:
-        filters["label"] = has_label(scene, path, labels)
-    if min_opacity > 0:
-        filters["opacity"] = expit(scene.parameters["logit_opacities"]) >= min_opacity
-    if box is not None:
-        means = scene.parameters["means"]
-        filters["box"] = np.all((means >= list(box[:3])) & (means <= list(box[3:])), axis=1)
-    return filters
-
-
 def asked_for(scene: Scene, query: Query) -> np.ndarray:
     """Which Gaussians the query selects, bool [N], crumbs apart. Raises DataFailure where it is probably not here."""
     answer = query.answer(scene.parameters["features"])
     if answer.present is False or not answer.selected.any():
         raise DataFailure(f"{answer}; ask for something else, or name a label with --keep-label")
     return substantial(scene.parameters["means"], np.exp(scene.parameters["log_scales"]), answer.selected)
-
-
-def has_label(scene: Scene, path: Path, names: tuple[str, ...]) -> np.ndarray:
-    """Which Gaussians bear one of the names. Raises ConfigError, with the nearest name, for one that is unknown."""
-    if scene.labels is None or scene.label_names is None:
-        why = scene.summary.get("left_out", {}).get("labels", "it has no semantics")
-        raise ConfigError(f"{path} has no labels: {why}")
-    for name in names:
-        if name not in scene.label_names:
-            near = suggest(name, scene.label_names, 1)
-            advice = f"did you mean {near[0]}?" if near else f"there are: {', '.join(scene.label_names)}"
-            raise ConfigError(f"no label is called {name}; {advice}")
-    return np.isin(scene.labels, [scene.label_names.index(name) for name in names])
 
 
 def corners(text: str | None) -> tuple[float, ...] | None:

@@ -21,8 +21,8 @@ from chebsplat.formats.images import read_rgb
 from chebsplat.formats.teacher_model import read_teacher
 from chebsplat.labels.tiling import window_starts
 from chebsplat.stages.runtime.command import n_threads
-from chebsplat.stages.settings import TeacherSection
-from chebsplat.stages.teacher_models.label_space import MAX_CHANNELS, closed_set, label_set, open_vocabulary
+from chebsplat.stages.settings import MAX_CHANNELS, TeacherSection
+from chebsplat.stages.teacher_models.label_space import closed_set, label_set, open_vocabulary
 from chebsplat.synthetic.layout import REFERENCE
 
 TEACHERS = {"segformer-b0-ade": "Xenova/segformer-b0-finetuned-ade-512-512"}  # ours: the hub's

@@ -9,6 +9,7 @@ from pathlib import Path
 
 import numpy as np
 import torch
+from scipy.special import expit
 
 from chebsplat.errors import ConfigError
 from chebsplat.formats.files import atomic_path
@@ -153,8 +154,6 @@ class OpenedScene:
         Args: mask: bool [N]; label: names to keep; min_opacity: in [0, 1]; box: x0, y0, z0, x1, y1, z1 of centres.
         Raises: ConfigError on a label that is not there, a mask of another shape, or where nothing is left.
         """
-        from chebsplat.stages.tools.extract import passing
-
         names = () if label is None else (label,) if isinstance(label, str) else tuple(label)
         kept = np.ones(len(self), bool) if mask is None else np.asarray(mask)
         if kept.shape != (len(self),) or kept.dtype != bool:
@@ -183,3 +182,31 @@ class OpenedScene:
         with atomic_path(path) as temporary:
             write_ply(temporary, self.parameters, int(self.parameters["degrees"].max()), self.labels, self.label_names)
         return path
+
+
+def passing(
+    scene: Scene, path: Path, labels: tuple[str, ...], min_opacity: float, box: Sequence[float] | None
+) -> dict[str, np.ndarray]:
+    """Which Gaussians pass each filter that is asked for, bool [N] by its name. Args and errors: see `extract`."""
+    filters: dict[str, np.ndarray] = {}
+    if labels:
+        filters["label"] = has_label(scene, path, labels)
+    if min_opacity > 0:
+        filters["opacity"] = expit(scene.parameters["logit_opacities"]) >= min_opacity
+    if box is not None:
+        means = scene.parameters["means"]
+        filters["box"] = np.all((means >= list(box[:3])) & (means <= list(box[3:])), axis=1)
+    return filters
+
+
+def has_label(scene: Scene, path: Path, names: tuple[str, ...]) -> np.ndarray:
+    """Which Gaussians bear one of the names. Raises ConfigError, with the nearest name, for one that is unknown."""
+    if scene.labels is None or scene.label_names is None:
+        why = scene.summary.get("left_out", {}).get("labels", "it has no semantics")
+        raise ConfigError(f"{path} has no labels: {why}")
+    for name in names:
+        if name not in scene.label_names:
+            near = suggest(name, scene.label_names, 1)
+            advice = f"did you mean {near[0]}?" if near else f"there are: {', '.join(scene.label_names)}"
+            raise ConfigError(f"no label is called {name}; {advice}")
+    return np.isin(scene.labels, [scene.label_names.index(name) for name in names])

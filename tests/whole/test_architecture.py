@@ -5,6 +5,7 @@ import json
 import os
 import subprocess
 import sys
+from graphlib import TopologicalSorter
 from pathlib import Path
 
 import pytest
@@ -77,6 +78,72 @@ def test_of_pipelines_only_the_command_knows_studies():
     for path in (ROOT / "pipelines").rglob("*.py"):
         if path.relative_to(ROOT / "pipelines").parts[0] not in ("studies", "cli"):
             assert not [name for name in imported_modules(path) if name.startswith("chebsplat.pipelines.studies")], path
+
+
+# Rooms of stages/ and pipelines/: each may import those before it that it names. A single module is named by its file.
+ROOMS = {
+    "stages": {
+        "registry": set(),
+        "settings": set(),
+        "runtime": {"registry", "settings"},
+        "measuring": set(),
+        "pages": set(),
+        "sources": {"runtime", "settings"},
+        "reconstruction": {"runtime", "settings"},
+        "training": {"runtime", "settings"},
+        "teacher_models": {"runtime", "settings"},
+        "shape_models": {"reconstruction", "runtime", "settings", "sources", "teacher_models"},
+        "tools": {"pages", "runtime", "settings", "shape_models", "sources", "teacher_models"},
+    },
+    "pipelines": {
+        "work": set(),
+        "planning": {"work"},
+        "running": {"planning", "work"},
+        "bases": {"planning", "running", "work"},
+        "studies": {"planning", "running", "work"},
+        "selection": {"bases", "planning"},
+        "api": {"running", "selection", "work"},
+        "cli": {"api", "bases", "planning", "running", "selection", "studies", "work"},
+    },
+}
+STAGE_MODULES = {path.stem for path in (ROOT / "stages").glob("*.py")} - {"__init__", *ROOMS["stages"]}
+ALSO_STAGES = {"tools", "teach"}  # commands on finished scenes run stages; teaching checks its graphs as `onnx` does
+
+
+def module_of(path):
+    """Dotted name of a module of ours."""
+    parts = path.relative_to(ROOT).with_suffix("").parts
+    parts = parts[:-1] if parts[-1] == "__init__" else parts
+    return ".".join(parts if parts[0] == "chebsplat" else ("chebsplat", *parts))
+
+
+MODULES = {module_of(path): path for path in SOURCES}
+
+
+def imported_by(path):
+    """Modules of ours that a module imports, at its top or inside a function."""
+    names = set(imported_modules(path))
+    found = {name if name in MODULES else name.rpartition(".")[0] for name in names if name.startswith("chebsplat.")}
+    return (found & MODULES.keys()) - {module_of(path)}
+
+
+@pytest.mark.parametrize("layer", ROOMS)
+def test_rooms_import_one_another_one_way(layer):
+    rooms, wrong = ROOMS[layer], []
+    for module, path in MODULES.items():
+        if not module.startswith(f"chebsplat.{layer}."):
+            continue
+        here = module.split(".")[2]
+        theirs = {name.split(".")[2] for name in imported_by(path) if name.startswith(f"chebsplat.{layer}.")}
+        allowed = rooms.get(here, rooms.keys() - {"tools"}) | {here}
+        allowed |= STAGE_MODULES if here in ALSO_STAGES else set()
+        wrong += [f"{module}: {name}" for name in sorted(theirs - allowed)]
+    assert not wrong
+
+
+def test_no_imports_run_in_a_circle():
+    graph = {module: imported_by(path) for module, path in MODULES.items()}
+    TopologicalSorter(graph).prepare()  # raises CycleError, which names the circle
 
 
 def test_formats_know_no_torch():
