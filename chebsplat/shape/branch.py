@@ -19,7 +19,6 @@ from chebsplat.shape.regions import Regions, regions_of
 from chebsplat.splats.rotations import rotation_matrices
 
 CHUNK = 256  # regions that are encoded at once
-OF_REGIONS = ("members", "centers", "descriptors", "positions", "cover", "weights", "cache")
 
 
 class FreshEncodings(NamedTuple):
@@ -131,7 +130,16 @@ class ShapeBranch(nn.Module):
         """What `refresh` computed and steps have changed since, beside the learned weights; tensors, plain values."""
         regions = self.regions
         assert regions is not None
-        return {name: getattr(self, name) for name in OF_REGIONS} | {
+        return {
+            "tensors": [
+                self.members,
+                self.centers,
+                self.descriptors,
+                self.positions,
+                self.cover,
+                self.weights,
+                self.cache,
+            ],
             "regions": [torch.from_numpy(a) for a in regions[:2]] + [float(v) for v in regions[2:]],
             "ids": self.ids.state_dict(len(self.cover)),
             "described": self.described.state_dict(),
@@ -139,8 +147,8 @@ class ShapeBranch(nn.Module):
 
     def load_region_state(self, state: dict[str, Any]) -> None:
         """Go on from what `region_state` returned."""
-        for name in OF_REGIONS:
-            setattr(self, name, state[name])
+        self.members, self.centers, self.descriptors, self.positions, *others = state["tensors"]
+        self.cover, self.weights, self.cache = others
         centers, members, radius, share = state["regions"]
         self.regions = Regions(centers.numpy(), members.numpy(), radius, share)
         self.ids.load_state_dict(state["ids"])

@@ -17,8 +17,6 @@ from chebsplat.training.model import Rendered, SceneModel
 FAINT = 0.005  # opacity below which a Gaussian is removed
 TINY = 1e-30  # scene units: a bound for what lies in a camera
 DIMMED = 0.01  # what a reset lowers opacities to
-TENSORS = ("gradient_sum", "gradient_count", "log_bound")
-COUNTS = ("n_grown", "n_reset", "n_added", "n_removed", "n_broken")
 
 
 class Population:
@@ -37,12 +35,15 @@ class Population:
 
     def state_dict(self) -> dict[str, Any]:
         """Counts, bounds, and the gradients gathered since growth: tensors, not copied, and plain values."""
-        return {name: getattr(self, name) for name in (*COUNTS, *TENSORS)}
+        return {
+            "counts": [self.n_grown, self.n_reset, self.n_added, self.n_removed, self.n_broken],
+            "tensors": [self.gradient_sum, self.gradient_count, self.log_bound],
+        }
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
         """Go on as the population whose `state_dict()` this is."""
-        for name, value in state.items():
-            setattr(self, name, value)
+        self.n_grown, self.n_reset, self.n_added, self.n_removed, self.n_broken = state["counts"]
+        self.gradient_sum, self.gradient_count, self.log_bound = state["tensors"]
 
     def clear_gradients(self) -> None:
         """Begin to gather gradients anew, of as many Gaussians as there are."""

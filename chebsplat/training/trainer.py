@@ -22,7 +22,6 @@ from chebsplat.training.population import Population, broken
 from chebsplat.training.schedule import Schedule, adam
 from chebsplat.views import Views
 
-PROGRESS = ("step", "seconds", "order", "members", "guidance")
 WEIGHT_SSIM = 0.2  # share of SSIM in the colour loss, 3DGS's λ
 READ_EVERY = 10  # steps on a GPU from one that waits for its figures to the next
 
@@ -155,12 +154,13 @@ class Trainer:
             "raw": {name: value.detach() for name, value in self.model.raw.items()},
             "modules": {name: module.state_dict() for name, module in self.model.modules.items()},
             "regions": None if self.model.shape is None else self.model.shape.region_state(),
-            "guides": [self.model.members, self.model.nearest],
+            "colour_guides": [self.model.members, self.model.nearest],
             "optimizer": self.optimizer.state_dict(),
             "order_generator": self.order_generator.bit_generator.state,
             "generator": self.generator.get_state(),
             "population": self.population.state_dict(),
-            "progress": {name: getattr(self, name) for name in PROGRESS},
+            "progress": (self.step, self.seconds, self.order),
+            "guides": (self.members, self.guidance),
         }
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
@@ -171,13 +171,13 @@ class Trainer:
             module.load_state_dict(state["modules"][name])
         if model.shape is not None:
             model.shape.load_region_state(state["regions"])
-        model.members, model.nearest = state["guides"]
+        model.members, model.nearest = state["colour_guides"]
         self.optimizer = adam(self.model, self.settings, self.extent)
         self.optimizer.load_state_dict(state["optimizer"])
         self.order_generator.bit_generator.state = state["order_generator"]
         self.generator.set_state(state["generator"])
-        for name, value in state["progress"].items():
-            setattr(self, name, value)
+        self.step, self.seconds, self.order = state["progress"]
+        self.members, self.guidance = state["guides"]
         self.population.load_state_dict(state["population"])
 
     def _encodes(self, share: float) -> bool:

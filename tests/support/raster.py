@@ -65,7 +65,7 @@ def _every_pair(
 ):  # fmt: skip
     y, x = torch.meshgrid(torch.arange(height) + 0.5, torch.arange(width) + 0.5, indexing="ij")
     pixels = torch.stack([x, y], -1).reshape(-1, 2).to(means)
-    views = [project(means, quats, scales, v, k, width, height, 0.01, 1e10, 0.3) for v, k in zip(viewmats, Ks)]  # noqa: B905
+    views = [project(means, quats, scales, v, k, (width, height), (0.01, 1e10), 0.3) for v, k in zip(viewmats, Ks)]  # noqa: B905
     means2d = torch.stack([view.means2d for view in views])
     if means2d.requires_grad:
         means2d.retain_grad()

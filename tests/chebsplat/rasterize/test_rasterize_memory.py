@@ -45,7 +45,7 @@ def peak():
         iterate(scene(N // 100, CHANNELS), view, gradients)
     arguments = scene(N, CHANNELS)
     means, quats, scales, opacities, _ = (a.detach() for a in arguments)
-    seen = project(means, quats, scales, viewmats[0], Ks[0], width, height, 0.01, 1e10, 0.3)
+    seen = project(means, quats, scales, viewmats[0], Ks[0], (width, height), (0.01, 1e10), 0.3)
     shown = seen.visible & (opacities >= reference.ALPHA_MIN)
     table = torch.cat([seen.means2d, seen.whitening, opacities[:, None]], 1)[shown]
     tiles = -(-width // 16), -(-height // 16)

@@ -21,7 +21,7 @@ def cloud(n=600, seed=0):
 
 def test_non_finite_points_are_refused():
     with pytest.raises(ValueError, match="finite"):
-        regions_of(np.full((3, 3), np.nan), DescribeSection(n_regions=2, region_size=2))
+        regions_of(np.full((3, 3), np.nan), DescribeSection(n_regions=2, region_size=4))
 
 
 @pytest.mark.parametrize("n_layers", [0, 2])
