@@ -23,7 +23,7 @@ CLUSTER := $(if $(filter-out local,$(on)),slurm)
 
 # `make scene=office0` needs no target: naming a scene, a sequence, a study or a benchmark means running it.
 .DEFAULT_GOAL := $(if $(study),study,$(if $(bench),bench-$(bench),$(if $(scene)$(sequence),run,help)))
-.PHONY: help run study slurm cluster-test view plan verify status clean-stale setup test test-all gpu soak stability bench text-model nouns knowledge calibration teacher teacher-quality lint lock
+.PHONY: help run study slurm cluster-test view plan verify status clean-stale setup test test-all test-lowest gpu soak stability bench text-model nouns knowledge calibration teacher teacher-quality lint lock
 
 run: $(READY) $(CLUSTER)  ## make scene=NAME|FOLDER [stage=] [set=a.b=c,...] [ablation=] [basis=NAME@REVISION|none] [cores=] [device=] [on=slurm]; or sequence=NAME
 	@$(CHEBSPLAT) run $(CHOICE) $(if $(stage),--stage '$(stage)') $(if $(cores),--cores '$(cores)') $(if $(device),--device '$(device)') $(if $(on),--on '$(on)')
@@ -65,6 +65,11 @@ test: $(READY)  ## the tests, in parallel, without the slow ones
 
 test-all: $(READY)  ## all tests, the slow ones too
 	@$(PY) -m pytest -q -n auto --dist loadgroup -m "not gpu" $(args)
+
+test-lowest: $(READY)  ## the tests with the lowest versions of dependencies that pyproject.toml allows, in build/lowest
+	@$(PY) -m uv venv -q --clear build/lowest
+	@$(PY) -m uv pip install -q --python build/lowest/bin/python --torch-backend auto --resolution lowest-direct --group dev -e .
+	@build/lowest/bin/python -m pytest -q -n auto --dist loadgroup -m "not slow and not gpu" -o filterwarnings= $(args)
 
 cluster-test: slurm  ## study=toys on a Slurm of its own on 127.0.0.1 (apt-get install munge slurm-wlm): build/cluster.csv
 	@$(PY) -m pytest -q -rs tests/pipelines/test_cluster.py $(args)
