@@ -128,3 +128,35 @@ def test_an_installed_wheel_opens_renders_and_asks_a_scene_from_another_folder(w
     done = subprocess.run(command, capture_output=True, text=True, cwd=tmp_path, env=environment)
     assert done.returncode == 0, done.stderr
     assert done.stdout.strip() == "True"
+
+
+def archived(built, tmp_path):
+    """The repository as a zip, its links kept."""
+    path = tmp_path / "project.zip"
+    subprocess.run(["git", "archive", "--format=zip", "-o", path, "HEAD"], cwd=ROOT, check=True)
+    return str(path)
+
+
+SOURCES = {
+    "wheel": lambda built, _: str(next(built.glob("*.whl"))),
+    "sdist": lambda built, _: str(next(built.glob("*.tar.gz"))),
+    "zip": archived,
+    "git": lambda built, _: f"git+file://{ROOT}",
+}
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("kind", SOURCES)
+def test_an_installation_runs_toy_without_setup(kind, built, tmp_path):
+    """All but chebsplat itself comes from where the tests run: its dependencies take gigabytes."""
+    if kind in ("zip", "git") and not (ROOT / ".git").exists():
+        pytest.skip("not a checkout")
+    place, source = tmp_path / "site", SOURCES[kind](built, tmp_path)
+    command = [sys.executable, "-m", "pip", "install", "--no-deps", "--no-index", "--no-build-isolation"]
+    subprocess.run([*command, "--target", str(place), source], check=True, capture_output=True)
+    environment = os.environ | {"PYTHONPATH": str(place), "CHEBSPLAT_WORK": str(tmp_path / "work")}
+    command = [sys.executable, "-P", "-m", "chebsplat.pipelines.cli", "run", "--scene", "toy", "--stage", "export"]
+    done = subprocess.run(command, capture_output=True, text=True, cwd=tmp_path, env=environment)
+    assert done.returncode == 0, done.stderr
+    ply = tmp_path / "work/toy/export/scene.ply"
+    assert ply.stat().st_size > 100_000
