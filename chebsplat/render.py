@@ -19,6 +19,9 @@ from chebsplat.splats.planes import inverse_depths
 from chebsplat.splats.sh import eval_sh
 from chebsplat.views import View, in_frustum
 
+PARTS = ("projection", "sh", "sort", "blend")
+NEAR, FAR, BLUR, MAX_ALPHA = 0.01, 1e10, 0.3, 0.99  # the defaults of `rasterize`
+
 
 def colors_by_degree(sh0: Tensor, shN: Tensor, directions: Tensor, degrees: Tensor) -> Tensor:
     """Colours [N, 3] of Gaussians sorted by ascending degree; each bucket evaluates its own bands only.
@@ -85,10 +88,6 @@ class SceneRenderer:
         arrays = tuple(part.numpy() for part in gaussians)
         depth, covered = depths(arrays, pose.numpy(), K.numpy(), (view.width, view.height), planes.numpy())
         return np.where((covered > 1e-3) & (depth > nearest) & np.isfinite(depth), depth, np.float32(np.nan)), covered
-
-
-PARTS = ("projection", "sh", "sort", "blend")
-NEAR, FAR, BLUR, MAX_ALPHA = 0.01, 1e10, 0.3, 0.99  # the defaults of `rasterize`
 
 
 @torch.no_grad()

@@ -15,8 +15,8 @@ FLOAT, DYNAMIC, FUSED = "encoder.onnx", "encoder.int8.onnx", "fusion.onnx"
 
 @dataclass
 class Encoder:
-    """models: paths by name, FLOAT, DYNAMIC (quantised to 8 bits) and FUSED; contract: see `stages.contract`; parity:
-    by model, sizes and largest difference from torch.
+    """models: paths by name, FLOAT, DYNAMIC (quantised to 8 bits) and FUSED; contract: see
+    `stages.shape_models.point_graph.contract`; parity: by model, sizes and largest difference from torch.
     """
 
     models: dict[str, Path]

@@ -29,6 +29,8 @@ RESTORE = "restore the file"
 # tomllib takes quadratic time over a dotted key; none of ours has more than four parts
 ENDLESS_KEY = re.compile(r"""(?<![\w"'-])(?:[\w"'-]++[ \t]*+\.[ \t]*+){64}""")
 SURROGATE = re.compile(r"\\u[dD][89a-fA-F]")
+CLOSED = {errno.EROFS, errno.EACCES, errno.EPERM}
+REFUSALS = {errno.ENOSPC, errno.EDQUOT} | CLOSED
 
 
 def regular(path: Path, remedy: str = RESTORE, error: type[ChebsplatError] = InputError) -> os.stat_result:
@@ -136,10 +138,6 @@ def sync(path: Path) -> None:
         os.fsync(handle)
     finally:
         os.close(handle)
-
-
-CLOSED = {errno.EROFS, errno.EACCES, errno.EPERM}
-REFUSALS = {errno.ENOSPC, errno.EDQUOT} | CLOSED
 
 
 @contextmanager

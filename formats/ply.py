@@ -18,6 +18,8 @@ from chebsplat.formats.files import regular
 REST = {0: 0, 1: 3, 2: 8, 3: 15}  # coefficients beyond band 0, by degree
 _FIXED = ["x", "y", "z", "nx", "ny", "nz", "f_dc_0", "f_dc_1", "f_dc_2"]
 _TAIL = ["opacity", "scale_0", "scale_1", "scale_2", "rot_0", "rot_1", "rot_2", "rot_3"]
+HEADER = 1 << 20  # bytes that a header may take
+_PART = re.compile(rb"^[ \t]*(?:element[ \t]+\S+[ \t]+(\d{1,30})|(property))\b", re.MULTILINE)
 
 
 def write_ply(
@@ -113,10 +115,6 @@ def read_ply(path: Path) -> tuple[dict[str, np.ndarray], int, np.ndarray | None]
         parameters["degrees"] = whole("sh_degree", 0, degree).astype(np.uint8)
     labels = whole("label", -1, 2**24).astype(np.int32) if "label" in names else None
     return parameters, degree, labels
-
-
-HEADER = 1 << 20  # bytes that a header may take
-_PART = re.compile(rb"^[ \t]*(?:element[ \t]+\S+[ \t]+(\d{1,30})|(property))\b", re.MULTILINE)
 
 
 def read_vertices(path: Path, remedy: str) -> Any:

@@ -14,6 +14,9 @@ from chebsplat.errors import InputError
 from chebsplat.formats.ply import read_vertices
 from chebsplat.formats.record import Array, Record
 
+MOST = 20_000_000  # points; a room's scan has some hundred thousand
+FARTHEST = 1e6  # scene units: beyond, float32 tells no 0.06 apart
+
 
 @dataclass
 class Points(Record):
@@ -50,10 +53,6 @@ def thinned(points: Points, most: int, seed: int) -> Points:
     kept = np.sort(np.random.default_rng(seed).choice(len(points.means), most, replace=False))
     fewer = {name: getattr(points, name)[kept] for name in ("means", "colors", "normals", "covariances")}
     return replace(points, **fewer, tracks=points.tracks[:0])
-
-
-MOST = 20_000_000  # points; a room's scan has some hundred thousand
-FARTHEST = 1e6  # scene units: beyond, float32 tells no 0.06 apart
 
 
 def read_cloud(path: Path) -> tuple[np.ndarray, np.ndarray | None]:

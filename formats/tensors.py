@@ -26,6 +26,10 @@ from chebsplat.formats.files import regular
 from chebsplat.formats.manifest import Manifest, remedy_of
 
 Spec = tuple[Any, ...]  # of an array: its dtype, then its sizes
+LARGEST = 256 << 20  # bytes that the arrays asked for may take in all, unpacked
+# what numpy and zipfile raise, of which a RuntimeError is an unknown compression
+_BROKEN = (OSError, ValueError, EOFError, RuntimeError, MemoryError, KeyError, TypeError,
+           zipfile.BadZipFile, zlib.error, lzma.LZMAError, tokenize.TokenError)  # fmt: skip
 
 
 def write_tensors(path: Path, arrays: Mapping[str, np.ndarray]) -> None:
@@ -64,12 +68,6 @@ def read_tensors(
         if not fits:
             raise InputError(f"{path}: {key} has shape {stored}, expected {tuple(shape)}; {remedy_of(root)}")
     return arrays
-
-
-LARGEST = 256 << 20  # bytes that the arrays asked for may take in all, unpacked
-# what numpy and zipfile raise, of which a RuntimeError is an unknown compression
-_BROKEN = (OSError, ValueError, EOFError, RuntimeError, MemoryError, KeyError, TypeError,
-           zipfile.BadZipFile, zlib.error, lzma.LZMAError, tokenize.TokenError)  # fmt: skip
 
 
 def read_npy(path: Path, remedy: str, largest: int = LARGEST) -> np.ndarray:

@@ -8,7 +8,7 @@ from chebsplat.errors import ConfigError
 from chebsplat.formats.names import suggest
 from chebsplat.pipelines.bases import revisions
 from chebsplat.pipelines.planning import sequences
-from chebsplat.pipelines.planning.plan import Overrides, Planner, merged, overrides
+from chebsplat.pipelines.planning.plan import Overrides, Planner, suffix, with_setting
 from chebsplat.stages.registry import STAGES
 
 
@@ -31,12 +31,12 @@ def plans(
         if sequence is not None:
             return sequences.chain(planner, sequence, settings, ablation)
         if basis == "none":
-            settings = merged(overrides(settings), {"refine": {"knowledge": "none"}})
+            settings = with_setting(settings, "refine", "knowledge", "none")
         if basis in ("", "none"):
             return [planner.plan(str(scene), settings, ablation)]
         earlier, path, name = revisions.before(planner, basis, settings, ablation)
         plan = planner.plan(str(scene), settings, ablation, path)
-        plan.title += ("+" if ablation or settings else "@") + f"basis={name}"
+        plan.title += ("+" if ablation or suffix(settings) else "@") + f"basis={name}"
         for one in earlier:
             one.asked = False
         return [*earlier, plan]

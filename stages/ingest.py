@@ -35,6 +35,7 @@ from chebsplat.stages.sources.common import resolve_source
 log = logging.getLogger("chebsplat")
 
 NAMED = 20  # blurred views in a message
+SEED = 0  # of all disturbances: the studies compare trainings on the same ones
 
 
 def read(name: str, source: SourceSection, settings: IngestSection, progress: Progress | None = None) -> dict[str, Any]:
@@ -180,9 +181,6 @@ def run(job: Job) -> None:
         job.left_out("views", f"{n_views - len(capture.names)} that ingest.max_train_views spares the training")
     job.facts |= {"source": capture.source, "n_views": len(capture.names), "n_test": int(np.sum(capture.is_test))}
     capture.write(job.out)
-
-
-SEED = 0  # of all disturbances: the studies compare trainings on the same ones
 
 
 def recolored(images: np.ndarray, is_test: np.ndarray, stops: float) -> np.ndarray:

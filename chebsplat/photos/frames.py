@@ -12,6 +12,8 @@ BLOCK = 64  # pixels a side: shifts of up to half of it are seen
 STRIDE = 32
 LEAST_PEAK = 0.05  # of a phase correlation, 1: an exact shift; lower ones are chance
 STEP = 0.075  # of the picture's width, by which it moves from one frame that is taken to the next
+WEAK = 0.5  # of the median variance: less detail than half of the views have
+SOFT = 0.6  # of the median ratio of fine to coarse detail
 
 
 def shifts(before: np.ndarray, after: np.ndarray) -> np.ndarray:
@@ -73,10 +75,6 @@ def choose(steps: np.ndarray, sharpness: np.ndarray, at_most: int) -> np.ndarray
         if len(rows):
             taken.append(rows[np.argmax(sharpness[rows])])
     return np.array(taken, int)
-
-
-WEAK = 0.5  # of the median variance: less detail than half of the views have
-SOFT = 0.6  # of the median ratio of fine to coarse detail
 
 
 def laplacian_variance(grey: np.ndarray) -> float:

@@ -21,6 +21,8 @@ BRIGHT = 0.3  # weight of a difference in brightness, as a logarithm, beside 1 -
 OUTSIDE = 4.0  # cost of a pixel that the other view does not see
 AT_ONCE = 8  # depths: what they take stays in a processor's cache
 BEST = 2  # views that must agree, of the neighbours: others may be covered
+SAME, THROUGH = 0.03, 0.05  # of a point's depth: what differs by less confirms it, what lies farther by more denies it
+DENIED = 0.5  # views that may deny a point, for each that confirms it
 
 
 def box_mean(values: Tensor, half: int) -> Tensor:
@@ -92,10 +94,6 @@ def _moments(values: Tensor) -> tuple[Tensor, Tensor]:
     """Mean and standard deviation of the patch about each pixel of [..., H, W]."""
     mean = box_mean(values, WINDOW)
     return mean, (box_mean(values.square(), WINDOW) - mean.square()).clamp_min(0).sqrt()
-
-
-SAME, THROUGH = 0.03, 0.05  # of a point's depth: what differs by less confirms it, what lies farther by more denies it
-DENIED = 0.5  # views that may deny a point, for each that confirms it
 
 
 def agreed(depth: np.ndarray, Ks: np.ndarray, poses: np.ndarray, others: np.ndarray, least: int) -> np.ndarray:

@@ -8,6 +8,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from chebsplat.kernels.dispatch import gsplat
 from chebsplat.rasterize import reference
 from chebsplat.rasterize.projection import is_antialiased
 
@@ -55,13 +56,7 @@ def rasterize(
         raise ValueError(f"max_alpha {max_alpha}; the cuda backend keeps none above {MAX_ALPHA}")
     if colors.shape[-1] > MOST:
         raise ValueError(f"{colors.shape[-1]} channels; the cuda backend takes at most {MOST} channels")
-    try:
-        from gsplat import rasterization
-    except ImportError as error:
-        raise ImportError(
-            "torch sees a GPU, but gsplat, which renders on it, cannot be imported: make setup device=cuda; "
-            "or move the tensors to the CPU, or pass backend='reference'"
-        ) from error
+    rasterization = gsplat().rasterization
     if len(means) == 0:  # the background: gsplat is not asked to sort an empty scene
         empty = (means, quats, scales, opacities, colors[..., :n_colors], viewmats, Ks, width, height)
         return reference.rasterize(*empty, backgrounds=backgrounds, absgrad=absgrad, cell_colors=cell_colors)

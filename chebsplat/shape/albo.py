@@ -13,6 +13,10 @@ import numpy as np
 import torch
 from torch import Tensor
 
+SMALLEST = 1e-3  # of λ_c and λ_max: a region of many components has K zero eigenvalues
+SAME = 1e-9  # eigenvalues this close are one eigenspace: round-off is 1e-15
+CLUSTER = 1e-4  # a gap below this leaves few digits of single eigenvectors in float32
+
 
 class Region(NamedTuple):
     """Regions in canonical pose-free units: rms radius 1 around the mean, float64."""
@@ -129,11 +133,6 @@ def similarity(region: Region, factors: Tensor, rotmats: Tensor, bandwidth: floa
     log_degrees = top + torch.where(degrees > 0, degrees, 1.0).log()
     exponent = log_weights - 0.5 * (log_degrees[:, :, None] + log_degrees[:, None])
     return torch.where(pair, exponent.clamp_max(0).exp(), 0.0)
-
-
-SMALLEST = 1e-3  # of λ_c and λ_max: a region of many components has K zero eigenvalues
-SAME = 1e-9  # eigenvalues this close are one eigenspace: round-off is 1e-15
-CLUSTER = 1e-4  # a gap below this leaves few digits of single eigenvectors in float32
 
 
 class Cut(NamedTuple):

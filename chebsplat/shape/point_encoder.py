@@ -20,6 +20,8 @@ from chebsplat.shape.point_inputs import N_OWN, RADII, PointInputs
 
 N_RELATIVE = 10
 CHUNK = 4096  # points encoded at once
+LEAST_VIEWS = 2  # that a point to learn from was seen in
+WARM_UP = 50  # steps
 
 
 class Cloud(NamedTuple):
@@ -172,10 +174,6 @@ def relative(cloud: Cloud, centers: Tensor, neighbors: Tensor, radius: float) ->
         others[..., 2:] - normal[..., 2:],
     ]
     return torch.cat(parts, -1)
-
-
-LEAST_VIEWS = 2  # that a point to learn from was seen in
-WARM_UP = 50  # steps
 
 
 @dataclass

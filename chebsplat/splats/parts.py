@@ -1,4 +1,6 @@
-"""What hangs together: Gaussians that touch, and those that touch them, are one part."""
+"""What hangs together: Gaussians that touch, and those that touch them, are one part; points by
+the cubes of a grid that hold them.
+"""
 
 from __future__ import annotations
 
@@ -11,6 +13,8 @@ from scipy.spatial import cKDTree
 
 NEIGHBORS = 16  # nearest of the chosen that a Gaussian is held against
 REACH = 2.0  # standard deviations along the longest axis
+Corner = np.ndarray | Sequence[float] | None
+FARTHEST = 2.0**40  # cubes from the origin along an axis; what lies beyond counts as there
 
 
 def parts(means: np.ndarray, scales: np.ndarray, chosen: np.ndarray) -> np.ndarray:
@@ -44,10 +48,6 @@ def substantial(means: np.ndarray, scales: np.ndarray, chosen: np.ndarray, least
     if len(sizes):
         kept[chosen] = sizes[numbers[chosen]] >= least * sizes[0]
     return kept
-
-
-Corner = np.ndarray | Sequence[float] | None
-FARTHEST = 2.0**40  # cubes from the origin along an axis; what lies beyond counts as there
 
 
 def cubes_of(points: np.ndarray, edge: float, origin: Corner = None) -> np.ndarray:

@@ -9,7 +9,7 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor
 
-from chebsplat.kernels.dispatch import is_compiled
+from chebsplat.kernels.dispatch import gsplat, is_compiled
 from chebsplat.splats import sh_kernels
 from chebsplat.splats.gaussians import take
 
@@ -59,14 +59,13 @@ def basis(directions: Tensor, degree: int) -> Tensor:
     return torch.stack(columns, -1)
 
 
-def light(coefficients: Tensor, directions: Tensor, degree: int) -> Tensor:
+def light(coefficients: Tensor, directions: Tensor, degree: int, backend: str = "auto") -> Tensor:
     """Light [N, 3] along directions [N, 3], normalised here, of coefficients [N, at least (degree + 1)², 3].
 
     Choices: on a GPU gsplat's own kernel, for which fifty operations there would be one each to wait for.
     """
-    if coefficients.device.type == "cuda":
-        from gsplat import spherical_harmonics
-
+    if coefficients.device.type == "cuda" and backend != "reference":
+        spherical_harmonics = gsplat().spherical_harmonics
         seen: Tensor = spherical_harmonics(degree, directions, coefficients)
         return seen
     values = basis(torch.nn.functional.normalize(directions, dim=-1), degree)
@@ -111,7 +110,7 @@ def colors_in_view(
         return sh_kernels.colors_in_view(bands, masks, index, means, eye, degree)
     coefficients = _coefficients(bands[: degree + 1], masks, index)
     directions = means.detach().index_select(0, index) - eye
-    return (light(coefficients, directions, min(degree, len(bands) - 1)) + 0.5).relu()
+    return (light(coefficients, directions, min(degree, len(bands) - 1), backend) + 0.5).relu()
 
 
 def _coefficients(bands: Sequence[Tensor], masks: Tensor | None, index: Tensor) -> Tensor:

@@ -1,7 +1,7 @@
 """Colour by spherical harmonics of the Gaussians in view, in numba: a Gaussian costs only the bands it keeps.
 
 Reads and writes whole parameters, so that no copy of the coefficients in view is ever made. A band is a tensor
-[N_l, 2 l + 1, 3] that the first N_l Gaussians have. `sh_colors` holds the plain twin, and chooses.
+[N_l, 2 l + 1, 3] that the first N_l Gaussians have. `sh` holds the plain twin, and chooses.
 """
 
 from __future__ import annotations
@@ -145,7 +145,7 @@ class _Colors(torch.autograd.Function):
 def colors_in_view(
     bands: Sequence[Tensor], masks: Tensor | None, index: Tensor, means: Tensor, eye: Tensor, degree: int
 ) -> Tensor:
-    """As `sh_colors.colors_in_view`, of float32 on the CPU; a closed band costs nothing, unless its mask learns."""
+    """As `sh.colors_in_view`, of float32 on the CPU; a closed band costs nothing, unless its mask learns."""
     used = [band if at <= degree else band[:0].detach() for at, band in enumerate(bands)]
     used += [bands[0].new_zeros(0, 2 * at + 1, 3) for at in range(len(used), 4)]
     if masks is None:

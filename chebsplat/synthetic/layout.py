@@ -13,6 +13,11 @@ from chebsplat.synthetic.textures import Material
 
 Tone = Sequence[float] | np.ndarray  # red, green, blue; linear, in [0, 1]
 WHITE = (0.78, 0.77, 0.74)
+SCENES = range(1000)  # named scenes and tests
+REFERENCE = range(8000, 8100)  # views that a teacher's channels are computed from
+HELD_OUT = range(9000, 9020)  # the embedded teacher is measured on these: the first half offices, the others rooms
+TRAINING = range(10_000, 20_000)  # the embedded teacher is trained on these
+KNOWLEDGE = range(20_000, 21_000)  # knowledge is taught on these
 
 
 @dataclass
@@ -184,10 +189,3 @@ def toy(b: Builder, p: Palette, rng: np.random.Generator, size: tuple[float, flo
     put.picture(b, north(w, d, w * 0.5, 1.5), p.wood, p.add("painting", *p.two_tones(0.4), 0.25), 1.0, 0.7)
     put.chair(b, Frame((w * 0.55, d * 0.75, 0), np.pi), p.wood, p.other_fabric)
     put.table(b, Frame((w * 0.5, d * 0.4, 0)), p.wood, 0.9, 0.5, 0.6)
-
-
-SCENES = range(1000)  # named scenes and tests
-REFERENCE = range(8000, 8100)  # views that a teacher's channels are computed from
-HELD_OUT = range(9000, 9020)  # the embedded teacher is measured on these: the first half offices, the others rooms
-TRAINING = range(10_000, 20_000)  # the embedded teacher is trained on these
-KNOWLEDGE = range(20_000, 21_000)  # knowledge is taught on these

@@ -3,23 +3,27 @@
 from __future__ import annotations
 
 import ctypes
+from contextlib import suppress
 from typing import Any, NamedTuple
 
 import numpy as np
 
 from chebsplat.errors import ConfigError
 
+TWO_ROUNDS = 40  # views from which on the path goes round twice
+
 
 def open3d() -> Any:
     """The module, loaded when it is first asked for.
 
     Raises: ConfigError, with the remedy, where it or a library that it is linked to is missing.
-    Choices: it wants libusb, which few machines have and libusb-package brings: what is loaded is found by its name.
+    Choices: libusb, which few machines have, is loaded first, from libusb-package: open3d's loader finds it by name.
     """
-    try:
+    with suppress(ImportError, OSError):  # the system may have one
         import libusb_package
 
         ctypes.CDLL(str(libusb_package.get_library_path()), ctypes.RTLD_GLOBAL)
+    try:
         import open3d as module
     except (ImportError, OSError) as error:
         remedy = "pip install open3d-cpu libusb-package; Debian, Ubuntu: apt install libegl1 libgl1 libgomp1"
@@ -63,9 +67,6 @@ class RayCaster:
 
     def _tensor(self, array: np.ndarray, dtype: Any) -> Any:
         return self._open3d.core.Tensor(np.ascontiguousarray(array, dtype))
-
-
-TWO_ROUNDS = 40  # views from which on the path goes round twice
 
 
 def look_at(eye: np.ndarray, target: np.ndarray) -> np.ndarray:

@@ -11,6 +11,8 @@ from typing import Any
 
 import numpy as np
 
+SAMPLES = ((-0.7, -0.6), (0.6, -0.7), (0.7, 0.6), (-0.6, 0.7))  # points of a panel that light is taken from
+
 
 @dataclass(frozen=True)
 class Material:
@@ -124,9 +126,6 @@ def colors(points: np.ndarray, materials: np.ndarray, table: list[Material]) -> 
             value = 0.6 * value + 0.4 * hue * np.float32(material.first[::-1])
         out[chosen] = value
     return out
-
-
-SAMPLES = ((-0.7, -0.6), (0.6, -0.7), (0.7, 0.6), (-0.6, 0.7))  # points of a panel that light is taken from
 
 
 def dot(a: np.ndarray, b: np.ndarray) -> np.ndarray:

@@ -116,20 +116,20 @@ def _places(
     """Places [A, 3] of new Gaussians in regions of members [R, n] (-1 where padded), steepest first, and the Gaussians
     [A] that they come from. Args: excess [R]: of the gradient over the threshold.
     """
-    tree, wanted = cKDTree(means), candidates
+    tree = cKDTree(means)
     centers, radii, spacings = _balls(tree, means, inside)
-    printed = wanted.printed
+    printed = candidates.printed
     volume = 4 / 3 * np.pi * (radii if printed else radii / np.where(spacings > 0, spacings, np.inf)) ** 3
     excess = np.minimum(excess, LARGEST if printed else 1)
-    counts = np.ceil(np.minimum(wanted.density * volume * excess, wanted.max_candidates)).astype(np.int64)
+    counts = np.ceil(np.minimum(candidates.density * volume * excess, candidates.max_candidates)).astype(np.int64)
     counts[np.cumsum(counts) - counts >= 16 * budget] = 0
     region = np.repeat(np.arange(len(counts)), counts)
     positions = centers[region] + radii[region, None] * _in_unit_ball(rng, len(region))
     distance, parents = tree.query(positions)
     spacing = spacings[region]
-    kept = np.flatnonzero((distance >= wanted.nearest * spacing) & (distance <= wanted.farthest * spacing))
+    kept = np.flatnonzero((distance >= candidates.nearest * spacing) & (distance <= candidates.farthest * spacing))
     kept = kept[np.sort(np.unique(parents[kept], return_index=True)[1])]
-    kept = kept[_apart(positions[kept], wanted.nearest * spacing[kept])][:budget]
+    kept = kept[_apart(positions[kept], candidates.nearest * spacing[kept])][:budget]
     return positions[kept], parents[kept]
 
 

@@ -17,6 +17,7 @@ C1, C2 = np.float32(0.01**2), np.float32(0.03**2)
 HALF = WINDOW // 2
 _x = np.arange(WINDOW) - HALF
 TAPS = (np.exp(-0.5 * (_x / SIGMA) ** 2) / np.exp(-0.5 * (_x / SIGMA) ** 2).sum()).astype(np.float32)
+TINY = np.float32(1e-12)
 
 
 @kernel
@@ -129,9 +130,6 @@ def photometric(a: np.ndarray, b: np.ndarray, weight: np.ndarray, weight_ssim: f
     gradient, distance = _gather(_blur_rows(slopes), a, b, weight, np.float32(weight_ssim))
     loss = (1 - weight_ssim) * distance.sum() + weight_ssim * (weight.sum(dtype=np.float64) - values.sum())
     return float(loss), gradient.reshape(shape)
-
-
-TINY = np.float32(1e-12)
 
 
 @inline

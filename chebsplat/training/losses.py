@@ -14,6 +14,8 @@ from chebsplat.settings import TrainSection
 from chebsplat.training.loss_kernels import C1, C2, TAPS, WINDOW
 from chebsplat.views import TaughtLabels
 
+TEMPERATURE = 0.1  # of the logits that cross-entropy is of
+
 
 @cache
 def _taps(dtype: torch.dtype, device: torch.device) -> Tensor:
@@ -183,9 +185,6 @@ def feature_distance_reference(
     difference = torch.where(share[..., None] != 0, pooled - target, 0.0)  # what does not count may be anything
     distance = difference.abs().mean(-1) if kind == "l1" else difference.square().mean(-1).clamp_min(1e-30).sqrt()
     return (distance * share).sum()
-
-
-TEMPERATURE = 0.1  # of the logits that cross-entropy is of
 
 
 def semantic_loss(

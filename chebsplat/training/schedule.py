@@ -14,7 +14,7 @@ LR_MODULES, LR_GATES = 3e-3, 1e-2  # of the encoder, and of the printed gates' w
 FASTER = {"means": 0.01, "features": 0.01, "modules": 0.01}  # what a rate has fallen to at the end; 0.1 elsewhere
 
 
-def decided(settings: TrainSection) -> None:
+def require_resolved(settings: TrainSection) -> None:
     """Raises ValueError naming a setting that is still open (`stages.training.defaults.resolved` decides them)."""
     left = [name for name, value in settings if value is None and name not in ("seconds", "start")]
     if left:
@@ -63,7 +63,7 @@ class Schedule:
     """
 
     def __init__(self, settings: TrainSection):
-        decided(settings)
+        require_resolved(settings)
         assert settings.steps is not None
         self.settings, self.steps = settings, settings.steps
         self.seconds: float | None = settings.seconds

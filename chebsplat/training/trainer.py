@@ -1,4 +1,6 @@
-"""One training: schedules, losses, growth and pruning of a scene model. Arrays in, arrays out; no files."""
+"""One training: schedules, losses, growth and pruning of a scene model. Arrays in, arrays out; no
+files. `Laps` are its seconds by part.
+"""
 
 from __future__ import annotations
 

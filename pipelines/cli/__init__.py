@@ -41,7 +41,7 @@ class Commands(Guarded):
 
 
 def run_stage(name: str, job: Any) -> None:
-    """Run a stage, whose module is loaded by then, with all that it computes with."""
+    """Import a stage's module only now, since it brings torch, and run it."""
     import_module(f"chebsplat.stages.{name}").run(job)
 
 

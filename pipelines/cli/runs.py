@@ -92,9 +92,8 @@ def study(
     """Run a study (of pipelines/configs/studies, or a .toml): its table, figure and page; goes on where it stopped."""
     from chebsplat.pipelines.running import cluster
     from chebsplat.pipelines.running.run import Outcome, device_of, say
-    from chebsplat.pipelines.studies import page, results, transfer
+    from chebsplat.pipelines.studies import page, results, tables, transfer
     from chebsplat.pipelines.studies import study as studies
-    from chebsplat.pipelines.studies import tables as reaching
 
     where, asked = cluster.checked(on), studies.read_study(name)
     computing = device_of(device, where)
@@ -110,7 +109,7 @@ def study(
 
     def write(failed: dict[str, tuple[int, str, Path]]) -> Path:
         rows = [results.row_of(run, failed) for run in runs]
-        more = reaching.sections(asked, rows) + (transfer.sections(asked, rows) if asked.sequences else [])
+        more = tables.sections(asked, rows) + (transfer.sections(asked, rows) if asked.sequences else [])
         return page.write(folder, asked, runs, rows, command, more).absolute()
 
     outcome = Outcome()

@@ -24,6 +24,17 @@ PACKAGE = Path(chebsplat.__file__).parent
 PLUMBING = tuple(f"chebsplat.{name}." for name in ("settings", "stages.settings", "stages.registry", "stages.runtime"))
 TEMPLATES = {".html", ".css", ".js"}  # of a package: what its modules fill
 OPTIONAL = {"av", "gsplat", "pillow_heif", "tokenizers", "transformers"}  # of extras: count where a scene uses them
+# Settings that say where raw files lie. Their content is hashed instead: where it lies is no matter.
+PLACES = (
+    ("source", "path"),
+    ("channels", "model"),
+    ("channels", "reference"),
+    ("teacher", "model"),
+    ("teacher", "labels"),
+    ("train", "start"),
+    ("knowledge", "model"),
+    ("evaluate", "lpips_weights"),
+)
 
 
 class Code:
@@ -133,19 +144,6 @@ def parsed(text: str, name: str) -> tuple[str, list[str]]:
             ):
                 node.body = node.body[1:] or [ast.Pass()]
     return hashlib.sha256(ast.dump(tree).encode()).hexdigest()[:16], sorted(imports)
-
-
-# Settings that say where raw files lie. Their content is hashed instead: where it lies is no matter.
-PLACES = (
-    ("source", "path"),
-    ("channels", "model"),
-    ("channels", "reference"),
-    ("teacher", "model"),
-    ("teacher", "labels"),
-    ("train", "start"),
-    ("knowledge", "model"),
-    ("evaluate", "lpips_weights"),
-)
 
 
 def step_key(

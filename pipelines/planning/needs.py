@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 from collections.abc import Iterable
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from chebsplat.errors import ConfigError
 from chebsplat.formats.images import is_heic, is_image, require_heic
@@ -23,9 +23,6 @@ from chebsplat.pipelines.work import store
 from chebsplat.pipelines.work.scenes import expanded
 from chebsplat.stages.sources.common import unread
 from chebsplat.stages.teacher_models.text_encoder import found
-
-if TYPE_CHECKING:
-    from chebsplat.formats.teacher_model import TeacherModel
 
 LIFTED = "train.features is lifted"
 POINTS = "train.encoder is points: the training holds none"

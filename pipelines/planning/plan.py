@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import hashlib
+import json
 import os
 import re
 import tomllib
@@ -40,6 +41,7 @@ if TYPE_CHECKING:
 
 
 Overrides = str | Mapping[str, Any]  # `section.key=value,...`, or sections by name
+OFF_IS_CHOICE = ("ingest.depth", "sfm.dense", "train.encoder", "train.densify", "train.exposure", "refine.smooth")
 
 
 @dataclass
@@ -99,8 +101,9 @@ def located(source: SourceSection) -> SourceSection:
 def suffix(settings: Overrides) -> str:
     """Settings as part of a folder's name: as they are where they fit, otherwise cut and told apart by a digest."""
     if not isinstance(settings, str):
-        items = ((section, key, value) for section, of in settings.items() for key, value in of.items())
-        settings = ",".join(f"{section}.{key}={value}" for section, key, value in items)
+        values = [(section, key, value) for section, of in overrides(settings).items() for key, value in of.items()]
+        words = (value if isinstance(value, str) else json.dumps(value) for _, _, value in values)
+        settings = ",".join(f"{section}.{key}={word}" for (section, key, _), word in zip(values, words, strict=True))
     text = re.sub(r"[^\w.=+-]+", "_", settings)
     return text if len(text) <= 80 else f"{text[:71]}-{hashlib.sha256(settings.encode()).hexdigest()[:8]}"
 
@@ -133,7 +136,14 @@ def overrides(settings: Overrides) -> dict[str, Any]:
     return values
 
 
-OFF_IS_CHOICE = ("ingest.depth", "sfm.dense", "train.encoder", "train.densify", "train.exposure", "refine.smooth")
+def with_setting(settings: Overrides, section: str, name: str, value: str) -> Overrides:
+    """Settings and one more, in the form that they have. Raises ConfigError if they hold it already."""
+    held = overrides(settings)
+    if name in held.get(section, {}):
+        raise ConfigError(f"{section}.{name} is given twice; leave one")
+    if isinstance(settings, str):
+        return ",".join(part for part in (settings, f"{section}.{name}={value}") if part)
+    return merged(held, {section: {name: value}})
 
 
 def parsed(key: str, value: str) -> Any:
@@ -187,7 +197,7 @@ class Planner:
             title += f"@{ablation}"
         if settings:
             values = merged(values, overrides(settings))
-            title += ("+" if ablation else "@") + suffix(settings)
+            title += f"{'+' if ablation else '@'}{name_part}" if (name_part := suffix(settings)) else ""
         config = placed(configs.build(values, f"scene {scene}"))
         asked = config.source
         source = located(resolve_source(name, asked))

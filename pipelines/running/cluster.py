@@ -1,7 +1,7 @@
 """A run on a cluster: what its jobs ask for, which steps go there together, and that they end with the run.
 
 Snakemake submits a job, and on its node starts one step after the other, each in a process of its own as on one
-machine. The pipe that ends jobs with their run (children.py) does not reach another machine: there, a thread
+machine. The pipe that ends jobs with their run (processes.py) does not reach another machine: there, a thread
 watches the run's lease on the shared store.
 """
 

@@ -18,8 +18,7 @@ from typing import Any
 
 from chebsplat.formats.files import atomic_write, explained
 from chebsplat.pipelines.planning.plan import Plan, Step
-from chebsplat.pipelines.running import cluster, job
-from chebsplat.pipelines.running import processes as children
+from chebsplat.pipelines.running import cluster, job, processes
 from chebsplat.pipelines.work import leases, store, summary
 from chebsplat.pipelines.work.store import say
 from chebsplat.pipelines.work.summary import aligned
@@ -122,7 +121,7 @@ def snakemake(
         code: int | None = None
         try:
             beside = rehearsal_command(entries) if on == cluster.LOCAL and cores > 1 else []
-            code = children.snakemake(words, store.work() / ".snakemake/cache", arguments, environment, beside)
+            code = processes.snakemake(words, store.work() / ".snakemake/cache", arguments, environment, beside)
             return failures(steps, folder, words) if code else Outcome()
         finally:
             if code != 0 and on != cluster.LOCAL:

@@ -28,6 +28,8 @@ LAST = "evaluate"  # a study measures; a page and an ONNX file for each of its r
 
 Sections = dict[str, dict[str, Any]]  # of a config; their values are checked where a run is planned
 Name = Annotated[str, Field(max_length=200), AfterValidator(printable)]
+EVERY = 1.0  # seconds between looks at what is finished
+REFRESH = 300.0  # seconds at least between two writings of a study's page while it runs
 
 
 class Budgets(Section):
@@ -256,10 +258,6 @@ def describe(steps: list[Step]) -> str:
     for step in steps:
         counts[step.stage] = counts.get(step.stage, 0) + 1
     return "to run: " + ", ".join(f"{n} {stage}" for stage, n in counts.items()) if counts else "nothing to run"
-
-
-EVERY = 1.0  # seconds between looks at what is finished
-REFRESH = 300.0  # seconds at least between two writings of a study's page while it runs
 
 
 @contextmanager

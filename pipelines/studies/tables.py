@@ -15,6 +15,7 @@ from chebsplat.pipelines.studies.study import Study
 
 COSTS = ("n_gaussians", "sh_kept", "bytes_ply", "bytes_ragged", "frames_per_second", "train_seconds")
 BY_SCENE = ("miou", "miou_gain", "psnr", "n_gaussians", "train_seconds")
+SHOWN = [figure for figure in FIGURES if figure.key in ("miou", "psnr")]
 
 
 @dataclass(frozen=True)
@@ -121,9 +122,6 @@ def left_out(rows: list[Row]) -> list[tuple[str, str, str]]:
         for entry in row["left_out"].items():
             variants.setdefault(entry, {})[row["variant"]] = None
     return sorted((*entry, "all" if len(by) == len(every) else ", ".join(by)) for entry, by in variants.items())
-
-
-SHOWN = [figure for figure in FIGURES if figure.key in ("miou", "psnr")]
 
 
 @dataclass(frozen=True)

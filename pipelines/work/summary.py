@@ -16,6 +16,9 @@ from chebsplat.formats import artifact
 from chebsplat.formats.artifact import read_document
 from chebsplat.pipelines.work import store
 
+RUNS, FAILED, WAITS, LEFT, DONE = "runs", "failed", "waits", "not begun", "done"
+LINES = 5  # of a failed step's log
+
 
 def figures(evaluation: Path) -> Any:
     """What an evaluation measured; None where there is none, or it is damaged (`chebsplat verify` says how)."""
@@ -83,10 +86,6 @@ def show_rows(rows: Sequence[Sequence[str]]) -> None:
     """Print rows in aligned columns."""
     for line in aligned(rows):
         print(line)
-
-
-RUNS, FAILED, WAITS, LEFT, DONE = "runs", "failed", "waits", "not begun", "done"
-LINES = 5  # of a failed step's log
 
 
 @dataclass(frozen=True)

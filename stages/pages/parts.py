@@ -26,6 +26,8 @@ CAPTIONS = {
     "error": "colour error",
     "wrong": "wrong labels",
 }
+SHARED = Path(__file__).parent
+REPORT = SHARED / "report.html"
 
 
 def side(caption: str, base: str, over: str | None = None) -> dict[str, str | None]:
@@ -136,10 +138,6 @@ def counted(labels: np.ndarray) -> dict[int, int]:
     """Pixels of each label of a map; -1 is none."""
     present, counts = np.unique(labels[labels >= 0], return_counts=True)
     return dict(zip(present.tolist(), counts.tolist(), strict=True))
-
-
-SHARED = Path(__file__).parent
-REPORT = SHARED / "report.html"
 
 
 def rendered(template: Path, narrow: int = 700, **values: Any) -> str:

@@ -25,6 +25,11 @@ log = logging.getLogger("chebsplat")
 PHOTOS, PAIRS = 8, 64  # a thread's share between two lines of progress; each such block of pairs indexes its views anew
 LEAST = 15  # matches of a pair that has any: pycolmap's own, of a free search
 LARGEST = 128  # features of a view, by size, that say how alike two views are
+FEW = 40  # views that are all matched with each other: 780 pairs, two to three minutes of a core
+TURN = 30.0  # degrees between two viewing directions that weigh like the capture's median distance of two cameras
+APART = 90.0  # degrees; views that face farther from each other share no feature that SIFT could match
+IN_A_ROW = 5  # views on either side in the order of names
+RATIO = 0.8  # Lowe's, of the distances of the nearest and the second nearest descriptor
 
 
 def file_of(view: int) -> str:
@@ -163,13 +168,6 @@ def _in_blocks(job: Job, items: list[Any], size: int, what: str) -> Iterator[lis
 
 def _cameras_differ(capture: Capture) -> bool:
     return not np.allclose(capture.Ks, capture.Ks[:1])
-
-
-FEW = 40  # views that are all matched with each other: 780 pairs, two to three minutes of a core
-TURN = 30.0  # degrees between two viewing directions that weigh like the capture's median distance of two cameras
-APART = 90.0  # degrees; views that face farther from each other share no feature that SIFT could match
-IN_A_ROW = 5  # views on either side in the order of names
-RATIO = 0.8  # Lowe's, of the distances of the nearest and the second nearest descriptor
 
 
 def matching_mode(wanted: str, n_views: int, posed: bool) -> str:

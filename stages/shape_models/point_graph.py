@@ -1,4 +1,4 @@
-"""The point encoder as an ONNX graph, operation by operation as torch computes it (see `stages.onnx_graphs`)."""
+"""The point encoder as an ONNX graph (see `region_graph`), and the contracts of all our ONNX files."""
 
 from __future__ import annotations
 

@@ -25,6 +25,13 @@ from chebsplat.stages.sources.pictures import open_photo
 
 GUESS = 1.2  # focal length in longer sides, where EXIF says nothing
 FILM = 36.0  # mm, the longer side of the frame that 35 mm equivalents refer to
+log = logging.getLogger("chebsplat")
+VIEWS, LEAST = 16, 8  # photos that the lens is estimated from: at most, and at least
+SIDE, SMALLEST = 1000, 320  # pixels of the longer side: what photos are reduced to, and under which none is looked at
+FEATURES = 2048  # of a photo: the largest ones
+REGISTERED = 0.75  # part of the photos that must register
+SEEN = 0.5  # pixels, of SIDE, that a corner is moved by; a lens that moves it less counts as straight
+STRONGEST = 0.4  # |k|: beyond it the estimate is none of a lens, but of a wrong model
 
 
 def read(folder: Path, settings: Any, class_names: tuple[str, ...] | None = None) -> dict[str, Any]:
@@ -70,16 +77,6 @@ def _listing(folder: Path) -> Listing:
             f"{guessed} of {len(frames)} photos have no focal length; {GUESS} times the longer side is the first guess."
         )
     return Listing("photos", frames, notes=notes, upright=True)
-
-
-log = logging.getLogger("chebsplat")
-
-VIEWS, LEAST = 16, 8  # photos that the lens is estimated from: at most, and at least
-SIDE, SMALLEST = 1000, 320  # pixels of the longer side: what photos are reduced to, and under which none is looked at
-FEATURES = 2048  # of a photo: the largest ones
-REGISTERED = 0.75  # part of the photos that must register
-SEEN = 0.5  # pixels, of SIDE, that a corner is moved by; a lens that moves it less counts as straight
-STRONGEST = 0.4  # |k|: beyond it the estimate is none of a lens, but of a wrong model
 
 
 class Lens(NamedTuple):

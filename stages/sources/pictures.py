@@ -20,6 +20,8 @@ DEEP = {"I", "I;16", "I;16B"}  # 16-bit
 GREY = DEEP | {"L", "P"}
 SAME_SHAPE = 0.02  # difference in aspect ratio that still counts as another resolution of the same picture
 LARGEST = 16 << 20  # bytes of a view's confidences: 4 million in single precision
+IGNORED = {"void", "ignore", "ignored", "unlabeled", "unlabelled", "undefined", "unknown"}
+MAX_ID = 65_535  # what 16 bits hold
 
 
 @contextmanager
@@ -95,10 +97,6 @@ def nearest(values: np.ndarray, at: np.ndarray, size: tuple[int, int]) -> np.nda
 
 def _by(size: tuple[int, int]) -> str:
     return f"{size[0]}x{size[1]}"
-
-
-IGNORED = {"void", "ignore", "ignored", "unlabeled", "unlabelled", "undefined", "unknown"}
-MAX_ID = 65_535  # what 16 bits hold
 
 
 def label_ids(frame: Frame, listing: Listing, size: tuple[int, int], at: np.ndarray) -> np.ndarray:

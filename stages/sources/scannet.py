@@ -21,6 +21,21 @@ OFF_CENTRE = 0.1  # of the width, by which a principal point may lie off the mid
 POINTS = "points3d.ply"
 PSEUDO, CONFIDENCE = "m2f_semantics", "m2f_probabilities"  # of Mask2Former with test-time augmentation
 OF_PL = ("splits.json", "segmentation_data.pkl", "rs_semantics", "m2f_semantics")  # never in an SG folder
+MODIFIED, COMBINED = "scannetv2-labels.modified.tsv", "scannet-labels.combined.tsv"
+OTHER = "otherprop"  # SG's id 0: known and ignored
+CORRECTED = 60_000  # plus an NYU class: raw ids of hand-corrected objects, above all of ScanNet's
+# Objects that the authors of Panoptic Lifting relabel by hand, as ScanNet has them wrong: object id -> NYU class.
+CORRECTIONS: dict[str, dict[int, int]] = {
+    "scene0050_02": {24: 37, 26: 37, 12: 6, 1: 6, 16: 9},
+    "scene0144_01": {4: 3, 13: 3, 5: 3},
+    "scene0221_01": {15: 7, 36: 15, 37: 1, 38: 1},
+    "scene0300_01": {13: 25, 14: 25, 20: 37},
+    "scene0389_00": {19: 37, 20: 3, 21: 3, 28: 37},
+    "scene0423_02": {6: 7},
+    "scene0616_00": {21: 1, 22: 1, 24: 1, 25: 1, 30: 1, 31: 1},
+    "scene0645_02": {5: 7, 6: 3, 25: 5, 41: 5, 27: 37, 32: 37, 34: 37, 60: 0, 61: 37},
+    "scene0693_00": {1: 1, 4: 1, 6: 3, 11: 8, 20: 40},
+}
 
 
 def read(folder: Path, settings: Any, class_names: tuple[str, ...] | None = None) -> dict[str, Any]:
@@ -163,24 +178,6 @@ def _listing(folder: Path) -> Listing:
     if unused := [name for name in others if (folder / name).exists()]:
         listing.notes.append(f"Not read: {', '.join(unused)}.")
     return listing
-
-
-MODIFIED, COMBINED = "scannetv2-labels.modified.tsv", "scannet-labels.combined.tsv"
-OTHER = "otherprop"  # SG's id 0: known and ignored
-CORRECTED = 60_000  # plus an NYU class: raw ids of hand-corrected objects, above all of ScanNet's
-
-# Objects that the authors of Panoptic Lifting relabel by hand, as ScanNet has them wrong: object id -> NYU class.
-CORRECTIONS: dict[str, dict[int, int]] = {
-    "scene0050_02": {24: 37, 26: 37, 12: 6, 1: 6, 16: 9},
-    "scene0144_01": {4: 3, 13: 3, 5: 3},
-    "scene0221_01": {15: 7, 36: 15, 37: 1, 38: 1},
-    "scene0300_01": {13: 25, 14: 25, 20: 37},
-    "scene0389_00": {19: 37, 20: 3, 21: 3, 28: 37},
-    "scene0423_02": {6: 7},
-    "scene0616_00": {21: 1, 22: 1, 24: 1, 25: 1, 30: 1, 31: 1},
-    "scene0645_02": {5: 7, 6: 3, 25: 5, 41: 5, 27: 37, 32: 37, 34: 37, 60: 0, 61: 37},
-    "scene0693_00": {1: 1, 4: 1, 6: 3, 11: 8, 20: 40},
-}
 
 
 def mapped(path: Path | None) -> dict[int, str]:

@@ -25,7 +25,7 @@ from chebsplat.synthetic import CLASS_NAMES
 
 log = logging.getLogger("chebsplat")
 
-SEEDS = range(21_000, 21_100)  # no other rooms have them (synthetic/seeds.py); named here, where no scene depends on it
+SEEDS = range(21_000, 21_100)  # no other rooms' (synthetic/layout.py); named here, where no scene depends on it
 N_VIEWS, N_POINTS = 16, 20_000  # of a room
 FITTED = 2000  # points of a room that the probability is fitted to
 LEAST = 20  # points of a class, of which a room has it; fewer, and nobody can tell

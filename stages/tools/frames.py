@@ -33,6 +33,8 @@ KINDS = ("color", "labels", "depth", "relevancy")
 SEMANTIC = ("labels", "relevancy")
 REQUEST = "frames.json"
 PNG_END = b"\0\0\0\0IEND\xaeB`\x82"  # the last chunk
+INSTALL = ".venv/bin/pip install -e '.[video]'"
+CRF = "18"  # x264's constant rate factor: hardly told from the frames by eye
 
 
 @dataclass(frozen=True)
@@ -186,10 +188,6 @@ def depth_colors(depth: np.ndarray, far: float) -> np.ndarray:
 
     colors = colormaps["turbo"](1 - (np.nan_to_num(depth, nan=far) / far).clip(0, 1))[..., :3]
     return np.where(np.isnan(depth)[..., None], 0, np.round(255 * colors)).astype(np.uint8)
-
-
-INSTALL = ".venv/bin/pip install -e '.[video]'"
-CRF = "18"  # x264's constant rate factor: hardly told from the frames by eye
 
 
 def library() -> Any:

@@ -30,6 +30,7 @@ REPOSITORY = re.compile(r"hf:([\w.-]+/[\w.-]+?)(?:@([\w./-]+))?")
 GRAPH, CLASSES, PREPARATION = "onnx/model.onnx", "config.json", "preprocessor_config.json"
 WIDER = 4 / 3  # of a photo than of the square that a segmenter is trained on
 AGAIN = "run the same command again"
+SHOWN = 8  # labels
 
 
 def get_teacher(name: str, out: Path | None = None, graph: str = GRAPH) -> tuple[Path, list[tuple[str, str]]]:
@@ -176,9 +177,6 @@ def preparation(path: Path, repository: str) -> dict[str, Any]:
             "the model yourself (docs/teachers.md)"
         )
     return {"mean": mean, "std": std, "size": sides, "base": round(max(sides) * WIDER)}
-
-
-SHOWN = 8  # labels
 
 
 def check(model: Path, photo: Path | None = None, labels: str | None = None) -> list[tuple[str, str]]:

@@ -36,6 +36,8 @@ from chebsplat.stages.shape_models.predictions import answered, shown
 from chebsplat.stages.teacher_models.text_encoder import found
 from chebsplat.stages.tools.page import foreign
 
+log = logging.getLogger("chebsplat")
+
 
 def lift_ply(
     ply: Path, capture: Path, points: Path | None, features: Path | None, model: Path | None, out: Path
@@ -111,9 +113,6 @@ def taught(capture: Path, model: Path | None, out: Path) -> Path:
         inputs["channels"] = out / "channels"
     publish("teacher", teacher.run, out / "teacher", inputs, config)
     return out / "teacher"
-
-
-log = logging.getLogger("chebsplat")
 
 
 def label_ply(

@@ -30,7 +30,7 @@ def mesh_of(
     Args: voxel: edge, scene units; None: the 250th part of the room; n_triangles: at most; raw: nothing is cleaned.
     Raises: ConfigError on a scene without cameras; DataFailure where its Gaussians show no surface.
     Choices: depth is that of `render_depth`, from every view of the capture; a pixel on an edge of depth has none. A
-      vertex means what the Gaussians around it mean (`evaluation.surface.features_at`).
+      vertex means what the Gaussians around it mean (`evaluation.metrics.features_at`).
     """
     if not scene.cameras:
         raise ConfigError(f"{scene.source} has no cameras to see its surface from; open a scene that was trained")

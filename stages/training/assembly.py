@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+import logging
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -32,6 +33,8 @@ from chebsplat.stages.training.views import training_views
 from chebsplat.training.model import SceneModel
 from chebsplat.training.trainer import Trainer
 
+log = logging.getLogger("chebsplat")
+
 
 @dataclass
 class Inputs:
@@ -57,21 +60,24 @@ def read_inputs(job: Job) -> Inputs:
 
 
 def assemble(job: Job, inputs: Inputs, backend: str = "auto") -> Trainer:
-    """A trainer before its first step, its open settings resolved; what it does without goes into the job's facts.
+    """A trainer before its first step, its open settings resolved; they, and what is off and why, become facts.
 
     Args: backend: of `rasterize`.
     Raises: ConfigError, InputError or DataFailure, as its parts do.
     """
     capture, points, features = inputs.capture, inputs.points, inputs.features
+    evidence = evidence_of(job.config.train, capture, points, features)
     exposures = _exposures(job, capture, points)
-    evidence = evidence_of(job.config.train, capture, points, features, job.facts.get("exposure_stops", {}).get("own"))
-    train = resolved(job.config.train, evidence)
-    job.facts["decided"] = decided(job.config.train, train)
+    stops = job.facts.get("exposure_stops", {}).get("own")
+    train = resolved(job.config.train, replace(evidence, exposure_spread=stops))
+    job.facts["decided"] = decided(job.config.train, train, features is not None)
     _note_left_out(job, train, features is not None, evidence.no_depth)
     torch.set_num_threads(n_threads())  # sums of torch depend on it; the same bytes are promised for the same number
     model = model_of(points, features, train, job.config.describe, job.device, backend)
     regions, descriptors = first_regions(inputs.descriptors)
     undone = exposures if train.exposure == "measured" else None
+    if undone is not None:
+        log.info("exposures of photos differ by %.2f stops from those about them: undone", stops)
     views = training_views(capture, points, features, bool(train.weight_depth), undone).to(job.device)
     if features is not None and train.feature_start == "lifted":
         if not start_features(model, capture, points, features, job.progress):
@@ -87,7 +93,9 @@ def assemble(job: Job, inputs: Inputs, backend: str = "auto") -> Trainer:
 
 
 def _exposures(job: Job, capture: Capture, points: Points) -> np.ndarray | None:
-    """Exposures [V, 3] that training photos have alone, in stops, and their spread as a fact; None: not measured."""
+    """How each training photo's exposure differs from its neighbours' [V, 3], stops; None: not measured. The spread
+    becomes a fact.
+    """
     wanted = job.config.train.exposure
     if wanted == "off" or (wanted == "auto" and capture.source.get("kind") == "generated"):
         return None

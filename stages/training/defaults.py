@@ -14,7 +14,7 @@ from chebsplat.settings import MOST_STEPS, TrainSection
 from chebsplat.stages.training.views import disagreement, training_rows
 
 OPEN = (None, "auto")  # values of a setting that leave it open
-FEWEST = 1000  # steps below which rates rise no further, and that a training has unless it is told
+FEWEST = 1000  # steps that a training has by default, at least; below it rates rise no further
 PUBLISHED = 30_000  # steps that 3DGS's rates are for
 TRAVEL, FASTEST = 10.0, 5e-2  # a features' rate: less than TRAVEL over all steps does not arrive
 DEPTH_WEIGHT = 0.8
@@ -30,7 +30,7 @@ class Evidence:
     n_views, n_pixels: of the training photos, in all.
     points_measured: initial points lie on measured surfaces.
     no_depth: why measured depth is not relied on ("": it is).
-    labels: that the teacher brings with a confidence: `none`, `taught`, or `given` by the source; None: no teacher.
+    labels: where labels with a confidence come from: `none`, `taught`, `given` (by the source); None: no teacher.
     exposure_spread: of the photos' own exposures, stops; None: not measured.
     """
 
@@ -83,7 +83,7 @@ def _by_steps(published: float, power: float) -> Default:
         assert train.steps is not None
         return published * max(PUBLISHED / max(train.steps, FEWEST), 1) ** power
 
-    return Default(rate, f"steps, as from {FEWEST} to 30,000: {published:g} (30,000 / steps)^{power:g}")
+    return Default(rate, f"steps, taken as {FEWEST} to 30,000: {published:g} (30,000 / steps)^{power:g}")
 
 
 def _features_rate(train: TrainSection, _: Evidence) -> float:
@@ -123,47 +123,41 @@ DEFAULTS = {  # in this order: a later one may ask for an earlier
 
 
 def resolved(train: TrainSection, evidence: Evidence) -> TrainSection:
-    """The section with every setting that it leaves open decided.
-
-    Raises: ConfigError where the teacher has not what `train.feature_loss` asks for.
-    """
-    if train.feature_loss == "cross-entropy" and evidence.labels == "none":
-        raise ConfigError(
-            "train.feature_loss is cross-entropy, but the teacher brings no labels with a confidence; use length"
-        )
+    """The section with every setting that it leaves open decided."""
     for name, default in DEFAULTS.items():
         if getattr(train, name) in OPEN:
             train = train.model_copy(update={name: default.value(train, evidence)})
     return train
 
 
-def decided(train: TrainSection, done: TrainSection) -> dict[str, dict[str, Any]]:
-    """What was decided of the settings that `train` leaves open: value and evidence by name."""
-    names = [name for name in DEFAULTS if getattr(train, name) in OPEN]
+def decided(train: TrainSection, done: TrainSection, with_features: bool) -> dict[str, dict[str, Any]]:
+    """What was decided of the settings that `train` leaves open and the training uses: value and evidence by name."""
+    unused = set() if with_features else {"feature_every", "feature_start", "feature_loss", "lr_features"}
+    unused |= {"opacity"} if train.start else set()
+    names = [name for name in DEFAULTS if getattr(train, name) in OPEN and name not in unused]
     return {name: {"value": getattr(done, name), "by": DEFAULTS[name].by} for name in names}
 
 
-def evidence_of(
-    train: TrainSection, capture: Capture, points: Points, features: Features | None, exposure_spread: float | None
-) -> Evidence:
-    """What the section's open settings are decided by; only what they ask for is measured.
+def evidence_of(train: TrainSection, capture: Capture, points: Points, features: Features | None) -> Evidence:
+    """What open settings are decided by, but for the photos' exposures; only what they ask for is measured.
 
-    Args: exposure_spread: as in `Evidence`.
-    Raises: InputError if capture and points do not belong together, DataFailure without a training view.
+    Raises: ConfigError where the teacher has not what `train.feature_loss` asks for, InputError if capture and points
+      do not belong together, DataFailure without a training view.
     """
     n_views = len(training_rows(capture, points))
     labels = None if features is None else "none"
     if features is not None and features.pseudo_labels is not None and features.confidence is not None:
-        labels = "taught"
-    if features is not None and features.convention.get("kind") == "given":
-        labels = "given"
+        labels = "given" if features.convention.get("kind") == "given" else "taught"
+    if train.feature_loss == "cross-entropy" and labels == "none":
+        raise ConfigError(
+            "train.feature_loss is cross-entropy, but the teacher brings no labels with a confidence; use length"
+        )
     return Evidence(
         n_views=n_views,
         n_pixels=n_views * capture.size[0] * capture.size[1],
         points_measured=points.notes.get("how") == "depth" or "n_from_depth" in points.notes,
         no_depth=_why_no_depth(capture, points) if train.weight_depth is None else "",
         labels=labels,
-        exposure_spread=exposure_spread,
     )
 
 

@@ -1,4 +1,6 @@
-"""An interrupted training goes on where it was last saved, to the same bytes."""
+"""An interrupted training goes on where it was last saved, to the same bytes; and
+what a checkpoint says of its training.
+"""
 
 from __future__ import annotations
 
@@ -23,6 +25,7 @@ from chebsplat.stages.runtime.config import checked
 
 log = logging.getLogger("chebsplat")
 SECONDS = 30.0  # between two saves
+LAYOUT = 2  # of a state: one of another layout is not gone on from
 
 
 class Saves:
@@ -37,7 +40,14 @@ class Saves:
         settings = job.config.sections(("describe", "train"))
         versions = {name: version(name) for name in ("torch", "numba")}
         self.identity = digest(
-            {"inputs": inputs, "config": settings, "device": job.device, "versions": versions, "threads": n_threads()}
+            {
+                "inputs": inputs,
+                "config": settings,
+                "device": job.device,
+                "versions": versions,
+                "threads": n_threads(),
+                "layout": LAYOUT,
+            }
         )
         self.file = job.scratch / "training.pt"
         self.saved = time.monotonic()

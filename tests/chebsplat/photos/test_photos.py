@@ -135,7 +135,7 @@ def test_the_depth_loss_is_on_where_views_tell_the_same_depth():
     capture, points = photographed("colmap", [1, 1, 1])
 
     def decided(**given):
-        evidence = evidence_of(TrainSection(**given), capture, points, None, None)
+        evidence = evidence_of(TrainSection(**given), capture, points, None)
         return resolved(TrainSection(**given), evidence).weight_depth, evidence.no_depth
 
     assert decided() == (0, "the capture has no depth in the unit of its poses")

@@ -91,7 +91,7 @@ def decided(train, features):
     """The section resolved for these features."""
     capture = SimpleNamespace(names=["a"], is_test=np.zeros(1, bool), size=(1, 1), depth=None, cam_from_world=None)
     points = SimpleNamespace(names=["a"], notes={}, depths=None)
-    return resolved(train, evidence_of(train, capture, points, features, None))
+    return resolved(train, evidence_of(train, capture, points, features))
 
 
 def test_labels_that_a_source_brings_are_learned_by_cross_entropy_unless_told_otherwise():

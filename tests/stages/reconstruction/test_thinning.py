@@ -124,6 +124,6 @@ def test_gaussians_start_surer_where_depth_is_measured(notes, opacity):
     config = Config()
     capture = SimpleNamespace(names=["a"], is_test=np.zeros(1, bool), size=(1, 1), depth=None, cam_from_world=None)
     for wanted, train in ((opacity, config.train), (0.2, config.train.model_copy(update={"opacity": 0.2}))):
-        train = resolved(train, evidence_of(train, capture, given, None, None))
+        train = resolved(train, evidence_of(train, capture, given, None))
         model = model_of(given, None, train, config.describe)
         assert model.raw["logit_opacities"].detach().sigmoid().numpy() == pytest.approx(wanted)
