@@ -143,9 +143,7 @@ def test_rooms_import_one_another_one_way(layer):
 
 def test_no_imports_run_in_a_circle():
     graph = {module: imported_by(path) for module, path in MODULES.items()}
-    TopologicalSorter(
-        graph
-    ).prepare()  # raises CycleError, which names the circle; `cli.runs` names the group at run time
+    TopologicalSorter(graph).prepare()  # or CycleError, which names it; `cli.runs` loads its group at run time
 
 
 def test_formats_know_no_torch():
