@@ -62,11 +62,11 @@ def basis(directions: Tensor, degree: int) -> Tensor:
 def light(coefficients: Tensor, directions: Tensor, degree: int, backend: str = "auto") -> Tensor:
     """Light [N, 3] along directions [N, 3], normalised here, of coefficients [N, at least (degree + 1)², 3].
 
-    Choices: on a GPU gsplat's own kernel, for which fifty operations there would be one each to wait for.
+    Raises: ImportError, with the remedy, on a GPU without gsplat, unless backend is `reference`.
+    Choices: on a GPU gsplat's own kernel: fifty operations there would be fifty launches to wait for.
     """
     if coefficients.device.type == "cuda" and backend != "reference":
-        spherical_harmonics = gsplat().spherical_harmonics
-        seen: Tensor = spherical_harmonics(degree, directions, coefficients)
+        seen: Tensor = gsplat().spherical_harmonics(degree, directions, coefficients)
         return seen
     values = basis(torch.nn.functional.normalize(directions, dim=-1), degree)
     return torch.einsum("nk,nkc->nc", values, coefficients[:, : n_coefficients(degree)])
