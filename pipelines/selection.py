@@ -1,4 +1,4 @@
-"""What a command or a call from Python asks for: the plans of a scene or a sequence, up to a stage."""
+"""Plans that a command or a call from Python asks for: of a scene or a sequence, up to a stage."""
 
 from __future__ import annotations
 

@@ -48,7 +48,7 @@ def spread(descriptors: Tensor, mask: Tensor) -> float:
 
 @dataclass(frozen=True)
 class Growth:
-    """How a basis grows.
+    """Limits and rules of a basis' growth.
 
     energy:    fraction of energy to reach: of captured + residual (`total`), or of the residual alone (the printed
                rule, which always adds a vector).

@@ -1,4 +1,4 @@
-"""What a descriptor is asked for, and what is found: shared by its compiled and its plain form. No torch."""
+"""Parameters and results of a descriptor, shared by its compiled and its plain form. No torch."""
 
 from __future__ import annotations
 

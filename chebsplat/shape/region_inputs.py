@@ -60,8 +60,8 @@ def in_scene(means: np.ndarray) -> np.ndarray:
 
 
 class Tokens(NamedTuple):
-    """What an encoder is fed with: how many regions reach a Gaussian at most, whether tokens hold descriptors, and
-    features, and where they lie (see `placed`).
+    """An encoder's tokens: how many regions reach a Gaussian at most, whether they hold descriptors, and features, and
+    where they lie (see `placed`).
     """
 
     n_covers: int

@@ -37,7 +37,7 @@ def region_gradients(gradients: Tensor, members: Tensor) -> Tensor:
 
 @dataclass(frozen=True)
 class Candidates:
-    """How many places for new Gaussians are drawn, and which are good.
+    """Number of places drawn for new Gaussians, and bounds of those that are kept.
 
     density:  a local spacing³ (α of Eq 12; printed: a cubic scene unit); max_candidates: of a region.
     nearest, farthest: bounds of the distance to the nearest Gaussian, in local spacings.

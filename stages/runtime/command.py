@@ -80,7 +80,7 @@ def command(name: str, run: Callable[[Job], None]) -> click.Command:
 
 @dataclass
 class Planned:
-    """What the planner knows of a step: its key (None: of settings and inputs alone), the identity of its code, and
+    """The planner's part of a step: its key (None: of settings and inputs alone), the identity of its code, and
     what it reads and computes within, which at its end can keep the artifact from being published.
     """
 

@@ -38,7 +38,7 @@ log = logging.getLogger("chebsplat")
 
 @dataclass
 class Inputs:
-    """What a training starts from. features: None without semantics; descriptors: None: the training makes its own."""
+    """Artifacts of a training. features: None without semantics; descriptors: None: the training makes its own."""
 
     capture: Capture
     points: Points
@@ -93,7 +93,7 @@ def assemble(job: Job, inputs: Inputs, backend: str = "auto") -> Trainer:
 
 
 def _exposures(job: Job, capture: Capture, points: Points) -> np.ndarray | None:
-    """How each training photo's exposure differs from its neighbours' [V, 3], stops; None: not measured. The spread
+    """Differences of training photos' exposures from their neighbours' [V, 3], stops; None: not measured. The spread
     becomes a fact.
     """
     wanted = job.config.train.exposure

@@ -25,7 +25,7 @@ LEAST_SPREAD = 0.05  # stops between the photos' own exposures, from which on th
 
 @dataclass(frozen=True)
 class Evidence:
-    """What is known of a scene before its training.
+    """Facts of a scene before its training, by which open settings are decided.
 
     n_views, n_pixels: of the training photos, in all.
     points_measured: initial points lie on measured surfaces.
@@ -44,7 +44,7 @@ class Evidence:
 
 @dataclass(frozen=True)
 class Default:
-    """How an open setting is decided: `value` of the section so far and the evidence; `by`: in words, for the docs."""
+    """Rule for an open setting: `value` of the section so far and the evidence; `by`: in words, for the docs."""
 
     value: Callable[[TrainSection, Evidence], Any]
     by: str
@@ -131,7 +131,7 @@ def resolved(train: TrainSection, evidence: Evidence) -> TrainSection:
 
 
 def decided(train: TrainSection, done: TrainSection, with_features: bool) -> dict[str, dict[str, Any]]:
-    """What was decided of the settings that `train` leaves open and the training uses: value and evidence by name."""
+    """Value and evidence, by name, of each setting that `train` leaves open and the training uses."""
     unused = set() if with_features else {"feature_every", "feature_start", "feature_loss", "lr_features"}
     unused |= {"opacity"} if train.start else set()
     names = [name for name in DEFAULTS if getattr(train, name) in OPEN and name not in unused]
@@ -139,7 +139,7 @@ def decided(train: TrainSection, done: TrainSection, with_features: bool) -> dic
 
 
 def evidence_of(train: TrainSection, capture: Capture, points: Points, features: Features | None) -> Evidence:
-    """What open settings are decided by, but for the photos' exposures; only what they ask for is measured.
+    """Evidence for the open settings, but for the photos' exposures; only what they ask for is measured.
 
     Raises: ConfigError where the teacher has not what `train.feature_loss` asks for, InputError if capture and points
       do not belong together, DataFailure without a training view.
@@ -162,7 +162,7 @@ def evidence_of(train: TrainSection, capture: Capture, points: Points, features:
 
 
 def _why_no_depth(capture: Capture, points: Points) -> str:
-    """Why a training does not rely on measured depth ("": it does).
+    """Reason for not relying on measured depth ("": it is relied on).
 
     Choices: not if the capture has no poses, since its unit is not the scene's then, nor if its views contradict one
       another, as a sensor's do: its noise and its place beside the colour camera would be taught. Swept depth is only

@@ -1,4 +1,4 @@
-"""What a finished training says of itself."""
+"""Facts of a finished training, for its manifest."""
 
 from __future__ import annotations
 
