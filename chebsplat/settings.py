@@ -36,7 +36,7 @@ class Section(BaseModel):
 
 
 class DescribeSection(Section):
-    """docs/method.md, section 2; shared by the describe stage and the refresh inside training."""
+    """docs/method.md, section 2; of the descriptors, and of the regions that training grows by."""
 
     # with 10 for a, 8 angles are better than 4 and 30 at ghosts and noisy frames
     n_angles: int = number(8, "rotations of the anisotropic metric (J)", 1, 64)
@@ -98,16 +98,10 @@ class TrainSection(Section):
         "of trained features: what the teacher's views say of the Gaussians at the start, or nothing; default: lifted "
         "from 40 views on",
     )
-    encoder: Literal["points", "transformer", "mlp", "off"] = setting(
-        "points",
-        "of points: taught over many rooms, frozen, used once the scene is trained; transformer: the paper's, of "
-        'regions, trained with the scene; mlp: its "no TLE"; off: no shape branch',
+    encoder: Literal["points", "off"] = setting(
+        "points", "of points: taught over many rooms, frozen, used once the scene is trained; off: none"
     )
-    albo: bool = setting(True, "tokens hold descriptors")
     prune: bool = setting(True, "remove Gaussians that add nothing")
-    prune_gate: Literal["product", "printed"] = setting(
-        "product", "of the logit of a Gaussian and one of its features; printed: the paper's two gates in a row"
-    )
     prune_semantic: bool = setting(True, 'features guard Gaussians from pruning; false: "no semantic guidance"')
     densify: Literal["mixed", "region", "classic", "off"] = setting(
         "mixed", "where Gaussians grow; mixed: region and classic by turns"
@@ -117,13 +111,7 @@ class TrainSection(Section):
         1e-4, "gradient to the 2D means that grows a Gaussian, half image widths", 1e-12, 1e3
     )
     sh_prune: bool = setting(True, "close SH bands that add nothing")
-    sh_masks: Literal["logits", "printed"] = setting(
-        "logits", "of a Gaussian's SH bands, guided by colour; printed: the paper's network, guided by semantics too"
-    )
     sh_guided: bool = setting(True, "false: nothing but a Gaussian's own logits closes its SH bands")
-    grow_rule: Literal["spacing", "printed"] = setting(
-        "spacing", "candidates by a region's volume in local spacings; printed: in scene units"
-    )
     # photos
     exposure: Literal["auto", "measured", "off"] = setting(
         "auto", "of photos; measured: what one has alone is undone; auto: where they differ"
@@ -135,26 +123,12 @@ class TrainSection(Section):
     sh_degree: int = number(3, "of colour, at most", 0, 3)
     max_gaussians: int = number(40_000, "growing stops here; more initial points are thinned", 16, 5_000_000)
     min_gaussians: int = number(64, "pruning stops here", 1, 5_000_000)
-    width: int = number(32, "of the encoder's tokens", 4, 1024)
-    n_layers: int = number(2, "of the encoder", 1, 64)
-    n_heads: int = number(4, "of the encoder's attention; divides width", 1, 64)
     feature_every: int | None = number(
         None, "steps from one that teaches features to the next; default: views / 10, from 1 to 4", 1, 1_000_000
     )
     depth_every: int = number(4, "steps from one that places the surface by measured depth to the next", 1, 1_000_000)
-    encode_every: int = number(4, "steps from one that encodes regions anew to the next", 1, 1_000_000)
-    regions_per_step: int = number(32, "encoded anew in such a step; the others come from the cache", 1, 4096)
-    n_covers: int = number(4, "regions that reach a Gaussian, at most", 1, 64)
-    context: Literal["features", "none"] = setting("features", "what tokens hold beside the descriptor")
-    inflation: float = number(0.25, "of a region's scales where it reaches Gaussians, in radii; 0: printed", 0, 10)
-    temperature: float = number(1.0, "of a region's weight at a Gaussian (τ of Eq 8)", 1e-6, 1e6)
-    gate_start: float = number(3.0, "bias of the fusion's gate at the start; 0: shape and features alike", -10, 10)
-    position: Literal["region", "center", "both"] = setting(
-        "region", "of a token: from the region's centre in radii, or (printed) the Gaussian's own in the scene"
-    )
     # schedule, as fractions of the budget
     coarse_until: float = number(0.1, "fraction of the training at half resolution", 0, 1)
-    encode_from: float = number(0.1, "fraction after which regions are encoded", 0, 1)
     densify_from: float = number(0.1, "fraction after which Gaussians grow", 0, 1)
     densify_until: float = number(0.6, "fraction after which they no longer do", 0, 1)
     n_densify: int = number(12, "how often they grow between the two", 0, 1000)
@@ -162,7 +136,7 @@ class TrainSection(Section):
     prune_from: float = number(0.4, "fraction after which Gaussians are pruned", 0, 1)
     remove_every: int = number(200, "steps from one pruning to the next, once growth is over", 1, 1_000_000)
     sh_freeze: float = number(0.8, "fraction after which SH bands stay as they are", 0, 1)
-    refresh_every: int = number(200, "steps between refreshes of regions and descriptors", 1, 1_000_000)
+    refresh_every: int = number(200, "steps between refreshes of regions", 1, 1_000_000)
     report_every: int = number(100, "steps between rows of the trace", 1, 1_000_000)
     # rates
     # 3DGS's are of 30,000 steps; a training of fewer goes further in each, of fewer than 1000 as far as one of 1000
@@ -184,7 +158,6 @@ class TrainSection(Section):
         "l1: the paper's and Feature-3DGS'; cross-entropy: of labels, weighted by confidence; "
         "default: that for labels that a source brings, else length",
     )
-    weight_shape: float = number(1.0, "of encodings' distance to their members' features; 0: the printed loss", 0, 1e4)
     weight_mask: float = number(1e-2, "of the penalty that closes pruning masks", 0, 1e4)
     weight_sh: float = number(4e-5, "of the penalty that closes SH bands", 0, 1e4)
     weight_depth: float | None = number(
@@ -196,15 +169,8 @@ class TrainSection(Section):
         "constant", "what modulates that pull; network: the paper's, of the shapes in view"
     )
 
-    @property
-    def trains_encoder(self) -> bool:
-        """Whether the training holds an encoder, of regions."""
-        return self.encoder in ("transformer", "mlp")
-
     @model_validator(mode="after")
     def _fits_together(self) -> TrainSection:
         if self.sh_prune and self.densify != "off" and self.densify_until > self.sh_freeze:
             raise ValueError("densify_until must not lie after sh_freeze, when SH bands are closed for good")
-        if self.encoder == "transformer" and self.width % self.n_heads:
-            raise ValueError(f"width {self.width} must be a multiple of n_heads {self.n_heads}")
         return self

@@ -10,7 +10,6 @@ from typing import Annotated, Any, ClassVar, Self
 
 import numpy as np
 
-from chebsplat.errors import InputError
 from chebsplat.formats import artifact
 from chebsplat.formats.cameras import Cameras
 from chebsplat.formats.files import read_text
@@ -26,11 +25,11 @@ class Gaussians:
 
     parameters: `means` [N,3] scene units, `log_scales` [N,3], `quats` [N,4] wxyz, `logit_opacities` [N],
                 `sh0` [N,1,3], `shN` [N,15,3], `degrees` u8 [N] highest SH band kept, and, where the scene has a
-                semantic branch, `features` [N,C] and `fused` [N,C].
+                semantic branch, `features` [N,C].
     cameras:    of the views it was trained and may be evaluated on.
-    modules:    weights of the encoder, gate and masks by dotted name; empty where they were left out.
+    modules:    weights of the semantic gate by dotted name; empty where they were left out.
     trace:      one row a report interval: error against run time.
-    notes:      encoder sizes, label names, and what the scene left out and why.
+    notes:      label names, and what the scene left out and why.
     """
 
     SCHEMA: ClassVar[str] = "chebsplat.gaussians/2"
@@ -39,14 +38,6 @@ class Gaussians:
     modules: dict[str, np.ndarray] = field(default_factory=dict)
     trace: list[dict[str, float]] = field(default_factory=list)
     notes: dict[str, Any] = field(default_factory=dict)
-
-    def encoder(self) -> tuple[dict[str, int], dict[str, np.ndarray]]:
-        """Settings and weights of the local encoder. Raises InputError if the scene was trained without one."""
-        if "encoder" not in self.notes:
-            raise InputError("the scene was trained without an encoder; train it with train.encoder = transformer")
-        prefix = "shape.encoder."
-        weights = {k.removeprefix(prefix): v for k, v in self.modules.items() if k.startswith(prefix)}
-        return self.notes["encoder"], weights
 
     def write(self, out: Path) -> None:
         """Fill the directory that `artifact.publish` yields. Raises ValueError on a non-finite parameter.
@@ -109,7 +100,6 @@ class Checkpoint(Record):
     module_shapes: dict[str, list[int]]
     notes: dict[str, Any]
     features: Annotated[np.ndarray | None, Array("float32", ("gaussian", "channel"))] = None
-    fused: Annotated[np.ndarray | None, Array("float32", ("gaussian", "channel"))] = None
 
 
 def read_trace(path: Path, manifest: Manifest) -> list[dict[str, float]]:

@@ -16,7 +16,6 @@ from chebsplat.formats.ply import REST, write_ply
 from chebsplat.formats.record import Array, Record
 
 LABELS = "labels.json"
-SEMANTIC = ("features", "raw_features")
 RAGGED = ("means", "log_scales", "quats", "sh0", "logit_opacities", "sh1", "sh2", "sh3")
 
 
@@ -25,10 +24,9 @@ class Scene:
     """N Gaussians sorted by SH degree, stably; raw float32 parameters as in `gaussians/2`.
 
     parameters: `means`, `log_scales`, `quats`, `logit_opacities`, `sh0` [N,1,3], `shN` [N,15,3] (zero above a
-                Gaussian's degree), `degrees` u8 [N] ascending; where there are semantics `features` [N,C], refined or
-                fused; where the scene has an encoder, `raw_features` [N,C] that encoder and gate see.
+                Gaussian's degree), `degrees` u8 [N] ascending; where there are semantics `features` [N,C].
     cameras:    of the views it can be evaluated on.
-    order:      i64 [N], row of each Gaussian in the checkpoint, on which the regions depend.
+    order:      i64 [N], row of each Gaussian in the checkpoint.
     labels:     i32 [N] class index, -1 none; None without semantics. label_names, label_embeddings f32 [L, C].
     summary:    counts, bytes, and what was left out and why.
     """
@@ -66,7 +64,7 @@ class Scene:
         for band in range(1, top + 1):
             rows = p["shN"][degrees >= band, REST[band - 1] : REST[band]]
             bands[f"sh{band}"] = rows.reshape(len(rows), -1)
-        steps = {name: float(np.abs(p[name]).max(initial=0)) / 32767 or 1.0 for name in SEMANTIC if name in p}
+        steps = {name: float(np.abs(p[name]).max(initial=0)) / 32767 or 1.0 for name in ("features",) if name in p}
         fixed = {name: np.round(p[name] / step).astype(np.int16) for name, step in steps.items()}
         stored = RaggedScene(
             **{name: p[name] for name in ("means", "log_scales", "quats", "logit_opacities")},
@@ -87,7 +85,7 @@ class Scene:
             "ply": (out / "scene.ply").stat().st_size,
             "split": sum(file.stat().st_size for file in out.glob("scene_d*.ply")),
             "ragged": _bytes_of(out, RAGGED),
-            "semantic": _bytes_of(out, SEMANTIC),
+            "semantic": _bytes_of(out, ("features",)),
         }
         stored.summary["bytes"] = sizes
         stored.write_attributes(out)
@@ -119,7 +117,7 @@ class RaggedScene(Record):
     """`Scene` as stored: a Gaussian pays only for the SH bands that it keeps, and for features in 16-bit fixed point.
 
     All but `degrees` are in order of degree. sh1, sh2, sh3: rows of the Gaussians that keep the band. steps: what an
-    integer of `features` and of `raw_features` counts.
+    integer of `features` counts.
     """
 
     SCHEMA: ClassVar[str] = Scene.SCHEMA
@@ -136,7 +134,6 @@ class RaggedScene(Record):
     sh2: Annotated[np.ndarray | None, Array("float32", ("gaussian_2", 15))] = None
     sh3: Annotated[np.ndarray | None, Array("float32", ("gaussian_3", 21))] = None
     features: Annotated[np.ndarray | None, Array("int16", ("gaussian", "channel"), "a step")] = None
-    raw_features: Annotated[np.ndarray | None, Array("int16", ("gaussian", "channel"), "a step")] = None
     labels: Annotated[np.ndarray | None, Array("int32", ("gaussian",), "class index, -1 none")] = None
     label_embeddings: Annotated[np.ndarray | None, Array("float32", ("label", "channel"))] = None
 

@@ -30,11 +30,9 @@ def run(job: Job) -> None:
     order = np.argsort(gaussians.parameters["degrees"], kind="stable")
     wanted = ("means", "log_scales", "quats", "logit_opacities", "sh0", "shN", "degrees")
     parameters = {name: gaussians.parameters[name][order] for name in wanted}
-    semantic = gaussians.parameters.get("fused", gaussians.parameters.get("features"))
+    semantic = gaussians.parameters.get("features")
     given = later_features(job, len(order))
     semantic = semantic if given is None else given
-    if "fused" in gaussians.parameters:  # what encoder and gate see, whatever the scene's features are made of
-        parameters["raw_features"] = gaussians.parameters["features"][order]
     labelled: dict[str, Any] = {}
     if semantic is None:
         job.left_out("labels", "the scene was trained without semantics")

@@ -40,7 +40,7 @@ def run(job: Job) -> None:
         raise InputError(
             f"{job.inputs['lifted']} is of {len(lifted.features)} Gaussians, not {len(p['means'])}; lift again"
         )
-    trained = p.get("fused", p.get("features"))
+    trained = p.get("features")
     capture = Capture.read(job.inputs["capture"]) if "capture" in job.inputs else None
     started = settings.start
     if started == "auto":  # Gaussians that no depth has placed lie where they look right, which lifting asks nothing of

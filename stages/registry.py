@@ -22,6 +22,7 @@ class Stage:
 
     of_scene: bool = True  # false: never a part of a scene's run, only what such a run is given
     after: tuple[str, ...] = ()  # stages of the scene that come first, although nothing of theirs is read
+    only_asked: bool = False  # no other stage and no report reads it: made where it is asked for by name
     on_device: bool = False  # computes on a GPU where one is used, to other bytes than the CPU's: the key says so then
     device_packages: tuple[str, ...] = ()  # what it computes with there
 
@@ -51,13 +52,12 @@ STAGES: dict[str, Stage] = {
               help="How far views agree on what the same points are: whether the teacher knows the scene."),
         Stage("teach", "chebsplat.knowledge/1", ("onnx", "knowledge"), (("channels", "channels"),), of_scene=False,
               help="Knowledge that scenes start from: a point encoder, taught over generated rooms."),
-        Stage("describe", "chebsplat.descriptors/1", ("describe",), (("points", "sfm"),),
+        Stage("describe", "chebsplat.descriptors/1", ("describe",), (("points", "sfm"),), only_asked=True,
               help="Anisotropic Chebyshev descriptors of the initial Gaussians (Eqs 1-6)."),
         Stage("train", "chebsplat.gaussians/2", ("describe", "train"),
               (("capture", "ingest"), ("points", "sfm")),
-              (("features", "teacher"), ("descriptors", "describe"), ("basis", "cks")),
-              after=("agree",), on_device=True, device_packages=("gsplat",),
-              help="Train the semantic Gaussian scene (Eqs 7-13)."),
+              (("features", "teacher"),), after=("agree",), on_device=True, device_packages=("gsplat",),
+              help="Train the semantic Gaussian scene (Eqs 11-13)."),
         Stage("lift", "chebsplat.lifted/2", ("lift",),
               (("capture", "ingest"), ("gaussians", "train"), ("features", "teacher")),
               help="Features of the teacher on trained Gaussians, and how much the views agree, without training."),
@@ -67,17 +67,12 @@ STAGES: dict[str, Stage] = {
         Stage("export", "chebsplat.scene/3", (), (("gaussians", "train"),),
               (("features", "teacher"), ("lifted", "lift"), ("refined", "refine")),
               help="Write PLY files, ragged zarr, the label dictionary and the summary."),
-        Stage("onnx", "chebsplat.encoder/2", ("onnx",), (("gaussians", "train"),),
-              help="Export the local encoder to ONNX and check it against torch."),
-        Stage("cks", "chebsplat.basis/3", ("scene", "cks"), (("gaussians", "train"),), (("basis", "cks"),),
-              help="Update the core knowledge space with a trained scene (Eqs 14-15)."),
         Stage("evaluate", "chebsplat.evaluation/2", ("evaluate",), (("capture", "ingest"), ("scene", "export")),
               (("features", "teacher"),), on_device=True, device_packages=("gsplat",),
               help="Measure the exported scene on the test views."),
         Stage("report", "chebsplat.report/1", (), (("evaluation", "evaluate"), ("gaussians", "train")),
               (("capture", "ingest"), ("points", "sfm"), ("channels", "channels"), ("features", "teacher"),
-               ("agreement", "agree"), ("descriptors", "describe"), ("lifted", "lift"), ("refined", "refine"),
-               ("scene", "export"), ("encoder", "onnx"), ("basis", "cks")),
+               ("agreement", "agree"), ("lifted", "lift"), ("refined", "refine"), ("scene", "export")),
               help="One self-contained HTML page with pictures, tables and error against run time."),
     )
 }  # fmt: skip

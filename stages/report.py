@@ -25,13 +25,10 @@ STAGE_OF = {
     "channels": "channels",
     "features": "teacher",
     "agreement": "agree",
-    "descriptors": "describe",
     "gaussians": "train",
     "lifted": "lift",
     "refined": "refine",
     "scene": "export",
-    "encoder": "onnx",
-    "basis": "cks",
     "evaluation": "evaluate",
 }
 BYTES = {
@@ -48,8 +45,8 @@ FRAMES = {"color": "colour", "color_and_features": "colour and features"}
 def run(job: Job) -> None:
     """One HTML page, and the figures as CSV, of what was measured and where it comes from.
 
-    Reads `evaluation` and `gaussians`, and of `capture`, `points`, `channels`, `features`, `agreement`, `descriptors`,
-    `lifted`, `refined`, `scene`, `encoder` and `basis` what there is. Writes `report`.
+    Reads `evaluation` and `gaussians`, and of `capture`, `points`, `channels`, `features`, `agreement`, `lifted`,
+    `refined` and `scene` what there is. Writes `report`.
     """
     evaluation = Evaluation.read(job.inputs["evaluation"])
     gaussians = Gaussians.read(job.inputs["gaussians"])
@@ -101,10 +98,6 @@ def run(job: Job) -> None:
         raise DataFailure(f"the page would have {len(text) / 1e6:.0f} MB; lower ingest.max_side")
     (job.out / "report.html").write_text(text)
     job.facts |= {"page": "report.html", "psnr": figures["image"]["psnr"]}
-    if "descriptors" in facts:
-        known = facts["descriptors"]
-        kept = ("spectrum", "n_cuts", "n_cuts_in_clusters", "n_in_float64")
-        job.facts["descriptors"] = {name: known[name] for name in kept if name in known}
 
 
 def decided_rows(facts: dict[str, Any]) -> list[tuple[str, str, str]]:
@@ -128,16 +121,11 @@ def teacher_words(facts: dict[str, Any]) -> tuple[str, str]:
 
 def absent_stages(job: Job, gaussians: Gaussians) -> dict[str, str]:
     """Stages of which this scene has no artifact, and why."""
-    encoder = gaussians.notes.get("encoder")
-    unneeded = "no shape encoder is trained"
     reasons = {
         "features": "rendering only: the scene has no semantics" if "features" not in gaussians.parameters else "",
         "agreement": "the scene has no teacher, or its agreement was not measured",
-        "descriptors": unneeded if encoder is None else "the encoder's tokens hold no descriptor",
         "lifted": "the scene has no teacher, or its features were not lifted",
         "refined": "the scene has no teacher, or its features were not refined",
-        "encoder": unneeded if encoder is None else "",
-        "basis": "no sequence is named",
     }
     absent = {role: why for role, why in reasons.items() if role not in job.inputs}
     return {f"stage {STAGE_OF[role]}": why or "its artifact was not given" for role, why in absent.items()}
@@ -181,9 +169,6 @@ def summary_rows(figures: dict[str, Any], by_degree: list[int] | None, trained: 
         under = f"{split['width']}x{split['height']}, {threads}, {split['device']}"
         parts = {"projection": "projection", "sh": "SH", "sort": "sort", "blend": "blend"}
         rows += [[f"ms a frame, {name} ({under})", f"{split[part]:.2f}", ""] for part, name in parts.items()]
-    if known := trained.get("encoder"):
-        share = f"{known['agreement']:.1%} (the commonest label: {known['commonest']:.1%})"
-        rows.append(["Gaussians that encodings alone name as their features do", share, ""])
     rows += [[f"ms a training step, {part}", f"{v:.2f}", ""] for part, v in trained["milliseconds"].items()]
     if peak := trained.get("peak_device_bytes"):
         rows.append(["bytes of the GPU's memory in training, at most", f"{peak:,}", ""])

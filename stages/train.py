@@ -1,4 +1,4 @@
-"""train: the semantic Gaussian scene (Eqs 7-13), with its trace of error against run time."""
+"""train: the semantic Gaussian scene (Eqs 11-13), with its trace of error against run time."""
 
 from __future__ import annotations
 
@@ -17,10 +17,9 @@ log = logging.getLogger("chebsplat")
 
 
 def run(job: Job) -> None:
-    """Optimise Gaussians, their semantics and the shape encoder (Eqs 7-13; docs/method.md, sections 3 to 8).
+    """Optimise Gaussians and their semantics (Eqs 11-13; docs/method.md, sections 3 to 8).
 
-    Reads `capture`, `points` and, with semantics, `features`, `descriptors` and the `basis` of earlier scenes. Writes
-    `gaussians`.
+    Reads `capture`, `points` and, with semantics, `features`. Writes `gaussians`.
     """
     inputs = read_inputs(job)
     trainer = assemble(job, inputs)
@@ -42,7 +41,4 @@ def run(job: Job) -> None:
     notes |= {"n_removed": population.n_removed, "n_broken": population.n_broken, "n_initial": n_initial}
     if features is not None:
         notes |= {"label_names": features.label_names, "convention": features.convention}
-    if trainer.model.shape is not None:
-        encoder = trainer.model.shape.encoder
-        notes["encoder"] = {"n_inputs": encoder.n_inputs, "n_channels": encoder.n_channels} | encoder.settings
     Gaussians(parameters, cameras, modules, trace, notes).write(job.out)

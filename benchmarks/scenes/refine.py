@@ -56,12 +56,12 @@ class Scene:
         self.points, self.taught = Points.read(work / "sfm"), Features.read(work / "teacher")
         parameters = self.gaussians.parameters
         self.means, self.surface = parameters["means"], surface_of(parameters)
-        self.features: np.ndarray = parameters.get("fused", parameters["features"])
+        self.features: np.ndarray = parameters["features"]
 
     def score(self, features: np.ndarray) -> tuple[float, float]:
         """mIoU and OA of the test views, by these features [N, C]."""
         capture, cameras, names = self.capture, self.gaussians.cameras, list(self.capture.class_names or [])
-        parameters = {name: values for name, values in self.gaussians.parameters.items() if name != "fused"}
+        parameters = self.gaussians.parameters
         renderer, row = SceneRenderer(parameters | {"features": features}), {n: k for k, n in enumerate(capture.names)}
         as_class = np.array([names.index(name) if name in names else len(names) for name in self.taught.label_names])
         counts = np.zeros((len(names) + 1,) * 2, np.int64)

@@ -15,7 +15,6 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
-from chebsplat.shape.encoder import Standardize
 from chebsplat.shape.point_inputs import N_OWN, RADII, PointInputs
 
 N_RELATIVE = 10
@@ -38,6 +37,29 @@ def cloud_of(inputs: PointInputs) -> Cloud:
     """Tensors of the arrays; they share memory."""
     own, means, normals, descriptors = (torch.from_numpy(v) for v in inputs[:4])
     return Cloud(own, means, normals, descriptors, torch.from_numpy(inputs.neighbors.astype(np.int64)))
+
+
+class Standardize(nn.Module):
+    """Every input less its mean, over its deviation, within ±5; constants, no weights.
+
+    Choices: a LayerNorm over a point's descriptor would compare its degrees with one another: their means differ by
+      more than they vary from one point to the next.
+    """
+
+    mean: Tensor
+    deviation: Tensor
+
+    def __init__(self, n_inputs: int):
+        super().__init__()
+        self.register_buffer("mean", torch.zeros(n_inputs))
+        self.register_buffer("deviation", torch.ones(n_inputs))
+
+    def set(self, mean: Tensor, deviation: Tensor) -> None:
+        """The constants [n] of all inputs."""
+        self.mean[:], self.deviation[:] = mean, deviation.clamp_min(1e-6)
+
+    def forward(self, inputs: Tensor) -> Tensor:
+        return ((inputs - self.mean) / self.deviation).clamp(-5, 5)
 
 
 class Scale(nn.Module):
@@ -99,11 +121,11 @@ class PointEncoder(nn.Module):
         directions, each scaled to a deviation of 1.
         """
         own = torch.cat([cloud.own[::sample] for cloud in clouds])
-        self.norm_own.set(0, own.mean(0), own.std(0))
+        self.norm_own.set(own.mean(0), own.std(0))
         if not self.settings["n_descriptors"]:
             return
         descriptors = torch.cat([cloud.descriptors[::sample] for cloud in clouds])
-        self.norm_descriptors.set(0, descriptors.mean(0), descriptors.std(0))
+        self.norm_descriptors.set(descriptors.mean(0), descriptors.std(0))
         standard = self.norm_descriptors(descriptors).double()
         values, axes = torch.linalg.eigh(standard.T @ standard / len(standard))
         count = self.settings["n_components"]

@@ -13,7 +13,6 @@ from torch import Tensor
 from chebsplat.splats.rotations import rotation_matrices
 
 SHRINK = 1.6  # 3DGS's divisor of the scales of two Gaussians that replace one
-LARGEST = 1e300  # of the excess: no volume grows nothing, however steep
 
 
 class Additions(NamedTuple):
@@ -39,7 +38,7 @@ def region_gradients(gradients: Tensor, members: Tensor) -> Tensor:
 class Candidates:
     """Number of places drawn for new Gaussians, and bounds of those that are kept.
 
-    density:  a local spacing³ (α of Eq 12; printed: a cubic scene unit); max_candidates: of a region.
+    density:  a local spacing³ (α of Eq 12); max_candidates: of a region.
     nearest, farthest: bounds of the distance to the nearest Gaussian, in local spacings.
     Raises: ValueError on bounds that are not positive and in order.
     """
@@ -48,7 +47,6 @@ class Candidates:
     max_candidates: int = 32
     nearest: float = 0.5
     farthest: float = 1.5
-    printed: bool = False
 
     def __post_init__(self) -> None:
         if not 0 < self.nearest < self.farthest:
@@ -75,10 +73,10 @@ def densify(
     Raises:  ValueError on a threshold that is not positive.
     Choices: local spacing is the median over the members of the mean distance to the three nearest Gaussians, members
       or not. A region of radius ρ gets density · 4/3 π (ρ / spacing)³ · min(gradient / threshold − 1, 1) candidates,
-      rounded up (printed: density · 4/3 π ρ³ · (gradient / threshold − 1)), uniform in the ball about its members'
-      mean; new ones also keep `nearest` spacings apart. Each inherits from the nearest Gaussian, which is its parent
-      once at most, and both change so that the two render like the one (`shared_opacity`, `shared_scales`). Gaussians
-      with non-finite means are left out. Neighbours are searched for on the CPU, wherever the Gaussians are.
+      rounded up, uniform in the ball about its members' mean; new ones also keep `nearest` spacings apart. Each
+      inherits from the nearest Gaussian, which is its parent once at most, and both change so that the two render like
+      the one (`shared_opacity`, `shared_scales`). Gaussians with non-finite means are left out. Neighbours are searched
+      for on the CPU, wherever the Gaussians are.
     """
     if not threshold > 0:
         raise ValueError(f"threshold {threshold} is not positive")
@@ -118,9 +116,8 @@ def _places(
     """
     tree = cKDTree(means)
     centers, radii, spacings = _balls(tree, means, inside)
-    printed = candidates.printed
-    volume = 4 / 3 * np.pi * (radii if printed else radii / np.where(spacings > 0, spacings, np.inf)) ** 3
-    excess = np.minimum(excess, LARGEST if printed else 1)
+    volume = 4 / 3 * np.pi * (radii / np.where(spacings > 0, spacings, np.inf)) ** 3
+    excess = np.minimum(excess, 1)
     counts = np.ceil(np.minimum(candidates.density * volume * excess, candidates.max_candidates)).astype(np.int64)
     counts[np.cumsum(counts) - counts >= 16 * budget] = 0
     region = np.repeat(np.arange(len(counts)), counts)

@@ -1,4 +1,4 @@
-"""Which Gaussians there are: growth, removal, the freeze of SH bands. Parameters, moments and regions keep together."""
+"""Which Gaussians there are: growth, removal, the freeze of SH bands. Parameters and moments keep together."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ class Population:
 
     places: of the training cameras, scene units [V, 3]; those that are not finite bound nothing.
     `n_grown` and `n_reset` count the times that some were added and that all were dimmed, the others Gaussians:
-    `n_broken` those whose values a step made non-finite. The caller refreshes the model's regions after any change.
+    `n_broken` those whose values a step made non-finite. The caller refreshes the regions after any change.
     """
 
     def __init__(self, model: SceneModel, settings: TrainSection, extent: float, places: np.ndarray):
@@ -96,8 +96,7 @@ class Population:
             additions = densify.clone_or_split(raw, gradient, threshold, 0.01 * self.extent, budget, generator)
         else:
             mean = densify.region_gradients(gradient, members)
-            candidates = densify.Candidates(printed=settings.grow_rule == "printed")
-            additions = densify.densify(raw, members, mean, threshold, budget, generator, candidates)
+            additions = densify.densify(raw, members, mean, threshold, budget, generator)
         self.n_added += len(additions.parents)
         optimizer_rows.apply_additions(optimizer, self.model.raw, additions)
 
@@ -135,24 +134,17 @@ class Population:
 
     def _keep(self, optimizer: torch.optim.Optimizer, rows: Tensor) -> None:
         optimizer_rows.prune_optimizer(optimizer, self.model.raw, rows)
-        if self.model.shape is not None:
-            self.model.shape.keep(rows)
         self.clear_gradients()
 
     @torch.no_grad()
-    def freeze_bands(self, optimizer: torch.optim.Optimizer, features: Tensor | None) -> None:
-        """Fix every Gaussian's SH degree, once: what is closed leaves parameters, moments and memory.
-
-        features [N, C] of all Gaussians: they guide the printed masks.
-        """
+    def freeze_bands(self, optimizer: torch.optim.Optimizer) -> None:
+        """Fix every Gaussian's SH degree, once: what is closed leaves parameters, moments and memory."""
         raw = self.model.raw
-        degrees = sh_prune.degrees(self.model.final_band_masks(features)).clamp_max(self.settings.sh_degree)
+        degrees = sh_prune.degrees(sh_prune.band_mask(raw["sh_logits"])).clamp_max(self.settings.sh_degree)
         rows = sh_prune.ragged_rows(degrees)
         optimizer_rows.drop(optimizer, raw, "sh_logits")
         bands = {f"sh{band}": rows[band] for band in range(1, 4)}
         optimizer_rows.reorder_optimizer(optimizer, raw, {name: bands.get(name, rows[0]) for name in raw})
-        if self.model.shape is not None:
-            self.model.shape.reorder(rows[0])
         self.clear_gradients()
 
 

@@ -7,10 +7,9 @@ import torch
 from chebsplat.settings import MOST_STEPS, TrainSection
 from chebsplat.splats.sh import MAX_DEGREE
 from chebsplat.training.model import SceneModel
-from chebsplat.training.prune import SemanticGate
 
 LR_OPACITIES = 5e-2  # of opacities before the sigmoid, 3DGS's
-LR_MODULES, LR_GATES = 3e-3, 1e-2  # of the encoder, and of the printed gates' weights
+LR_MODULES = 3e-3  # of the semantic gate
 FASTER = {"means": 0.01, "features": 0.01, "modules": 0.01}  # what a rate has fallen to at the end; 0.1 elsewhere
 
 
@@ -49,11 +48,8 @@ def adam(model: SceneModel, settings: TrainSection, extent: float) -> torch.opti
     for name, value in model.raw.items():
         rate = base_rates[name] * (extent if name == "means" else 1)
         groups.append({"params": [value], "rate": rate, "name": name})
-    printed = {part for part in (model.semantic_gate, model.band_network) if not isinstance(part, SemanticGate)}
-    for name, rate, own in (("modules", LR_MODULES, False), ("gates", LR_GATES, True)):
-        weights = [p for module in model.modules.values() if (module in printed) == own for p in module.parameters()]
-        if weights:
-            groups.append({"params": weights, "rate": rate, "name": name})
+    if weights := [p for module in model.modules.values() for p in module.parameters()]:
+        groups.append({"params": weights, "rate": LR_MODULES, "name": "modules"})
     return torch.optim.Adam(groups, eps=1e-15, fused=True)
 
 
@@ -111,10 +107,6 @@ class Schedule:
     def reset(self, share: float) -> int:
         """How many times opacities were to fall until now."""
         return sum(share >= at for at in self.resets)
-
-    def encodes(self, share: float) -> bool:
-        """Are regions encoded?"""
-        return share >= self.settings.encode_from
 
     def prunes(self, share: float) -> bool:
         """Are Gaussians pruned?"""

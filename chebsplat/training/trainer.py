@@ -16,8 +16,8 @@ from chebsplat.cameras import centers
 from chebsplat.errors import DataFailure
 from chebsplat.evaluation.metrics import psnr
 from chebsplat.settings import TrainSection
-from chebsplat.shape.regions import Regions, regions_of
-from chebsplat.training import sh_mask_network, sh_prune
+from chebsplat.shape.regions import regions_of
+from chebsplat.training import sh_prune
 from chebsplat.training.losses import depth_distance, photometric, semantic_loss
 from chebsplat.training.model import Rendered, SceneModel
 from chebsplat.training.population import Population, broken
@@ -34,30 +34,14 @@ class Trainer:
     Args:
       settings: resolved, nothing left open (`stages.training.defaults`).
       extent:   scene units, scales the means' learning rate.
-      basis:    matrices [q, r] by name of an earlier scene's knowledge; None: of none.
-      regions, descriptors: of the model's Gaussians as they are; None: they are computed.
-      cameras:  what is learned of each view's camera; None: nothing.
-    The model's Gaussians say which device computes; views, cameras and regions are to be there, too. On a GPU a step
-    waits for no number but that of the Gaussians in view, and of regions where it encodes them: a loss that is not
-    finite is found within READ_EVERY steps.
+    The model's Gaussians say which device computes; views and cameras are to be there, too. On a GPU a step waits for
+    no number but that of the Gaussians in view: a loss that is not finite is found within READ_EVERY steps.
     `state_dict()` between two steps holds all that the steps to come depend on: a trainer that loads it takes them as
     this one does, to the bit, with as many threads.
     """
 
-    def __init__(
-        self,
-        model: SceneModel,
-        views: Views,
-        settings: TrainSection,
-        extent: float,
-        *,
-        basis: dict[str, Tensor] | None = None,
-        regions: Regions | None = None,
-        descriptors: Tensor | None = None,
-    ):
+    def __init__(self, model: SceneModel, views: Views, settings: TrainSection, extent: float):
         self.model, self.views, self.settings, self.extent = model, views, settings, extent
-        given = basis if basis and model.shape is not None else {}
-        self.basis = {name: value.to(model.device) for name, value in given.items()}
         self.schedule = Schedule(settings)
         assert settings.feature_every is not None and settings.weight_depth is not None
         self.feature_every, self.weight_depth = settings.feature_every, settings.weight_depth
@@ -70,7 +54,7 @@ class Trainer:
         self.seconds = 0.0  # of the steps but the first
         self.population = Population(model, settings, extent, centers(views.viewmats.cpu().numpy()))
         self.laps = Laps()  # of the same steps; after a resume, from there on
-        self.refresh(regions, descriptors)
+        self.refresh()
 
     @property
     def share(self) -> float:
@@ -120,7 +104,7 @@ class Trainer:
         if removing or due:
             self.refresh()
         if frozen and "sh_logits" in self.model.raw:
-            self.population.freeze_bands(self.optimizer, self._features(share))
+            self.population.freeze_bands(self.optimizer)
             self.refresh()
 
     def _drop_broken(self) -> None:
@@ -134,29 +118,18 @@ class Trainer:
         """Of all Gaussians, once pruning has begun."""
         if not self.schedule.prunes(share):
             return None
-        features = None if self.model.semantic_gate is None else self._features(share)
-        return self.model.soft_mask(self.model.rows, features)
+        return self.model.soft_mask(self.model.rows, self.model.raw.get("features"))
 
     @torch.no_grad()
     def final_mask(self) -> Tensor | None:
         """m̂ [N] of all Gaussians as they are, None without pruning."""
         return self._soft_mask(self.share)
 
-    @torch.no_grad()
-    def _features(self, share: float) -> Tensor | None:
-        """Of all Gaussians, fused where they are rendered so; encodings are as the last refresh or step left them."""
-        features, shape = self.model.raw.get("features"), self.model.shape
-        if shape is None or features is None or not self._encodes(share):
-            return features
-        return shape.fuse(features, self.model.rows)
-
     def state_dict(self) -> dict[str, Any]:
         """All that the steps to come depend on: tensors (shared, not copied) and plain values."""
         return {
             "raw": {name: value.detach() for name, value in self.model.raw.items()},
             "modules": {name: module.state_dict() for name, module in self.model.modules.items()},
-            "regions": None if self.model.shape is None else self.model.shape.region_state(),
-            "colour_guides": [self.model.members, self.model.nearest],
             "optimizer": self.optimizer.state_dict(),
             "order_generator": self.order_generator.bit_generator.state,
             "generator": self.generator.get_state(),
@@ -171,9 +144,6 @@ class Trainer:
         model.raw = {name: value.requires_grad_(True) for name, value in state["raw"].items()}
         for name, module in model.modules.items():
             module.load_state_dict(state["modules"][name])
-        if model.shape is not None:
-            model.shape.load_region_state(state["regions"])
-        model.members, model.nearest = state["colour_guides"]
         self.optimizer = adam(self.model, self.settings, self.extent)
         self.optimizer.load_state_dict(state["optimizer"])
         self.order_generator.bit_generator.state = state["order_generator"]
@@ -182,22 +152,12 @@ class Trainer:
         self.members, self.guidance = state["guides"]
         self.population.load_state_dict(state["population"])
 
-    def _encodes(self, share: float) -> bool:
-        return self.model.shape is not None and self.schedule.encodes(share)
-
-    def refresh(self, regions: Regions | None = None, descriptors: Tensor | None = None) -> None:
-        """Regions and descriptors of the Gaussians as they are now."""
+    def refresh(self) -> None:
+        """Regions of the Gaussians as they are now."""
         self.laps.mark("growth and pruning")
-        shape = self.model.shape
-        if shape is not None:
-            shape.refresh(self.model.raw, regions, descriptors)
-            regions = shape.regions
-        elif regions is None:
-            means = self.model.raw["means"].detach().double().cpu().numpy()
-            regions = regions_of(means, self.model.describe)
-        assert regions is not None
+        means = self.model.raw["means"].detach().double().cpu().numpy()
+        regions = regions_of(means, self.model.describe)
         self.members, self.guidance = torch.as_tensor(regions.members).to(self.model.device), None
-        self.model.follow(regions)
         self.population.note_distances()
         self.laps.mark("refresh")
 
@@ -224,8 +184,6 @@ class Trainer:
             self.schedule.degree(share),
             masked=pruning,
             semantic=taught,
-            fused=self._encodes(share),
-            generator=self.generator if self.step % settings.encode_every == 0 else None,
             grid=None if wanted is None else (wanted.shape[0], wanted.shape[1]),
             depth=surface is not None,
         )
@@ -268,14 +226,8 @@ class Trainer:
             losses["features"] = semantic_loss(rendered.features, wanted, labels, mask, settings, backend)
         if auxiliary.soft_mask is not None:
             losses["mask"] = settings.weight_mask * auxiliary.soft_mask.mean()
-        if auxiliary.shape_distance is not None and settings.weight_shape > 0:
-            losses["shape"] = settings.weight_shape * auxiliary.shape_distance
-        if auxiliary.delta is not None:
-            losses["sh"] = settings.weight_sh * sh_mask_network.sh_loss(auxiliary.delta)
-        elif auxiliary.band_masks is not None:
+        if auxiliary.band_masks is not None:
             losses["sh"] = settings.weight_sh * sh_prune.sh_loss(auxiliary.band_masks, self._guided(rendered.index))
-        if self.basis and self.model.shape is not None and auxiliary.fresh is not None:  # as often as views pull it
-            losses["basis"] = settings.weight_basis * self.model.shape.basis_loss(self.basis, auxiliary.fresh)
         return losses
 
     @torch.no_grad()
@@ -293,10 +245,10 @@ class Trainer:
 
     @torch.no_grad()
     def finish(self) -> dict[str, np.ndarray]:
-        """Final raw parameters: degrees fixed, bands above them zero, fused features of every Gaussian."""
+        """Final raw parameters: degrees fixed, bands above them zero."""
         self._drop_broken()
         if "sh_logits" in self.model.raw:
-            self.population.freeze_bands(self.optimizer, self._features(self.share))
+            self.population.freeze_bands(self.optimizer)
         bands = [band.detach() for band in self.model.bands()][: self.schedule.degree(1.0) + 1]
         others = self.model.raw.keys() - {"sh1", "sh2", "sh3", "prune_logits"}
         parameters = {name: self.model.raw[name].detach().cpu().numpy() for name in sorted(others)}
@@ -304,8 +256,7 @@ class Trainer:
         parameters["degrees"] = np.zeros(len(self.model), np.uint8)
         for band in bands[1:]:
             parameters["degrees"][: len(band)] += 1
-        fused = self.model.fused_features()
-        return parameters if fused is None else parameters | {"fused": fused}
+        return parameters
 
 
 class Laps:

@@ -1,4 +1,4 @@
-"""Commands on a finished scene, or before one: query, mesh, extract, encode, lift, label,
+"""Commands on a finished scene, or before one: query, mesh, extract, lift, label,
 check-teacher, get-teacher, knowledge, calibrate.
 """
 
@@ -93,28 +93,6 @@ def extract(
     opened = load(scene)
     query_vectors = None if text is None else opened.understood(text, against)
     told(write(opened, out, labels, min_opacity, corners(box), query_vectors), out)
-
-
-@click.command()
-@click.argument("scene")
-@click.option("--encoder", help="an onnx artifact, or a model in it; default: the scene's")
-@click.option("--features", type=click.Path(path_type=Path), help="of a PLY: .npy [N, C], float32, before fusion")
-@click.option("--out", type=NewPath(".npz"), required=True, help="the .npz to write")
-@click.option("--device", type=click.Choice(["cpu", "cuda"]), default="cpu", show_default=True, help="of the models")
-def encode(scene: str, encoder: str | None, features: Path | None, out: Path, device: str) -> None:
-    """Fused features of a finished SCENE (or a .ply), by onnxruntime, without torch."""
-    from chebsplat.pipelines.work.finished import artifact_of, scene_folder
-    from chebsplat.stages.tools.encode import encode as write
-
-    if scene.endswith(".ply"):
-        if encoder is None:
-            raise ConfigError(f"{scene} is a PLY, which has no encoder of its own; add --encoder")
-        source = Path(scene)
-    else:
-        source = artifact_of(scene, "export")
-        encoder = encoder or str(scene_folder(scene) / "onnx")
-    model = Path(encoder) if encoder.endswith(".onnx") else artifact_of(encoder, "onnx")
-    told(write(source, model, features, out, device), out)
 
 
 @click.command()
@@ -237,4 +215,4 @@ def mesh(scene: str, out: Path, voxel: float | None, triangles: int, raw: bool) 
     told(facts, out)
 
 
-COMMANDS = (query, calibrate, check_teacher, get_teacher, extract, encode, lift, label, knowledge, mesh)
+COMMANDS = (query, calibrate, check_teacher, get_teacher, extract, lift, label, knowledge, mesh)

@@ -25,7 +25,6 @@ from chebsplat.stages.sources.common import unread
 from chebsplat.stages.teacher_models.text_encoder import found
 
 LIFTED = "train.features is lifted"
-POINTS = "train.encoder is points: the training holds none"
 PHOTOGRAPHS = ("photos", "colmap", "transforms", "seven_scenes", "video")  # kinds that hold photos of any place
 UNASKED = "no teacher is named"
 HOW = (
@@ -61,17 +60,8 @@ def left_out_stages(config: Any, kind: str, why: str, probe: dict[str, bool]) ->
     left_out: dict[str, str] = {}
     if kind == "none":
         left_out |= {"teacher": f"{why}: {HOW}" if why == UNASKED else why}
-        left_out |= {"describe": f"no semantics to describe shape for ({why})"}
-        left_out |= {"onnx": f"no encoder is trained ({why})", "lift": f"no teacher's features to lift ({why})"}
+        left_out |= {"lift": f"no teacher's features to lift ({why})"}
         left_out |= {"refine": f"no semantic features to refine ({why})", "agree": f"no teacher's labels ({why})"}
-    elif config.train.features == "lifted":
-        left_out |= {"describe": LIFTED, "onnx": LIFTED}
-    elif config.train.encoder == "off":
-        left_out |= {"describe": "train.encoder is off", "onnx": "train.encoder is off"}
-    elif config.train.encoder == "points":
-        left_out |= {"describe": POINTS, "onnx": f"{POINTS}: it comes with the knowledge, in ONNX, too"}
-    elif not config.train.albo:
-        left_out |= {"describe": "train.albo is false: tokens hold no descriptor"}
     if probe["poses"] and config.sfm.poses != "adjusted":
         tested = config.sfm.poses == "auto" and config.source.kind != "generated"
         has_depth = probe["depth"] and config.ingest.depth == "auto"
@@ -90,12 +80,7 @@ def left_out_knowledge(config: Any, kind: str, why: str, basis: Path | None, kee
     """Why a scene does not train on a given basis, or keeps nothing of its knowledge, if so."""
     if kind != "none" and config.train.features == "lifted":
         kind, why = "none", LIFTED
-    reasons = {
-        "mlp": "train.encoder is mlp: it has no attention weights",
-        "points": POINTS,
-        "off": "train.encoder is off",
-    }
-    unable = f"no encoder is trained ({why})" if kind == "none" else reasons.get(config.train.encoder, "")
+    unable = f"no encoder is trained ({why})" if kind == "none" else f"train.encoder is {config.train.encoder}"
     left_out = {} if basis is None or not unable else {"basis": unable}
     if unable or not keep:
         left_out["cks"] = unable or "no sequence is named"

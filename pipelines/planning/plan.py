@@ -186,12 +186,9 @@ class Planner:
         Args: settings: over the scene's own; basis: an earlier scene's basis to train on; keep_knowledge: end with a
               cks step; values: config sections that replace the scene's own, before ablation and settings (a study's).
         Raises: ConfigError, InputError.
-        Choices: a scene of a sequence, or on a basis, trains the encoder of regions, which a basis is of.
         """
         name, own = scene_values(scene)
         values, title = merged(own, values or {}), ""
-        if basis is not None or keep_knowledge:
-            values = merged({"train": {"encoder": "transformer"}}, values)
         if ablation:
             values = merged(values, read_toml("ablations", ablation))
             title += f"@{ablation}"

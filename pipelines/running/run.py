@@ -87,7 +87,8 @@ def say_result(plan: Plan, stage: str | None) -> None:
 def wanted_steps(plan: Plan, stage: str | None, others: Iterable[Plan] = ()) -> list[Step]:
     """All steps of a plan, or its `stage`, and what they need, of other plans too."""
     by_path = {step.path: step for some in (*others, plan) for step in some.steps}
-    waiting, needed = [step for step in plan.steps if stage in (None, step.stage)], set()
+    asked = {stage} if stage else {step.stage for step in plan.steps if not STAGES[step.stage].only_asked}
+    waiting, needed = [step for step in plan.steps if step.stage in asked], set()
     while waiting:
         step = waiting.pop()
         needed.add(step.key)

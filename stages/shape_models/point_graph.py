@@ -1,17 +1,72 @@
-"""The point encoder as an ONNX graph (see `region_graph`), and the contracts of all our ONNX files."""
+"""The point encoder as an ONNX graph, operation by operation as torch computes it, and its contract.
+
+Written by hand: torch's own exporter traces for 20 s and more. `stages.teach` compares it with torch at every export.
+"""
 
 from __future__ import annotations
 
 from typing import TYPE_CHECKING, Any
 
-from onnx import ModelProto, TensorProto
+import numpy as np
+from onnx import GraphProto, ModelProto, NodeProto, TensorProto, checker, helper, numpy_helper
 
 from chebsplat.shape.point_inputs import N_OWN, RADII
-from chebsplat.stages.shape_models.region_graph import Graph, number, whole
 
 if TYPE_CHECKING:
-    from chebsplat.shape.encoder import Standardize
-    from chebsplat.shape.point_encoder import PointEncoder, Scale
+    from chebsplat.shape.point_encoder import PointEncoder, Scale, Standardize
+
+OPSET = 18
+Value = Any  # the name of what a node makes, a torch tensor, or a NumPy constant
+
+
+class Graph:
+    """Nodes in the order of their making. Dimensions of inputs and outputs are numbers, or names of any size from 1."""
+
+    def __init__(self, **inputs: tuple[int, list[int | str]]):
+        """inputs: by name, element type and shape."""
+        self.inputs = [helper.make_tensor_value_info(name, *entry) for name, entry in inputs.items()]
+        self.nodes: list[NodeProto] = []
+        self.constants: list[TensorProto] = []
+
+    def add(self, operator: str, *inputs: Value, **attributes: Any) -> str:
+        """One node with one output; gives its name."""
+        made = f"{operator.lower()}_{len(self.nodes)}"
+        self.nodes.append(helper.make_node(operator, [self._name(v) for v in inputs], [made], **attributes))
+        return made
+
+    def _name(self, value: Value) -> str:
+        if isinstance(value, str):
+            return value
+        array = value if isinstance(value, np.ndarray) else value.detach().numpy()
+        name = f"constant_{len(self.constants)}"
+        self.constants.append(numpy_helper.from_array(np.ascontiguousarray(array).reshape(array.shape), name))
+        return name
+
+    def linear(self, values: Value, layer: Any) -> str:
+        """values Wᵀ + b of an `nn.Linear`."""
+        return self.add("Add", self.add("MatMul", values, layer.weight.T), layer.bias)
+
+    def model(self, name: str, **outputs: tuple[str, list[int | str]]) -> ModelProto:
+        """outputs: by name, the float32 value that it is, and its shape. Raises onnx.checker.ValidationError."""
+        for output, (value, _) in outputs.items():
+            self.nodes.append(helper.make_node("Identity", [value], [output]))
+        made = [helper.make_tensor_value_info(o, TensorProto.FLOAT, shape) for o, (_, shape) in outputs.items()]
+        graph: GraphProto = helper.make_graph(self.nodes, name, self.inputs, made, self.constants)
+        opsets = [helper.make_opsetid("", OPSET)]
+        version = helper.find_min_ir_version_for(opsets)
+        model = helper.make_model(graph, opset_imports=opsets, ir_version=version, producer_name="chebsplat")
+        checker.check_model(model)
+        return model
+
+
+def number(value: float) -> np.ndarray:
+    """A float32 constant []."""
+    return np.array(value, np.float32)
+
+
+def whole(*values: int) -> np.ndarray:
+    """An int64 constant [n]."""
+    return np.array(values, np.int64)
 
 
 def point_model(encoder: PointEncoder) -> ModelProto:
@@ -108,83 +163,6 @@ def point_contract(encoder: PointEncoder) -> dict[str, Any]:
         },
         "normalization": "none outside the graph",
         "settings": settings,
-    }
-
-
-POSITIONS = {  # units and meaning
-    "region": ("region radii", "(mean - centre) / radius"),
-    "center": ("scene extents", "(mean - median) / extent, the 0.95 quantile of largest distances along an axis"),
-    "both": ("region radii, scene extents", "(mean - centre) / radius, then (mean - median) / extent"),
-}
-
-
-def contract(encoder: Any, config: dict[str, Any]) -> dict[str, Any]:
-    """Inputs, outputs and settings of the graphs that the onnx stage writes, as JSON-able values.
-
-    Args:
-      encoder: the `encoder.RegionEncoder`.
-      config:  the sections `describe` and `train` that the scene was trained with.
-    """
-    describe, train = config["describe"], config["train"]
-    described = train["albo"]
-    context = train["context"] == "features"
-    n_described = encoder.n_inputs - encoder.n_channels * context
-    first = [f"a descriptor of {n_described} values, [angles, degrees] flattened, as computed (Eqs 4-6)"] * described
-    first += [f"the Gaussian's {encoder.n_channels} semantic features before fusion"] * context
-    inputs = {
-        "inputs": array(
-            "float32",
-            ["regions", "members", encoder.n_inputs],
-            "none",
-            ", then ".join(first) or "nothing: the encoder sees positions alone",
-        ),
-        "positions": array("float32", ["regions", "members", encoder.n_positions], *POSITIONS[train["position"]]),
-        "mask": array(
-            "bool", ["regions", "members"], "", "true where a member exists; what stands elsewhere is unread"
-        ),
-    }
-    c = encoder.n_channels
-    return {
-        "encoder": {
-            "files": ["encoder.onnx", "encoder.int8.onnx"],
-            "inputs": inputs,
-            "outputs": {"encodings": array("float32", ["regions", c], "none", "one semantic vector a region (Eq 7)")},
-            "normalization": "none outside the graph: it begins by standardising each input with constants of its own",
-        },
-        "fusion": _fusion(c),
-        "settings": {
-            "describe": describe,
-            "n_covers": train["n_covers"],
-            "described": described,
-            "context": context,
-            "position": train["position"],
-            "n_inputs": encoder.n_inputs,
-            "n_channels": c,
-        }
-        | encoder.settings,
-    }
-
-
-def _fusion(c: int) -> dict[str, Any]:
-    """The part of the contract on the fusion of features of c channels."""
-    inputs = {
-        "features": array("float32", ["gaussians", c], "none", "semantic features before fusion"),
-        "encodings": array("float32", ["regions", c], "none", "the encoder's output"),
-        "cover": array("int64", ["gaussians", "covers"], "", "regions that reach a Gaussian, nearest first; -1: none"),
-        "means": array("float32", ["gaussians", 3], "scene units", "centres of the Gaussians"),
-        "centers": array("float32", ["regions", 3], "scene units", "centre of the Gaussian that a region is built on"),
-        "quats": array("float32", ["regions", 4], "none", "its rotation, wxyz, of any length"),
-        "scales": array("float32", ["regions", 3], "scene units", "its standard deviations, not their logarithms"),
-        "radius": array("float32", [], "scene units", "of all regions"),
-    }
-    return {
-        "files": ["fusion.onnx"],
-        "inputs": inputs,
-        "outputs": {
-            "fused": array("float32", ["gaussians", c], "none", "features after propagation and gate (Eqs 8-10)"),
-            "gate": array("float32", ["gaussians", c], "none", "the share of `features`; 1 where nothing covers"),
-        },
-        "normalization": "none",
     }
 
 

@@ -12,15 +12,12 @@ from torch import Tensor
 
 from chebsplat.cameras import extent
 from chebsplat.errors import ConfigError, DataFailure, InputError
-from chebsplat.formats.basis import read_basis
 from chebsplat.formats.cameras import Cameras
 from chebsplat.formats.capture import Capture
-from chebsplat.formats.descriptors import Descriptors, read_descriptors
 from chebsplat.formats.features import Features
 from chebsplat.formats.ply import read_ply
 from chebsplat.formats.points import Points, thinned
 from chebsplat.settings import DescribeSection, TrainSection
-from chebsplat.shape.regions import Regions
 from chebsplat.splats.gaussians import initial_gaussians
 from chebsplat.stages.runtime.command import Job, n_threads
 from chebsplat.stages.runtime.progress import Progress
@@ -28,7 +25,6 @@ from chebsplat.stages.settings import LiftSection
 from chebsplat.stages.training.defaults import LIFTED_FROM, OPEN, decided, evidence_of, resolved
 from chebsplat.stages.training.lifting import lifted_from
 from chebsplat.stages.training.photos import own_exposures
-from chebsplat.stages.training.saves import without_basis
 from chebsplat.stages.training.views import training_views
 from chebsplat.training.model import SceneModel
 from chebsplat.training.trainer import Trainer
@@ -38,12 +34,11 @@ log = logging.getLogger("chebsplat")
 
 @dataclass
 class Inputs:
-    """Artifacts of a training. features: None without semantics; descriptors: None: the training makes its own."""
+    """Artifacts of a training. features: None without semantics."""
 
     capture: Capture
     points: Points
     features: Features | None = None
-    descriptors: Descriptors | None = None
 
 
 def read_inputs(job: Job) -> Inputs:
@@ -52,11 +47,10 @@ def read_inputs(job: Job) -> Inputs:
     Raises: InputError if artifacts do not belong together or are damaged.
     """
     train = job.config.train
-    capture, given = Capture.read(job.inputs["capture"]), Points.read(job.inputs["points"])
-    descriptors, points = described(job, given), within_cap(job, given)
+    capture, points = Capture.read(job.inputs["capture"]), within_cap(job, Points.read(job.inputs["points"]))
     taught = "features" in job.inputs and train.semantics and train.features == "trained"
     features = Features.read(job.inputs["features"]) if taught else None
-    return Inputs(capture, points, features, descriptors if points is given and not train.start else None)
+    return Inputs(capture, points, features)
 
 
 def assemble(job: Job, inputs: Inputs, backend: str = "auto") -> Trainer:
@@ -74,7 +68,6 @@ def assemble(job: Job, inputs: Inputs, backend: str = "auto") -> Trainer:
     _note_left_out(job, train, features is not None, evidence.no_depth)
     torch.set_num_threads(n_threads())  # sums of torch depend on it; the same bytes are promised for the same number
     model = model_of(points, features, train, job.config.describe, job.device, backend)
-    regions, descriptors = first_regions(inputs.descriptors)
     undone = exposures if train.exposure == "measured" else None
     if undone is not None:
         log.info("exposures of photos differ by %.2f stops from those about them: undone", stops)
@@ -87,9 +80,7 @@ def assemble(job: Job, inputs: Inputs, backend: str = "auto") -> Trainer:
         if job.config.train.feature_start in OPEN:
             why = f"of {len(views.names)} training views, fewer than {LIFTED_FROM}, it costs colour"
         job.left_out("lifted start of features", why)
-    basis = knowledge(job, model, train)
-    scale = extent(points.cam_from_world)
-    return Trainer(model, views, train, scale, basis=basis, regions=regions, descriptors=descriptors)
+    return Trainer(model, views, train, extent(points.cam_from_world))
 
 
 def _exposures(job: Job, capture: Capture, points: Points) -> np.ndarray | None:
@@ -120,14 +111,9 @@ def _note_left_out(job: Job, train: TrainSection, has_semantics: bool, no_depth:
             why = "train.features is lifted: they follow the training"
         job.left_out("semantic branch", why)
     unneeded = {
-        "shape encoder": [
-            (not has_semantics, "no semantics to encode"),
-            (not train.trains_encoder, f"train.encoder is {train.encoder}"),
-        ],
         "pruning": [(not train.prune, "train.prune is false")],
         "densification": [(train.densify == "off", "train.densify is off")],
         "SH pruning": [(not train.sh_prune, "train.sh_prune is false")],
-        "knowledge basis": [("basis" not in job.inputs, "no sequence is named: this scene starts from nothing")],
     }
     for what, reasons in unneeded.items():
         applying = [reason for applies, reason in reasons if applies]
@@ -191,59 +177,9 @@ def started(ply: Path, train: TrainSection) -> dict[str, Tensor]:
     return {name: torch.tensor(values, dtype=torch.float32) for name, values in raw.items()}
 
 
-def knowledge(job: Job, model: SceneModel, train: TrainSection) -> dict[str, Tensor]:
-    """Bases of earlier scenes; with `train.warm_start` the encoder also starts from their weights."""
-    if "basis" not in job.inputs or model.shape is None:
-        return {}
-    basis, maps = read_basis(job.inputs["basis"]), model.shape.encoder.linear_maps()
-    unfit, wrong = without_basis(maps, basis.bases)
-    if wrong:
-        raise InputError(f"{job.inputs['basis']} does not fit the encoder at {wrong[0]}; start another sequence")
-    if unfit:
-        job.left_out(f"knowledge of {', '.join(unfit)}", "the earlier encoder has none of this shape")
-    if train.warm_start:
-        state = model.shape.encoder.state_dict()
-        fitting = {k: torch.from_numpy(v) for k, v in basis.weights.items() if k in state and state[k].shape == v.shape}
-        model.shape.encoder.load_state_dict(state | fitting)
-        model.shape.keeps_norm = any(name.startswith("norm_input.") for name in fitting)
-        job.facts["warm_started"] = len(fitting)
-        if other := sorted(state.keys() - fitting.keys()):
-            job.left_out(f"warm start of {', '.join(other)}", "the earlier encoder has none of this shape")
-    followed = maps.keys() - set(unfit) if train.weight_basis > 0 else set()
-    return {name: torch.from_numpy(basis.bases[name]) for name in maps if name in followed}
-
-
 def within_cap(job: Job, points: Points) -> Points:
     """The points that a training starts from: all, or as many as `max_gaussians` lets in."""
     n, most = len(points.means), job.config.train.max_gaussians
     if n > most:
-        job.left_out(f"{n - most} of {n} initial points, and regions of all", f"train.max_gaussians is {most}")
+        job.left_out(f"{n - most} of {n} initial points", f"train.max_gaussians is {most}")
     return thinned(points, most, job.config.train.seed)
-
-
-def described(job: Job, points: Points) -> Descriptors | None:
-    """The describe stage's regions where there are any. Raises InputError unless they are of these points and settings.
-
-    They are read before anything is built, so that a wrong artifact costs no time.
-    """
-    if "descriptors" not in job.inputs:
-        return None
-    path = job.inputs["descriptors"]
-    stored = read_descriptors(path)
-    if max(stored.members.max(initial=-1), stored.centers.max(initial=-1)) >= len(points.means):
-        raise InputError(f"{path} describes other points; run the describe stage on these points")
-    describe = job.config.describe
-    wrong = [f"describe.{name}" for name, value in describe.model_dump().items() if stored.settings.get(name) != value]
-    if wrong:
-        raise InputError(f"{path} has another {wrong[0]}; run the describe stage with this config")
-    if stored.values.shape[1:3] != (stored.members.shape[1], describe.n_angles):
-        raise InputError(f"{path} has descriptors of another shape; run the describe stage again")
-    return stored
-
-
-def first_regions(stored: Descriptors | None) -> tuple[Regions | None, Tensor | None]:
-    """The describe stage's regions and descriptors for a training to start from; None: it makes its own."""
-    if stored is None:
-        return None, None
-    regions = Regions(stored.centers, stored.members, stored.settings["radius"], stored.settings["share"])
-    return regions, torch.from_numpy(stored.values)

@@ -35,8 +35,7 @@ def follow(job: Job, trainer: Trainer) -> list[dict[str, float]]:
         job.facts["resumed_at"] = [*held["resumed_at"], trainer.step]
         log.info("resumed at step %d", trainer.step)
     with deferred() as asked:
-        periods = train.encode_every, trainer.feature_every
-        losses: deque[float | Tensor] = deque(maxlen=max(periods))  # some terms are in one step of so many alone
+        losses: deque[float | Tensor] = deque(maxlen=trainer.feature_every)  # the features' is in one step of so many
         rounds = job.progress.track(trainer.steps(), lambda: expected(trainer), "train", start=trainer.step)
         for figures, status in rounds:
             since.append(figures)
@@ -60,7 +59,7 @@ def measured(trainer: Trainer, since: list[dict[str, float | Tensor]], watched: 
     """A row of the trace, from the figures of steps since the row before and the PSNR of the training views watched."""
     row: dict[str, float | Tensor] = {"step": trainer.step, "seconds": trainer.seconds, "n": since[-1]["n"]}
     for name in {name for entry in since for name in entry} - row.keys():
-        values = [entry[name] for entry in since if name in entry]  # encodings have a loss in some steps only
+        values = [entry[name] for entry in since if name in entry]  # the features' is in some steps only
         row[name] = sum(values) / len(values)
     row |= {"psnr": trainer.held_in_psnr(watched), "sh_kept": trainer.model.sh_kept()}
     return {k: float(v) for k, v in row.items()}

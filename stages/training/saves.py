@@ -1,31 +1,21 @@
-"""An interrupted training goes on where it was last saved, to the same bytes; and
-what a checkpoint says of its training.
-"""
+"""An interrupted training goes on where it was last saved, to the same bytes."""
 
 from __future__ import annotations
 
 import logging
 import time
 from importlib.metadata import version
-from pathlib import Path
 from typing import Any
 
-import numpy as np
 import torch
-from torch import Tensor
 
-from chebsplat.errors import InputError
 from chebsplat.formats.artifact import digest, read_manifest
 from chebsplat.formats.files import atomic_path
-from chebsplat.formats.gaussians import Gaussians
-from chebsplat.settings import DescribeSection, TrainSection
-from chebsplat.shape.encoder import RegionEncoder
 from chebsplat.stages.runtime.command import Job, n_threads
-from chebsplat.stages.runtime.config import checked
 
 log = logging.getLogger("chebsplat")
 SECONDS = 30.0  # between two saves
-LAYOUT = 2  # of a state: one of another layout is not gone on from
+LAYOUT = 3  # of a state: one of another layout is not gone on from
 
 
 class Saves:
@@ -77,28 +67,3 @@ class Saves:
                 torch.save(held, handle)
         except (OSError, RuntimeError) as error:  # torch has its own word for a full disk
             log.warning("%s cannot be saved (%s): the training goes on without", self.file, error)
-
-
-def trained_with(path: Path) -> dict[str, Any]:
-    """The sections `describe` and `train` that the checkpoint was made with. Raises InputError if it names none."""
-    config, file = read_manifest(path).config, path / "artifact.json"
-    if not {"describe", "train"} <= set(config):
-        raise InputError(f"{file} does not say how the scene was trained; train it again")
-    return {
-        "describe": checked(DescribeSection, config["describe"], f"{file}: describe", InputError).model_dump(),
-        "train": checked(TrainSection, config["train"], f"{file}: train", InputError).model_dump(),
-    }
-
-
-def restored_encoder(gaussians: Gaussians) -> RegionEncoder:
-    """The local encoder of a checkpoint. Raises InputError if the scene was trained without one."""
-    return RegionEncoder.restored(*gaussians.encoder())
-
-
-def without_basis(maps: dict[str, Tensor], bases: dict[str, np.ndarray]) -> tuple[list[str], list[str]]:
-    """Names of linear maps [q, p] that have no basis of q rows: of those that read what a scene brings, and of others.
-
-    The width of a token's inputs follows teacher and settings; all other widths are the encoder's own.
-    """
-    unfit = [name for name, W in maps.items() if name not in bases or len(bases[name]) != len(W)]
-    return [n for n in unfit if n.startswith("embed_")], [n for n in unfit if not n.startswith("embed_")]
