@@ -31,7 +31,6 @@ STAGE_OF = {
     "refined": "refine",
     "scene": "export",
     "encoder": "onnx",
-    "basis": "cks",
     "evaluation": "evaluate",
 }
 BYTES = {
@@ -49,7 +48,7 @@ def run(job: Job) -> None:
     """One HTML page, and the figures as CSV, of what was measured and where it comes from.
 
     Reads `evaluation` and `gaussians`, and of `capture`, `points`, `channels`, `features`, `agreement`, `descriptors`,
-    `lifted`, `refined`, `scene`, `encoder` and `basis` what there is. Writes `report`.
+    `lifted`, `refined`, `scene` and `encoder` what there is. Writes `report`.
     """
     evaluation = Evaluation.read(job.inputs["evaluation"])
     gaussians = Gaussians.read(job.inputs["gaussians"])
@@ -137,7 +136,6 @@ def absent_stages(job: Job, gaussians: Gaussians) -> dict[str, str]:
         "lifted": "the scene has no teacher, or its features were not lifted",
         "refined": "the scene has no teacher, or its features were not refined",
         "encoder": unneeded if encoder is None else "",
-        "basis": "no sequence is named",
     }
     absent = {role: why for role, why in reasons.items() if role not in job.inputs}
     return {f"stage {STAGE_OF[role]}": why or "its artifact was not given" for role, why in absent.items()}

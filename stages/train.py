@@ -19,7 +19,7 @@ log = logging.getLogger("chebsplat")
 def run(job: Job) -> None:
     """Optimise Gaussians, their semantics and the shape encoder (Eqs 7-13; docs/method.md, sections 3 to 8).
 
-    Reads `capture`, `points` and, with semantics, `features`, `descriptors` and the `basis` of earlier scenes. Writes
+    Reads `capture`, `points` and, with semantics, `features`, `descriptors` and, of the scene before, `earlier`. Writes
     `gaussians`.
     """
     inputs = read_inputs(job)

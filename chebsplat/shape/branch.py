@@ -9,7 +9,6 @@ import torch
 from torch import Tensor, nn
 
 from chebsplat.settings import DescribeSection, TrainSection
-from chebsplat.shape import cks
 from chebsplat.shape.described import n_degrees
 from chebsplat.shape.encoder import RegionEncoder
 from chebsplat.shape.fusion import Gate, fuse_in_view, propagate, propagation_weights, share_undefined
@@ -56,9 +55,7 @@ class ShapeBranch(nn.Module):
         if n_context:  # unit vectors
             rms = torch.full((n_context,), n_context**-0.5)
             self.encoder.norm_input.set(self.n_described, torch.zeros(n_context), rms)
-        self.keeps_norm = False  # an earlier scene's constants are kept, with its weights
         self.gate = Gate(n_channels, train.gate_start)
-        self.modulation = cks.Modulation(n_channels) if train.alpha == "network" else None
         self.regions: Regions | None = None
         self.described = Descriptors(describe)
         self.ids = GaussianIds()
@@ -110,7 +107,7 @@ class ShapeBranch(nn.Module):
         else:
             described = self.described.update(means, quats, log_scales, members, descriptors)
         rows = described[members >= 0]
-        if self.n_described and len(rows) and not self.keeps_norm:
+        if self.n_described and len(rows):
             self.encoder.norm_input.set(0, rows.mean(0), rows.std(0, unbiased=False))
         places, near = placed(means.numpy(), regions, self.train_settings.n_covers, self.train_settings.position)
         positions, cover = torch.from_numpy(places), torch.from_numpy(near)
@@ -195,8 +192,3 @@ class ShapeBranch(nn.Module):
         wanted = features.detach()[members.clamp_min(0)]
         mask = members >= 0
         return ((fresh.values[:, None] - wanted).square().sum(-1) + 1e-12).sqrt()[mask].mean()
-
-    def basis_loss(self, bases: dict[str, Tensor], fresh: FreshEncodings) -> Tensor:
-        """How far the encoder lies outside earlier scenes' bases (Eq 14), modulated by the shapes it sees."""
-        loss = cks.basis_loss(self.encoder.linear_maps(), bases, self.backend)
-        return loss if self.modulation is None else self.modulation(fresh.values.mean(0)) * loss

@@ -44,8 +44,7 @@ class Standardize(nn.Module):
 class Attention(nn.Module):
     """Multi-head self-attention whose padded keys get no weight.
 
-    Choices: weights start at a deviation of 0.02: what is learned outweighs them, so that the knowledge space, which is
-      spanned by these weights, holds what was learned and not what was drawn.
+    Choices: weights start at a deviation of 0.02: what is learned outweighs what was drawn.
     """
 
     def __init__(self, width: int, n_heads: int):
@@ -154,14 +153,3 @@ class RegionEncoder(nn.Module):
         encoder = cls(**settings)
         encoder.load_state_dict({name: torch.from_numpy(value) for name, value in weights.items()})
         return encoder.eval()
-
-    def linear_maps(self) -> dict[str, Tensor]:
-        """W [q, p] by name of each linear map z W that the knowledge space follows: inputs, attention and decoder."""
-        layers: dict[str, nn.Linear] = {"embed_position": self.embed_position, "hidden": self.hidden}
-        if self.n_inputs:
-            layers["embed_input"] = self.embed_input
-        for index, block in enumerate(self.blocks):
-            for part in ("query", "key", "value", "output"):
-                layers[f"blocks.{index}.{part}"] = getattr(block.attention, part)
-        layers |= {f"decode.{k}": layer for k, layer in enumerate(self.decode) if isinstance(layer, nn.Linear)}
-        return {name: layer.weight.T for name, layer in layers.items()}

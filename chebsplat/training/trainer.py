@@ -34,7 +34,6 @@ class Trainer:
     Args:
       settings: resolved, nothing left open (`stages.training.defaults`).
       extent:   scene units, scales the means' learning rate.
-      basis:    matrices [q, r] by name of an earlier scene's knowledge; None: of none.
       regions, descriptors: of the model's Gaussians as they are; None: they are computed.
       cameras:  what is learned of each view's camera; None: nothing.
     The model's Gaussians say which device computes; views, cameras and regions are to be there, too. On a GPU a step
@@ -51,13 +50,10 @@ class Trainer:
         settings: TrainSection,
         extent: float,
         *,
-        basis: dict[str, Tensor] | None = None,
         regions: Regions | None = None,
         descriptors: Tensor | None = None,
     ):
         self.model, self.views, self.settings, self.extent = model, views, settings, extent
-        given = basis if basis and model.shape is not None else {}
-        self.basis = {name: value.to(model.device) for name, value in given.items()}
         self.schedule = Schedule(settings)
         assert settings.feature_every is not None and settings.weight_depth is not None
         self.feature_every, self.weight_depth = settings.feature_every, settings.weight_depth
@@ -274,8 +270,6 @@ class Trainer:
             losses["sh"] = settings.weight_sh * sh_mask_network.sh_loss(auxiliary.delta)
         elif auxiliary.band_masks is not None:
             losses["sh"] = settings.weight_sh * sh_prune.sh_loss(auxiliary.band_masks, self._guided(rendered.index))
-        if self.basis and self.model.shape is not None and auxiliary.fresh is not None:  # as often as views pull it
-            losses["basis"] = settings.weight_basis * self.model.shape.basis_loss(self.basis, auxiliary.fresh)
         return losses
 
     @torch.no_grad()

@@ -54,7 +54,6 @@ NEEDS = {  # measured in 18 scenes on two EPYC cores: seconds (median, most); mo
     "refine": Need(5, 4000),  # 9, 22; 1083 MB
     "export": Need(5, 2000),  # 1, 2; 138 MB
     "onnx": Need(5, 2000),
-    "cks": Need(5, 2000),
     "evaluate": Need(5, 2000),  # 5, 27; 646 MB
     "report": Need(5, 2000),  # 2, 7; 144 MB
 }
@@ -152,8 +151,6 @@ def together(entries: list[dict[str, Any]]) -> list[str]:
             return "capture", inputs["capture"]
         if stage == "train":
             return "train", entry["path"]
-        if stage == "cks":
-            return "train", inputs["gaussians"]
         if before := by_path.get(
             inputs.get({"describe": "points", "agree": "features", "evaluate": "scene"}.get(stage))
         ):

@@ -12,7 +12,6 @@ from torch import Tensor
 
 from chebsplat.cameras import extent
 from chebsplat.errors import ConfigError, DataFailure, InputError
-from chebsplat.formats.basis import read_basis
 from chebsplat.formats.cameras import Cameras
 from chebsplat.formats.capture import Capture
 from chebsplat.formats.descriptors import Descriptors, read_descriptors
@@ -28,7 +27,6 @@ from chebsplat.stages.settings import LiftSection
 from chebsplat.stages.training.defaults import LIFTED_FROM, OPEN, decided, evidence_of, resolved
 from chebsplat.stages.training.lifting import lifted_from
 from chebsplat.stages.training.photos import own_exposures
-from chebsplat.stages.training.saves import without_basis
 from chebsplat.stages.training.views import training_views
 from chebsplat.training.model import SceneModel
 from chebsplat.training.trainer import Trainer
@@ -87,9 +85,7 @@ def assemble(job: Job, inputs: Inputs, backend: str = "auto") -> Trainer:
         if job.config.train.feature_start in OPEN:
             why = f"of {len(views.names)} training views, fewer than {LIFTED_FROM}, it costs colour"
         job.left_out("lifted start of features", why)
-    basis = knowledge(job, model, train)
-    scale = extent(points.cam_from_world)
-    return Trainer(model, views, train, scale, basis=basis, regions=regions, descriptors=descriptors)
+    return Trainer(model, views, train, extent(points.cam_from_world), regions=regions, descriptors=descriptors)
 
 
 def _exposures(job: Job, capture: Capture, points: Points) -> np.ndarray | None:
@@ -127,7 +123,6 @@ def _note_left_out(job: Job, train: TrainSection, has_semantics: bool, no_depth:
         "pruning": [(not train.prune, "train.prune is false")],
         "densification": [(train.densify == "off", "train.densify is off")],
         "SH pruning": [(not train.sh_prune, "train.sh_prune is false")],
-        "knowledge basis": [("basis" not in job.inputs, "no sequence is named: this scene starts from nothing")],
     }
     for what, reasons in unneeded.items():
         applying = [reason for applies, reason in reasons if applies]
@@ -189,28 +184,6 @@ def started(ply: Path, train: TrainSection) -> dict[str, Tensor]:
     for band in range(1, min(degree, train.sh_degree) + 1):
         raw[f"sh{band}"] = parameters["shN"][:, band**2 - 1 : (band + 1) ** 2 - 1]
     return {name: torch.tensor(values, dtype=torch.float32) for name, values in raw.items()}
-
-
-def knowledge(job: Job, model: SceneModel, train: TrainSection) -> dict[str, Tensor]:
-    """Bases of earlier scenes; with `train.warm_start` the encoder also starts from their weights."""
-    if "basis" not in job.inputs or model.shape is None:
-        return {}
-    basis, maps = read_basis(job.inputs["basis"]), model.shape.encoder.linear_maps()
-    unfit, wrong = without_basis(maps, basis.bases)
-    if wrong:
-        raise InputError(f"{job.inputs['basis']} does not fit the encoder at {wrong[0]}; start another sequence")
-    if unfit:
-        job.left_out(f"knowledge of {', '.join(unfit)}", "the earlier encoder has none of this shape")
-    if train.warm_start:
-        state = model.shape.encoder.state_dict()
-        fitting = {k: torch.from_numpy(v) for k, v in basis.weights.items() if k in state and state[k].shape == v.shape}
-        model.shape.encoder.load_state_dict(state | fitting)
-        model.shape.keeps_norm = any(name.startswith("norm_input.") for name in fitting)
-        job.facts["warm_started"] = len(fitting)
-        if other := sorted(state.keys() - fitting.keys()):
-            job.left_out(f"warm start of {', '.join(other)}", "the earlier encoder has none of this shape")
-    followed = maps.keys() - set(unfit) if train.weight_basis > 0 else set()
-    return {name: torch.from_numpy(basis.bases[name]) for name in maps if name in followed}
 
 
 def within_cap(job: Job, points: Points) -> Points:

@@ -25,8 +25,6 @@ def facts_of(
         facts["described_anew"] = model.shape.described.share_described
         if trainer.settings.inflation == 0:
             facts["guarded"] = model.shape.share_undefined
-        if model.shape.modulation is not None and trainer.basis:
-            facts["alpha"] = float(model.shape.modulation(model.shape.cache.mean(0)))
         if features is not None:
             alone = model.shape.alone().cpu().numpy()
             facts["encoder"] = agreement(alone, parameters["features"], features.label_embeddings)

@@ -10,9 +10,7 @@ from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import torch
-from torch import Tensor
 
 from chebsplat.errors import InputError
 from chebsplat.formats.artifact import digest, read_manifest
@@ -93,12 +91,3 @@ def trained_with(path: Path) -> dict[str, Any]:
 def restored_encoder(gaussians: Gaussians) -> RegionEncoder:
     """The local encoder of a checkpoint. Raises InputError if the scene was trained without one."""
     return RegionEncoder.restored(*gaussians.encoder())
-
-
-def without_basis(maps: dict[str, Tensor], bases: dict[str, np.ndarray]) -> tuple[list[str], list[str]]:
-    """Names of linear maps [q, p] that have no basis of q rows: of those that read what a scene brings, and of others.
-
-    The width of a token's inputs follows teacher and settings; all other widths are the encoder's own.
-    """
-    unfit = [name for name, W in maps.items() if name not in bases or len(bases[name]) != len(W)]
-    return [n for n in unfit if n.startswith("embed_")], [n for n in unfit if not n.startswith("embed_")]
