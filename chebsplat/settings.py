@@ -152,11 +152,6 @@ class TrainSection(Section):
     weight_depth: float | None = number(
         None, "of the relative distance to measured depth; default: 0.8 where views agree on it, else 0", 0, 1e4
     )
-    weight_basis: float = number(1.0, "of the pull towards the earlier scenes' knowledge", 0, 1e4)
-    warm_start: bool = setting(True, "start the encoder from the basis' stored weights")
-    alpha: Literal["network", "constant"] = setting(
-        "constant", "what modulates that pull; network: the paper's, of the shapes in view"
-    )
 
     @model_validator(mode="after")
     def _fits_together(self) -> TrainSection:

@@ -37,7 +37,6 @@ def train(
     capture: str | Path,
     *,
     ablation: str = "",
-    basis: str = "",
     cores: int | None = None,
     device: str = "auto",
     **settings: dict[str, Any],
@@ -46,12 +45,12 @@ def train(
 
     Args:
       capture:  a folder of photos or another source, or the name of a scene.
-      ablation: a named set of settings; basis: as of `make scene=… basis=`; cores: default: all.
+      ablation: a named set of settings; cores: default: all.
       settings: sections of settings by name, as `train={"steps": 1000}` (`chebsplat settings` lists them).
     Raises: ConfigError or InputError before anything runs; ChebsplatError if a stage fails, whose log says why.
     """
     used = device_of(device)
-    chosen = plans(str(capture), None, settings, ablation, basis, running=True, device=used)
+    chosen = plans(str(capture), None, settings, ablation, running=True, device=used)
     if execute(chosen, None, cores or os.cpu_count() or 1, used):
         raise ChebsplatError(f"{capture} could not be finished; the lines above name the stage and its log")
     return load(store.work() / chosen[-1].title)

@@ -191,20 +191,6 @@ class OnnxSection(Section):
     tolerance: float = number(1e-5, "largest difference from torch", 1e-12, 1)
 
 
-class CksSection(Section):
-    energy: float = number(0.96, "share of the energy that the basis grows to hold", 1e-3, 1)
-    tolerance: float = number(0.2, "ρ, or ρ′, below which a scene adds nothing (ε)", 1e-6, 10)
-    max_rank: float = number(0.875, "columns, at most, as a fraction of a linear map's inputs", 1e-3, 0.999)
-    energy_rule: Literal["total", "residual"] = setting(
-        "total", "of all a scene holds, or (the printed rule) of what the basis misses"
-    )
-    max_added: float = number(0.25, "columns that a scene may add, as a fraction of those left", 1e-3, 1)
-    n_scenes: int = number(20, "scenes that can each add a column: the first ones leave enough of them", 1, 10_000)
-    update_rule: Literal["residual", "printed"] = setting(
-        "residual", "what decides if a scene adds: its relative residual ρ; printed: ρ′ = ρ (1 + κ σ_f)"
-    )
-
-
 class EvaluateSection(Section):
     boundary: int = number(5, "pixels, half width of the boundary band", 1, 100)
     timing_repeats: int = number(3, "of every frame; 0: no timing; studies then evaluate in parallel", 0, 1000)

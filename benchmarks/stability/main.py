@@ -14,7 +14,6 @@ from benchmarks.stability import (  # noqa: F401  # importing a module registers
     fusion,
     gates,
     growth,
-    knowledge,
     losses,
     pruning,
     regions,

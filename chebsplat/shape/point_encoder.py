@@ -168,11 +168,6 @@ class PointEncoder(nn.Module):
         encoder.load_state_dict({name: torch.from_numpy(value) for name, value in weights.items()})
         return encoder.eval()
 
-    def linear_maps(self) -> dict[str, Tensor]:
-        """W [q, p] by name of each linear map z W, for the knowledge space."""
-        layers = {name: module for name, module in self.named_modules() if isinstance(module, nn.Linear)}
-        return {name: layer.weight.T for name, layer in layers.items()}
-
 
 def relative(cloud: Cloud, centers: Tensor, neighbors: Tensor, radius: float) -> Tensor:
     """How neighbours [B, K] lie about points [B], in radii: [B, K, 10].

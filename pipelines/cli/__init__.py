@@ -9,7 +9,6 @@ from typing import Any, NoReturn
 import click
 
 from chebsplat.pipelines.cli import about, renders, runs, upkeep, uses
-from chebsplat.pipelines.cli.basis import basis
 from chebsplat.pipelines.cli.group import Guarded, logged
 from chebsplat.stages.registry import STAGES
 
@@ -50,5 +49,5 @@ def main() -> None:
     """Semantic 3D Gaussian Splatting that understands shape."""
 
 
-for _command in (*runs.COMMANDS, *about.COMMANDS, *upkeep.COMMANDS, *uses.COMMANDS, *renders.COMMANDS, basis):
+for _command in (*runs.COMMANDS, *about.COMMANDS, *upkeep.COMMANDS, *uses.COMMANDS, *renders.COMMANDS):
     main.add_command(_command)

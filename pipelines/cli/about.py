@@ -17,7 +17,6 @@ WIDEST = 36  # characters of a column of ranges
 @click.command()
 def scenes() -> None:
     """List the scenes, ablations, sequences and studies that have a name, and scenes whose data must be brought."""
-    from chebsplat.pipelines.bases.revisions import head_names
     from chebsplat.pipelines.work.scenes import data_of, names
     from chebsplat.pipelines.work.summary import show_rows
 
@@ -30,7 +29,6 @@ def scenes() -> None:
     show_rows([(f"  {name}", str(path), there[name]) for name, (_, path) in needed.items()])
     for kind in ("ablations", "sequences", "studies"):
         print(f"{kind}: {' '.join(names(kind))}")
-    print(f"HEADs: {' '.join(head_names()) or 'none'}")
 
 
 @click.command()

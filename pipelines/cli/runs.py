@@ -13,14 +13,11 @@ from chebsplat.stages.runtime.device import DEVICES
 
 OPTIONS = [
     click.option("--scene", help="a name from `chebsplat scenes`, a folder, or a video"),
-    click.option("--sequence", help="scenes in order, each starting from the knowledge of those before"),
+    click.option(
+        "--sequence", help="scenes in order, each with the knowledge of the one before; needs --ablation paper"
+    ),
     click.option("--set", "settings", default="", help="section.key=value,..."),
     click.option("--ablation", default="", help="a named set of settings"),
-    click.option(
-        "--basis",
-        default="",
-        help="start from this knowledge: NAME[@REVISION] of a sequence or HEAD, FOLDER/; none: nor what is shipped",
-    ),
 ]
 
 
@@ -62,14 +59,13 @@ def run(stage: str | None, cores: int | None, device: str, on: str, **choice: An
 @ON_DEVICE
 def plan(device: str, **choice: Any) -> None:
     """Show what would run, what is fresh, and what the scene leaves out, and why."""
-    from chebsplat.pipelines.running.run import device_of, wanted_steps
+    from chebsplat.pipelines.running.run import device_of
     from chebsplat.pipelines.selection import plans
 
     chosen = plans(**choice, device=device_of(device))
-    keys = {step.key for one in chosen if one.asked for step in wanted_steps(one, None, chosen)}
     for one in chosen:
         print(f"{one.title}: {one.source}")
-        for step in (step for step in one.steps if step.key in keys):
+        for step in one.steps:
             print(f"  {'fresh' if step.fresh else 'would run':9s} {step.stage:9s} {step.key}")
         for what, why in one.left_out.items():
             print(f"  left out  {what}: {why}")
@@ -92,7 +88,7 @@ def study(
     """Run a study (of pipelines/configs/studies, or a .toml): its table, figure and page; goes on where it stopped."""
     from chebsplat.pipelines.running import cluster
     from chebsplat.pipelines.running.run import Outcome, device_of, say
-    from chebsplat.pipelines.studies import page, results, tables, transfer
+    from chebsplat.pipelines.studies import page, results, tables
     from chebsplat.pipelines.studies import study as studies
 
     where, asked = cluster.checked(on), studies.read_study(name)
@@ -109,8 +105,7 @@ def study(
 
     def write(failed: dict[str, tuple[int, str, Path]]) -> Path:
         rows = [results.row_of(run, failed) for run in runs]
-        more = tables.sections(asked, rows) + (transfer.sections(asked, rows) if asked.sequences else [])
-        return page.write(folder, asked, runs, rows, command, more).absolute()
+        return page.write(folder, asked, runs, rows, command, tables.sections(asked, rows)).absolute()
 
     outcome = Outcome()
     if not no_run:

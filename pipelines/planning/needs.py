@@ -76,17 +76,6 @@ def unread_inputs(config: Any, stage: str) -> set[str]:
     return {"train": {"features"} if lifted else set(), "export": {"lifted"}}.get(stage, set())
 
 
-def left_out_knowledge(config: Any, kind: str, why: str, basis: Path | None, keep: bool) -> dict[str, str]:
-    """Why a scene does not train on a given basis, or keeps nothing of its knowledge, if so."""
-    if kind != "none" and config.train.features == "lifted":
-        kind, why = "none", LIFTED
-    unable = f"no encoder is trained ({why})" if kind == "none" else f"train.encoder is {config.train.encoder}"
-    left_out = {} if basis is None or not unable else {"basis": unable}
-    if unable or not keep:
-        left_out["cks"] = unable or "no sequence is named"
-    return left_out
-
-
 def left_out_channels(kind: str, model: TeacherModel | None) -> dict[str, str]:
     """Why a scene keeps its teacher's channels, if it does."""
     if model is None:

@@ -20,7 +20,6 @@ from chebsplat.pipelines.planning.code import PACKAGE, PLACES, Code, step_key
 from chebsplat.pipelines.planning.needs import (
     knowledge_given,
     left_out_channels,
-    left_out_knowledge,
     left_out_stages,
     media_packages,
     source_sentence,
@@ -64,16 +63,12 @@ class Step:
 
 @dataclass
 class Plan:
-    """Steps in order, with what is left out and why. `title` names the links: scene[@ablation].
-
-    `asked` is false of a scene that is only made as far as another one needs it.
-    """
+    """Steps in order, with what is left out and why. `title` names the links: scene[@ablation]."""
 
     title: str
     source: str
     steps: list[Step]
     left_out: dict[str, str] = field(default_factory=dict)
-    asked: bool = True
 
     @property
     def targets(self) -> dict[str, Path]:
@@ -136,16 +131,6 @@ def overrides(settings: Overrides) -> dict[str, Any]:
     return values
 
 
-def with_setting(settings: Overrides, section: str, name: str, value: str) -> Overrides:
-    """Settings and one more, in the form that they have. Raises ConfigError if they hold it already."""
-    held = overrides(settings)
-    if name in held.get(section, {}):
-        raise ConfigError(f"{section}.{name} is given twice; leave one")
-    if isinstance(settings, str):
-        return ",".join(part for part in (settings, f"{section}.{name}={value}") if part)
-    return merged(held, {section: {name: value}})
-
-
 def parsed(key: str, value: str) -> Any:
     """A value as TOML reads it, text where it does not; `on` and `off` are switches, where `off` is no choice."""
     if value in ("on", "off") and key in OFF_IS_CHOICE:
@@ -177,14 +162,13 @@ class Planner:
         scene: str,
         settings: Overrides = "",
         ablation: str = "",
-        basis: Path | None = None,
-        keep_knowledge: bool = False,
+        earlier: Path | None = None,
         values: dict[str, Any] | None = None,
     ) -> Plan:
         """The steps of one scene.
 
-        Args: settings: over the scene's own; basis: an earlier scene's basis to train on; keep_knowledge: end with a
-              cks step; values: config sections that replace the scene's own, before ablation and settings (a study's).
+        Args: settings: over the scene's own; earlier: the training of the scene before, in a sequence; values: config
+              sections that replace the scene's own, before ablation and settings (a study's).
         Raises: ConfigError, InputError.
         """
         name, own = scene_values(scene)
@@ -207,7 +191,6 @@ class Planner:
         config = config.model_copy(update={"source": source, "teacher": teacher, "channels": channels})
         model = read_teacher(Path(teacher.model)) if kind == "onnx" and teacher.model else None
         left_out = left_out_stages(config, kind, why, probe) | left_out_channels(kind, model)
-        left_out |= left_out_knowledge(config, kind, why, basis, keep_knowledge)
         known, unknown = knowledge_given(config, kind, self.running) if "refine" not in left_out else (None, "")
         left_out |= {"knowledge of shape": unknown} if unknown else {}
         config = config.model_copy(update={"refine": config.refine.model_copy(update={"knowledge": None})})  # an input
@@ -218,15 +201,15 @@ class Planner:
                 continue
             unread = unread_inputs(config, stage.name)
             inputs = {role: steps[of].path for role, of in stage.roles.items() if of in steps and role not in unread}
-            if basis is not None and "basis" not in left_out and stage.name in ("train", "cks"):
-                inputs["basis"] = basis
+            if stage.name == "train" and earlier is not None:
+                inputs["earlier"] = earlier
             if stage.name == "refine" and known is not None:
                 inputs["knowledge"] = known
             elif stage.name == "refine":
                 inputs.pop("points", None)
             keys = {role: path.name for role, path in inputs.items()}
             steps[stage.name] = self.step(stage, config, inputs, keys, used.get(stage.name, ()))
-            steps[stage.name].after = [steps[earlier].path for earlier in stage.after if earlier in steps]
+            steps[stage.name].after = [steps[before].path for before in stage.after if before in steps]
         title = self._named(scene) + title
         return Plan(title, source_sentence(name, asked, source), list(steps.values()), left_out)
 

@@ -1,4 +1,4 @@
-"""Plans of more than a scene: scenes in order, each starting from the knowledge of those before; what teaches it."""
+"""Plans of more than a scene: scenes in order, each with the knowledge of the one before; what teaches knowledge."""
 
 from __future__ import annotations
 
@@ -31,19 +31,18 @@ def scenes_of(name: str) -> list[str]:
     return scenes
 
 
-def chain(
-    planner: Planner, name: str, settings: Overrides = "", ablation: str = "", length: int | None = None
-) -> list[Plan]:
-    """Plans of the first `length` scenes of a sequence; the basis of each is what its `cks` step makes.
+def chain(planner: Planner, name: str, settings: Overrides = "", ablation: str = "") -> list[Plan]:
+    """Plans of a sequence's scenes, each of whose trainings reads that of the scene before.
 
-    Choices: a scene that has no knowledge to give (no encoder) passes on the basis that it was given.
+    Raises: ConfigError without the ablation `paper`, whose printed form alone carries knowledge.
     """
+    scenes = scenes_of(name)
+    if ablation != "paper":
+        raise ConfigError("sequences carry knowledge in the paper's printed form only; add ablation=paper")
     found: list[Plan] = []
-    basis: Path | None = None
-    for place, scene in enumerate(scenes_of(name)[:length], start=1):
-        plan = planner.plan(scene, settings, ablation, basis, keep_knowledge=True)
+    for place, scene in enumerate(scenes, start=1):
+        plan = planner.plan(scene, settings, ablation, earlier=found[-1].targets["train"] if found else None)
         plan.title = f"{Path(name).stem}-{place}-{plan.title}"
-        basis = plan.targets.get("cks", basis)
         found.append(plan)
     return found
 

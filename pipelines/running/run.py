@@ -50,8 +50,7 @@ def device_of(wanted: str, on: str = cluster.LOCAL) -> str:
 
 def execute(plans: list[Plan], stage: str | None, cores: int, device: str = "cpu", on: str = cluster.LOCAL) -> int:
     """Bring plans up to date, up to `stage`; prints where the last artifact (the report's page) is on stdout."""
-    asked = [plan for plan in plans if plan.asked]
-    steps = {step.key: step for plan in asked for step in wanted_steps(plan, stage, plans)}
+    steps = {step.key: step for plan in plans for step in wanted_steps(plan, stage, plans)}
     stale = [step for step in steps.values() if not step.fresh]
     for plan in plans:
         say(f"{plan.title}: {plan.source}")
@@ -69,7 +68,7 @@ def execute(plans: list[Plan], stage: str | None, cores: int, device: str = "cpu
         return code
     if stale:
         seconds(list(steps.values()), {step.key for step in stale})
-    for plan in asked:
+    for plan in plans:
         say_result(plan, stage)
     return 0
 

@@ -10,7 +10,7 @@ import matplotlib.pyplot as plt
 import numpy as np
 
 from chebsplat.evaluation.statistics import summarize
-from chebsplat.pipelines.studies.results import Row, counted, groups
+from chebsplat.pipelines.studies.results import Row, groups
 
 MARKERS = "osD^vP*X<>"
 Traces = list[tuple[Row, list[dict[str, float]]]]
@@ -23,7 +23,7 @@ def draw(path: Path, rows: list[Row], traces: Traces, settings: dict[str, float]
     """
     matplotlib.use("Agg")
 
-    done = [row for row in counted(rows) if row["state"] == "done"]
+    done = [row for row in rows if row["state"] == "done"]
     variants = list(dict.fromkeys(row["variant"] for row in rows))
     style = {
         name: {"color": f"C{k % 10}", "marker": MARKERS[k % len(MARKERS)], "label": name}

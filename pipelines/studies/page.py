@@ -89,13 +89,9 @@ def note(study: Study, rows: list[Row]) -> str:
     """How to read the table."""
     n_scenes = len({row["scene"] for row in rows})
     unit = f"Student's over the {n_scenes} scenes" if n_scenes > 1 else "Student's over the seeds of the one scene"
-    first = (
-        " Of a sequence neither the first scene, which has no earlier knowledge, nor one that comes again is counted."
-        if study.sequences
-        else ""
-    )
+    first = ""
     if any(hasattr(protocols.ALL[row["protocol"]], "over_scenes") for row in rows):
-        first += " mIoU, mAcc and OA are of all scenes of a seed together, as the protocol has it."
+        first = " mIoU, mAcc and OA are of all scenes of a seed together, as the protocol has it."
     return (
         f"Mean ± standard deviation over scenes and seeds, on the views of the protocol. Below it: the mean difference "
         f"(× ratio) from {study.baseline} of runs with the same scene, seed, condition and budget, with its "

@@ -29,10 +29,10 @@ def gallery(study: Study, runs: list[Run], rows: list[Row]) -> dict[str, Any]:
         for run, row in zip(runs, rows, strict=True)
         if (run.condition, run.budget, row["state"]) == (condition, budget, "done")
     ]
-    scenes: dict[tuple[str, str], dict[str, Run]] = {}
+    scenes: dict[str, dict[str, Run]] = {}
     for run, _ in of_interest:
         if run.seed == study.seeds[0]:
-            scenes.setdefault((run.sequence, run.scene), {})[run.variant] = run
+            scenes.setdefault(run.scene, {})[run.variant] = run
     names = {where: _names(some) for where, some in scenes.items()}
     union = list(dict.fromkeys(name for own in names.values() for name in own))
     pictures: list[dict[str, Any]] = []
@@ -41,7 +41,7 @@ def gallery(study: Study, runs: list[Run], rows: list[Row]) -> dict[str, Any]:
         table = np.array([*(union.index(name) for name in names[where]), -1])
         evaluations = {variant: Evaluation.read(run.plan.targets["evaluate"]) for variant, run in some.items()}
         images, counts = _images(evaluations, table, len(union))
-        pictures.append({"name": " ".join(part for part in where if part), "images": images})
+        pictures.append({"name": where, "images": images})
         pixels.update(counts)
     variants = [v for v in study.variants if v != study.baseline]
     compared = variants[0] if variants else study.baseline
@@ -126,7 +126,7 @@ def _classes(of_interest: list[tuple[Run, Row]], variant: str, baseline: str, co
         values_of: dict[str, list[float]] = {}
         for run, row in of_interest:
             for name, value in row["segmentation"].get("scene", {}).get("iou", {}).items():
-                if run.variant == wanted and run.place != 1 and value is not None:
+                if run.variant == wanted and value is not None:
                     values_of.setdefault(name, []).append(value)
         return {name: float(np.mean(values)) for name, values in values_of.items()}
 

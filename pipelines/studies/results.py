@@ -48,7 +48,7 @@ FIGURES = (
     Figure("train_seconds", "training, s", 1, 1, True),
 )
 OTHERS = ("miou_teacher", "protocol", "held_in_psnr", "steps", "threads", "device", "train_key", "evaluate_key")
-IDENTITY = ("condition", "variant", "budget", "sequence", "place", "visit", "scene", "seed", "state")
+IDENTITY = ("condition", "variant", "budget", "scene", "seed", "state")
 POOLED = ("miou", "miou_gain", "macc", "oa")  # what a protocol may work out over all scenes together
 COLUMNS = (*IDENTITY, *(figure.key for figure in FIGURES), *OTHERS)
 
@@ -108,7 +108,7 @@ def segmented(scene: dict[str, Any], teacher: dict[str, Any]) -> Row:
 
 
 def over_scenes(rows: list[Row]) -> list[Row]:
-    """One row a seed (and sequence), its POOLED figures those of all its scenes together as the protocol has it.
+    """One row a seed, its POOLED figures those of all its scenes together as the protocol has it.
 
     Args: rows: finished ones of one protocol. The rows themselves, where it has no rule for several scenes.
     """
@@ -116,11 +116,11 @@ def over_scenes(rows: list[Row]) -> list[Row]:
     if rule is None:
         return rows
     pooled = []
-    for members in groups([row for row in rows if row["segmentation"]], "sequence", "seed").values():
+    for members in groups([row for row in rows if row["segmentation"]], "seed").values():
         sides = [[row["segmentation"].get(side) for row in members] for side in ("scene", "teacher")]
         scene, teacher = ({} if None in of_side else rule(of_side) for of_side in sides)
         name = "+".join(sorted(row["scene"] for row in members))
-        pooled.append(dict.fromkeys(POOLED) | members[0] | {"scene": name, "place": 0} | segmented(scene, teacher))
+        pooled.append(dict.fromkeys(POOLED) | members[0] | {"scene": name} | segmented(scene, teacher))
     return pooled
 
 
@@ -155,21 +155,13 @@ def groups(rows: list[Row], *names: str) -> dict[tuple, list[Row]]:
     return members
 
 
-def counted(rows: list[Row]) -> list[Row]:
-    """Without the first scene of a sequence, which has no earlier knowledge, and scenes that come again, which know
-    themselves.
-    """
-    return [row for row in rows if row["place"] != 1 and row["visit"] == 1]
-
-
 def compare(rows: list[Row], baseline: str) -> list[Line]:
     """Mean ± spread over scenes and seeds, and paired differences against the baseline.
 
-    Choices: of a sequence only those rows that are `counted`; every row is written.
-      A pair needs both runs: what failed on either side drops out of the difference, and the line counts its runs.
+    Choices: a pair needs both runs: what failed on either side drops out of the difference; the line counts its runs.
       Where a protocol works out a figure over all scenes together, that of a seed is one value, and needs all of them.
     """
-    by_line = groups(counted(rows), "condition", "budget", "variant")
+    by_line = groups(rows, "condition", "budget", "variant")
     lines = []
     for (condition, budget, variant), members in by_line.items():
         done = [row for row in members if row["state"] == "done"]
@@ -191,13 +183,10 @@ def compare(rows: list[Row], baseline: str) -> list[Line]:
 
 
 def pairs(done: list[Row], against: list[Row], key: str) -> list[tuple[str, float, float]]:
-    """(scene, value, the baseline's) of the same scene, seed and place in a sequence.
-
-    Choices: a scene in several sequences is one unit: its baseline is the same run in all of them.
-    """
+    """(scene, value, the baseline's) of the same scene and seed."""
 
     def place(row: Row) -> tuple:
-        return row["sequence"], row["place"], row["scene"], row["seed"]
+        return row["scene"], row["seed"]
 
     other = {place(row): row[key] for row in against if row[key] is not None}
     return [(row["scene"], row[key], other[place(row)]) for row in done if row[key] is not None and place(row) in other]

@@ -1,4 +1,4 @@
-"""Studies: scenes (or sequences) × conditions × variants × budgets × seeds, planned and stored; their progress."""
+"""Studies: scenes × conditions × variants × budgets × seeds, planned and stored; their progress."""
 
 from __future__ import annotations
 
@@ -8,14 +8,12 @@ import time
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
-from pathlib import Path
 from typing import Annotated, Any
 
 from pydantic import AfterValidator, Field, model_validator
 
 from chebsplat.errors import ChebsplatError, ConfigError
 from chebsplat.pipelines.planning.plan import Plan, Planner, Step, merged, suffix
-from chebsplat.pipelines.planning.sequences import scenes_of
 from chebsplat.pipelines.running.cluster import LOCAL
 from chebsplat.pipelines.running.run import Outcome, say, snakemake, wanted_steps
 from chebsplat.pipelines.work import store
@@ -50,53 +48,41 @@ class Study(Section):
     conditions and variants hold config sections.
 
     Conditions are what results are averaged within (a teacher, a noise level); variants are compared, each with
-    `baseline`, under the same condition, budget, scene and seed. A variant may also name an `ablation`, and, in a study
-    of sequences, `knowledge = false`: every scene from nothing. What a scene passes on is what it learned with the last
-    budget, whatever the budget of the next: budgets then show how soon a scene gets somewhere, all else being equal.
+    `baseline`, under the same condition, budget, scene and seed. A variant may also name an `ablation`.
     """
 
     title: str
     about: str
-    scenes: list[Text] = Field([], max_length=1000)
-    sequences: list[Text] = Field([], max_length=1000)
+    scenes: list[Text] = Field(min_length=1, max_length=1000)
     seeds: list[Annotated[int, Field(ge=0, lt=2**31)]] = Field([0], min_length=1, max_length=1000)
     budgets: Budgets = Budgets()
     baseline: str
     settings: Sections = Field({})
     conditions: dict[Name, Sections] = Field({"": {}}, max_length=1000)
     variants: dict[Name, dict[str, Any]] = Field(min_length=1, max_length=1000)
-    pairs: list[Annotated[tuple[str, str], Field(strict=False)]] = Field([])  # compared besides: second with first
     against: str = ""  # section.key whose value is the figure's horizontal axis, instead of run time
 
     @model_validator(mode="after")
     def _fits_together(self) -> Study:
-        if bool(self.scenes) == bool(self.sequences):
-            raise ValueError("name scenes or sequences, one of them")
-        for name in (self.baseline, *(name for pair in self.pairs for name in pair)):
-            if name not in self.variants:
-                raise ValueError(f"{name[:60]!r} is none of its variants: {', '.join(self.variants)}")
-        kinds = {"ablation": str, "knowledge": bool}
+        if self.baseline not in self.variants:
+            raise ValueError(f"{self.baseline[:60]!r} is none of its variants: {', '.join(self.variants)}")
         for name, variant in self.variants.items():
             for key, value in variant.items():
-                if not isinstance(value, kinds.get(key, dict)):
-                    raise ValueError(f"variants.{name}.{key}: a {kinds.get(key, dict).__name__} is needed")
+                kind = str if key == "ablation" else dict
+                if not isinstance(value, kind):
+                    raise ValueError(f"variants.{name}.{key}: a {kind.__name__} is needed")
         return self
 
 
 @dataclass(frozen=True)
 class Run:
-    """One point of a study. `place` counts from 1 within a sequence, and `visit` how often its scene has come; 0 and 1
-    outside one.
-    """
+    """One point of a study."""
 
     condition: str
     variant: str
     budget: str
     scene: str
     seed: int
-    sequence: str
-    place: int
-    visit: int
     plan: Plan = field(compare=False)
 
     @property
@@ -110,7 +96,7 @@ class Run:
     @property
     def name(self) -> str:
         """The name of its link, which a reader can tell the run by."""
-        parts = (self.condition, self.variant, self.budget, self.sequence, self.place or "", self.scene)
+        parts = (self.condition, self.variant, self.budget, self.scene)
         return suffix("-".join(str(p) for p in parts if p).replace(" ", "")) + f"-seed{self.seed}"
 
 
@@ -156,17 +142,14 @@ def expand(study: Study, running: bool = False, device: str = "cpu") -> list[Run
     Choices: all runs of a condition are measured under one protocol, since figures of two must not meet in a mean.
     """
     planner = Planner(running=running, device=device)
-    chains = [("", [scene]) for scene in study.scenes]
-    chains += [(Path(name).stem, scenes_of(name)) for name in study.sequences]
-    order = list(study.budgets.settings())
     runs: list[Run] = []
     try:
-        for sequence, chain in chains:
-            for seed, condition in itertools.product(study.seeds, study.conditions):
-                some: list[Run] = []
+        for scene, seed, condition in itertools.product(study.scenes, study.seeds, study.conditions):
+            for budget, spent in study.budgets.settings().items():
                 for variant in study.variants:
-                    some += _chain(planner, study, condition, variant, seed, sequence, chain)
-                runs += sorted(some, key=lambda run: (order.index(run.budget), run.place))
+                    values = merged(_values(study, condition, variant), {"train": spent})
+                    plan = planner.plan(scene, values=merged(values, seeded(scene, values, seed)))
+                    runs.append(Run(condition, variant, budget, plan.title, seed, plan))
     finally:
         planner.save()
     for condition in study.conditions:
@@ -176,28 +159,12 @@ def expand(study: Study, running: bool = False, device: str = "cpu") -> list[Run
     return runs
 
 
-def _chain(
-    planner: Planner, study: Study, condition: str, variant: str, seed: int, sequence: str, chain: list[str]
-) -> Iterator[Run]:
-    """The runs of scenes that follow one another, with every budget; the chain of a scene on its own has one link."""
+def _values(study: Study, condition: str, variant: str) -> Sections:
+    """The settings of a variant under a condition, its ablation's among them."""
     own = dict(study.variants[variant])
     ablation = own.pop("ablation", None)
-    knowledge = bool(own.pop("knowledge", True)) and bool(sequence)
-    basis: Path | None = None
-    budgets = study.budgets.settings()
-    for place, scene in enumerate(chain, start=1):
-        values = merged(study.settings, study.conditions[condition])
-        values = merged(values, read_toml("ablations", ablation) if ablation else {})
-        values = merged(values, own)
-        earlier = basis
-        for budget, spent in budgets.items():
-            settings = merged(values, {"train": spent})
-            settings = merged(settings, seeded(scene, settings, seed))
-            keep = knowledge and budget == list(budgets)[-1]
-            plan = planner.plan(scene, basis=earlier, keep_knowledge=keep, values=settings)
-            basis = plan.targets.get("cks", basis)
-            where = (place, chain[:place].count(scene)) if sequence else (0, 1)
-            yield Run(condition, variant, budget, plan.title, seed, sequence, *where, plan)
+    values = merged(study.settings, study.conditions[condition])
+    return merged(merged(values, read_toml("ablations", ablation) if ablation else {}), own)
 
 
 def seeded(scene: str, values: dict[str, Any], seed: int) -> dict[str, Any]:
@@ -208,13 +175,8 @@ def seeded(scene: str, values: dict[str, Any], seed: int) -> dict[str, Any]:
 
 def outstanding(runs: list[Run]) -> list[Step]:
     """Steps that are not there yet, each once."""
-    steps = {step.key: step for run in runs for step in (*run.steps, *_knowledge(run))}
+    steps = {step.key: step for run in runs for step in run.steps}
     return [step for step in steps.values() if not step.fresh]
-
-
-def _knowledge(run: Run) -> list[Step]:
-    """The basis that the next scene of a sequence trains on."""
-    return [step for step in run.plan.steps if step.stage == "cks"]
 
 
 def execute(
@@ -229,13 +191,13 @@ def execute(
     """Compute what is outstanding, cores // threads jobs at once; links in `work/study-NAME` keep its artifacts, and
     `refresh` shows now and then what there is.
 
-    A scene (or sequence) and seed is finished, and measured, before the next begins: a study cut short has compared
+    A scene and seed is finished, and measured, before the next begins: a study cut short has compared
     something. A step that fails costs the runs that need it, and no other. On a cluster all are in the queue at once.
     """
     outcome = Outcome()
     parts: dict[str, list[Run]] = {}
     for run in runs:
-        title = f"{run.sequence or run.scene}, seed {run.seed}" if on == LOCAL else name
+        title = f"{run.scene}, seed {run.seed}" if on == LOCAL else name
         parts.setdefault(title, []).append(run)
     links = {run.name: run.plan.targets[LAST] for run in runs}
     at_once = f"{cores // threads} at once, {threads} threads each"

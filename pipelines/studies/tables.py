@@ -10,7 +10,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from chebsplat.evaluation.statistics import Difference, Summary, summarize
-from chebsplat.pipelines.studies.results import FIGURES, Figure, Line, Row, counted, groups
+from chebsplat.pipelines.studies.results import FIGURES, Figure, Line, Row, groups
 from chebsplat.pipelines.studies.study import Study
 
 COSTS = ("n_gaussians", "sh_kept", "bytes_ply", "bytes_ragged", "frames_per_second", "train_seconds")
@@ -87,8 +87,8 @@ def tables(lines: list[Line], baseline: str) -> list[tuple[list[str], list[tuple
 
 
 def scene_table(rows: list[Row]) -> list[list[str]]:
-    """Header and rows: each scene apart, mean ± spread over seeds (and, in sequences, over orders)."""
-    done = [row for row in counted(rows) if row["state"] == "done"]
+    """Header and rows: each scene apart, mean ± spread over seeds."""
+    done = [row for row in rows if row["state"] == "done"]
     figures = [
         figure for figure in FIGURES if figure.key in BY_SCENE and any(row[figure.key] is not None for row in done)
     ]
@@ -105,7 +105,7 @@ def scene_table(rows: list[Row]) -> list[list[str]]:
 
 def missing(rows: list[Row]) -> list[tuple[str, str]]:
     """(run, why) of every run without figures."""
-    keys = ("scene", "condition", "variant", "budget", "sequence")
+    keys = ("scene", "condition", "variant", "budget")
     return [
         (", ".join(str(row[k]) for k in keys if row[k]) + f", seed {row['seed']}", row["state"])
         for row in rows
@@ -149,7 +149,7 @@ def reach(points: Sequence[tuple[float, float]], target: float) -> Reach:
 def sections(study: Study, rows: list[Row]) -> list[Section]:
     """One section; none without two budgets, or before a scene has the baseline's last one."""
     budgets = list(study.budgets.settings())
-    done = [row for row in counted(rows) if row["state"] == "done"]
+    done = [row for row in rows if row["state"] == "done"]
     table = []
     for (condition, scene), some in groups(done, "condition", "scene").items():
         by = {name: groups(of, "budget") for (name,), of in groups(some, "variant").items()}
@@ -169,7 +169,7 @@ def sections(study: Study, rows: list[Row]) -> list[Section]:
     note = (
         f"Where the line through the budgets' means first reaches what {study.baseline} ends with ({budgets[-1]}), in "
         "seconds of training and as a share of its seconds; '≤': with the smallest budget already. "
-        "Means over seeds and orders."
+        "Means over seeds."
     )
     return [Section(f"Seconds to what {study.baseline} ends with", note, [header, *table])]
 

@@ -30,7 +30,7 @@ def links(folder: Path) -> dict[str, Path]:
 
 
 def titles() -> list[str]:
-    """Names of the folders of links in work: of scenes, with their settings, of sequences, studies and HEADs."""
+    """Names of the folders of links in work: of scenes, with their settings, of sequences and studies."""
     base = store.work()
     there = sorted(os.listdir(base)) if os.path.isdir(base) else []
     return [name for name in there if not name.startswith(".") and name != "store" and links(base / name)]

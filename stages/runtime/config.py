@@ -43,7 +43,6 @@ class Config(Section):
     refine: parts.RefineSection = parts.RefineSection()
     knowledge: parts.KnowledgeSection = parts.KnowledgeSection()
     onnx: parts.OnnxSection = parts.OnnxSection()
-    cks: parts.CksSection = parts.CksSection()
     evaluate: parts.EvaluateSection = parts.EvaluateSection()
 
     def sections(self, names: tuple[str, ...]) -> dict[str, Any]:

@@ -1,1 +1,0 @@
-"""The knowledge that a sequence of scenes hands on."""
