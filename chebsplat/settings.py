@@ -43,6 +43,7 @@ class DescribeSection(Section):
     max_degree: int = number(8, "degree of the Chebyshev descriptor (D)", 2, 64)
     anisotropy: float = number(10.0, "of the metric (a); 0: isotropic", 0, 1e4)
     bandwidth: float = number(0.7, "of the edge weights, relative to a region's radius", 1e-3, 1e3)
+    n_eigs: int = number(16, "eigenvalues that the printed method keeps (K)", 1, 64)
     region_size: int = number(32, "Gaussians in a region, at most", 4, 64)
     n_regions: int = number(768, "regions that cover the scene", 1, 200_000)
     overlap: float = number(1.5, "radius of regions over the least that covers the scene", 1, 10)
@@ -50,7 +51,7 @@ class DescribeSection(Section):
 
     @model_validator(mode="after")
     def _fits_in_memory(self) -> DescribeSection:
-        size = 4 * self.n_regions * self.region_size * self.n_angles * (self.max_degree - 1)
+        size = 4 * self.n_regions * self.region_size * self.n_angles * (self.max_degree + 1)
         if size > DESCRIPTOR_BYTES:
             raise ValueError(
                 f"n_regions, region_size, n_angles and max_degree make descriptors of {size / 2**30:.0f} GB; "

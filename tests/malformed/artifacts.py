@@ -21,7 +21,6 @@ from chebsplat.formats.basis import Basis, write_basis
 from chebsplat.formats.cameras import Cameras
 from chebsplat.formats.capture import Capture
 from chebsplat.formats.descriptors import Descriptors, write_descriptors
-from chebsplat.formats.encoder import DYNAMIC, FLOAT, FUSED, write_encoder
 from chebsplat.formats.evaluation import Evaluation, ViewAgreement
 from chebsplat.formats.features import Features
 from chebsplat.formats.gaussians import Gaussians
@@ -41,7 +40,7 @@ KEY = "0123456789abcdef"
 MEMBER = "data/values.bin"
 VIEWS, LABELS = [f"view_{k}" for k in range(V)], ["wall", "floor", "sofa"]
 NOTES = {"left_out": {}, "n_initial": N}
-DESCRIBED = {"n_angles": 2, "max_degree": 3, "anisotropy": 10.0, "bandwidth": 0.7, "spectrum": "full", "n_eigs": 16}
+DESCRIBED = {"n_angles": 2, "max_degree": 3, "anisotropy": 10.0, "bandwidth": 0.7}
 
 
 @functools.cache
@@ -203,7 +202,7 @@ def _poses() -> tuple[np.ndarray, np.ndarray]:
 def _parameters() -> dict[str, np.ndarray]:
     rng = np.random.default_rng(0)
     shapes = {"means": (N, 3), "log_scales": (N, 3), "quats": (N, 4), "logit_opacities": (N,), "sh0": (N, 1, 3)}
-    shapes |= {"features": (N, C), "fused": (N, C)}
+    shapes["features"] = (N, C)
     p = {name: rng.normal(0, 0.5, shape).astype(np.float32) for name, shape in shapes.items()}
     p["means"][:, 2] += 3
     return p | {"shN": np.zeros((N, 15, 3), np.float32), "degrees": np.zeros(N, np.uint8)}
@@ -250,10 +249,9 @@ def _descriptors(out: Path) -> None:
 
 
 def _gaussians(out: Path) -> None:
-    encoder = {"n_inputs": 9, "n_channels": C, "width": 8, "n_layers": 1, "n_heads": 2}
     trace = [{"step": 10.0, "seconds": 1.0, "n": float(N), "psnr": 20.0}]
-    notes = NOTES | {"encoder": encoder, "label_names": LABELS}
-    modules = {"shape.gate.weight": np.ones((2, 2), np.float32)}
+    notes = NOTES | {"label_names": LABELS}
+    modules = {"semantic_gate.linear.weight": np.ones((1, C), np.float32)}
     Gaussians(_parameters(), _cameras(), modules, trace, notes).write(out)
 
 
@@ -286,25 +284,8 @@ def _knowledge(out: Path) -> None:
 
 def _scene(out: Path) -> None:
     p = _parameters()
-    p["raw_features"] = p.pop("fused")
     labels = np.arange(N, dtype=np.int32) % len(LABELS)
     Scene(p, _cameras(), np.arange(N), labels, LABELS, _embeddings(), NOTES).write(out)
-
-
-def _encoder(out: Path) -> None:
-    for name in (FLOAT, DYNAMIC, FUSED):
-        (out / name).write_bytes(b"no model")
-    describe = DESCRIBED | {"n_regions": 4, "region_size": 8, "seed": 0}
-    settings = {"describe": describe, "n_covers": 2, "described": True, "context": True, "n_inputs": 9, "n_channels": C}
-    write_encoder(out, {"encoder": {}, "fusion": {}, "settings": settings}, {FLOAT: [], DYNAMIC: [], FUSED: []})
-
-
-def _basis(out: Path) -> None:
-    report = {"rank_before": 0, "rank_after": 2, "added": 2, "rho": 1.0, "rho_after": 0.1}
-    report |= {"energy": 0.99, "rho_printed": 2.0}
-    entry = {"scene": "toy", "gaussians": KEY, "spread": 1.0, "maps": {"blocks.0.query": report}}
-    bases = {"blocks.0.query": np.eye(8, 2, dtype=np.float32)}
-    write_basis(out, Basis(bases, {"blocks.0.query": np.eye(8, dtype=np.float32)}, [entry]))
 
 
 def _evaluation(out: Path) -> None:

@@ -22,8 +22,8 @@ SETTINGS: list[tuple[str, object, str]] = [  # a setting of a config, its value,
     ("teacher.scales", [], "teacher.scales"),
     ("teacher.scales", [0.0], "teacher.scales.0"),
     ("teacher.scales", [1.0] * 100, "teacher.scales"),
-    ("describe.spectrum", ["full"], "describe.spectrum"),
-    ("train.encoder", "trnsformer", "'transformer'"),
+    ("refine.smooth", ["on"], "refine.smooth"),
+    ("train.encoder", "pints", "'points'"),
     ("train.seconds", float("inf"), "a finite number is needed"),
     ("train.semantics", 1, "true or false is needed"),
     ("train.densify_until", 0.9, "densify_until"),
@@ -44,7 +44,6 @@ SET = {  # --set: what stderr names
     "train.steps=" + "9" * 5000: "train.steps",
     "train.steps=" + DEEP: "train.steps",
     "teacher.labels=a\nb": "teacher.labels",
-    "train.encoder=transformer,train.width=30": "width",
     "describe.n_regions=200000,describe.n_angles=64": "descriptors of",
 }
 TOMLS: list[tuple[str, bytes, str]] = [  # what a config holds, a word of the message
