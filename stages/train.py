@@ -19,8 +19,8 @@ log = logging.getLogger("chebsplat")
 def run(job: Job) -> None:
     """Optimise Gaussians, their semantics and the shape encoder (Eqs 7-13; docs/method.md, sections 3 to 8).
 
-    Reads `capture`, `points` and, with semantics, `features`, `descriptors` and, of the scene before, `earlier`. Writes
-    `gaussians`.
+    Reads `capture`, `points` and, with semantics, `features` and `descriptors`; in a sequence, the `gaussians` of the
+    scene before. Writes `gaussians`.
     """
     inputs = read_inputs(job)
     trainer = assemble(job, inputs)

@@ -17,7 +17,6 @@ from typing import Any
 import numpy as np
 
 from chebsplat.formats import artifact
-from chebsplat.formats.basis import Basis, write_basis
 from chebsplat.formats.cameras import Cameras
 from chebsplat.formats.capture import Capture
 from chebsplat.formats.descriptors import Descriptors, write_descriptors
@@ -112,7 +111,7 @@ OF_ANY: list[Damage] = [
 ]
 
 
-def met(name: str, ask: Callable[[Path], Arguments], word: str, edit: Edit, of: str = "cks") -> Row:
+def met(name: str, ask: Callable[[Path], Arguments], word: str, edit: Edit, of: str = "describe") -> Row:
     """A damaged artifact in folder/in."""
 
     def build(folder: Path) -> Arguments:
@@ -126,7 +125,10 @@ def rows() -> Iterator[Row]:
     for what, edit, word in OF_ANY:
         yield met(f"{what}, in verify", lambda folder: ["verify", folder / "in"], word, edit)
     for what, edit, word in (OF_ANY[0], OF_ANY[6], OF_INPUTS[5]):
-        yield met(f"{what}, in plan", lambda folder: ["plan", "--scene", "toy", "--basis", f"{folder}/in/"], word, edit)
+        set_ = "refine.knowledge={}/in".format
+        yield met(
+            f"{what}, in plan", lambda folder: ["plan", "--scene", "toy", "--set", set_(folder)], word, edit, "teach"
+        )
     roles = [(name, role) for name, one in STAGES.items() for role in one.roles]
     for number, (name, role) in enumerate(roles):
         what, edit, word = OF_INPUTS[number % len(OF_INPUTS)]
@@ -299,14 +301,6 @@ def _encoder(out: Path) -> None:
     write_encoder(out, {"encoder": {}, "fusion": {}, "settings": settings}, {FLOAT: [], DYNAMIC: [], FUSED: []})
 
 
-def _basis(out: Path) -> None:
-    report = {"rank_before": 0, "rank_after": 2, "added": 2, "rho": 1.0, "rho_after": 0.1}
-    report |= {"energy": 0.99, "rho_printed": 2.0}
-    entry = {"scene": "toy", "gaussians": KEY, "spread": 1.0, "maps": {"blocks.0.query": report}}
-    bases = {"blocks.0.query": np.eye(8, 2, dtype=np.float32)}
-    write_basis(out, Basis(bases, {"blocks.0.query": np.eye(8, dtype=np.float32)}, [entry]))
-
-
 def _evaluation(out: Path) -> None:
     (width, height), blank = SIZE, np.zeros((1, SIZE[1], SIZE[0], 3), np.uint8)
     sizes = dict.fromkeys(("unpruned_ply", "ply", "split", "ragged", "semantic"), 100)
@@ -333,6 +327,5 @@ WRITERS: dict[str, Callable[[Path], None]] = {
     "refine": _refined,
     "export": _scene,
     "onnx": _encoder,
-    "cks": _basis,
     "evaluate": _evaluation,
 }

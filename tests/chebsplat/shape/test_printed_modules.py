@@ -7,7 +7,6 @@ import pytest
 import torch
 from scipy.special import erf
 
-from chebsplat.shape.cks import Growth, update
 from chebsplat.shape.encoder import N_FREQUENCIES, RegionEncoder, positional_encoding
 from chebsplat.shape.fusion import Fusion, Gate, propagate, propagation_weights
 from chebsplat.shape.region_inputs import in_scene
@@ -186,27 +185,6 @@ def test_the_printed_growth_is_density_times_volume_times_excess_within_the_ball
     added = densify(raw, members, gradient, 2.0, 10_000, generator, Candidates(density=density, printed=True, **bounds))
     assert len(added.parents) == math.ceil(6.1 * excess)
     assert ((added.rows["means"].double() - centre).norm(dim=1) <= radius * (1 + 1e-5)).all()
-
-
-@pytest.mark.parametrize(("novelty", "grows"), [(1.0, False), (1.5, True)])
-def test_the_printed_update_of_knowledge_is_its_formula(novelty, grows):
-    """Eq 15: where ρ (1 + κ σ_f) > ε, the fewest left singular vectors of the residual with 96 % of its energy."""
-    rng = np.random.default_rng(0)
-    basis = np.linalg.qr(rng.normal(size=(24, 4)))[0].astype(np.float32)
-    W = basis @ rng.normal(size=(4, 30)) + 0.05 * rng.normal(size=(24, 30))
-    B = np.linalg.qr(basis.astype(np.float64))[0]
-    residual = W - B @ B.T @ W
-    rho = np.linalg.norm(residual) / np.linalg.norm(W)
-    vectors, values, _ = np.linalg.svd(residual)
-    count = 1 + int((np.cumsum(values**2) / (residual**2).sum() < 0.96).sum())
-    options = {"rule": "residual", "update_rule": "printed", "tolerance": 1.2 * rho, "novelty": novelty}
-    free = {"max_rank": 0.999, "max_added": 1.0, "n_scenes": 1}
-    grown, report = update(torch.from_numpy(basis), torch.from_numpy(W), Growth(**options, **free))
-    assert abs(report["rho"] - rho) < 1e-12 and abs(report["rho_printed"] - rho * novelty) < 1e-12
-    assert report["added"] == (count if grows else 0)
-    if grows:
-        wanted = np.concatenate([B, vectors[:, :count]], 1)
-        assert np.abs(grown.double().numpy() @ grown.double().numpy().T - wanted @ wanted.T).max() < 1e-6  # float32
 
 
 def test_l1_of_features_is_its_formula_and_finite_differences_confirm_its_gradient():
