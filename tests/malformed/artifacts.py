@@ -121,14 +121,15 @@ def met(name: str, ask: Callable[[Path], Arguments], word: str, edit: Edit, of: 
     return Row("artifact", name, build, ("/in", word), alone="pipe" in name)
 
 
+def planned(folder: Path) -> Arguments:
+    return ["plan", "--scene", "toy", "--set", f"refine.knowledge={folder}/in"]
+
+
 def rows() -> Iterator[Row]:
     for what, edit, word in OF_ANY:
         yield met(f"{what}, in verify", lambda folder: ["verify", folder / "in"], word, edit)
     for what, edit, word in (OF_ANY[0], OF_ANY[6], OF_INPUTS[5]):
-        set_ = "refine.knowledge={}/in".format
-        yield met(
-            f"{what}, in plan", lambda folder: ["plan", "--scene", "toy", "--set", set_(folder)], word, edit, "teach"
-        )
+        yield met(f"{what}, in plan", planned, word, edit, "teach")
     roles = [(name, role) for name, one in STAGES.items() for role in one.roles]
     for number, (name, role) in enumerate(roles):
         what, edit, word = OF_INPUTS[number % len(OF_INPUTS)]
