@@ -17,7 +17,6 @@ from typing import Any
 import numpy as np
 
 from chebsplat.formats import artifact
-from chebsplat.formats.basis import Basis, write_basis
 from chebsplat.formats.cameras import Cameras
 from chebsplat.formats.capture import Capture
 from chebsplat.formats.descriptors import Descriptors, write_descriptors
@@ -111,7 +110,7 @@ OF_ANY: list[Damage] = [
 ]
 
 
-def met(name: str, ask: Callable[[Path], Arguments], word: str, edit: Edit, of: str = "cks") -> Row:
+def met(name: str, ask: Callable[[Path], Arguments], word: str, edit: Edit, of: str = "describe") -> Row:
     """A damaged artifact in folder/in."""
 
     def build(folder: Path) -> Arguments:
@@ -121,11 +120,15 @@ def met(name: str, ask: Callable[[Path], Arguments], word: str, edit: Edit, of: 
     return Row("artifact", name, build, ("/in", word), alone="pipe" in name)
 
 
+def planned(folder: Path) -> Arguments:
+    return ["plan", "--scene", "toy", "--set", f"refine.knowledge={folder}/in"]
+
+
 def rows() -> Iterator[Row]:
     for what, edit, word in OF_ANY:
         yield met(f"{what}, in verify", lambda folder: ["verify", folder / "in"], word, edit)
     for what, edit, word in (OF_ANY[0], OF_ANY[6], OF_INPUTS[5]):
-        yield met(f"{what}, in plan", lambda folder: ["plan", "--scene", "toy", "--basis", f"{folder}/in/"], word, edit)
+        yield met(f"{what}, in plan", planned, word, edit, "teach")
     roles = [(name, role) for name, one in STAGES.items() for role in one.roles]
     for number, (name, role) in enumerate(roles):
         what, edit, word = OF_INPUTS[number % len(OF_INPUTS)]
@@ -314,6 +317,5 @@ WRITERS: dict[str, Callable[[Path], None]] = {
     "refine": _refined,
     "export": _scene,
     "onnx": _encoder,
-    "cks": _basis,
     "evaluate": _evaluation,
 }

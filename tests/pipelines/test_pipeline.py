@@ -22,7 +22,7 @@ from chebsplat.pipelines.work.scenes import CONFIGS, names, read_toml
 from chebsplat.stages.registry import STAGES
 
 PLANNED = {name for name, stage in STAGES.items() if stage.of_scene}
-ALL = [name for name in STAGES if name in PLANNED - {"channels", "cks"}]
+ALL = [name for name in STAGES if name in PLANNED - {"channels"}]
 AFTER_TRAIN = ["train", "lift", "refine", "export", "onnx", "evaluate", "report"]
 
 
@@ -260,12 +260,12 @@ def test_generated_and_replica_scenes_never_share_a_key(tmp_path, monkeypatch):
 @pytest.mark.parametrize(
     ("settings", "left_out"),
     [
-        ("", {"channels", "cks"}),
-        ("train.semantics=false", {"channels", "teacher", "agree", "describe", "lift", "refine", "onnx", "cks"}),
-        ("teacher.kind=none", {"channels", "teacher", "agree", "describe", "lift", "refine", "onnx", "cks"}),
-        ("train.features=lifted", {"channels", "describe", "onnx", "cks"}),
-        ("train.encoder=off", {"channels", "describe", "onnx", "cks"}),
-        ("train.albo=false", {"channels", "describe", "cks"}),
+        ("", {"channels"}),
+        ("train.semantics=false", {"channels", "teacher", "agree", "describe", "lift", "refine", "onnx"}),
+        ("teacher.kind=none", {"channels", "teacher", "agree", "describe", "lift", "refine", "onnx"}),
+        ("train.features=lifted", {"channels", "describe", "onnx"}),
+        ("train.encoder=off", {"channels", "describe", "onnx"}),
+        ("train.albo=false", {"channels", "describe"}),
     ],
 )
 def test_a_scene_leaves_out_what_it_does_not_need_and_says_why(settings, left_out):
@@ -284,14 +284,6 @@ def test_lifted_features_reach_the_export_and_trained_ones_do_not_wait_for_them(
     by_stage = {step.stage: set(step.inputs) for step in Planner().plan("toy").steps}
     assert by_stage["export"] == {"gaussians", "features", "refined"}
     assert "features" in by_stage["train"]
-
-
-@pytest.mark.parametrize("settings", ["train.semantics=false", "train.encoder=off", "train.features=lifted"])
-def test_a_scene_without_an_encoder_takes_no_knowledge(settings):
-    basis = Planner().plan("toy", keep_knowledge=True).targets["cks"]
-    plan = Planner().plan("toy", settings, basis=basis, keep_knowledge=True)
-    assert all("basis" not in step.inputs for step in plan.steps)
-    assert "cks" in plan.left_out
 
 
 @pytest.mark.parametrize("kind", ["scenes", "ablations", "sequences"])

@@ -97,12 +97,6 @@ def without_gaussians(checkpoint):
     return {"parameters": {name: values[:0] for name, values in checkpoint.parameters.items()}}
 
 
-def encoder_without_attention(toy, tmp):
-    config = changed(train={"encoder": "mlp", "steps": 8})
-    assert run_stage("train", tmp / "mlp", inputs_of(toy, "train"), config) == 0
-    return {"gaussians": tmp / "mlp"}, TOY
-
-
 only_test_views = but_for("capture", lambda capture: {"is_test": capture.is_test | True})
 FAILURES = {  # the inputs of a stage that are others than the toy scene's, and its config
     "ingest": one_photo,
@@ -117,7 +111,6 @@ FAILURES = {  # the inputs of a stage that are others than the toy scene's, and 
     "refine": but_for("gaussians", without_gaussians),
     "export": but_for("gaussians", without_gaussians),
     "onnx": lambda toy, tmp: ({}, changed(onnx={"tolerance": 1e-12})),
-    "cks": encoder_without_attention,
     "evaluate": but_for("capture", lambda capture: {"is_test": capture.is_test & False}),
     "report": but_for("gaussians", lambda checkpoint: {"trace": []}),
 }
@@ -142,7 +135,7 @@ def test_rendering_only_scenes_leave_the_semantic_branch_out(toy, tmp_path):
     assert "features" not in Gaussians.read(gaussians).parameters
     assert "segmentation" not in Evaluation.read(evaluation).figures
     text = page.read_text()
-    for what in ("semantic branch", "stage teacher", "stage describe", "stage onnx", "stage cks"):
+    for what in ("semantic branch", "stage teacher", "stage describe", "stage onnx"):
         assert what in text
 
 

@@ -64,14 +64,6 @@ def test_where_knowledge_lies_is_no_matter_and_damage_is_noticed(quick_plans, tm
         refine_of("refine.knowledge=mine")
 
 
-def test_a_scene_of_a_sequence_trains_the_encoder_that_a_basis_is_of(quick_plans):
-    plan = Planner().plan("office0", keep_knowledge=True)
-    train = next(step for step in plan.steps if step.stage == "train")
-    assert train.sections["train"]["encoder"] == "transformer"
-    assert "cks" in plan.targets
-    assert "knowledge of shape" in plan.left_out
-
-
 def test_another_teacher_has_none_until_it_is_taught(quick_plans, tmp_path):
     model = knowing_rooms(color_teacher(tmp_path, name="mine"))
     step, left_out = refine_of(f"teacher.kind=onnx,teacher.model={model}")

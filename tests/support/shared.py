@@ -47,7 +47,6 @@ INPUTS = {
         "knowledge": "teach",
     },
     "onnx": {"gaussians": "train"},
-    "cks": {"gaussians": "train"},
     "evaluate": {"capture": "ingest", "scene": "export", "features": "teacher"},
     "report": {
         "evaluation": "evaluate",

@@ -1,4 +1,4 @@
-"""Scenes in order: what a change of the order makes stale, and what a given basis means."""
+"""Scenes in order: what each reads of the one before, and what a change of the order makes stale."""
 
 import pytest
 from shared import ROOT
@@ -7,7 +7,6 @@ from chebsplat.errors import ConfigError
 from chebsplat.pipelines.planning.plan import Planner, overrides
 from chebsplat.pipelines.planning.sequences import chain, scenes_of
 from chebsplat.pipelines.running.run import wanted_steps
-from chebsplat.pipelines.selection import checked_stage, plans
 
 BEFORE_TRAIN = {"ingest", "sfm", "teacher", "agree", "describe"}
 LABELS = "teacher.kind=labels"
@@ -37,7 +36,7 @@ def sequence(tmp_path):
 def keys(path):
     """By scene: its steps' keys by stage."""
     planner = Planner()
-    found = chain(planner, path, LABELS)
+    found = chain(planner, path, LABELS, "paper")
     planner.save()
     return [
         (scene, {step.stage: step.key for step in plan.steps})
@@ -66,48 +65,27 @@ def test_a_change_of_order_makes_exactly_what_depends_on_it_stale(sequence, orde
         assert changed == (set() if scene in untouched else before[scene].keys() - BEFORE_TRAIN), scene
 
 
-def test_scene_k_trains_on_revision_k_minus_one_and_the_first_on_none(sequence):
-    found = chain(Planner(), sequence(*ORDER), LABELS)
+def test_scene_k_reads_the_training_of_scene_k_minus_one_and_the_first_none(sequence):
+    found = chain(Planner(), sequence(*ORDER), LABELS, "paper")
     for place, plan in enumerate(found):
-        read = {step.stage: step.inputs.get("basis") for step in plan.steps if step.stage in ("train", "cks")}
-        earlier = found[place - 1].targets["cks"] if place else None
-        assert read == {"train": earlier, "cks": earlier}
-    assert [plan.title for plan in found[:2]] == [f"mine-1-toy@{LABELS}", f"mine-2-office0@{LABELS}"]
+        read = {step.stage: step.inputs["earlier"] for step in plan.steps if "earlier" in step.inputs}
+        assert read == ({"train": found[place - 1].targets["train"]} if place else {})
+    assert [plan.title for plan in found[:2]] == [f"mine-1-toy@paper+{LABELS}", f"mine-2-office0@paper+{LABELS}"]
+    stages = [step.stage for step in wanted_steps(found[2], "train", found)]
+    assert (stages.count("train"), stages.count("evaluate")) == (3, 0)
 
 
-def ask(scene=None, basis="", settings=LABELS, sequence=None, ablation=""):
-    return plans(scene=scene, sequence=sequence, settings=settings, ablation=ablation, basis=basis)
+def test_the_first_scene_of_a_sequence_is_the_scene_alone(sequence):
+    (first, _), alone = chain(Planner(), sequence("toy", "office0"), "", "paper"), Planner().plan("toy", "", "paper")
+    assert first.targets == alone.targets
 
 
-def test_a_scene_on_a_given_revision_is_trained_as_the_next_of_the_sequence(sequence):
-    path = sequence("toy", "office0", "office1")
-    *earlier, plan = ask("room0", f"{path}@2")
-    as_third = chain(Planner(), sequence("toy", "office0", "room0", name="other"), LABELS)[2]
-    assert plan.targets["train"] == as_third.targets["train"]
-    assert plan.targets["evaluate"] == as_third.targets["evaluate"]
-    assert plan.left_out["cks"] == "no sequence is named"
-    assert plan.title == f"room0@{LABELS}+basis=mine@2"
-    assert [found.asked for found in earlier] == [False, False]
-    wanted = wanted_steps(plan, None, [*earlier, plan])
-    stages = [step.stage for step in wanted]
-    assert (stages.count("train"), stages.count("cks")) == (3, 2)
-    assert (stages.count("evaluate"), stages.count("onnx")) == (1, 1)  # of the earlier scenes only what it needs
-    assert ask("room0", path)[-1].title.endswith("basis=mine@3")  # the newest, where none is named
-    only_train = wanted_steps(plan, "train", [*earlier, plan])
-    assert [step.stage for step in only_train].count("cks") == 2
-    assert checked_stage("evaluate", [*earlier, plan]) == "evaluate"
-
-
-def test_without_a_basis_the_stage_is_left_out_and_said():
-    (plan,) = ask("toy", settings="")
-    assert "cks" not in plan.targets
-    assert plan.left_out["cks"] == "no sequence is named"
-
-
-def test_a_sequence_of_scenes_without_encoder_carries_nothing(sequence):
-    for plan in chain(Planner(), sequence("toy", "office0"), ablation="no-tle"):
-        assert plan.left_out["cks"] == "train.encoder is mlp: it has no attention weights"
-        assert all("basis" not in step.inputs for step in plan.steps)
+@pytest.mark.parametrize("ablation", ["", "no-tle"])
+def test_only_the_printed_form_has_sequences(ablation):
+    with pytest.raises(
+        ConfigError, match="sequences carry knowledge in the paper's printed form only; add ablation=pa"
+    ):
+        chain(Planner(), "toys", ablation=ablation)
 
 
 def test_settings_may_have_spaces_about_their_commas_and_are_given_once():
