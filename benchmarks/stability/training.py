@@ -54,9 +54,7 @@ def tiny_trainer(means: np.ndarray | None = None, views: Views | None = None, **
         "max_gaussians": len(means) + 100,
         "n_densify": 2,
     }
-    config = Config.model_validate(
-        {"train": small | settings, "describe": {"n_regions": 24, "region_size": 16}}
-    )
+    config = Config.model_validate({"train": small | settings, "describe": {"n_regions": 24, "region_size": 16}})
     torch.manual_seed(config.train.seed)
     model = SceneModel(initial_gaussians(means, colors, shapes, opacity=0.5), config.describe, config.train, CHANNELS)
     views = four_views() if views is None else views

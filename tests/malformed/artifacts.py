@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import atexit
 import functools
-import pickle
 import shutil
 import tempfile
 from collections.abc import Callable, Iterator
@@ -31,7 +30,7 @@ from chebsplat.formats.scene import Scene
 from chebsplat.settings import DescribeSection
 from chebsplat.stages.registry import STAGES
 from chebsplat.stages.runtime.config import Config
-from malformed.edits import DEEP, Edit, changed, cut, flipped, no_file, npy, put, remove
+from malformed.edits import DEEP, Edit, changed, cut, flipped, no_file, put, remove
 from malformed.row import Arguments, Row, stage
 
 N, V, C, SIZE = 40, 3, 5, (24, 16)  # Gaussians, views, channels, width and height
@@ -138,26 +137,13 @@ def rows() -> Iterator[Row]:
             return stage(name, folder, {}, **needed, **{role: folder / "in"})
 
         yield met(f"{what}, in {name} --in-{role}", ask, word, edit, STAGES[name].roles[role])
-    for what, content, word in FEATURES:
-        yield encoded("features.npy", what, put("features.npy", content), word)
     for what, content, word in SPLATS:
-        yield encoded("scene.ply", what, put("scene.ply", content), word)
-    for name in ("features.npy", "scene.ply"):
-        yield encoded(name, "a pipe", no_file(name, "pipe"), "a pipe", alone=True)
+        yield splats(what, put("scene.ply", content), word)
+    yield splats("a pipe", no_file("scene.ply", "pipe"), "a pipe", alone=True)
 
 
-# files from elsewhere, met by `encode`: features of Gaussians, and the Gaussians
+# Gaussians from elsewhere, met by `lift`
 
-FEATURES: list[tuple[str, bytes, str]] = [
-    ("nothing", b"", "not a readable .npy"),
-    ("a pickle", pickle.dumps([1, 2]), "not a readable .npy"),
-    ("terabytes", npy(np.zeros(3, np.float32), shape=(10**6, 10**6)), "it declares"),
-    ("objects", npy(np.zeros(3), descr="|O"), "pickled objects"),
-    ("one dimension", npy(np.zeros(N, np.float32)), "one row a Gaussian"),
-    ("other rows", npy(np.zeros((3, C), np.float32)), "one row a Gaussian"),
-    ("nan", npy(np.full((N, C), np.nan, np.float32)), "finite"),
-    ("words", npy(np.full((N, C), "a")), "one row a Gaussian"),
-]
 HEADER = b"ply\nformat binary_little_endian 1.0\nelement vertex 2\nproperty float x\n"
 AXES = b"property float y\nproperty float z\nend_header\n"
 SPLATS: list[tuple[str, bytes, str]] = [
@@ -168,15 +154,12 @@ SPLATS: list[tuple[str, bytes, str]] = [
 ]
 
 
-def encoded(named: str, what: str, edit: Edit, word: str, alone: bool = False) -> Row:
+def splats(what: str, edit: Edit, word: str, alone: bool = False) -> Row:
     def build(folder: Path) -> Arguments:
-        shutil.copyfile(artifacts() / "export/scene.ply", folder / "scene.ply")
-        (folder / "features.npy").write_bytes(npy(np.zeros((N, C), np.float32)))
         edit(folder)
-        given = ["--encoder", artifacts() / "onnx", "--features", folder / "features.npy", "--out", folder / "out.npz"]
-        return ["encode", folder / "scene.ply", *given]
+        return ["lift", folder / "scene.ply", "--out", folder / "out"]
 
-    return Row("encode", f"{named}: {what}", build, (named, word), alone=alone)
+    return Row("splats", what, build, ("scene.ply", word), alone=alone)
 
 
 # small artifacts of every schema
@@ -316,6 +299,5 @@ WRITERS: dict[str, Callable[[Path], None]] = {
     "lift": _lifted,
     "refine": _refined,
     "export": _scene,
-    "onnx": _encoder,
     "evaluate": _evaluation,
 }
