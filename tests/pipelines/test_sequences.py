@@ -80,7 +80,7 @@ def test_the_first_scene_of_a_sequence_is_the_scene_alone(sequence):
     assert first.targets == alone.targets
 
 
-@pytest.mark.parametrize("ablation", ["", "no-tle"])
+@pytest.mark.parametrize("ablation", ["", "no-shape"])
 def test_only_the_printed_form_has_sequences(ablation):
     with pytest.raises(
         ConfigError, match="sequences carry knowledge in the paper's printed form only; add ablation=pa"
@@ -89,7 +89,7 @@ def test_only_the_printed_form_has_sequences(ablation):
 
 
 def test_settings_may_have_spaces_about_their_commas_and_are_given_once():
-    wanted = {"train": {"steps": 5, "albo": False}, "teacher": {"scales": [0.5, 1.0]}}
-    assert overrides("train.steps=5, train.albo = off ,teacher.scales=[0.5, 1.0]") == wanted
+    wanted = {"train": {"steps": 5, "prune": False}, "teacher": {"scales": [0.5, 1.0]}}
+    assert overrides("train.steps=5, train.prune = off ,teacher.scales=[0.5, 1.0]") == wanted
     with pytest.raises(ConfigError, match=r"train\.steps is given twice"):
-        overrides("train.steps=5,train.albo=off,train.steps=6")
+        overrides("train.steps=5,train.prune=off,train.steps=6")

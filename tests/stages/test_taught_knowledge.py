@@ -46,9 +46,8 @@ def refine_of(settings="", scene="office0"):
 def test_a_scene_starts_from_the_knowledge_that_ships_unless_it_is_told_not_to(quick_plans):
     step, left_out = refine_of()
     assert step.inputs["knowledge"].name == artifact.read_manifest(SHIPPED).key
-    assert {"describe", "onnx"} <= set(left_out)
     assert "knowledge of shape" not in left_out
-    for settings in ("refine.knowledge=none", "train.encoder=transformer", "train.encoder=off"):
+    for settings in ("refine.knowledge=none", "train.encoder=off"):
         step, left_out = refine_of(settings)
         assert not {"knowledge", "points"} & set(step.inputs), settings
         assert left_out["knowledge of shape"]

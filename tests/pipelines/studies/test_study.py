@@ -101,12 +101,12 @@ def test_a_study_is_every_combination_and_each_step_once():
     assert len({run.name for run in runs}) == len({run.plan.targets["evaluate"] for run in runs}) == 16
     counts = [step.stage for step in outstanding(runs)]
     assert {stage: counts.count(stage) for stage in counts} == {
-        "ingest": 1, "sfm": 1, "describe": 1, "teacher": 4, "agree": 4, "train": 16, "lift": 16, "refine": 16,
+        "ingest": 1, "sfm": 1, "teacher": 4, "agree": 4, "train": 16, "lift": 16, "refine": 16,
         "export": 16, "evaluate": 16,
     }  # fmt: skip
     settings = [step.sections["train"] for step in outstanding(runs) if step.stage == "train"]
     assert {(s["steps"], s["seed"], s["encoder"]) for s in settings} == {
-        (steps, seed, encoder) for steps in (10, 20) for seed in (0, 1) for encoder in ("transformer", "off")
+        (steps, seed, encoder) for steps in (10, 20) for seed in (0, 1) for encoder in ("points", "off")
     }
 
 
@@ -316,11 +316,11 @@ def test_every_study_of_ours_can_be_planned(name):
 
 def test_a_study_that_extends_another_has_its_values_but_for_its_own_and_names_what_it_takes():
     base = read_study("parts")
-    own = {"extends": "parts", "title": "T", "seeds": [7], "variants": ["no-tle", "features-only"]}
+    own = {"extends": "parts", "title": "T", "seeds": [7], "variants": ["no-ash", "features-only"]}
     found = checked_study(own, "mine")
     assert (found.title, found.seeds) == ("T", [7])
     assert (found.about, found.scenes, found.budgets) == (base.about, base.scenes, base.budgets)
-    assert found.variants == {name: base.variants[name] for name in ("no-tle", "features-only")}
+    assert found.variants == {name: base.variants[name] for name in ("no-ash", "features-only")}
 
 
 @pytest.mark.parametrize(
@@ -360,7 +360,7 @@ train = {{ sh_degree = 2 }}
     command = [sys.executable, "-m", "chebsplat.pipelines.cli", "study", str(tmp_path / "mine.toml")]
     command += ["--cores", "1", "--threads", "2", "--out", str(tmp_path / "out")]
     for to_run in (
-        "1 ingest, 1 sfm, 1 teacher, 1 agree, 1 describe, 2 train, 2 lift, 2 refine, 2 export, 2 evaluate",
+        "1 ingest, 1 sfm, 1 teacher, 1 agree, 2 train, 2 lift, 2 refine, 2 export, 2 evaluate",
         "1 evaluate",
     ):
         done = subprocess.run(command, capture_output=True, text=True, cwd=ROOT, env=os.environ)
