@@ -42,21 +42,11 @@ class DescribeSection(Section):
     n_angles: int = number(8, "rotations of the anisotropic metric (J)", 1, 64)
     max_degree: int = number(8, "degree of the Chebyshev descriptor (D)", 2, 64)
     anisotropy: float = number(10.0, "of the metric (a); 0: isotropic", 0, 1e4)
-    metric: Literal["relative", "printed"] = setting(
-        "relative", "scales relative to the region's median; printed: in scene units"
-    )
-    axis: Literal["tangent", "world"] = setting(
-        "tangent", "that metrics turn about: the region's own; world: z for all (printed)"
-    )
     bandwidth: float = number(0.7, "of the edge weights, relative to a region's radius", 1e-3, 1e3)
-    spectrum: Literal["full", "taper", "hard"] = setting("full", "eigenvalues that count; hard: the paper's cut")
-    n_eigs: int = number(16, "eigenvalues kept by taper and hard (K)", 1, 64)
-    from_degree: int | None = number(None, "first degree; default: 2 (0 and 1 are constant), 0 of a cut spectrum", 0, 2)
+    n_eigs: int = number(16, "eigenvalues that the printed method keeps (K)", 1, 64)
     region_size: int = number(32, "Gaussians in a region, at most", 4, 64)
     n_regions: int = number(768, "regions that cover the scene", 1, 200_000)
-    region_radius: float | None = number(None, "scene units; default: such that regions cover the scene", 1e-9, 1e9)
     overlap: float = number(1.5, "radius of regions over the least that covers the scene", 1, 10)
-    thinning: bool = setting(True, "members from a thinned set, to fill a region; false: the nearest to its centre")
     seed: int = seed("of the choice of regions")
 
     @model_validator(mode="after")

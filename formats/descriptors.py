@@ -23,8 +23,8 @@ SPECS: dict[str, Spec] = {
 @dataclass
 class Descriptors:
     """centers: i64 [M] indices of the points that regions are centred on. members: i64 [M, n], -1 where padded.
-    values: f32 [M, n, J, P], zero where padded; P = D - 1 degrees of the full spectrum (settings["spectrum"]), D + 1
-    of a cut one. settings: the parameters they were computed with, and the regions' radius and share.
+    values: f32 [M, n, J, P], zero where padded; P = D - 1 degrees. settings: the parameters they were
+    computed with, and the regions' radius and share.
     """
 
     centers: np.ndarray

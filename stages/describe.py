@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import logging
-
 import numpy as np
 
 from chebsplat.errors import DataFailure
@@ -13,8 +11,6 @@ from chebsplat.shape.descriptor import describe_members
 from chebsplat.shape.regions import regions_of
 from chebsplat.splats.gaussians import activated, initial_gaussians
 from chebsplat.stages.runtime.command import Job
-
-log = logging.getLogger("chebsplat")
 
 
 def run(job: Job) -> None:
@@ -38,14 +34,12 @@ def run(job: Job) -> None:
         raise DataFailure(f"{bad} of {len(values)} regions have non-finite descriptors")
     if settings.n_angles == 1:
         job.left_out("rotations", "describe.n_angles is 1")
-    job.facts |= {"spectrum": settings.spectrum, "n_in_float64": described.n_exact}
-    if settings.spectrum == "hard":
-        job.facts |= {"n_cuts": described.n_cuts, "n_cuts_in_clusters": described.n_clustered}
-        job.facts["n_guarded"] = described.n_guarded
-    if described.n_clustered:
-        where = f"{described.n_clustered} of {described.n_cuts} cuts fell into a cluster of eigenvalues"
-        log.warning("%s: values there depend on round-off; describe.spectrum = 'taper' does not cut", where)
-    job.facts |= {"n_regions": len(values), "radius": regions.radius, "n_values": int(np.prod(values.shape[2:]))}
+    job.facts |= {
+        "n_in_float64": described.n_exact,
+        "n_regions": len(values),
+        "radius": regions.radius,
+        "n_values": int(np.prod(values.shape[2:])),
+    }
     facts = settings.model_dump(mode="json") | {"radius": regions.radius, "share": regions.share}
     record = Descriptors(regions.centers, regions.members, values, facts)
     write_descriptors(job.out, record)

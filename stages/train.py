@@ -20,8 +20,8 @@ log = logging.getLogger("chebsplat")
 def run(job: Job) -> None:
     """Optimise Gaussians and their semantics (Eqs 11-13; docs/method.md, sections 3 to 8).
 
-    Reads `capture`, `points`, with semantics `features`, and the training of the scene `earlier` in a sequence. Writes
-    `gaussians`.
+    Reads `capture`, `points` and, with semantics, `features`; in a sequence, the `gaussians` of the scene before.
+    Writes `gaussians`.
     """
     inputs = read_inputs(job)
     trainer = assemble(job, inputs)

@@ -147,26 +147,6 @@ def faint_edge() -> Outcome:
     return compare(region, bandwidth=float(2 / np.sqrt(np.log(1e200))))
 
 
-# the printed metric, of scales in scene units, turned about the world's axis
-
-PRINTED: dict[str, Callable[[], Region]] = {
-    "scales 1e-20": lambda: stretched(lambda s: 1e-20 * s),
-    "scales 1e+20": lambda: stretched(lambda s: 1e20 * s),
-    "scales 1e-20 to 1e20": lambda: stretched(lambda s: 10.0 ** np.linspace(-20, 20, s.size).reshape(s.shape)),
-    "all scales equal": lambda: stretched(lambda s: np.full(s.shape, 0.3)),
-    "all scales 0": lambda: stretched(lambda s: 0 * s),
-    "all alike and coincident": lambda: upright(np.zeros((16, 3))),
-    "along the axis": lambda: cloud()._replace(means=cloud().means * [0, 0, 1]),
-    "units 1e-30": lambda: placed(1e-30),
-    "units 1e+30": lambda: placed(1e30),
-}
-
-
-@case("as printed, {name}", name=PRINTED)
-def printed_metric(name: str) -> Outcome:
-    return compare(PRINTED[name](), metric="printed", axis="world")
-
-
 # settings
 
 

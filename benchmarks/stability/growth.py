@@ -1,4 +1,4 @@
-"""Regions that break the printed count of new Gaussians (Eq 12; docs/method.md, section 5).
+"""Regions that break the count of new Gaussians (Eq 12; docs/method.md, section 5).
 
 The error is the share of new values that are not finite, or 1 if a new Gaussian lies outside its region's ball or more
 came than a region may have.
@@ -41,7 +41,7 @@ REGIONS: dict[str, Growing] = {
 
 
 @case("Eq 12, {name}", name=REGIONS)
-def printed_count(name: str) -> Outcome:
+def count(name: str) -> Outcome:
     """Raises ValueError where none came and some should, or the reverse."""
     region = REGIONS[name]
     g = torch.Generator().manual_seed(0)
@@ -49,7 +49,7 @@ def printed_count(name: str) -> Outcome:
     size = math.log(0.05 * region.unit) if region.unit else -3.0
     raw |= {"log_scales": torch.full((N, 3), size), "logit_opacities": torch.zeros(N)}
     members, gradient = torch.arange(N).reshape(2, -1), torch.tensor([region.gradient, 0.5])
-    options = {"density": 10, "max_candidates": MOST, "nearest": 1e-3, "farthest": 1e3, "printed": True}
+    options = {"density": 10, "max_candidates": MOST, "nearest": 1e-3, "farthest": 1e3}
     added = densify(raw, members, gradient, 1.0, 10_000, torch.Generator().manual_seed(1), Candidates(**options))
     if bool(len(added.parents)) != region.grows:
         raise ValueError(f"{len(added.parents)} new Gaussians")

@@ -11,13 +11,10 @@ import torch
 from benchmarks import shared
 from benchmarks.stability import (  # noqa: F401  # importing a module registers its cases
     descriptor,
-    fusion,
-    gates,
     growth,
     losses,
     pruning,
     regions,
-    tokens,
     training,
 )
 from benchmarks.stability.case import CASES, Row, run

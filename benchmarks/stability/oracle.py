@@ -24,14 +24,8 @@ def describe(
     max_degree: int = 8,
     anisotropy: float = 10.0,
     bandwidth: float = 0.7,
-    metric: str = "relative",
-    axis: str = "region",
 ) -> np.ndarray:
-    """One region without padding, [n, 3], [n, 3], [n, 3, 3] -> [n, J, D - 1], rounded to float64 at the end.
-
-    Args: metric: deviations relative to the region's, or in scene units (`printed`); axis: the region's own, or z of
-      the `world`, whose angles are not paired.
-    """
+    """One region without padding, [n, 3], [n, 3], [n, 3, 3] -> [n, J, D - 1], rounded to float64 at the end."""
     n = len(means)
     if n == 0:
         return np.zeros((0, n_angles, max_degree - 1))
@@ -39,18 +33,14 @@ def describe(
         c, s, R = _exact(means), _exact(scales), _exact(rotmats)
         c = c - c.sum(0) / n
         radius = mpmath.sqrt((c * c).sum() / n) or mpmath.mpf(1)
-        in_scene_units = s
         c, s = c / radius, s / radius
         typical = sorted(s.max(1))[(n - 1) // 2]
         # A typical scale of 0: what is larger than typical is infinitely larger.
         ratio = s / typical if typical else np.where(s > 0, mpmath.mpf(10) ** 300, mpmath.mpf(0))
-        ratio = in_scene_units if metric == "printed" else ratio
         factors = _sqrt(1 / (1 + mpmath.mpf(anisotropy) * ratio**2))[:, :, None] * R.transpose(0, 2, 1)
-        around, certainty = (_exact(np.array([0, 0, 1])), None) if axis == "world" else _axis(c, s, R)
+        around, certainty = _axis(c, s, R)
         angles = [_diagonals(_similarity(c, factors, _rotation(around, j, n_angles), bandwidth), max_degree) * n
                   for j in range(n_angles)]  # fmt: skip
-        if axis == "world":
-            return np.stack(angles, 1).astype(np.float64)
         out = [angles[0]]
         for j in range(1, n_angles):
             a, b = angles[min(j, n_angles - j)], angles[max(j, n_angles - j)]

@@ -6,10 +6,8 @@ naming its step.
 
 from __future__ import annotations
 
-import tomllib
 from collections.abc import Callable
 from dataclasses import replace
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -45,30 +43,18 @@ def sphere(n: int) -> np.ndarray:
     return torch.nn.functional.normalize(points, dim=-1).numpy()
 
 
-def tiny_trainer(
-    means: np.ndarray | None = None,
-    views: Views | None = None,
-    describe: dict[str, Any] | None = None,
-    **settings: Any,
-) -> Trainer:
-    """A trainer of few Gaussians, by default 300 on a unit sphere.
-
-    Args: settings: what differs in the config's train section; describe: in the other one.
-    """
+def tiny_trainer(means: np.ndarray | None = None, views: Views | None = None, **settings: Any) -> Trainer:
+    """A trainer of few Gaussians, by default 300 on a unit sphere; settings: what differs in the train section."""
     means = sphere(300) if means is None else means
     colors = (torch.rand(len(means), 3, generator=torch.Generator().manual_seed(2)) * 255).byte().numpy()
     shapes = local_shape(means, 8)[0] if len(means) > 1 else np.eye(3, dtype=np.float32)[None] * 0.01
     small = {
-        "encoder": "transformer",
         "steps": 20,
         "min_gaussians": 8,
         "max_gaussians": len(means) + 100,
         "n_densify": 2,
-        "width": 16,
     }
-    config = Config.model_validate(
-        {"train": small | settings, "describe": {"n_regions": 24, "region_size": 16} | (describe or {})}
-    )
+    config = Config.model_validate({"train": small | settings, "describe": {"n_regions": 24, "region_size": 16}})
     torch.manual_seed(config.train.seed)
     model = SceneModel(initial_gaussians(means, colors, shapes, opacity=0.5), config.describe, config.train, CHANNELS)
     views = four_views() if views is None else views
@@ -77,10 +63,10 @@ def tiny_trainer(
     return Trainer(model, views, train, 1.0)
 
 
-def _with_views(*, prune_gate: str = "product", sh_masks: str = "logits", **changes: Callable[[Views], Any]) -> Trainer:
+def _with_views(**changes: Callable[[Views], Any]) -> Trainer:
     views = four_views()
     changed = replace(views, **{name: change(views) for name, change in changes.items()})
-    return tiny_trainer(views=changed, prune_gate=prune_gate, sh_masks=sh_masks)
+    return tiny_trainer(views=changed)
 
 
 def _corrupt(value: float) -> Callable[[Views], Any]:
@@ -127,13 +113,6 @@ def _rates(factor: float) -> Trainer:
     return trainer
 
 
-def _printed(means: np.ndarray) -> Trainer:
-    """A training as `ablation=paper` has it."""
-    path = Path(__file__).parents[2] / "pipelines" / "configs" / "ablations" / "paper.toml"
-    settings = tomllib.loads(path.read_text())
-    return tiny_trainer(means, describe=settings["describe"], **{"min_gaussians": 1} | settings["train"])
-
-
 def _flat() -> np.ndarray:
     return sphere(300) * np.array([1, 1, 0], np.float32)
 
@@ -141,22 +120,6 @@ def _flat() -> np.ndarray:
 SCENES: dict[str, Callable[[], Trainer]] = {
     "all masks closing": lambda: tiny_trainer(weight_mask=1e4, lr_masks=10.0, prune_from=0.1),
     "all bands closing": lambda: tiny_trainer(weight_sh=1e4, lr_sh_masks=10.0),
-    "printed gates, all masks closing": lambda: tiny_trainer(
-        prune_gate="printed", weight_mask=1e4, lr_masks=10.0, prune_from=0.1
-    ),
-    "printed gates, all bands closing": lambda: tiny_trainer(sh_masks="printed", weight_sh=1e4, lr_sh_masks=10.0),
-    "printed gates, one Gaussian": lambda: tiny_trainer(
-        sphere(1), min_gaussians=1, prune_gate="printed", sh_masks="printed"
-    ),
-    "printed gates, features of 1e6": lambda: _with_views(
-        features=lambda v: lambda k: 1e6 * v.features(k),  # type: ignore[misc]
-        prune_gate="printed",
-        sh_masks="printed",
-    ),
-    "printed form, one Gaussian": lambda: _printed(sphere(1)),
-    "printed form, coincident Gaussians": lambda: _printed(np.zeros((40, 3), np.float32)),
-    "printed form, one plane": lambda: _printed(_flat()),
-    "printed form, units of 1e6": lambda: _printed(1e6 * sphere(300)),
     "one Gaussian": lambda: tiny_trainer(sphere(1), min_gaussians=1),
     "two coincident Gaussians": lambda: tiny_trainer(np.zeros((2, 3), np.float32), min_gaussians=1),
     "one plane": lambda: tiny_trainer(_flat()),

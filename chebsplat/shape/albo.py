@@ -1,21 +1,11 @@
-"""Anisotropic Laplace-Beltrami operator of a region of Gaussians (Eqs 1-3), and descriptors of a part of its spectrum
-(Eqs 4-6 with K < n), in float64: tapered at K, or cut hard behind it.
-
-g^d(i) = n Σ_k w_k T_d(x_k) ψ_k(i)², d = 0...D, with eigenpairs (λ_k, ψ_k) of L = I − S in rising order. ψ² = a φ² for
-eigenvectors φ = A^-1/2 ψ of Eq 3 of unit A-norm, so it does not depend on the basis of an eigenspace that is whole.
-"""
+"""Anisotropic Laplace-Beltrami operator of a region of Gaussians (Eqs 1-3), in float64."""
 
 from __future__ import annotations
 
 from typing import NamedTuple
 
-import numpy as np
 import torch
 from torch import Tensor
-
-SMALLEST = 1e-3  # of λ_c and λ_max: a region of many components has K zero eigenvalues
-SAME = 1e-9  # eigenvalues this close are one eigenspace: round-off is 1e-15
-CLUSTER = 1e-4  # a gap below this leaves few digits of single eigenvectors in float32
 
 
 class Region(NamedTuple):
@@ -25,7 +15,6 @@ class Region(NamedTuple):
     scales: Tensor  # [M, n, 3]
     rotmats: Tensor  # [M, n, 3, 3]
     mask: Tensor  # [M, n] bool, false where padded or not finite
-    unit: Tensor  # [M, 1, 1], scene units
 
 
 def canonicalize(means: Tensor, scales: Tensor, rotmats: Tensor, mask: Tensor) -> Region:
@@ -54,20 +43,16 @@ def canonicalize(means: Tensor, scales: Tensor, rotmats: Tensor, mask: Tensor) -
     radius = torch.where(square > 0, square, 1.0).sqrt()  # the root of 0 has no gradient
     scales = torch.where(keep, scales.double() / extent / radius, 0.0)
     rotmats = torch.where(keep[..., None], rotmats.double(), torch.eye(3, dtype=torch.float64))
-    return Region(means / radius, scales, rotmats, mask, extent * radius)
+    return Region(means / radius, scales, rotmats, mask)
 
 
-def metric_factors(region: Region, anisotropy: float, *, printed: bool = False) -> Tensor:
+def metric_factors(region: Region, anisotropy: float) -> Tensor:
     """Y_i = diag(sqrt(m_i)) R_iᵀ with m_ik = 1 / (1 + a (s_ik / s̃)²) (Eq 1); |Y_i Δ|² is the squared length of Δ.
 
-    Args: printed: m_ik = 1 / (1 + a s_ik²) in scene units.
     Returns: [M, n, 3, 3].
     Choices: s̃ is the region's median largest scale, so that anisotropy does not fade with the scene's units; a region
     whose s̃ is 0 is isotropic wherever its scales are 0.
     """
-    if printed:
-        lengths = anisotropy**0.5 * region.scales * region.unit
-        return (1 / torch.hypot(torch.ones_like(lengths), lengths))[..., None] * region.rotmats.transpose(-1, -2)
     largest = region.scales.amax(-1)
     typical = torch.where(region.mask, largest, torch.nan).nanmedian(1).values.nan_to_num(0.0)[:, None, None]
     ratio = torch.where(
@@ -133,70 +118,3 @@ def similarity(region: Region, factors: Tensor, rotmats: Tensor, bandwidth: floa
     log_degrees = top + torch.where(degrees > 0, degrees, 1.0).log()
     exponent = log_weights - 0.5 * (log_degrees[:, :, None] + log_degrees[:, None])
     return torch.where(pair, exponent.clamp_max(0).exp(), 0.0)
-
-
-class Cut(NamedTuple):
-    """values f64 [M, n, D + 1]; n_cuts regions were cut below n; n_clustered of the cuts asked for fell into a
-    cluster, so that they were moved behind it or lie at a gap below `CLUSTER`; n_guarded have a λ_max below `SMALLEST`.
-    """
-
-    values: Tensor
-    n_cuts: int
-    n_clustered: int
-    n_guarded: int
-
-
-def cut_spectrum(S: Tensor, mask: Tensor, n_eigs: int, max_degree: int, *, hard: bool) -> Cut:
-    """The lowest part of each region's spectrum.
-
-    Args: S f64 [M, n, n] from `albo.similarity`; mask [M, n]; n_eigs: K, at least 1.
-    Returns: values, zero where padded.
-    Choices: `hard` keeps the K smallest and all of the last one's eigenspace, w = 1, x = 2 λ / λ_max − 1 with λ_max
-      the largest kept one. Otherwise w = 1 − smoothstep(2 λ / λ_c − 1) and x = 2 min(λ / λ_c, 1) − 1 with
-      λ_c = λ_(K+1), the last of all if K >= n: no cluster is ever split. Neither λ_max nor λ_c goes below
-      `SMALLEST`. Eigenpairs on one thread: libraries slow down severalfold when they share such small matrices out.
-    """
-    m, n = mask.shape
-    count = mask.sum(1).numpy()
-    laplacian = torch.eye(n, dtype=torch.float64) - S.detach()
-    # Padding goes behind the spectrum, which ends at 2.
-    laplacian = laplacian + torch.diag_embed(torch.where(mask, 0.0, 3.0).double())
-    values, vectors = _eigenpairs(laplacian)
-    values = np.clip(values, 0.0, None)
-    index, rows = np.arange(n), np.arange(m)
-    wanted = np.minimum(n_eigs, count)
-    valid = index < count[:, None]
-    n_cuts = n_clustered = n_guarded = 0
-    if hard:
-        gaps = np.diff(values, axis=1, append=np.inf)  # behind each eigenvalue
-        gaps = np.where(index < count[:, None] - 1, gaps, np.inf)
-        chained = np.where(index < wanted[:, None] - 1, True, gaps <= SAME)
-        kept = 1 + np.argmin(np.concatenate([chained[:, :-1], np.zeros((m, 1), bool)], 1), axis=1)
-        kept = np.minimum(kept, count)
-        cuts = wanted < count
-        n_cuts = int(cuts.sum())
-        n_clustered = int((cuts & (gaps[rows, np.maximum(wanted, 1) - 1] <= CLUSTER)).sum())
-        weights = (index < kept[:, None]).astype(np.float64)
-        largest = values[rows, np.maximum(kept, 1) - 1]
-        n_guarded = int(((largest < SMALLEST) & (count > 1)).sum())
-        largest = np.maximum(largest, SMALLEST)[:, None]
-        x = 2 * np.minimum(values / largest, 1.0) - 1
-    else:
-        behind = np.minimum(wanted, np.maximum(count, 1) - 1)
-        largest = np.maximum(values[rows, behind], SMALLEST)[:, None]
-        t = np.clip(2 * values / largest - 1, 0.0, 1.0)
-        weights = np.where(valid, 1 - t * t * (3 - 2 * t), 0.0)
-        x = 2 * np.minimum(values / largest, 1.0) - 1
-    polynomials = np.cos(np.arange(max_degree + 1) * np.arccos(np.clip(x, -1.0, 1.0))[..., None])
-    out = count[:, None, None] * ((vectors**2) @ (weights[..., None] * polynomials))
-    return Cut(torch.from_numpy(np.where(mask.numpy()[..., None], out, 0.0)), n_cuts, n_clustered, n_guarded)
-
-
-def _eigenpairs(matrices: Tensor) -> tuple[np.ndarray, np.ndarray]:
-    threads = torch.get_num_threads()
-    torch.set_num_threads(1)
-    try:
-        values, vectors = torch.linalg.eigh(matrices)
-    finally:
-        torch.set_num_threads(threads)
-    return values.numpy(), vectors.numpy()

@@ -1,8 +1,7 @@
 """Chebyshev descriptors of regions of Gaussians (Eqs 4-6).
 
-Two backends agree to float32: `numba` compiles the full spectrum, `reference` (torch) differentiates it, and knows
-cut spectra and the printed metric and axis. Torch is imported where it is needed only: finished scenes are described
-without it.
+Two backends agree to float32: `numba` is compiled, `reference` (torch) differentiable. Torch is imported where it is
+needed only: finished scenes are described without it.
 """
 
 from __future__ import annotations
@@ -13,15 +12,14 @@ import numpy as np
 
 from chebsplat.settings import DescribeSection
 from chebsplat.shape import descriptor_kernel
-from chebsplat.shape.described import Described, Descriptor, compiles, n_degrees
-from chebsplat.splats.rotations import rotation_matrices, rotation_matrices_f64
+from chebsplat.shape.described import Described, Descriptor
+from chebsplat.splats.rotations import rotation_matrices_f64
 
 if TYPE_CHECKING:
     import torch
     from torch import Tensor
 
 DEFAULT = Descriptor()
-OF_REGIONS = {"n_regions", "region_size", "seed", "region_radius", "overlap", "thinning"}  # not of values
 
 
 def describe(
@@ -39,7 +37,7 @@ def describe(
     Args:
       means, scales, rotmats, mask: [M, n, ...], as `albo.canonicalize`.
       dtype:   of the result, float32 if None; float64 by the reference only.
-      backend: `numba` (what `compiles`, float32, no gradient; the same bits for any number of threads), `reference`, or
+      backend: `numba` (float32, no gradient; the same bits for any number of threads), `reference`, or
         `auto`: numba where it can.
     Returns: values [M, n, J, P], zero where padded and in regions of fewer than two Gaussians, which have no edge. Of
       the full spectrum it is the printed formula with K = n and λ_max = 2, without degrees 0 and 1, which vanish.
@@ -48,29 +46,24 @@ def describe(
     import torch
 
     w = wanted
-    if w.n_angles < 1 or w.max_degree < 2 or w.n_eigs < 1 or not w.bandwidth > 0 or not w.anisotropy >= 0:
-        raise ValueError("n_angles >= 1, max_degree >= 2, n_eigs >= 1, bandwidth > 0 and anisotropy >= 0 are needed")
+    if w.n_angles < 1 or w.max_degree < 2 or not w.bandwidth > 0 or not w.anisotropy >= 0:
+        raise ValueError("n_angles >= 1, max_degree >= 2, bandwidth > 0 and anisotropy >= 0 are needed")
     if means.shape != scales.shape or rotmats.shape != (*means.shape, 3) or mask.shape != means.shape[:2]:
         raise ValueError(f"shapes disagree: {means.shape}, {scales.shape}, {rotmats.shape}, {mask.shape}")
     regions, dtype = (means, scales, rotmats, mask), dtype or torch.float32
     differentiable = any(v.requires_grad for v in regions)
-    can_compile = compiles(w.spectrum, w.metric, w.axis) and dtype == torch.float32 and not differentiable
+    can_compile = dtype == torch.float32 and not differentiable
     if backend == "reference" or (backend == "auto" and not can_compile):
         from chebsplat.shape import descriptor_reference
 
-        found = descriptor_reference.describe(*regions, wanted, dtype=dtype)
-    elif backend not in ("auto", "numba"):
+        return Described(descriptor_reference.describe(*regions, wanted, dtype=dtype))
+    if backend not in ("auto", "numba"):
         raise ValueError(f"backend {backend!r} is none of auto, numba, reference")
-    elif not can_compile:
-        raise ValueError(
-            "the numba backend takes no cut spectrum, printed metric or axis, only float32 and no gradients"
-        )
-    else:
-        sizes = w.n_angles, w.max_degree, w.anisotropy, w.bandwidth
-        values, n_exact = _compiled(means.numpy(), scales.numpy(), rotmats.numpy(), mask.numpy(), *sizes)
-        found = Described(torch.from_numpy(values), n_exact=n_exact)
-    n = n_degrees(w.spectrum, w.max_degree, w.from_degree)  # what is missing in front vanishes identically
-    return found._replace(values=torch.nn.functional.pad(found.values, (n - found.values.shape[-1], 0)))
+    if not can_compile:
+        raise ValueError("the numba backend takes float32 only, and no gradients")
+    sizes = w.n_angles, w.max_degree, w.anisotropy, w.bandwidth
+    values, n_exact = _compiled(means.numpy(), scales.numpy(), rotmats.numpy(), mask.numpy(), *sizes)
+    return Described(torch.from_numpy(values), n_exact)
 
 
 def describe_members(
@@ -82,44 +75,22 @@ def describe_members(
     *,
     chunk: int = 2048,
 ) -> Described[np.ndarray]:
-    """Descriptors f32 [M, n, J, P] of regions whose members are gathered from Gaussians; torch only if cut or printed.
+    """Descriptors f32 [M, n, J, P] of regions whose members are gathered from Gaussians; without torch.
 
     Args:
       means:   [N, 3] scene units; quats [N, 4] wxyz, of any length; scales [N, 3] standard deviations, scene units.
       members: i64 [M, n], -1 where padded.
       chunk:   regions at a time, at most: bounds memory.
     """
-    full = compiles(settings.spectrum, settings.metric, settings.axis)
-    n = n_degrees(settings.spectrum, settings.max_degree, settings.from_degree)
-    values, counts = np.zeros((*members.shape, settings.n_angles, n), np.float32), np.zeros(4, np.int64)
-    step = chunk if full else min(chunk, 256)
-    for start in range(0, len(members), step):
-        part = members[start : start + step]
-        index = np.maximum(part, 0)
-        described = (_full if full else _reference)(means[index], quats[index], scales[index], part >= 0, settings)
-        values[start : start + step, ..., n - described.values.shape[-1] :] = described.values
-        counts += described[1:]
-    return Described(values, *counts.tolist())
-
-
-def _full(
-    means: np.ndarray, quats: np.ndarray, scales: np.ndarray, mask: np.ndarray, settings: DescribeSection
-) -> Described[np.ndarray]:
     sizes = settings.n_angles, settings.max_degree, settings.anisotropy, settings.bandwidth
-    values, n_exact = _compiled(means, scales, rotation_matrices_f64(quats), mask, *sizes)
-    return Described(values, n_exact=n_exact)
-
-
-def _reference(
-    means: np.ndarray, quats: np.ndarray, scales: np.ndarray, mask: np.ndarray, settings: DescribeSection
-) -> Described[np.ndarray]:
-    import torch
-
-    rotmats = rotation_matrices(torch.from_numpy(quats).reshape(-1, 4)).reshape(*mask.shape, 3, 3)
-    regions = torch.from_numpy(means), torch.from_numpy(scales), rotmats, torch.from_numpy(mask)
-    parameters = settings.model_dump(exclude=OF_REGIONS)
-    described = describe(*regions, Descriptor(**parameters), dtype=torch.float64, backend="reference")
-    return Described(described.values.float().numpy(), *described[1:])
+    values, n_exact = np.zeros((*members.shape, settings.n_angles, settings.max_degree - 1), np.float32), 0
+    for start in range(0, len(members), chunk):
+        part = members[start : start + chunk]
+        index = np.maximum(part, 0)
+        rotmats = rotation_matrices_f64(quats[index])
+        values[start : start + chunk], exact = _compiled(means[index], scales[index], rotmats, part >= 0, *sizes)
+        n_exact += exact
+    return Described(values, n_exact)
 
 
 def _compiled(

@@ -1,13 +1,12 @@
-"""The descriptor in torch: the oracle of `descriptor_kernel`, differentiable, of any precision and any spectrum."""
+"""The descriptor in torch: the oracle of `descriptor_kernel`, differentiable, of any precision."""
 
 from __future__ import annotations
 
-import numpy as np
 import torch
 from torch import Tensor
 
-from chebsplat.shape.albo import canonicalize, cut_spectrum, metric_factors, rotations_about, similarity, tangent_axis
-from chebsplat.shape.described import Described, Descriptor
+from chebsplat.shape.albo import canonicalize, metric_factors, rotations_about, similarity, tangent_axis
+from chebsplat.shape.described import Descriptor
 
 
 def chebyshev_diagonals(S: Tensor, max_degree: int) -> Tensor:
@@ -41,37 +40,27 @@ def describe(
     wanted: Descriptor,
     *,
     dtype: torch.dtype,
-) -> Described[Tensor]:
-    """As `descriptor.describe`; `dtype` is that of the recurrence, all before it is float64.
+) -> Tensor:
+    """Values as of `descriptor.describe`; `dtype` is that of the recurrence, all before it is float64.
 
     Choices: angles j and J − j are replaced by half their sum and half their absolute difference, so that the sign of
-    the axis does not matter; angles j > 0 fade to angle 0 where the axis is ill-defined; the axis has no gradient. The
-    world's axis has a sign and is defined everywhere: its angles are as printed.
+    the axis does not matter; angles j > 0 fade to angle 0 where the axis is ill-defined; the axis has no gradient.
     """
-    region, n_angles, axis = canonicalize(means, scales, rotmats, mask), wanted.n_angles, wanted.axis
-    factors = metric_factors(region, wanted.anisotropy, printed=wanted.metric == "printed")
+    region, n_angles = canonicalize(means, scales, rotmats, mask), wanted.n_angles
+    factors = metric_factors(region, wanted.anisotropy)
     around, certainty = tangent_axis(region)
-    if axis == "world":
-        around = around.new_tensor([0.0, 0.0, 1.0]).expand_as(around)
     count = region.mask.sum(1)[:, None, None]
-    angles, counts = [], np.zeros(3, np.int64)
+    angles = []
     for rotation in rotations_about(around, n_angles):
         S = similarity(region, factors, rotation, wanted.bandwidth)
-        if wanted.spectrum == "full":
-            angles.append(chebyshev_diagonals(S.to(dtype), wanted.max_degree) * count)
-        else:
-            cut = cut_spectrum(S, region.mask, wanted.n_eigs, wanted.max_degree, hard=wanted.spectrum == "hard")
-            angles.append(cut.values.to(dtype))
-            counts += cut[1:]
+        angles.append(chebyshev_diagonals(S.to(dtype), wanted.max_degree) * count)
     certainty = certainty.to(dtype)[:, None, None]
     keep = region.mask[..., None, None] & (count[..., None] > 1)
-    n_cuts, n_clustered, n_guarded = counts.tolist()
-    paired = angles if axis == "world" else angles[:1]
-    for j in range(len(paired), n_angles):
+    paired = angles[:1]
+    for j in range(1, n_angles):
         low, high = angles[min(j, n_angles - j)], angles[max(j, n_angles - j)]
         if j <= n_angles - j:
             paired.append(angles[0] + certainty * (0.5 * (low + high) - angles[0]))
         else:
             paired.append(certainty * 0.5 * (low - high).abs())
-    values = torch.where(keep, torch.stack(paired, 2), 0.0)
-    return Described(values, n_cuts, n_clustered, n_guarded=n_guarded)
+    return torch.where(keep, torch.stack(paired, 2), 0.0)

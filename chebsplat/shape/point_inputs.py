@@ -54,7 +54,7 @@ def point_inputs(
     Args:
       means:       [N, 3] scene units, float64; normals [N, 3] unit, towards a camera; covariances [N, 3, 3].
       up:          [3] against gravity; unit: scene units in a metre.
-      describe:    of the descriptors, the defaults if None: full spectrum, or torch is needed.
+      describe:    of the descriptors, the defaults if None.
       n_neighbors: K, at most 31; n_scales: S, of the first radii.
     Raises: ValueError on values that are not finite, or no unit at all.
     Choices: a neighbourhood of radius r is of points of which a cube of edge 0.36 r keeps one, so that K of them reach

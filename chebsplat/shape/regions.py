@@ -1,4 +1,4 @@
-"""Regions of Gaussians: farthest-point centres, bounded neighbourhoods, and which regions cover a point."""
+"""Regions of Gaussians: farthest-point centres and bounded neighbourhoods."""
 
 from __future__ import annotations
 
@@ -25,43 +25,32 @@ class Regions(NamedTuple):
     share: float = 1.0
 
 
-def regions_of(
-    means: np.ndarray, settings: DescribeSection, *, ids: np.ndarray | None = None, earlier: Regions | None = None
-) -> Regions:
+def regions_of(means: np.ndarray, settings: DescribeSection) -> Regions:
     """Cover points with regions (docs/method.md, section 2).
 
     Args:
       means:       [N, 3] scene units; float64 where the scene is far from the origin.
       settings:    how many regions and members at most; the seed of the first centre and of the thinning; the radius
-        over the covering radius, or in scene units: regions need not cover the points then, and centres are found anew
-        at every call; without thinning, members are the nearest points, however many a ball holds (printed).
-      ids:         i64 [N], what a point is called while others come and go; its index otherwise.
-      earlier:     regions whose centres, radius and share are kept if they still fit (their members are not read).
+        over the covering radius.
     Returns: regions; zero of them for N = 0, fewer than n_regions where points coincide.
     Raises:  ValueError on non-finite means.
     Choices: centres by farthest-point sampling; the radius is `overlap` times the covering radius, so that regions
       overlap. Neighbours come from a thinned set of about `region_size` points a ball, else a region of the nearest
       ones would shrink to a speck inside a dense ball; the centre itself is always a member. A point is thinned away
-      by a hash of its id, so that a point that comes, goes or moves changes the regions around it and no others.
+      by a hash of its index.
     """
-    region_size, radius = settings.region_size, settings.region_radius
+    region_size = settings.region_size
     if not np.isfinite(means).all():
         raise ValueError("means are not finite")
     n = len(means)
     n_regions = min(settings.n_regions, n)
     if n == 0:
         return Regions(np.zeros(0, np.int64), np.zeros((0, region_size), np.int64), 0.0)
-    keys = _uniform(np.arange(n) if ids is None else ids, settings.seed)
-    still_covering = None
-    if earlier is not None and radius is None:
-        still_covering = _hold(means, earlier, n_regions, settings.overlap)
-    if still_covering is None:
-        start = int(np.random.default_rng(settings.seed).integers(n))
-        centers, reach = farthest_points(means, n_regions, start)
-        radius = radius or settings.overlap * reach or 1.0
-        share = _share(means, centers, radius, region_size, keys) if settings.thinning else 1.0
-    else:
-        centers, radius, share = still_covering
+    keys = _uniform(np.arange(n), settings.seed)
+    start = int(np.random.default_rng(settings.seed).integers(n))
+    centers, reach = farthest_points(means, n_regions, start)
+    radius = settings.overlap * reach or 1.0
+    share = _share(means, centers, radius, region_size, keys)
     return Regions(centers, _neighbourhoods(means, centers, radius, share, region_size, keys), radius, share)
 
 
@@ -86,31 +75,6 @@ def farthest_points(means: np.ndarray, count: int, start: int) -> tuple[np.ndarr
     if len(picked) == len(centers):
         return centers, 0.0
     return centers, float(np.linalg.norm(means[centers] - means[picked[count]], axis=1).min())
-
-
-def covering(points: np.ndarray, centers: np.ndarray, radius: float, n_covers: int) -> np.ndarray:
-    """The nearest regions whose ball holds each point: i64 [N, n_covers], -1 where fewer do."""
-    if len(centers) == 0 or len(points) == 0:
-        return np.full((len(points), n_covers), -1, np.int64)
-    distance, index = cKDTree(centers).query(points, n_covers, distance_upper_bound=radius, workers=-1)
-    distance, index = distance.reshape(len(points), n_covers), index.reshape(len(points), n_covers)
-    return np.where(np.isfinite(distance), index, -1)
-
-
-def _hold(means: np.ndarray, earlier: Regions, count: int, overlap: float) -> tuple[np.ndarray, float, float] | None:
-    """Earlier centres, the few that are missing filled in where points are farthest; None if they no longer fit."""
-    missing = count - len(earlier.centers)
-    if not 0 <= missing <= count // 8:
-        return None
-    centers = list(earlier.centers)
-    reach = _tree(means[earlier.centers]).query(means, workers=-1)[0]
-    for _ in range(missing):
-        centers.append(int(reach.argmax()))
-        reach = np.minimum(reach, np.linalg.norm(means - means[centers[-1]], axis=1))
-    farthest = float(reach.max())
-    if not earlier.radius / (2 * overlap) <= farthest <= earlier.radius:  # sampled, it is radius / overlap
-        return None
-    return np.array(centers, np.int64), earlier.radius, earlier.share
 
 
 def _share(means: np.ndarray, centers: np.ndarray, radius: float, region_size: int, keys: np.ndarray) -> float:

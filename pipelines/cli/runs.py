@@ -13,9 +13,7 @@ from chebsplat.stages.runtime.device import DEVICES
 
 OPTIONS = [
     click.option("--scene", help="a name from `chebsplat scenes`, a folder, or a video"),
-    click.option(
-        "--sequence", help="scenes in order, each with the knowledge of the one before; needs --ablation paper"
-    ),
+    click.option("--sequence", help="scenes in order, each given the training before it; needs --ablation paper"),
     click.option("--set", "settings", default="", help="section.key=value,..."),
     click.option("--ablation", default="", help="a named set of settings"),
 ]

@@ -109,7 +109,7 @@ def make_scene():
         labels,
         ["wall", "floor"],
         np.eye(2, 4, dtype=np.float32),
-        {"left_out": {"cks": "none"}},
+        {"left_out": {"lift": "none"}},
     )
 
 

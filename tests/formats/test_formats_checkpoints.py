@@ -31,7 +31,7 @@ def publish(path, gaussians):
 
 @pytest.mark.parametrize("n", [0, 1, 5])
 def test_checkpoint_round_trip_is_exact(tmp_path, n):
-    modules = {"encoder.w": np.arange(6, dtype=np.float32).reshape(2, 3), "gate.b": np.float32([7])}
+    modules = {"gate.w": np.arange(6, dtype=np.float32).reshape(2, 3), "gate.b": np.float32([7])}
     trace = [{"step": 1.0, "seconds": 0.5, "psnr": 20.25}]
     given = Gaussians(example(n), CAMERAS, modules, trace, {"label_names": ["wall"]})
     found = Gaussians.read(publish(tmp_path / "g", given))

@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import atexit
 import functools
-import pickle
 import shutil
 import tempfile
 from collections.abc import Callable, Iterator
@@ -17,11 +16,9 @@ from typing import Any
 import numpy as np
 
 from chebsplat.formats import artifact
-from chebsplat.formats.basis import Basis, write_basis
 from chebsplat.formats.cameras import Cameras
 from chebsplat.formats.capture import Capture
 from chebsplat.formats.descriptors import Descriptors, write_descriptors
-from chebsplat.formats.encoder import DYNAMIC, FLOAT, FUSED, write_encoder
 from chebsplat.formats.evaluation import Evaluation, ViewAgreement
 from chebsplat.formats.features import Features
 from chebsplat.formats.gaussians import Gaussians
@@ -33,7 +30,7 @@ from chebsplat.formats.scene import Scene
 from chebsplat.settings import DescribeSection
 from chebsplat.stages.registry import STAGES
 from chebsplat.stages.runtime.config import Config
-from malformed.edits import DEEP, Edit, changed, cut, flipped, no_file, npy, put, remove
+from malformed.edits import DEEP, Edit, changed, cut, flipped, no_file, put, remove
 from malformed.row import Arguments, Row, stage
 
 N, V, C, SIZE = 40, 3, 5, (24, 16)  # Gaussians, views, channels, width and height
@@ -41,7 +38,7 @@ KEY = "0123456789abcdef"
 MEMBER = "data/values.bin"
 VIEWS, LABELS = [f"view_{k}" for k in range(V)], ["wall", "floor", "sofa"]
 NOTES = {"left_out": {}, "n_initial": N}
-DESCRIBED = {"n_angles": 2, "max_degree": 3, "anisotropy": 10.0, "bandwidth": 0.7, "spectrum": "full", "n_eigs": 16}
+DESCRIBED = {"n_angles": 2, "max_degree": 3, "anisotropy": 10.0, "bandwidth": 0.7}
 
 
 @functools.cache
@@ -112,7 +109,7 @@ OF_ANY: list[Damage] = [
 ]
 
 
-def met(name: str, ask: Callable[[Path], Arguments], word: str, edit: Edit, of: str = "cks") -> Row:
+def met(name: str, ask: Callable[[Path], Arguments], word: str, edit: Edit, of: str = "describe") -> Row:
     """A damaged artifact in folder/in."""
 
     def build(folder: Path) -> Arguments:
@@ -122,11 +119,15 @@ def met(name: str, ask: Callable[[Path], Arguments], word: str, edit: Edit, of: 
     return Row("artifact", name, build, ("/in", word), alone="pipe" in name)
 
 
+def planned(folder: Path) -> Arguments:
+    return ["plan", "--scene", "toy", "--set", f"refine.knowledge={folder}/in"]
+
+
 def rows() -> Iterator[Row]:
     for what, edit, word in OF_ANY:
         yield met(f"{what}, in verify", lambda folder: ["verify", folder / "in"], word, edit)
     for what, edit, word in (OF_ANY[0], OF_ANY[6], OF_INPUTS[5]):
-        yield met(f"{what}, in plan", lambda folder: ["plan", "--scene", "toy", "--basis", f"{folder}/in/"], word, edit)
+        yield met(f"{what}, in plan", planned, word, edit, "teach")
     roles = [(name, role) for name, one in STAGES.items() for role in one.roles]
     for number, (name, role) in enumerate(roles):
         what, edit, word = OF_INPUTS[number % len(OF_INPUTS)]
@@ -136,26 +137,13 @@ def rows() -> Iterator[Row]:
             return stage(name, folder, {}, **needed, **{role: folder / "in"})
 
         yield met(f"{what}, in {name} --in-{role}", ask, word, edit, STAGES[name].roles[role])
-    for what, content, word in FEATURES:
-        yield encoded("features.npy", what, put("features.npy", content), word)
     for what, content, word in SPLATS:
-        yield encoded("scene.ply", what, put("scene.ply", content), word)
-    for name in ("features.npy", "scene.ply"):
-        yield encoded(name, "a pipe", no_file(name, "pipe"), "a pipe", alone=True)
+        yield splats(what, put("scene.ply", content), word)
+    yield splats("a pipe", no_file("scene.ply", "pipe"), "a pipe", alone=True)
 
 
-# files from elsewhere, met by `encode`: features of Gaussians, and the Gaussians
+# Gaussians from elsewhere, met by `lift`
 
-FEATURES: list[tuple[str, bytes, str]] = [
-    ("nothing", b"", "not a readable .npy"),
-    ("a pickle", pickle.dumps([1, 2]), "not a readable .npy"),
-    ("terabytes", npy(np.zeros(3, np.float32), shape=(10**6, 10**6)), "it declares"),
-    ("objects", npy(np.zeros(3), descr="|O"), "pickled objects"),
-    ("one dimension", npy(np.zeros(N, np.float32)), "one row a Gaussian"),
-    ("other rows", npy(np.zeros((3, C), np.float32)), "one row a Gaussian"),
-    ("nan", npy(np.full((N, C), np.nan, np.float32)), "finite"),
-    ("words", npy(np.full((N, C), "a")), "one row a Gaussian"),
-]
 HEADER = b"ply\nformat binary_little_endian 1.0\nelement vertex 2\nproperty float x\n"
 AXES = b"property float y\nproperty float z\nend_header\n"
 SPLATS: list[tuple[str, bytes, str]] = [
@@ -166,15 +154,12 @@ SPLATS: list[tuple[str, bytes, str]] = [
 ]
 
 
-def encoded(named: str, what: str, edit: Edit, word: str, alone: bool = False) -> Row:
+def splats(what: str, edit: Edit, word: str, alone: bool = False) -> Row:
     def build(folder: Path) -> Arguments:
-        shutil.copyfile(artifacts() / "export/scene.ply", folder / "scene.ply")
-        (folder / "features.npy").write_bytes(npy(np.zeros((N, C), np.float32)))
         edit(folder)
-        given = ["--encoder", artifacts() / "onnx", "--features", folder / "features.npy", "--out", folder / "out.npz"]
-        return ["encode", folder / "scene.ply", *given]
+        return ["lift", folder / "scene.ply", "--out", folder / "out"]
 
-    return Row("encode", f"{named}: {what}", build, (named, word), alone=alone)
+    return Row("splats", what, build, ("scene.ply", word), alone=alone)
 
 
 # small artifacts of every schema
@@ -203,7 +188,7 @@ def _poses() -> tuple[np.ndarray, np.ndarray]:
 def _parameters() -> dict[str, np.ndarray]:
     rng = np.random.default_rng(0)
     shapes = {"means": (N, 3), "log_scales": (N, 3), "quats": (N, 4), "logit_opacities": (N,), "sh0": (N, 1, 3)}
-    shapes |= {"features": (N, C), "fused": (N, C)}
+    shapes["features"] = (N, C)
     p = {name: rng.normal(0, 0.5, shape).astype(np.float32) for name, shape in shapes.items()}
     p["means"][:, 2] += 3
     return p | {"shN": np.zeros((N, 15, 3), np.float32), "degrees": np.zeros(N, np.uint8)}
@@ -250,10 +235,9 @@ def _descriptors(out: Path) -> None:
 
 
 def _gaussians(out: Path) -> None:
-    encoder = {"n_inputs": 9, "n_channels": C, "width": 8, "n_layers": 1, "n_heads": 2}
     trace = [{"step": 10.0, "seconds": 1.0, "n": float(N), "psnr": 20.0}]
-    notes = NOTES | {"encoder": encoder, "label_names": LABELS}
-    modules = {"shape.gate.weight": np.ones((2, 2), np.float32)}
+    notes = NOTES | {"label_names": LABELS}
+    modules = {"semantic_gate.linear.weight": np.ones((1, C), np.float32)}
     Gaussians(_parameters(), _cameras(), modules, trace, notes).write(out)
 
 
@@ -286,25 +270,8 @@ def _knowledge(out: Path) -> None:
 
 def _scene(out: Path) -> None:
     p = _parameters()
-    p["raw_features"] = p.pop("fused")
     labels = np.arange(N, dtype=np.int32) % len(LABELS)
     Scene(p, _cameras(), np.arange(N), labels, LABELS, _embeddings(), NOTES).write(out)
-
-
-def _encoder(out: Path) -> None:
-    for name in (FLOAT, DYNAMIC, FUSED):
-        (out / name).write_bytes(b"no model")
-    describe = DESCRIBED | {"n_regions": 4, "region_size": 8, "seed": 0}
-    settings = {"describe": describe, "n_covers": 2, "described": True, "context": True, "n_inputs": 9, "n_channels": C}
-    write_encoder(out, {"encoder": {}, "fusion": {}, "settings": settings}, {FLOAT: [], DYNAMIC: [], FUSED: []})
-
-
-def _basis(out: Path) -> None:
-    report = {"rank_before": 0, "rank_after": 2, "added": 2, "rho": 1.0, "rho_after": 0.1}
-    report |= {"energy": 0.99, "rho_printed": 2.0}
-    entry = {"scene": "toy", "gaussians": KEY, "spread": 1.0, "maps": {"blocks.0.query": report}}
-    bases = {"blocks.0.query": np.eye(8, 2, dtype=np.float32)}
-    write_basis(out, Basis(bases, {"blocks.0.query": np.eye(8, dtype=np.float32)}, [entry]))
 
 
 def _evaluation(out: Path) -> None:
@@ -332,7 +299,5 @@ WRITERS: dict[str, Callable[[Path], None]] = {
     "lift": _lifted,
     "refine": _refined,
     "export": _scene,
-    "onnx": _encoder,
-    "cks": _basis,
     "evaluate": _evaluation,
 }

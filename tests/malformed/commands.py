@@ -2,12 +2,9 @@
 
 from __future__ import annotations
 
-import os
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 
-from chebsplat.formats import artifact
-from chebsplat.formats.manifest import Manifest
 from chebsplat.stages.registry import STAGES
 from malformed.artifacts import KEY, fake
 from malformed.edits import DEEP, Edit, no_file, put, swollen
@@ -22,8 +19,8 @@ SETTINGS: list[tuple[str, object, str]] = [  # a setting of a config, its value,
     ("teacher.scales", [], "teacher.scales"),
     ("teacher.scales", [0.0], "teacher.scales.0"),
     ("teacher.scales", [1.0] * 100, "teacher.scales"),
-    ("describe.spectrum", ["full"], "describe.spectrum"),
-    ("train.encoder", "trnsformer", "'transformer'"),
+    ("refine.smooth", ["on"], "refine.smooth"),
+    ("train.encoder", "pints", "'points'"),
     ("train.seconds", float("inf"), "a finite number is needed"),
     ("train.semantics", 1, "true or false is needed"),
     ("train.densify_until", 0.9, "densify_until"),
@@ -44,7 +41,6 @@ SET = {  # --set: what stderr names
     "train.steps=" + "9" * 5000: "train.steps",
     "train.steps=" + DEEP: "train.steps",
     "teacher.labels=a\nb": "teacher.labels",
-    "train.encoder=transformer,train.width=30": "width",
     "describe.n_regions=200000,describe.n_angles=64": "descriptors of",
 }
 TOMLS: list[tuple[str, bytes, str]] = [  # what a config holds, a word of the message
@@ -70,11 +66,9 @@ STUDIES: list[tuple[str, str, str]] = [  # what is wrong, the text, what stderr 
     ("no seeds", STUDY + "seeds = []\n[variants.a]\n", "seeds"),
     ("infinite seconds", STUDY + "budgets.seconds = [inf]\n[variants.a]\n", "budgets.seconds"),
     ("a section that is a number", STUDY + "settings = { train = 5 }\n[variants.a]\n", "settings.train"),
-    ("no scenes", STUDY.replace('"toy"', "") + "[variants.a]\n", "scenes or sequences"),
-    ("sequences, too", STUDY + 'sequences = ["toys"]\n[variants.a]\n', "scenes or sequences"),
+    ("no scenes", STUDY.replace('"toy"', "") + "[variants.a]\n", "scenes"),
     ("an ablation that is a number", STUDY + "[variants.a]\nablation = 5\n", "variants.a.ablation"),
     ("a condition that is a number", STUDY + "conditions = { x = 5 }\n[variants.a]\n", "conditions.x"),
-    ("pairs that are none", STUDY + 'pairs = [["a"]]\n[variants.a]\n', "pairs"),
     ("a setting out of range", STUDY + "[variants.a.train]\nwidth = 100000\n", "train.width"),
     ("an unknown setting", STUDY + "[variants.a.train]\nwitdh = 32\n", "train.witdh"),
     ("an unknown ablation", STUDY + '[variants.a]\nablation = "no-tel"\n', "no-tel"),
@@ -88,7 +82,6 @@ NAMES: list[tuple[str, str, int]] = [  # a command's words, what it must name, i
     ("run --scene toy --sequence toys", "sequence=", 2),
     ("run --scene toy --stage trian", "train", 2),
     ("run --scene toy --stage ../train", "stage", 2),
-    ("run --scene toy --stage cks", "no sequence", 2),
     ("run --scene toy --cores 0", "--cores", 2),
     ("run --scene toy --device tpu", "--device", 2),
     ("run --scene toy --nonsense", "No such option", 2),
@@ -100,19 +93,10 @@ NAMES: list[tuple[str, str, int]] = [  # a command's words, what it must name, i
     (f"run --scene ./{LONG}", LONG[:70], 3),
     ("run --scene ~nobody-of-this-name", "~nobody-of-this-name", 2),
     ("run --sequence ofices", "offices", 2),
+    ("run --sequence toys", "add ablation=paper", 2),
+    ("run --sequence toys --ablation no-tle", "add ablation=paper", 2),
     ("run --sequence nowhere.toml", "nowhere.toml", 2),
     (f"plan --sequence {LONG}.toml", LONG[:70], 2),
-    ("plan --scene toy --basis nobody", "nobody", 2),
-    ("plan --scene toy --basis offices@99", "offices@99", 2),
-    ("plan --scene toy --basis @", "NAME@REVISION", 2),
-    ("plan --scene toy --basis offices@0", "NAME@REVISION", 2),
-    ("plan --scene toy --basis offices@²", "NAME@REVISION", 2),
-    ("plan --scene toy --basis ../../x@1", "no basis is called ../../x", 2),
-    ("plan --scene toy --basis ./nowhere/", "no basis is called", 2),
-    ("plan --scene toy --basis ./", "not a finished artifact", 3),
-    ("plan --scene toy --basis offices@2 --ablation no-shape", "holds no knowledge: train.encoder is off", 2),
-    ("plan --scene toy --basis offices@2 --ablation no-tle", "holds no knowledge: train.encoder is mlp", 2),
-    ("plan --sequence offices --basis offices@2", "starts from nothing", 2),
     ("study methd", "did you mean method", 2),
     ("study ../studies/toys", "../studies/toys", 2),
     ("study nowhere.toml", "nowhere.toml", 2),
@@ -132,10 +116,6 @@ NAMES: list[tuple[str, str, int]] = [  # a command's words, what it must name, i
     ("encode nowhere.ply --encoder ./nowhere --out x.npz", "./nowhere", 3),
     ("lift nowhere.ply --capture ./nowhere --out x", "./nowhere", 3),
     ("check-teacher nowhere.onnx", "nowhere.onnx", 3),
-    ("basis show ofices", "offices", 2),
-    ("basis log ./nowhere", "nowhere", 2),
-    ("basis diff offices@0 offices", "offices@0", 2),
-    ("basis nonsense", "nonsense", 2),
     ("nonsense", "nonsense", 2),
     ("sfm --out x", "Missing option '--in-capture'", 2),
 ]
@@ -304,20 +284,6 @@ def several(folder: Path) -> None:
         linked(folder / "work", f"toy@train.steps={steps}", "train")
 
 
-def head(name: str, target: str) -> Edit:
-    """A revision of a HEAD that is a link to `target`, relative to the HEAD's folder."""
-
-    def edit(folder: Path) -> None:
-        work = folder / "work"
-        (work / "basis-shared").mkdir(parents=True)
-        for key in (KEY, "another"):
-            with artifact.publish(work / "store/cks" / key, Manifest(STAGES["cks"].schema, KEY, "cks")):
-                pass
-        os.symlink(target, work / "basis-shared" / name)
-
-    return edit
-
-
 def work() -> Iterator[Row]:
     def damaged(folder: Path) -> None:
         linked(folder / "work", "toy", "train", "{")
@@ -325,7 +291,7 @@ def work() -> Iterator[Row]:
     def unfinished(folder: Path) -> None:
         linked(folder / "work", "toy", "train")
 
-    for line in ("verify toy", "rm toy", "clean-stale", "clean-stale --yes", "basis extend h toy"):
+    for line in ("verify toy", "rm toy", "clean-stale", "clean-stale --yes"):
         yield words("work, a manifest cut short", line.split(), "artifact.json", "does not parse", code=3, edit=damaged)
     for what, text in (("cut short", "{"), ("of another kind", '{"steps": [3]}'), ("a folder", None)):
         yield words(f"work, a plan {what}", ["clean-stale", "--yes"], "plan.json", code=3, edit=plan_under_way(text))
@@ -338,11 +304,6 @@ def work() -> Iterator[Row]:
     yield words("work, photos", ["extract", "images", "--out", "x.ply"], "images", code=3, edit=photo)
     yield words("work, links elsewhere", ["rm", "./mine", "--yes"], "mine", code=3,
                 edit=lambda folder: linked(folder, "mine", "train"))  # fmt: skip
-    good = f"../store/cks/{KEY}"
-    for name, target in (("100000000", good), ("9", good), ("1", "../store/cks/nothing"), ("1", "1"), ("1", "../.."),
-                         ("1", "../store/cks/another")):  # fmt: skip
-        kind = f"work, revision {name} leads to {target}"
-        yield words(kind, ["basis", "log", "shared"], f"basis-shared/{name}", code=3, edit=head(name, target))
 
 
 def rows() -> Iterator[Row]:

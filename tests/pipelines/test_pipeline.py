@@ -22,8 +22,9 @@ from chebsplat.pipelines.work.scenes import CONFIGS, names, read_toml
 from chebsplat.stages.registry import STAGES
 
 PLANNED = {name for name, stage in STAGES.items() if stage.of_scene}
-ALL = [name for name in STAGES if name in PLANNED - {"channels", "cks"}]
-AFTER_TRAIN = ["train", "lift", "refine", "export", "onnx", "evaluate", "report"]
+ALL = [name for name in STAGES if name in PLANNED - {"channels"}]
+MADE = [name for name in ALL if not STAGES[name].only_asked]  # by a run that names no stage
+AFTER_TRAIN = ["train", "lift", "refine", "export", "evaluate", "report"]
 
 
 @pytest.fixture(autouse=True)
@@ -97,7 +98,7 @@ CODE_CHANGES = [
     (report_code, ["report"]),
     (format_code, ["export", "evaluate", "report"]),
     (trainer_code, AFTER_TRAIN),
-    (descriptor_code, ["describe", *AFTER_TRAIN]),
+    (descriptor_code, ["describe", "refine", "export", "evaluate", "report"]),
     (deep_code, ALL),
 ]
 
@@ -115,14 +116,13 @@ def test_a_change_of_code_makes_exactly_these_stages_stale(tmp_path, source_tree
 
 SETTING_CHANGES = [
     ("train.steps=61", AFTER_TRAIN),
-    ("train.albo=off", AFTER_TRAIN),
+    ("train.prune=off", AFTER_TRAIN),
     ("teacher.confusion=0.2", ["teacher", "agree", *AFTER_TRAIN]),
     ("agree.n_points=700", ["agree", "report"]),
     ("describe.bandwidth=0.8", ["describe", *AFTER_TRAIN]),
     ("sfm.max_points=700", ["sfm", "agree", "describe", *AFTER_TRAIN]),
     ("lift.gate=0.3", ["lift", "refine", "export", "evaluate", "report"]),
     ("refine.smooth=on", ["refine", "export", "evaluate", "report"]),
-    ("onnx.tolerance=1e-4", ["onnx", "report"]),
     ("evaluate.boundary=3", ["evaluate", "report"]),
     ("source.seed=7", ALL),
     ("train.steps=60", []),
@@ -260,12 +260,11 @@ def test_generated_and_replica_scenes_never_share_a_key(tmp_path, monkeypatch):
 @pytest.mark.parametrize(
     ("settings", "left_out"),
     [
-        ("", {"channels", "cks"}),
-        ("train.semantics=false", {"channels", "teacher", "agree", "describe", "lift", "refine", "onnx", "cks"}),
-        ("teacher.kind=none", {"channels", "teacher", "agree", "describe", "lift", "refine", "onnx", "cks"}),
-        ("train.features=lifted", {"channels", "describe", "onnx", "cks"}),
-        ("train.encoder=off", {"channels", "describe", "onnx", "cks"}),
-        ("train.albo=false", {"channels", "describe", "cks"}),
+        ("", {"channels"}),
+        ("train.semantics=false", {"channels", "teacher", "agree", "lift", "refine"}),
+        ("teacher.kind=none", {"channels", "teacher", "agree", "lift", "refine"}),
+        ("train.features=lifted", {"channels"}),
+        ("train.encoder=off", {"channels"}),
     ],
 )
 def test_a_scene_leaves_out_what_it_does_not_need_and_says_why(settings, left_out):
@@ -284,14 +283,6 @@ def test_lifted_features_reach_the_export_and_trained_ones_do_not_wait_for_them(
     by_stage = {step.stage: set(step.inputs) for step in Planner().plan("toy").steps}
     assert by_stage["export"] == {"gaussians", "features", "refined"}
     assert "features" in by_stage["train"]
-
-
-@pytest.mark.parametrize("settings", ["train.semantics=false", "train.encoder=off", "train.features=lifted"])
-def test_a_scene_without_an_encoder_takes_no_knowledge(settings):
-    basis = Planner().plan("toy", keep_knowledge=True).targets["cks"]
-    plan = Planner().plan("toy", settings, basis=basis, keep_knowledge=True)
-    assert all("basis" not in step.inputs for step in plan.steps)
-    assert "cks" in plan.left_out
 
 
 @pytest.mark.parametrize("kind", ["scenes", "ablations", "sequences"])
@@ -366,14 +357,14 @@ def test_a_failed_run_tells_a_stage_that_failed_from_one_that_was_killed(tmp_pat
     steps = {step.stage: step for step in Planner().plan("toy").steps}
     for step in steps.values():  # as a plan is written
         (tmp_path / f"{step.stage}-{step.key}.exit").write_text("0")
-    for stage in ("onnx", "train"):
+    for stage in ("lift", "train"):
         (tmp_path / f"{stage}-{steps[stage].key}.log").touch()
-    (tmp_path / f"onnx-{steps['onnx'].key}.exit").write_text("4")
+    (tmp_path / f"lift-{steps['lift'].key}.exit").write_text("4")
     outcome = failures(list(steps.values()), tmp_path, tmp_path / "snakemake.log")
     assert outcome.code == 4
-    assert set(outcome.failed) == {steps["onnx"].key, steps["train"].key}
+    assert set(outcome.failed) == {steps["lift"].key, steps["train"].key}
     told = capfd.readouterr().err
-    assert "onnx failed with exit code 4" in told
+    assert "lift failed with exit code 4" in told
     assert "train was killed" in told
     assert failures([steps["report"]], tmp_path, tmp_path / "snakemake.log").code == 1
     assert "snakemake.log" in capfd.readouterr().err
@@ -399,14 +390,14 @@ def test_a_run_makes_the_report_and_a_second_run_does_nothing(work):
     assert {"test PSNR", "mIoU", "Gaussians", "PLY"} <= table
     assert "its 2D teacher" in first.stderr
     times = {p: p.stat().st_mtime_ns for p in work.glob("store/*/*/artifact.json")}
-    assert len(times) == len(ALL)
+    assert len(times) == len(MADE)
     second = chebsplat("run", "--scene", "toy", "--set", FAST)
     assert second.returncode == 0
     assert second.stdout.strip() == page
     assert "to run" not in second.stderr
     assert times == {p: p.stat().st_mtime_ns for p in work.glob("store/*/*/artifact.json")}
     only = chebsplat("run", "--scene", "toy", "--set", FAST + ",evaluate.boundary=3")
-    assert f"to run: evaluate report   fresh: {len(ALL) - 2}" in only.stderr
+    assert f"to run: evaluate report   fresh: {len(MADE) - 2}" in only.stderr
     assert "report: done" in only.stderr
     assert "already there" not in only.stderr
     assert "profile" not in first.stderr + only.stderr
@@ -420,13 +411,15 @@ def test_a_run_makes_the_report_and_a_second_run_does_nothing(work):
 
 @pytest.mark.xdist_group("cli")
 def test_a_failing_stage_gives_its_exit_code_and_nothing_half_made(work):
-    failed = chebsplat("run", "--scene", "toy", "--set", "onnx.tolerance=1e-12," + FAST)
+    failed = chebsplat("run", "--scene", "toy", "--set", "ingest.test_every=10000,ingest.test_offset=9999," + FAST)
     assert failed.returncode == 4
-    told = next(line for line in failed.stderr.splitlines() if line.startswith("onnx failed with exit code 4; log: "))
+    told = next(
+        line for line in failed.stderr.splitlines() if line.startswith("evaluate failed with exit code 4; log: ")
+    )
     with open(told.split("log: ")[1]) as log:
-        assert "onnx.tolerance is 1.0e-12" in log.read()
+        assert "test view" in log.read()
     assert list(work.glob("toy*/train"))
-    assert not list(work.glob("store/onnx/*"))
+    assert not list(work.glob("store/evaluate/*"))
 
 
 @pytest.mark.xdist_group("cli")

@@ -15,7 +15,7 @@ from chebsplat.stages.runtime.progress import Progress
 from chebsplat.stages.runtime.stopping import heeded
 from chebsplat.stages.training.loop import follow
 
-SETTINGS = TrainSection(encode_every=4, report_every=6)
+SETTINGS = TrainSection(report_every=6)
 
 
 class Alternating:
@@ -25,7 +25,7 @@ class Alternating:
 
     def __init__(self, stop_at=None):
         self.step, self.seconds, self.stop_at, self.settings = 0, 0.0, stop_at, SETTINGS
-        self.views, self.feature_every = SimpleNamespace(names=["a", "b"]), 1
+        self.views, self.feature_every = SimpleNamespace(names=["a", "b"]), 4
         self.model = SimpleNamespace(sh_kept=lambda: 0.5)
         self.schedule = SimpleNamespace(last_step=lambda step, seconds: 12)
 

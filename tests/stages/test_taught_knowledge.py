@@ -46,9 +46,8 @@ def refine_of(settings="", scene="office0"):
 def test_a_scene_starts_from_the_knowledge_that_ships_unless_it_is_told_not_to(quick_plans):
     step, left_out = refine_of()
     assert step.inputs["knowledge"].name == artifact.read_manifest(SHIPPED).key
-    assert {"describe", "onnx"} <= set(left_out)
     assert "knowledge of shape" not in left_out
-    for settings in ("refine.knowledge=none", "train.encoder=transformer", "train.encoder=off"):
+    for settings in ("refine.knowledge=none", "train.encoder=off"):
         step, left_out = refine_of(settings)
         assert not {"knowledge", "points"} & set(step.inputs), settings
         assert left_out["knowledge of shape"]
@@ -62,14 +61,6 @@ def test_where_knowledge_lies_is_no_matter_and_damage_is_noticed(quick_plans, tm
     (tmp_path / "mine/weights.safetensors").write_bytes(b"x")
     with pytest.raises(InputError, match=r"weights\.safetensors"):
         refine_of("refine.knowledge=mine")
-
-
-def test_a_scene_of_a_sequence_trains_the_encoder_that_a_basis_is_of(quick_plans):
-    plan = Planner().plan("office0", keep_knowledge=True)
-    train = next(step for step in plan.steps if step.stage == "train")
-    assert train.sections["train"]["encoder"] == "transformer"
-    assert "cks" in plan.targets
-    assert "knowledge of shape" in plan.left_out
 
 
 def test_another_teacher_has_none_until_it_is_taught(quick_plans, tmp_path):

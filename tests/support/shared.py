@@ -19,7 +19,6 @@ TOY = {
     "describe": {"n_regions": 24, "region_size": 8},
     "knowledge": {"n_rooms": 1, "n_held_out": 1, "n_views": 6, "n_points": 200, "steps": 3},
     "train": {
-        "encoder": "transformer",
         "steps": 24,
         "max_gaussians": 500,
         "n_densify": 2,
@@ -35,7 +34,7 @@ INPUTS = {
     "agree": {"capture": "ingest", "points": "sfm", "features": "teacher"},
     "teach": {"channels": "channels"},
     "describe": {"points": "sfm"},
-    "train": {"capture": "ingest", "points": "sfm", "features": "teacher", "descriptors": "describe"},
+    "train": {"capture": "ingest", "points": "sfm", "features": "teacher"},
     "export": {"gaussians": "train", "features": "teacher"},
     "lift": {"capture": "ingest", "gaussians": "train", "features": "teacher"},
     "refine": {
@@ -46,14 +45,11 @@ INPUTS = {
         "points": "sfm",
         "knowledge": "teach",
     },
-    "onnx": {"gaussians": "train"},
-    "cks": {"gaussians": "train"},
     "evaluate": {"capture": "ingest", "scene": "export", "features": "teacher"},
     "report": {
         "evaluation": "evaluate",
         "gaussians": "train",
         "scene": "export",
-        "encoder": "onnx",
         "features": "teacher",
         "agreement": "agree",
     },

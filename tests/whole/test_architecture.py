@@ -107,7 +107,7 @@ ROOMS = {
     },
 }
 STAGE_MODULES = {path.stem for path in (ROOT / "stages").glob("*.py")} - {"__init__", *ROOMS["stages"]}
-ALSO_STAGES = {"tools", "teach"}  # commands on finished scenes run stages; teaching checks its graphs as `onnx` does
+ALSO_STAGES = {"tools"}  # commands on finished scenes run stages
 
 
 def module_of(path):
@@ -161,7 +161,7 @@ def test_a_stage_is_known_by_every_kernel_it_runs_and_every_package_it_loads():
     kernels = [path for path in PACKAGE.rglob("*.py") if "chebsplat.kernels.jit import" in path.read_text()]
     assert len(kernels) > 8
     assert not [path for path in kernels if str(path) not in found]
-    assert {"onnx", "onnxruntime", "torch"} <= set(code.stage("onnx")["packages"])
+    assert {"onnx", "onnxruntime", "torch"} <= set(code.stage("teach")["packages"])
 
 
 def test_tools_that_walk_the_links_see_each_file_once(tmp_path):

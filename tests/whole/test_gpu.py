@@ -8,7 +8,7 @@ from benchmarks.training.cost import trainer_from
 from chebsplat.stages.runtime import config as configs
 
 pytestmark = pytest.mark.gpu
-SETTINGS = {"densify": "off", "encoder": "transformer", "encode_from": 0.1, "prune_from": 0.1}
+SETTINGS = {"densify": "off", "prune_from": 0.1}
 
 
 @pytest.fixture

@@ -9,7 +9,7 @@ import torch
 
 from chebsplat.cameras import common_up, upright
 from chebsplat.shape import point_encoder
-from chebsplat.shape.point_encoder import PointEncoder, cloud_of
+from chebsplat.shape.point_encoder import PointEncoder, Standardize, cloud_of
 from chebsplat.shape.point_inputs import RADII, REACH, point_inputs
 from chebsplat.splats.gaussians import local_shape
 from chebsplat.synthetic.rays import look_at, walk
@@ -174,3 +174,10 @@ def test_upright_is_a_rotation_whatever_up_is():
         np.testing.assert_allclose(R @ up, [0, 0, np.linalg.norm(up)], atol=1e-12)
     with pytest.raises(ValueError, match="no length"):
         upright(np.zeros(3))
+
+
+def test_inputs_are_standardised_and_outliers_bounded():
+    norm = Standardize(3)
+    norm.set(torch.tensor([100.0, -2.0, 0.0]), torch.tensor([0.5, 0.0, 1.0]))
+    found = norm(torch.tensor([[101.0, -2.0, 0.25], [1e30, -2.0, -9.0]]))
+    assert found.tolist() == [[2.0, 0.0, 0.25], [5.0, 0.0, -5.0]]
