@@ -95,9 +95,6 @@ class TrainSection(Section):
         "of trained features: what the teacher's views say of the Gaussians at the start, or nothing; default: lifted "
         "from 40 views on",
     )
-    encoder: Literal["points", "off"] = setting(
-        "points", "of points: taught over many rooms, frozen, used once the scene is trained; off: none"
-    )
     prune: bool = setting(True, "remove Gaussians that add nothing")
     prune_semantic: bool = setting(True, 'features guard Gaussians from pruning; false: "no semantic guidance"')
     densify: Literal["mixed", "region", "classic", "off"] = setting(

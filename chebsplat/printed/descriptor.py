@@ -56,7 +56,7 @@ def eigenpairs(weights: Tensor, present: Tensor, n_eigs: int) -> tuple[Tensor, T
       is there twice (those that LAPACK returns). A region of fewer than K members has zeros beyond.
     """
     n, dtype, shape = weights.shape[-1], weights.dtype, weights.shape[:-2]
-    weights, present = weights.reshape(-1, n, n).double(), present.reshape(-1, n)
+    weights, present = weights.reshape(shape.numel(), n, n).double(), present.reshape(shape.numel(), n)
     degree = weights.sum(-1)
     attached = degree > 0
     root = torch.where(attached, degree, 1.0).rsqrt()
@@ -110,6 +110,8 @@ def descriptor(
     Args: centers [..., n, 3], covariances [..., n, 3, 3]; angles [J] radians.
     Choices: no gradient, since eigenvectors have none where eigenvalues coincide.
     """
+    if present.shape[-1] == 0:
+        return centers.new_zeros(*present.shape, len(angles) * (degree + 1))
     metrics = metric(covariances, beta)
     parts = []
     for angle in angles.to(centers):

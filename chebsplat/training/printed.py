@@ -159,7 +159,7 @@ class PrintedScene(SceneModel):
         grid: tuple[int, int] | None = None,
         depth: bool = False,
     ) -> Rendered:
-        """As `SceneModel.render`, by the print; masks are applied from the first step on, `masked` or not."""
+        """As `SceneModel.render`, by the print; features are fused at every step."""
         raw = self.raw
         with torch.no_grad():
             index = in_frustum(raw["means"], view, 3 * raw["log_scales"].amax(1).exp())
@@ -167,7 +167,9 @@ class PrintedScene(SceneModel):
         fused, _, _, regions, _, tokens, _ = self.encoded(index, REGIONS_IN_VIEW)
         if self.keeps_gradient and fused.requires_grad:
             fused.retain_grad()
-        soft, delta = self.masks(raw["features"].index_copy(0, index, fused), index, regions)
+        soft = delta = None
+        if masked:
+            soft, delta = self.masks(raw["features"].index_copy(0, index, fused), index, regions)
         scales, opacities = take(raw["log_scales"], index).exp(), take(raw["logit_opacities"], index).sigmoid()
         if soft is not None:
             scales, opacities = pruning.apply_mask(pruning.binarize(soft[index], THRESHOLD), scales, opacities)

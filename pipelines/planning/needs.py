@@ -145,8 +145,6 @@ def knowledge_given(config: Any, kind: str, running: bool) -> tuple[Path | None,
     wanted = config.refine.knowledge
     if wanted == "none":
         return None, "refine.knowledge is none"
-    if wanted is None and config.train.encoder != "points":
-        return None, f"train.encoder is {config.train.encoder}"
     if wanted is not None:
         return store.taken_in(Path(expanded(wanted)).expanduser().resolve(), "teach", SCHEMA, running), ""
     model = read_teacher(Path(config.teacher.model or EMBEDDED)) if kind == "onnx" else None

@@ -97,14 +97,12 @@ def _exposure(_: TrainSection, evidence: Evidence) -> str:
 
 
 PRINTED: dict[str, Any] = {  # what the printed method does without, and where it differs
-    "encoder": "off",
     "scale_limit": 1000,
     "weight_depth": 0.0,
     "feature_every": 1,
     "feature_start": "zero",
     "feature_loss": "l1",
     "densify": "region",
-    "prune_from": 0.0,
     "sh_freeze": 1.0,
     "sh_guided": False,
     "exposure": "off",
@@ -141,7 +139,8 @@ DEFAULTS = {  # in this order: a later one may ask for an earlier
 def resolved(train: TrainSection, evidence: Evidence) -> TrainSection:
     """The section with every setting that it leaves open decided, and those of the printed method as it has them."""
     if train.method == "printed":
-        train = train.model_copy(update=PRINTED | ({"densify": "off"} if train.without == "densification" else {}))
+        left_out = {"densification": {"densify": "off"}, "pruning guidance": {"densify_semantic": False}}
+        train = train.model_copy(update=PRINTED | left_out.get(train.without, {}))
     for name, default in DEFAULTS.items():
         if getattr(train, name) in OPEN:
             train = train.model_copy(update={name: default.value(train, evidence)})
