@@ -29,6 +29,7 @@ class Stage:
     def device(self, wanted: str, sections: Mapping[str, Any]) -> str:
         """What computes it, where `wanted` is there: that, or the CPU, where its settings make no use of a GPU."""
         idle = self.name == "teacher" and sections["teacher"]["kind"] in MODEL_FREE
+        idle = idle or (self.name == "train" and sections["train"]["method"] == "printed")  # plain torch and SciPy
         return wanted if self.on_device and not idle else "cpu"
 
     @property

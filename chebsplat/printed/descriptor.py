@@ -7,6 +7,7 @@ names neither the neighbours of a Gaussian (here: all of its region) nor the axi
 
 from __future__ import annotations
 
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -16,7 +17,7 @@ CONDITION = 1e-8  # of degrees, the least over the largest, down to which D^-1/2
 
 def metric(covariances: Tensor, beta: float) -> Tensor:
     """M_i = R_i diag(1 / (1 + beta lambda)) R_i^T of covariances [..., 3, 3] (Eq 1)."""
-    values, axes = torch.linalg.eigh(covariances)
+    values, axes = _eigh(covariances)
     shrunk = 1 / (1 + beta * values.clamp_min(0))
     shaped: Tensor = (axes * shrunk[..., None, :]) @ axes.mT
     return shaped
@@ -61,7 +62,7 @@ def eigenpairs(weights: Tensor, present: Tensor, n_eigs: int) -> tuple[Tensor, T
     attached = degree > 0
     root = torch.where(attached, degree, 1.0).rsqrt()
     beyond = torch.diag_embed(torch.where(present, 1.0, 10.0).to(weights))  # absent members come last
-    values, vectors = torch.linalg.eigh(beyond - root[..., :, None] * weights * root[..., None, :])
+    values, vectors = _eigh(beyond - root[..., :, None] * weights * root[..., None, :])
     vectors = root[..., None] * vectors
     least = degree.masked_fill(~attached, torch.inf).amin(-1)
     if (apart := least < CONDITION * degree.amax(-1)).any():
@@ -119,6 +120,12 @@ def descriptor(
         weights = edge_weights(centers, rotation @ metrics @ rotation.T, present, sigma)
         parts.append(chebyshev(*eigenpairs(weights, present, n_eigs), degree))
     return torch.where(present[..., None], torch.cat(parts, -1), 0.0)
+
+
+def _eigh(matrices: Tensor) -> tuple[Tensor, Tensor]:
+    """`torch.linalg.eigh` by NumPy: torch wakes all threads for each small matrix, and waits where others compute."""
+    values, vectors = np.linalg.eigh(matrices.numpy())
+    return torch.from_numpy(values), torch.from_numpy(vectors)
 
 
 def _about_z(angle: Tensor) -> Tensor:
