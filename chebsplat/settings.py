@@ -79,6 +79,13 @@ class TrainSection(Section):
         0.999,
     )
     # what is built
+    method: Literal["ours", "printed"] = setting("ours", "printed: the paper's, to the letter (docs/method.md)")
+    without: Literal["nothing", "descriptor", "transformer", "pruning guidance", "densification", "SH guidance"] = (
+        setting("nothing", "of the printed method: a row of the paper's Table 5")
+    )
+    region_gradient: Literal["means", "features"] = setting(
+        "means", "that grows Gaussians in the printed method: of the loss to 2D means, or to fused features"
+    )
     semantics: bool = setting(True, "false: colour only")
     features: Literal["trained", "lifted"] = setting(
         "trained", "of Gaussians; lifted: colour alone is trained, and the teacher's features are lifted afterwards"
@@ -87,9 +94,6 @@ class TrainSection(Section):
         None,
         "of trained features: what the teacher's views say of the Gaussians at the start, or nothing; default: lifted "
         "from 40 views on",
-    )
-    encoder: Literal["points", "off"] = setting(
-        "points", "of points: taught over many rooms, frozen, used once the scene is trained; off: none"
     )
     prune: bool = setting(True, "remove Gaussians that add nothing")
     prune_semantic: bool = setting(True, 'features guard Gaussians from pruning; false: "no semantic guidance"')

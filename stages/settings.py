@@ -174,6 +174,11 @@ class RefineSection(Section):
         "show, where it has none",
     )
 
+    @property
+    def changes_nothing(self) -> bool:
+        """Whether features stay as the training left them."""
+        return (self.start, self.smooth, self.knowledge) == ("trained", "off", "none")
+
 
 class KnowledgeSection(Section):
     """What scenes start from: a point encoder, taught once a teacher over generated rooms."""

@@ -9,9 +9,10 @@ from chebsplat.errors import DataFailure
 from chebsplat.formats.cameras import Cameras
 from chebsplat.formats.gaussians import Gaussians
 from chebsplat.stages.runtime.command import Job
-from chebsplat.stages.training.assembly import assemble, read_inputs
-from chebsplat.stages.training.facts import facts_of
+from chebsplat.stages.training.assembly import KNOWLEDGE, assemble, read_inputs
+from chebsplat.stages.training.facts import facts_of, printed_facts
 from chebsplat.stages.training.loop import follow
+from chebsplat.training.printed import PrintedScene
 
 log = logging.getLogger("chebsplat")
 
@@ -26,6 +27,10 @@ def run(job: Job) -> None:
     trainer = assemble(job, inputs)
     points, features, n_initial = inputs.points, inputs.features, len(trainer.model)
     trace = follow(job, trainer)
+    printed = trainer.model if isinstance(trainer.model, PrintedScene) else None
+    if printed is not None and features is not None:
+        job.facts["printed"] = printed_facts(printed, features)
+    bases = {} if printed is None else printed.grown_bases()
     parameters, population = trainer.finish(), trainer.population
     if population.n_broken:
         log.warning("%d Gaussians became non-finite and were removed", population.n_broken)
@@ -37,6 +42,7 @@ def run(job: Job) -> None:
         for n, m in trainer.model.modules.items()
         for k, v in m.state_dict().items()
     }
+    modules |= {KNOWLEDGE + name: basis.numpy() for name, basis in bases.items()}
     cameras = Cameras(points.names, points.Ks, points.cam_from_world, *inputs.capture.size)
     notes: dict[str, Any] = {"left_out": job.facts.get("left_out", {}), "n_added": population.n_added}
     notes |= {"n_removed": population.n_removed, "n_broken": population.n_broken, "n_initial": n_initial}

@@ -19,6 +19,7 @@ from chebsplat.splats.gaussians import initial_gaussians, local_shape
 from chebsplat.stages.runtime.config import Config
 from chebsplat.stages.training.defaults import Evidence, resolved
 from chebsplat.training.model import SceneModel
+from chebsplat.training.printed import PrintedScene
 from chebsplat.training.trainer import Trainer
 from chebsplat.views import Views
 
@@ -56,7 +57,8 @@ def tiny_trainer(means: np.ndarray | None = None, views: Views | None = None, **
     }
     config = Config.model_validate({"train": small | settings, "describe": {"n_regions": 24, "region_size": 16}})
     torch.manual_seed(config.train.seed)
-    model = SceneModel(initial_gaussians(means, colors, shapes, opacity=0.5), config.describe, config.train, CHANNELS)
+    kind = PrintedScene if config.train.method == "printed" else SceneModel
+    model = kind(initial_gaussians(means, colors, shapes, opacity=0.5), config.describe, config.train, CHANNELS)
     views = four_views() if views is None else views
     n_views, height, width = views.images.shape[:3]
     train = resolved(config.train, Evidence(n_views, n_views * height * width))

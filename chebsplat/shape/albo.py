@@ -114,7 +114,8 @@ def similarity(region: Region, factors: Tensor, rotmats: Tensor, bandwidth: floa
     log_weights = torch.where(pair, log_weights, 0.0)
     top = torch.where(pair, log_weights, -torch.inf).amax(-1).detach()
     top = torch.where(torch.isfinite(top), top, 0.0)
-    degrees = torch.where(pair, (log_weights - top[..., None]).clamp_max(0).exp(), 0.0).sum(-1)
+    # Not by clamp_max: from torch 2.14 on it has no gradient at the bound, where each row's top lies.
+    degrees = torch.where(pair, log_weights - top[..., None], -torch.inf).exp().sum(-1)
     log_degrees = top + torch.where(degrees > 0, degrees, 1.0).log()
     exponent = log_weights - 0.5 * (log_degrees[:, :, None] + log_degrees[:, None])
     return torch.where(pair, exponent.clamp_max(0).exp(), 0.0)

@@ -23,11 +23,15 @@ NEAREST = 0.01  # scene units, of a plane's depth: the rasterizer's near plane
 class Auxiliary:
     """What losses need beside the picture; None where it was not wanted or does not exist.
 
-    soft_mask: m̂ [V] of the pruning gates; band_masks [V, 3].
+    soft_mask: m̂ [V] of the pruning gates; band_masks [V, 3]. Of the printed method: soft_mask [N] and delta [N, 4] of
+    all Gaussians, fused features [V, C], and L_reg [] (`knowledge`).
     """
 
     soft_mask: Tensor | None = None
     band_masks: Tensor | None = None
+    delta: Tensor | None = None
+    fused: Tensor | None = None
+    knowledge: Tensor | None = None
 
 
 @dataclass
@@ -108,10 +112,18 @@ class SceneModel:
         """Part of all SH coefficients up to degree 3 that the Gaussians keep; until the freeze, would keep."""
         counts = [len(band) for band in self.bands()[1:]]
         if "sh_logits" in self.raw:
-            open_bands = sh_prune.band_mask(self.raw["sh_logits"].detach()) > 0.5
-            counts = open_bands.sum(0).tolist()[: len(counts)]
+            counts = (self.open_bands() > 0.5).sum(0).tolist()[: len(counts)]
         kept = sum(count * (2 * band + 3) for band, count in enumerate(counts))
         return float((len(self) + kept) / (16 * max(len(self), 1)))
+
+    @torch.no_grad()
+    def open_bands(self) -> Tensor:
+        """Masks [N, 3] in {0, 1} of SH bands 1 to 3, as they are."""
+        return sh_prune.band_mask(self.raw["sh_logits"])
+
+    def settled_degrees(self) -> Tensor:
+        """SH degree u8 [N] that each Gaussian keeps for good."""
+        return sh_prune.degrees(self.open_bands())
 
     def soft_mask(self, index: Tensor, features: Tensor | None) -> Tensor | None:
         """m̂ [V] in (0, 1) of the pruning gates, None where pruning is off."""

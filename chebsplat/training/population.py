@@ -13,6 +13,7 @@ from torch import Tensor
 from chebsplat.settings import TrainSection
 from chebsplat.training import densify, optimizer_rows, prune, sh_prune
 from chebsplat.training.model import Rendered, SceneModel
+from chebsplat.training.printed import PrintedScene
 
 FAINT = 0.005  # opacity below which a Gaussian is removed
 TINY = 1e-30  # scene units: a bound for what lies in a camera
@@ -52,6 +53,12 @@ class Population:
 
     def note_gradients(self, rendered: Rendered) -> None:
         """Length of the total loss' gradient to the 2D means, in half image widths as gsplat counts it."""
+        if self.settings.region_gradient == "features" and rendered.auxiliary.fused is not None:
+            gradient = rendered.auxiliary.fused.grad
+            if gradient is not None:
+                self.gradient_sum.index_add_(0, rendered.index, gradient.norm(dim=-1))
+                self.gradient_count[rendered.index] += 1
+            return
         gradient = rendered.meta["means2d"].grad
         if gradient is None:
             return
@@ -92,7 +99,9 @@ class Population:
         if budget == 0:
             return
         gradient, threshold = self.gradient_sum / self.gradient_count.clamp_min(1), settings.grow_threshold
-        if settings.densify == "classic" or (settings.densify == "mixed" and self.n_grown % 2 == 0):
+        if isinstance(self.model, PrintedScene):
+            additions = self.model.additions(gradient, threshold, budget, generator)
+        elif settings.densify == "classic" or (settings.densify == "mixed" and self.n_grown % 2 == 0):
             additions = densify.clone_or_split(raw, gradient, threshold, 0.01 * self.extent, budget, generator)
         else:
             mean = densify.region_gradients(gradient, members)
@@ -140,7 +149,7 @@ class Population:
     def freeze_bands(self, optimizer: torch.optim.Optimizer) -> None:
         """Fix every Gaussian's SH degree, once: what is closed leaves parameters, moments and memory."""
         raw = self.model.raw
-        degrees = sh_prune.degrees(sh_prune.band_mask(raw["sh_logits"])).clamp_max(self.settings.sh_degree)
+        degrees = self.model.settled_degrees().clamp_max(self.settings.sh_degree)
         rows = sh_prune.ragged_rows(degrees)
         optimizer_rows.drop(optimizer, raw, "sh_logits")
         bands = {f"sh{band}": rows[band] for band in range(1, 4)}

@@ -117,5 +117,5 @@ class Schedule:
         return share >= self.settings.densify_until
 
     def freezes_bands(self, share: float) -> bool:
-        """Do SH bands stay as they are?"""
-        return share >= self.settings.sh_freeze
+        """Do SH bands stay as they are? Those that are to stay from the end on do so once the training has ended."""
+        return self.settings.sh_freeze < 1 and share >= self.settings.sh_freeze

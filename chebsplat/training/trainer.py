@@ -21,6 +21,7 @@ from chebsplat.training import sh_prune
 from chebsplat.training.losses import depth_distance, photometric, semantic_loss
 from chebsplat.training.model import Rendered, SceneModel
 from chebsplat.training.population import Population, broken
+from chebsplat.training.printed import PrintedScene, auxiliary_losses
 from chebsplat.training.schedule import Schedule, adam
 from chebsplat.views import Views
 
@@ -45,10 +46,13 @@ class Trainer:
         self.schedule = Schedule(settings)
         assert settings.feature_every is not None and settings.weight_depth is not None
         self.feature_every, self.weight_depth = settings.feature_every, settings.weight_depth
+        self.members = torch.zeros(0, 0, dtype=torch.int64)
         self.guidance: Tensor | None = None
         self.optimizer = adam(self.model, self.settings, self.extent)
         self.order_generator = np.random.default_rng(settings.seed)
         self.generator = torch.Generator().manual_seed(settings.seed)
+        if isinstance(model, PrintedScene):
+            model.draws = self.generator
         self.order: list[int] = []  # views still to be seen before any is seen again
         self.step = 0
         self.seconds = 0.0  # of the steps but the first
@@ -155,9 +159,10 @@ class Trainer:
     def refresh(self) -> None:
         """Regions of the Gaussians as they are now."""
         self.laps.mark("growth and pruning")
-        means = self.model.raw["means"].detach().double().cpu().numpy()
-        regions = regions_of(means, self.model.describe)
-        self.members, self.guidance = torch.as_tensor(regions.members).to(self.model.device), None
+        if not isinstance(self.model, PrintedScene):  # which has regions of its own at each step
+            means = self.model.raw["means"].detach().double().cpu().numpy()
+            regions = regions_of(means, self.model.describe)
+            self.members, self.guidance = torch.as_tensor(regions.members).to(self.model.device), None
         self.population.note_distances()
         self.laps.mark("refresh")
 
@@ -224,6 +229,8 @@ class Trainer:
         if rendered.features is not None and wanted is not None:
             labels = None if self.views.labels is None else self.views.labels(view)
             losses["features"] = semantic_loss(rendered.features, wanted, labels, mask, settings, backend)
+        if isinstance(self.model, PrintedScene):
+            return losses | auxiliary_losses(auxiliary)
         if auxiliary.soft_mask is not None:
             losses["mask"] = settings.weight_mask * auxiliary.soft_mask.mean()
         if auxiliary.band_masks is not None:
@@ -256,6 +263,8 @@ class Trainer:
         parameters["degrees"] = np.zeros(len(self.model), np.uint8)
         for band in bands[1:]:
             parameters["degrees"][: len(band)] += 1
+        if isinstance(self.model, PrintedScene):  # what the print renders
+            parameters["features"] = self.model.fused_features()
         return parameters
 
 

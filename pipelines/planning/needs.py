@@ -62,6 +62,10 @@ def left_out_stages(config: Any, kind: str, why: str, probe: dict[str, bool]) ->
         left_out |= {"teacher": f"{why}: {HOW}" if why == UNASKED else why}
         left_out |= {"lift": f"no teacher's features to lift ({why})"}
         left_out |= {"refine": f"no semantic features to refine ({why})", "agree": f"no teacher's labels ({why})"}
+    if config.train.method == "printed" or config.refine.changes_nothing:
+        printed = config.train.method == "printed"
+        reason = "the printed method ends with its training" if printed else "refine is asked for nothing"
+        left_out |= {"lift": reason, "refine": reason}
     if probe["poses"] and config.sfm.poses != "adjusted":
         tested = config.sfm.poses == "auto" and config.source.kind != "generated"
         has_depth = probe["depth"] and config.ingest.depth == "auto"
@@ -141,8 +145,6 @@ def knowledge_given(config: Any, kind: str, running: bool) -> tuple[Path | None,
     wanted = config.refine.knowledge
     if wanted == "none":
         return None, "refine.knowledge is none"
-    if wanted is None and config.train.encoder != "points":
-        return None, f"train.encoder is {config.train.encoder}"
     if wanted is not None:
         return store.taken_in(Path(expanded(wanted)).expanduser().resolve(), "teach", SCHEMA, running), ""
     model = read_teacher(Path(config.teacher.model or EMBEDDED)) if kind == "onnx" else None

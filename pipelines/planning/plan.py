@@ -40,7 +40,7 @@ if TYPE_CHECKING:
 
 
 Overrides = str | Mapping[str, Any]  # `section.key=value,...`, or sections by name
-OFF_IS_CHOICE = ("ingest.depth", "sfm.dense", "train.encoder", "train.densify", "train.exposure", "refine.smooth")
+OFF_IS_CHOICE = ("ingest.depth", "sfm.dense", "train.densify", "train.exposure", "refine.smooth")
 
 
 @dataclass

@@ -15,6 +15,7 @@ from chebsplat.errors import ConfigError, DataFailure, InputError
 from chebsplat.formats.cameras import Cameras
 from chebsplat.formats.capture import Capture
 from chebsplat.formats.features import Features
+from chebsplat.formats.gaussians import Gaussians
 from chebsplat.formats.ply import read_ply
 from chebsplat.formats.points import Points, thinned
 from chebsplat.settings import DescribeSection, TrainSection
@@ -27,9 +28,11 @@ from chebsplat.stages.training.lifting import lifted_from
 from chebsplat.stages.training.photos import own_exposures
 from chebsplat.stages.training.views import training_views
 from chebsplat.training.model import SceneModel
+from chebsplat.training.printed import PrintedScene
 from chebsplat.training.trainer import Trainer
 
 log = logging.getLogger("chebsplat")
+KNOWLEDGE = "knowledge."  # begins the names of bases among a training's modules
 
 
 @dataclass
@@ -80,7 +83,23 @@ def assemble(job: Job, inputs: Inputs, backend: str = "auto") -> Trainer:
         if job.config.train.feature_start in OPEN:
             why = f"of {len(views.names)} training views, fewer than {LIFTED_FROM}, it costs colour"
         job.left_out("lifted start of features", why)
+    if isinstance(model, PrintedScene) and "earlier" in job.inputs:
+        model.bases = knowledge_of(job.inputs["earlier"], model)
     return Trainer(model, views, train, extent(points.cam_from_world))
+
+
+def knowledge_of(earlier: Path, model: PrintedScene) -> dict[str, Tensor]:
+    """Bases that the training of the scene before left (Eq 15).
+
+    Raises: InputError if they are of an encoder of another shape.
+    """
+    modules = Gaussians.read(earlier).modules
+    held = {n: torch.from_numpy(v) for n, v in modules.items() if n.startswith(KNOWLEDGE)}
+    bases = {name.removeprefix(KNOWLEDGE): basis for name, basis in held.items()}
+    maps = model.printed.encoder.key_projections()
+    if any(name not in maps or len(basis) != len(maps[name]) for name, basis in bases.items()):
+        raise InputError(f"{earlier} has knowledge of another encoder; start another sequence")
+    return bases
 
 
 def _exposures(job: Job, capture: Capture, points: Points) -> np.ndarray | None:
@@ -139,6 +158,10 @@ def model_of(
         assert train.opacity is not None
         initial = initial_gaussians(points.means, points.colors, points.covariances, train.opacity)
     raw = {name: value.to(device) for name, value in initial.items()}
+    if train.method == "printed":
+        if features is None:
+            raise ConfigError("train.method = printed is semantic: it needs a teacher")
+        return PrintedScene(raw, describe, train, features.features.shape[-1], backend)
     return SceneModel(raw, describe, train, None if features is None else features.features.shape[-1], backend)
 
 

@@ -96,6 +96,20 @@ def _exposure(_: TrainSection, evidence: Evidence) -> str:
     return "off" if spread is None or spread < LEAST_SPREAD else "measured"
 
 
+PRINTED: dict[str, Any] = {  # what the printed method does without, and where it differs
+    "scale_limit": 1000,
+    "weight_depth": 0.0,
+    "feature_every": 1,
+    "feature_start": "zero",
+    "feature_loss": "l1",
+    "densify": "region",
+    "sh_freeze": 1.0,
+    "sh_guided": False,
+    "exposure": "off",
+    "lr_masks": 1e-2,
+    "lr_sh_masks": 1e-2,
+}
+
 DEFAULTS = {  # in this order: a later one may ask for an earlier
     "steps": Default(_steps, "pixels of the training photos: 280 a megapixel, from 1000 to 3000"),
     "feature_every": Default(_feature_every, "training views: a tenth of their number, from 1 to 4"),
@@ -123,7 +137,10 @@ DEFAULTS = {  # in this order: a later one may ask for an earlier
 
 
 def resolved(train: TrainSection, evidence: Evidence) -> TrainSection:
-    """The section with every setting that it leaves open decided."""
+    """The section with every setting that it leaves open decided, and those of the printed method as it has them."""
+    if train.method == "printed":
+        left_out = {"densification": {"densify": "off"}, "pruning guidance": {"densify_semantic": False}}
+        train = train.model_copy(update=PRINTED | left_out.get(train.without, {}))
     for name, default in DEFAULTS.items():
         if getattr(train, name) in OPEN:
             train = train.model_copy(update={name: default.value(train, evidence)})

@@ -10,6 +10,7 @@ import torch
 from chebsplat.formats.features import Features
 from chebsplat.labels.decode import decode_labels
 from chebsplat.stages.runtime.command import Job
+from chebsplat.training.printed import PrintedScene
 from chebsplat.training.trainer import Trainer
 
 FEW = 20  # a class of fewer Gaussians has no mean worth comparing
@@ -31,6 +32,22 @@ def facts_of(
         facts["peak_device_bytes"] = torch.cuda.max_memory_allocated()
     facts["milliseconds"] = {part: 1e3 * seconds / timed for part, seconds in trainer.laps.seconds.items()}
     return facts
+
+
+def printed_facts(model: PrintedScene, features: Features) -> dict[str, Any]:
+    """What the printed method has learned: how gates and masks lie, and what encodings alone know.
+
+    `agreement`: of the Gaussians, the part whose label by their regions' encodings alone is that by their own features;
+    `commonest`: the part that has the commonest label, which an encoder that knows nothing reaches; `ranks` of bases.
+    """
+    whole = model.whole()
+    named, wanted = (
+        decode_labels(values.detach().cpu().numpy(), features.label_embeddings)
+        for values in (whole.shape, model.raw["features"])
+    )
+    facts = {"histograms": model.histograms(), "agreement": float((named == wanted).mean())}
+    facts["commonest"] = float(np.bincount(wanted).max() / len(wanted))
+    return facts | {"ranks": {name: basis.shape[1] for name, basis in model.bases.items()}}
 
 
 def guidance(

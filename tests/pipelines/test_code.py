@@ -60,7 +60,7 @@ def keys(*arguments):
     return {step.stage: step.key for step in Planner().plan(*map(str, arguments)).steps}
 
 
-@pytest.mark.parametrize("settings", ["", "teacher.kind=auto", "train.semantics=false", "train.encoder=off"])
+@pytest.mark.parametrize("settings", ["", "teacher.kind=auto", "train.semantics=false", "train.method=printed"])
 def test_an_extra_that_a_scene_does_not_use_makes_nothing_stale(extras, settings):
     before = keys("toy", settings)
     extras()

@@ -264,7 +264,7 @@ def test_generated_and_replica_scenes_never_share_a_key(tmp_path, monkeypatch):
         ("train.semantics=false", {"channels", "teacher", "agree", "lift", "refine"}),
         ("teacher.kind=none", {"channels", "teacher", "agree", "lift", "refine"}),
         ("train.features=lifted", {"channels"}),
-        ("train.encoder=off", {"channels"}),
+        ("train.method=printed", {"channels", "lift", "refine"}),
     ],
 )
 def test_a_scene_leaves_out_what_it_does_not_need_and_says_why(settings, left_out):

@@ -47,12 +47,11 @@ def test_a_scene_starts_from_the_knowledge_that_ships_unless_it_is_told_not_to(q
     step, left_out = refine_of()
     assert step.inputs["knowledge"].name == artifact.read_manifest(SHIPPED).key
     assert "knowledge of shape" not in left_out
-    for settings in ("refine.knowledge=none", "train.encoder=off"):
-        step, left_out = refine_of(settings)
-        assert not {"knowledge", "points"} & set(step.inputs), settings
-        assert left_out["knowledge of shape"]
+    step, left_out = refine_of("refine.knowledge=none")
+    assert not {"knowledge", "points"} & set(step.inputs)
+    assert left_out["knowledge of shape"]
     assert "knowledge" in refine_of("teacher.kind=labels")[0].inputs  # by the names of its classes
-    assert "knowledge" in refine_of(f"train.encoder=off,refine.knowledge={SHIPPED}")[0].inputs
+    assert "knowledge" in refine_of(f"refine.knowledge={SHIPPED}")[0].inputs
 
 
 def test_where_knowledge_lies_is_no_matter_and_damage_is_noticed(quick_plans, tmp_path):

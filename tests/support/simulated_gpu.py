@@ -25,6 +25,7 @@ FACTORIES = {torch.zeros, torch.ones, torch.full, torch.empty, torch.eye, torch.
 FACTORIES |= {torch.from_numpy, torch.rand, torch.randn, torch.randint, torch.randperm, torch.linspace}
 JOINING = {aten.cat.default, aten.stack.default}  # not even a single number may lie elsewhere
 INDEXING = {aten.index.Tensor, aten.index_put_.default, aten.index_put.default, aten._unsafe_index.Tensor}
+INDEXING |= {aten.index_fill_.int_Scalar}  # `x[i] = 0` in torch 2.15; with i elsewhere, a GPU's takes index_put_
 WAITING = {aten.nonzero.default, aten._unique2.default, aten.masked_select.default, aten.unique_consecutive.default}
 PURGE_EVERY = 5000  # operations
 
@@ -109,7 +110,8 @@ class _Operations(TorchDispatchMode):
             gpu.record("down", inputs[0], str(func))
         if on_gpu and (func in WAITING or (func in INDEXING and _by_mask(args[1]))):
             gpu.record("wait", inputs[0], str(func))
-        out = func(*args, **kwargs)
+        with torch._C.DisableTorchFunction():  # in backward, torch 2.7 would ask `_Functions` again
+            out = func(*args, **kwargs)
         given = {tensor.untyped_storage()._cdata for tensor in inputs}
         for tensor in tree_leaves(out):
             fresh = isinstance(tensor, Tensor) and tensor.untyped_storage()._cdata not in given
@@ -192,7 +194,7 @@ class _Functions(TorchFunctionMode):
 
 
 def _by_mask(index: Any) -> bool:
-    return any(isinstance(part, Tensor) and part.dtype == torch.bool for part in index)
+    return any(isinstance(part, Tensor) and part.dtype == torch.bool for part in tree_leaves(index))
 
 
 def _full(device: str | torch.device) -> torch.device:

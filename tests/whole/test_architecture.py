@@ -28,13 +28,14 @@ PACKAGES = {
     "labels": set(),
     "photos": {"cameras", "kernels"},
     "splats": {"kernels"},
+    "printed": set(),  # the paper in plain torch: nothing of ours
     "views": set(),
     "rasterize": {"kernels", "splats"},
     "render": {"rasterize", "splats", "views"},
     "shape": {"cameras", "kernels", "settings", "splats"},
     "lifting": {"cameras", "kernels", "labels", "rasterize", "render", "splats", "views"},
     "evaluation": {"labels", "splats"},
-    "training": {"cameras", "evaluation", "kernels", "rasterize", "settings", "shape", "splats", "views"},
+    "training": {"cameras", "evaluation", "kernels", "printed", "rasterize", "settings", "shape", "splats", "views"},
 }
 SOURCES = [p for layer in LAYERS for p in sorted((ROOT / layer).rglob("*.py"))]
 
@@ -72,6 +73,10 @@ def test_packages_of_the_maths_import_one_another_one_way():
         found.setdefault(own, set()).update(parts[1] for parts in names if parts[1] not in (own, "errors"))
     found = {own: imported for own, imported in found.items() if own not in ("__init__", "errors")}
     assert found == PACKAGES
+
+
+def test_the_printed_method_stays_short_enough_to_be_read_beside_the_paper():
+    assert sum(len(path.read_text().splitlines()) for path in (ROOT / "chebsplat/printed").glob("*.py")) <= 1100
 
 
 def test_of_pipelines_only_the_command_knows_studies():

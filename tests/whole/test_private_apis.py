@@ -4,7 +4,7 @@ import inspect
 
 
 def test_numba_keeps_kernels_as_our_cache_expects():
-    """Checked with numba 0.62.1 and 0.68.1. If this fails: mend `_ByModule` and `_KernelCache` in kernels/jit.py after
+    """Checked with numba 0.62.0 and 0.68.1. If this fails: mend `_ByModule` and `_KernelCache` in kernels/jit.py after
     numba/core/caching.py, or give kernels `cache=True`, at the cost of compiling anew in every clone.
     """
     from numba.core import caching
@@ -18,7 +18,7 @@ def test_numba_keeps_kernels_as_our_cache_expects():
 
 
 def test_numba_calls_our_cache_where_a_dispatcher_has_one():
-    """Checked with numba 0.62.1 and 0.68.1. If this fails: `_compiled` in kernels/jit.py has to set it elsewhere."""
+    """Checked with numba 0.62.0 and 0.68.1. If this fails: `_compiled` in kernels/jit.py has to set it elsewhere."""
     from chebsplat.rasterize import tiles
 
     dispatcher = next(value for value in vars(tiles).values() if hasattr(value, "py_func"))
@@ -26,7 +26,7 @@ def test_numba_calls_our_cache_where_a_dispatcher_has_one():
 
 
 def test_numba_has_what_explicit_vectors_are_made_of():
-    """Checked with numba 0.62.1 and 0.68.1. If this fails: chebsplat/kernels/simd.py and rasterize/blocks.py build LLVM
+    """Checked with numba 0.62.0 and 0.68.1. If this fails: chebsplat/kernels/simd.py and rasterize/blocks.py build LLVM
     instructions with these; their plain twins are in rasterize/cells.py.
     """
     from numba.core import cgutils, event, types

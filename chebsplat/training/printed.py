@@ -1,0 +1,304 @@
+"""The paper's method in the trainer: a scene whose every step runs the modules of `chebsplat.printed`."""
+
+from __future__ import annotations
+
+import math
+from typing import Any, NamedTuple
+
+import numpy as np
+import torch
+from scipy.spatial import cKDTree
+from torch import Tensor, nn
+
+from chebsplat.printed import densification, encoding, knowledge, losses, propagation, pruning, sh_pruning
+from chebsplat.printed.descriptor import descriptor
+from chebsplat.printed.fusion import Gate
+from chebsplat.printed.regions import Regions, regions_of
+from chebsplat.rasterize import rasterize
+from chebsplat.settings import DescribeSection, TrainSection
+from chebsplat.splats.gaussians import covariances, take
+from chebsplat.splats.sh import colors_in_view
+from chebsplat.training.densify import Additions
+from chebsplat.training.model import Auxiliary, Rendered, SceneModel
+from chebsplat.views import View, in_frustum
+
+REGIONS_IN_VIEW = 256
+N_LAYERS, N_HEADS = 2, 4
+TEMPERATURE = 1.0  # tau of Eq 8
+THRESHOLD = 0.1  # of soft masks, of Gaussians and of SH bands
+SOFTNESS = 100.0  # gamma of Eq 13: a bin's edge is about a tenth of a colour's usual range
+CANDIDATES, MOST = 8, 32  # in a region of the mean number of points, and in any (Eq 12)
+NEAREST, FARTHEST = 0.5, 2.0  # of a candidate to its neighbour, in the scene's median spacings
+STEEP_FEATURES = 1e-7  # |grad f| that adds Gaussians, where the features' gradient is read
+KAPPA, EPSILON, ETA = 1.0, 0.2, 0.9  # of the knowledge space's growth (Eq 15)
+
+
+class Modules(nn.Module):
+    """What the printed method learns beside the Gaussians. without: the part of Table 5 that is left out."""
+
+    def __init__(self, n_channels: int, describe: DescribeSection, without: str):
+        super().__init__()
+        self.width = describe.n_angles * (describe.max_degree + 1)  # Q
+        self.encoder: encoding.Encoder | encoding.PointMLP
+        if without in ("descriptor", "transformer"):
+            self.encoder = encoding.PointMLP(self.width, n_channels)
+        else:
+            self.encoder = encoding.Encoder(self.width, n_channels, N_LAYERS, N_HEADS)
+        self.gate = Gate(n_channels)
+        self.pruning = None if without == "pruning guidance" else pruning.PruningGate(n_channels)
+        self.band_masks = None if without == "SH guidance" else sh_pruning.BandMasks(n_channels)
+        self.modulation = knowledge.Modulation(self.width)
+
+
+class Encoded(NamedTuple):
+    """fused [V, C], shape [V, C] and gate [V, C] of Gaussians; regions of their rows, with encodings [M, C], tokens
+    [M, t, Q] and descriptors [M, n, Q].
+    """
+
+    fused: Tensor
+    shape: Tensor
+    gate: Tensor
+    regions: Regions
+    encodings: Tensor
+    tokens: Tensor
+    descriptors: Tensor
+
+
+class PrintedScene(SceneModel):
+    """A `SceneModel` by the print: `sh_logits` are [N, 4], and fused features go into everything.
+
+    bases: B of each key projection matrix, by name, of the scenes before; empty: none. Regions, descriptors and
+    weights of Eq 8 are those of the Gaussians as they are at a step, without gradient to means and covariances.
+    """
+
+    def __init__(
+        self,
+        raw: dict[str, Tensor],
+        describe: DescribeSection,
+        train: TrainSection,
+        n_channels: int,
+        backend: str = "auto",
+    ):
+        self.printed, self.without = Modules(n_channels, describe, train.without), train.without
+        super().__init__(raw, describe, train, n_channels, backend)
+        self.semantic_gate = None
+        if "sh_logits" in self.raw:
+            self.raw["sh_logits"] = torch.zeros(len(self), 4, device=self.device, requires_grad=True)
+        self.angles = torch.arange(describe.n_angles) * (2 * math.pi / describe.n_angles)
+        self.draws = torch.Generator()  # the trainer's, once there is one
+        self.bases: dict[str, Tensor] = {}
+        self.keeps_gradient = train.region_gradient == "features"
+        self.n_in_view = len(self)  # Gaussians, in the view before
+
+    @property
+    def modules(self) -> dict[str, nn.Module]:
+        return {"printed": self.printed}
+
+    def encoded(self, index: Tensor, count: int) -> Encoded:
+        """Fused features [V, C] of the Gaussians `index` [V] by `count` regions of them (Eqs 1-10)."""
+        raw, parts = self.raw, self.printed
+        with torch.no_grad():
+            points = raw["means"][index]
+            spreads = covariances(raw["quats"][index], raw["log_scales"][index].exp())
+            regions = regions_of(points, count, self.describe.region_size, self.draws)
+            rows, present = regions.members.clamp_min(0), regions.members >= 0
+            largest = raw["log_scales"][index].amax(1).exp().square().median() if len(index) else 1.0
+            described = points.new_zeros(*rows.shape, parts.width)
+            if self.without != "descriptor":
+                described = descriptor(
+                    points[rows],
+                    spreads[rows],
+                    present,
+                    self.angles,
+                    beta=self.describe.anisotropy / float(largest),
+                    sigma=self.describe.bandwidth * regions.radius,
+                    n_eigs=self.describe.n_eigs,
+                    degree=self.describe.max_degree,
+                )
+            middle = regions.centers
+            shares = propagation.weights(points, points[middle], spreads[middle], regions.pairs, TEMPERATURE)
+            covered = torch.zeros(len(index), dtype=torch.bool)
+            covered[regions.pairs[0]] = True
+        tokens = parts.encoder.tokens(described, points[rows])
+        encodings = parts.encoder(tokens, present)
+        shape = propagation.propagate(encodings, shares, regions.pairs, len(index))
+        semantic = take(raw["features"], index)
+        fused, gate = parts.gate(shape, semantic, covered), parts.gate.values(shape, semantic).detach()
+        return Encoded(fused, shape, gate, regions, encodings, tokens, described)
+
+    def masks(self, features: Tensor, index: Tensor, regions: Regions) -> tuple[Tensor | None, Tensor | None]:
+        """Soft masks [N] of all Gaussians and [N, 4] of their SH bands; None where switched off.
+
+        Args: features [N, C]: fused where they are in the regions of the Gaussians `index`, else their own.
+        """
+        raw, parts = self.raw, self.printed
+        soft = delta = None
+        if "prune_logits" in raw:
+            logits = raw["prune_logits"]
+            soft = logits.sigmoid() if parts.pruning is None else parts.pruning(features, logits)
+        if "sh_logits" in raw:
+            logits = raw["sh_logits"]
+            if parts.band_masks is None:
+                delta = (logits + sh_pruning.STARTS_AT).sigmoid()
+            else:
+                members = torch.where(regions.members >= 0, index[regions.members.clamp_min(0)], -1)
+                bins = parts.band_masks.n_bins
+                histograms = sh_pruning.region_histograms(self.bands(), members, bins, SOFTNESS)
+                region = torch.full((len(self),), -1, dtype=torch.int64)
+                region[index] = regions.nearest(raw["means"].detach()[index])
+                delta = parts.band_masks(features, logits, histograms, region)
+        return soft, delta
+
+    def render(
+        self,
+        view: View,
+        degree: int,
+        *,
+        masked: bool = True,
+        semantic: bool = True,
+        grid: tuple[int, int] | None = None,
+        depth: bool = False,
+    ) -> Rendered:
+        """As `SceneModel.render`, by the print; features are fused at every step."""
+        raw = self.raw
+        with torch.no_grad():
+            index = in_frustum(raw["means"], view, 3 * raw["log_scales"].amax(1).exp())
+        self.n_in_view = len(index)
+        fused, _, _, regions, _, tokens, _ = self.encoded(index, REGIONS_IN_VIEW)
+        if self.keeps_gradient and fused.requires_grad:
+            fused.retain_grad()
+        soft = delta = None
+        if masked:
+            soft, delta = self.masks(raw["features"].index_copy(0, index, fused), index, regions)
+        scales, opacities = take(raw["log_scales"], index).exp(), take(raw["logit_opacities"], index).sigmoid()
+        if soft is not None:
+            scales, opacities = pruning.apply_mask(pruning.binarize(soft[index], THRESHOLD), scales, opacities)
+        bands = self.bands()
+        if delta is not None:
+            open_bands = pruning.binarize(delta, THRESHOLD)
+            bands = [band * open_bands[:, i, None, None] for i, band in enumerate(bands)]
+        eye = -view.viewmat[:3, :3].T @ view.viewmat[:3, 3]
+        colors = colors_in_view(bands, None, index, raw["means"], eye, degree, self.backend)
+        channels = torch.cat([colors, fused], -1) if semantic else colors
+        gaussians = take(raw["means"], index), take(raw["quats"], index), scales, opacities
+        camera = view.viewmat[None], view.K[None], view.width, view.height
+        render, alpha, meta = rasterize(*gaussians, channels, *camera, backend=self.backend)
+        image, features = render[0].split([3, channels.shape[1] - 3], -1)
+        auxiliary = Auxiliary(soft_mask=soft, delta=delta, fused=fused)
+        auxiliary.knowledge = self._pull(tokens, regions)
+        return Rendered(image, alpha[0], features if semantic else None, meta, index, auxiliary)
+
+    def _pull(self, tokens: Tensor, regions: Regions) -> Tensor | None:
+        """L_reg (Eq 14): mean over key projection matrices, alpha the mean over regions; None without a basis."""
+        if not self.bases or not len(regions.centers):
+            return None
+        present = nn.functional.pad(regions.members >= 0, (1, 0), value=True)
+        alpha = self.printed.modulation(tokens, present).mean()
+        maps = self.printed.encoder.key_projections()
+        pulls = [knowledge.regularizer(maps[name], B, alpha) for name, B in self.bases.items()]
+        return torch.stack(pulls).mean()
+
+    @torch.no_grad()
+    def whole(self) -> Encoded:
+        """Of all Gaussians, with regions as dense as in a view.
+
+        Choices: the print fuses within a view's frustum; a scene that is stored has one feature a Gaussian.
+        """
+        share = len(self) / max(self.n_in_view, 1)
+        return self.encoded(self.rows, math.ceil(REGIONS_IN_VIEW * share))
+
+    @torch.no_grad()
+    def soft_mask(self, index: Tensor, features: Tensor | None) -> Tensor | None:
+        """Soft mask [V] by fused features of the whole scene."""
+        whole = self.whole()
+        soft = self.masks(whole.fused, self.rows, whole.regions)[0]
+        return None if soft is None else soft[index]
+
+    @torch.no_grad()
+    def open_bands(self) -> Tensor:
+        """Masks [N, 3] of SH bands 1 to 3, which are not nested."""
+        return self._open()[:, 1:].float()
+
+    @torch.no_grad()
+    def settled_degrees(self) -> Tensor:
+        """The highest open band u8 [N], once coefficients of closed ones, the lowest included, have been set to 0."""
+        is_open = self._open()
+        for band, kept in zip(self.bands(), is_open.unbind(1), strict=False):
+            band.mul_(kept[:, None, None])
+        degrees = torch.arange(4, device=self.device) * is_open
+        return degrees.amax(1).to(torch.uint8)
+
+    def _open(self) -> Tensor:
+        """Whether each Gaussian's SH bands 0 to 3 are open, bool [N, 4]."""
+        whole = self.whole()
+        delta = self.masks(whole.fused, self.rows, whole.regions)[1]
+        assert delta is not None
+        return delta > THRESHOLD
+
+    @torch.no_grad()
+    def fused_features(self) -> np.ndarray:
+        """Fused features [N, C] of all Gaussians."""
+        fused: np.ndarray = self.whole().fused.cpu().numpy()
+        return fused
+
+    @torch.no_grad()
+    def grown_bases(self) -> dict[str, Tensor]:
+        """The knowledge after this scene (Eq 15): sigma_f is the mean over regions."""
+        whole = self.whole()
+        sigma = float(knowledge.spread(whole.descriptors, whole.regions.members >= 0).mean())
+        return {
+            name: knowledge.update(W, self.bases.get(name), sigma, kappa=KAPPA, epsilon=EPSILON, eta=ETA)
+            for name, W in self.printed.encoder.key_projections().items()
+        }
+
+    @torch.no_grad()
+    def histograms(self) -> dict[str, Any]:
+        """How gates and masks lie once they have learned: shares in ten bins of [0, 1]."""
+        whole = self.whole()
+        soft, delta = self.masks(whole.fused, self.rows, whole.regions)
+        parts = {"gate": whole.gate, "mask": soft}
+        if delta is not None:
+            parts |= {f"sh{degree}": column for degree, column in enumerate(delta.unbind(1))}
+        return {
+            name: (values.flatten().histc(10, 0, 1) / max(values.numel(), 1)).tolist()
+            for name, values in parts.items()
+            if values is not None
+        }
+
+    @torch.no_grad()
+    def additions(self, gradient: Tensor, threshold: float, budget: int, generator: torch.Generator) -> Additions:
+        """New Gaussians in regions of steep gradient [N] (Eqs 11-12), the steepest first, `budget` at most.
+
+        Choices: alpha_d is such that a region of the mean number of points gets CANDIDATES; V_pc is the ball's.
+          Bounds of the distance are NEAREST and FARTHEST times the scene's median spacing.
+        """
+        means = self.raw["means"].detach()
+        count = math.ceil(REGIONS_IN_VIEW * len(self) / max(self.n_in_view, 1))
+        regions = regions_of(means, count, self.describe.region_size, generator)
+        mean = densification.mean_gradients(gradient, regions.pairs, len(regions.centers))
+        if self.keeps_gradient:
+            threshold = STEEP_FEATURES
+        n_points = torch.bincount(regions.pairs[1], minlength=len(regions.centers))
+        volume = densification.ball_volume(regions.radius)
+        density = CANDIDATES * float(n_points.double().mean()) / volume
+        counts = densification.candidate_counts(torch.full_like(mean, volume), n_points, density, MOST)
+        order = mean.argsort(descending=True, stable=True)
+        order = order[mean[order] > threshold]
+        middle = means[regions.centers[order]].repeat_interleave(counts[order], 0)
+        candidates = densification.in_ball(middle, regions.radius, generator)
+        spacing = _median_spacing(means)
+        kept, parents = densification.accepted(candidates, means, NEAREST * spacing, FARTHEST * spacing)
+        candidates, parents = candidates[kept][:budget], parents[kept][:budget]
+        rows = {name: value.detach()[parents] for name, value in self.raw.items()}
+        return Additions(parents, rows | {"means": candidates}, {})
+
+
+def _median_spacing(means: Tensor) -> float:
+    """Median distance of points [N, 3] to their nearest other one, scene units."""
+    places = means.double().numpy()
+    return float(np.median(cKDTree(places).query(places, 2)[0][:, 1])) if len(places) > 1 else 1.0
+
+
+def auxiliary_losses(auxiliary: Auxiliary) -> dict[str, Tensor]:
+    """L_mask, L_SH and L_reg of a rendered view."""
+    return losses.auxiliary_losses(auxiliary.soft_mask, auxiliary.delta, auxiliary.knowledge)
