@@ -139,7 +139,7 @@ DEFAULTS = {  # in this order: a later one may ask for an earlier
 def resolved(train: TrainSection, evidence: Evidence) -> TrainSection:
     """The section with every setting that it leaves open decided, and those of the printed method as it has them."""
     if train.method == "printed":
-        left_out = {"densification": {"densify": "off"}, "pruning guidance": {"densify_semantic": False}}
+        left_out: dict[str, dict[str, Any]] = {"densification": {"densify": "off"}, "pruning guidance": {"densify_semantic": False}}
         train = train.model_copy(update=PRINTED | left_out.get(train.without, {}))
     for name, default in DEFAULTS.items():
         if getattr(train, name) in OPEN:
