@@ -11,6 +11,18 @@ from typing import Any, Literal
 from pydantic import BaseModel, ConfigDict, Field, model_validator
 
 MOST_STEPS = 3000  # of a training that is not told how many
+PRINTED: dict[str, Any] = {  # train settings that `train.method = "printed"` decides
+    "scale_limit": 1000.0,
+    "weight_depth": 0.0,
+    "feature_every": 1,
+    "feature_start": "zero",
+    "feature_loss": "l1",
+    "densify": "region",
+    "sh_freeze": 1.0,
+    "sh_guided": False,
+    "exposure": "off",
+    "lr_sh_masks": 5e-2,
+}
 DESCRIPTOR_BYTES = 4 << 30  # of one scene's descriptors, at most
 
 
@@ -160,6 +172,14 @@ class TrainSection(Section):
 
     @model_validator(mode="after")
     def _fits_together(self) -> TrainSection:
+        if self.method == "printed":
+            for name, value in PRINTED.items():
+                if getattr(self, name) not in (value, type(self).model_fields[name].default):
+                    raise ValueError(f"method is printed, which has {name} = {value}; leave {name} out")
+            if not (self.semantics and self.features == "trained"):
+                raise ValueError("method is printed, which trains features; leave semantics and features out")
+        elif self.without != "nothing" or self.region_gradient != "means":
+            raise ValueError("without and region_gradient are of the printed method; set method = printed")
         if self.sh_prune and self.densify != "off" and self.densify_until > self.sh_freeze:
             raise ValueError("densify_until must not lie after sh_freeze, when SH bands are closed for good")
         return self

@@ -32,6 +32,7 @@ from chebsplat.training.printed import PrintedScene
 from chebsplat.training.trainer import Trainer
 
 log = logging.getLogger("chebsplat")
+PRINTED_METHOD = "train.method is printed"
 KNOWLEDGE = "knowledge."  # begins the names of bases among a training's modules
 
 
@@ -79,8 +80,8 @@ def assemble(job: Job, inputs: Inputs, backend: str = "auto") -> Trainer:
         if not start_features(model, capture, points, features, job.progress):
             job.left_out("lifted start of features", "no training view says anything of a Gaussian")
     elif features is not None:
-        why = "train.feature_start is zero"
-        if job.config.train.feature_start in OPEN:
+        why = PRINTED_METHOD if train.method == "printed" else "train.feature_start is zero"
+        if train.method == "ours" and job.config.train.feature_start in OPEN:
             why = f"of {len(views.names)} training views, fewer than {LIFTED_FROM}, it costs colour"
         job.left_out("lifted start of features", why)
     if isinstance(model, PrintedScene) and "earlier" in job.inputs:
@@ -113,17 +114,25 @@ def _exposures(job: Job, capture: Capture, points: Points) -> np.ndarray | None:
     return exposures
 
 
+def _why_no_exposure(given: TrainSection, stops: float | None) -> str:
+    """Reason for leaving photos' exposures as they are. stops: their spread, where it was measured."""
+    if stops is not None:
+        return f"photos differ by {stops:.2f} stops from those about them"
+    return "train.exposure is off" if given.exposure == "off" else "views are generated, all alike"
+
+
 def _note_left_out(job: Job, train: TrainSection, has_semantics: bool, no_depth: str) -> None:
     """Say what this training does without, and why. train: resolved."""
     given = job.config.train
     stops = job.facts.get("exposure_stops", {}).get("own")
-    if not train.weight_depth:
-        job.left_out("depth loss", "train.weight_depth is 0" if given.weight_depth is not None else no_depth)
-    if train.exposure == "off" and stops is not None:
-        job.left_out("exposure by photo", f"photos differ by {stops:.2f} stops from those about them")
-    elif train.exposure == "off":
-        off = given.exposure == "off"
-        job.left_out("exposure by photo", "train.exposure is off" if off else "views are generated, all alike")
+    if given.method == "printed":
+        for what in ("depth loss", "exposure by photo"):
+            job.left_out(what, PRINTED_METHOD)
+    else:
+        if not train.weight_depth:
+            job.left_out("depth loss", "train.weight_depth is 0" if given.weight_depth is not None else no_depth)
+        if train.exposure == "off":
+            job.left_out("exposure by photo", _why_no_exposure(given, stops))
     if not has_semantics:
         why = "no teacher features: rendering only" if train.semantics else "train.semantics is false"
         if train.semantics and train.features == "lifted":

@@ -10,7 +10,7 @@ from chebsplat.errors import ConfigError
 from chebsplat.formats.capture import Capture
 from chebsplat.formats.features import Features
 from chebsplat.formats.points import Points
-from chebsplat.settings import MOST_STEPS, TrainSection
+from chebsplat.settings import MOST_STEPS, PRINTED, TrainSection
 from chebsplat.stages.training.views import disagreement, training_rows
 
 OPEN = (None, "auto")  # values of a setting that leave it open
@@ -96,20 +96,6 @@ def _exposure(_: TrainSection, evidence: Evidence) -> str:
     return "off" if spread is None or spread < LEAST_SPREAD else "measured"
 
 
-PRINTED: dict[str, Any] = {  # what the printed method does without, and where it differs
-    "scale_limit": 1000,
-    "weight_depth": 0.0,
-    "feature_every": 1,
-    "feature_start": "zero",
-    "feature_loss": "l1",
-    "densify": "region",
-    "sh_freeze": 1.0,
-    "sh_guided": False,
-    "exposure": "off",
-    "lr_masks": 1e-2,
-    "lr_sh_masks": 1e-2,
-}
-
 DEFAULTS = {  # in this order: a later one may ask for an earlier
     "steps": Default(_steps, "pixels of the training photos: 280 a megapixel, from 1000 to 3000"),
     "feature_every": Default(_feature_every, "training views: a tenth of their number, from 1 to 4"),
@@ -136,11 +122,16 @@ DEFAULTS = {  # in this order: a later one may ask for an earlier
 }
 
 
+WITHOUT: dict[str, dict[str, Any]] = {  # rows of Table 5 that the trainer sees to
+    "densification": {"densify": "off"},
+    "pruning guidance": {"densify_semantic": False},
+}
+
+
 def resolved(train: TrainSection, evidence: Evidence) -> TrainSection:
     """The section with every setting that it leaves open decided, and those of the printed method as it has them."""
     if train.method == "printed":
-        left_out: dict[str, dict[str, Any]] = {"densification": {"densify": "off"}, "pruning guidance": {"densify_semantic": False}}
-        train = train.model_copy(update=PRINTED | left_out.get(train.without, {}))
+        train = train.model_copy(update=PRINTED | WITHOUT.get(train.without, {}))
     for name, default in DEFAULTS.items():
         if getattr(train, name) in OPEN:
             train = train.model_copy(update={name: default.value(train, evidence)})
@@ -152,7 +143,9 @@ def decided(train: TrainSection, done: TrainSection, with_features: bool) -> dic
     unused = set() if with_features else {"feature_every", "feature_start", "feature_loss", "lr_features"}
     unused |= {"opacity"} if train.start else set()
     names = [name for name in DEFAULTS if getattr(train, name) in OPEN and name not in unused]
-    return {name: {"value": getattr(done, name), "by": DEFAULTS[name].by} for name in names}
+    printed = PRINTED if train.method == "printed" else {}
+    by = {name: "the printed method" if name in printed else DEFAULTS[name].by for name in names}
+    return {name: {"value": getattr(done, name), "by": by[name]} for name in names}
 
 
 def evidence_of(train: TrainSection, capture: Capture, points: Points, features: Features | None) -> Evidence:
