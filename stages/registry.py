@@ -51,7 +51,7 @@ STAGES: dict[str, Stage] = {
         Stage("agree", "chebsplat.agreement/2", ("agree",),
               (("capture", "ingest"), ("points", "sfm"), ("features", "teacher")),
               help="How far views agree on what the same points are: whether the teacher knows the scene."),
-        Stage("teach", "chebsplat.knowledge/1", ("onnx", "knowledge"), (("channels", "channels"),), of_scene=False,
+        Stage("teach", "chebsplat.knowledge/1", ("knowledge",), (("channels", "channels"),), of_scene=False,
               help="Knowledge that scenes start from: a point encoder, taught over generated rooms."),
         Stage("describe", "chebsplat.descriptors/1", ("describe",), (("points", "sfm"),), only_asked=True,
               help="Anisotropic Chebyshev descriptors of the initial Gaussians (Eqs 1-6)."),

@@ -192,10 +192,6 @@ class KnowledgeSection(Section):
     seed: int = seed("of what is drawn in teaching")
 
 
-class OnnxSection(Section):
-    tolerance: float = number(1e-5, "largest difference from torch", 1e-12, 1)
-
-
 class EvaluateSection(Section):
     boundary: int = number(5, "pixels, half width of the boundary band", 1, 100)
     timing_repeats: int = number(3, "of every frame; 0: no timing; studies then evaluate in parallel", 0, 1000)

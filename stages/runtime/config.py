@@ -42,7 +42,6 @@ class Config(Section):
     lift: parts.LiftSection = parts.LiftSection()
     refine: parts.RefineSection = parts.RefineSection()
     knowledge: parts.KnowledgeSection = parts.KnowledgeSection()
-    onnx: parts.OnnxSection = parts.OnnxSection()
     evaluate: parts.EvaluateSection = parts.EvaluateSection()
 
     def sections(self, names: tuple[str, ...]) -> dict[str, Any]:

@@ -49,7 +49,7 @@ def test_on_one_machine_a_step_is_a_job():
 
 def test_steps_of_seconds_go_with_what_they_follow():
     toy = [["ingest", "sfm", "teacher", "agree"], ["train", "lift", "refine", "export", "evaluate"]]
-    assert [some[:6] for some in jobs(entries_of(Planner().plan("toy").steps))] == sorted(toy)
+    assert [some[:6] for some in jobs(entries_of(wanted_steps(Planner().plan("toy"), None)))] == sorted(toy)
     office = jobs(entries_of(Planner().plan("office0").steps))
     assert ["ingest", "sfm"] in office and ["train"] in office and ["teacher", "agree"] in office
     assert ["lift", "refine", "export", "evaluate", "report"] in office
@@ -71,7 +71,7 @@ def test_a_study_of_short_trainings_is_one_job_a_run():
 
 
 def test_jobs_ask_for_the_most_that_a_step_needs_for_the_time_of_all_and_for_a_gpu_where_one_computes():
-    made = cluster.jobs_of(entries_of(Planner(device="cuda").plan("office0").steps, "cuda"), "slurm")
+    made = cluster.jobs_of(entries_of(wanted_steps(Planner(device="cuda").plan("office0"), None), "cuda"), "slurm")
     train = next(one for name, one in made.items() if name.startswith("train"))
     assert train["gpus"] == 1 and train["mem_mb"] == cluster.NEEDS["train"].mem_mb
     assert train["minutes"] >= 5 * 239 / 60  # five times what 3000 steps took at most

@@ -149,7 +149,7 @@ def test_content_of_raw_files_counts_and_their_time_and_place_do_not(tmp_path):
     shutil.move(tmp_path / "photos", moved / "photos")
     assert stale(scene=f"{moved}/photos/") == []
     shutil.copy(moved / "photos/1.jpg", moved / "photos/2.jpg")
-    semantic = ("teacher", "agree", "describe", "lift", "refine", "onnx")  # left out: nobody named a teacher
+    semantic = ("teacher", "agree", "lift", "refine")  # left out: nobody named a teacher
     assert stale(scene=f"{moved}/photos/") == [stage for stage in ALL if stage not in semantic]
 
 
@@ -278,7 +278,7 @@ def test_lifted_features_reach_the_export_and_trained_ones_do_not_wait_for_them(
     by_stage = {step.stage: set(step.inputs) for step in Planner().plan("toy", "train.features=lifted").steps}
     assert by_stage["train"] == {"capture", "points"}
     assert by_stage["lift"] == {"capture", "gaussians", "features"}
-    assert by_stage["refine"] == {"capture", "gaussians", "features", "lifted"}
+    assert by_stage["refine"] == {"capture", "gaussians", "features", "lifted", "points", "knowledge"}
     assert by_stage["export"] == {"gaussians", "features", "refined"}
     by_stage = {step.stage: set(step.inputs) for step in Planner().plan("toy").steps}
     assert by_stage["export"] == {"gaussians", "features", "refined"}
@@ -390,7 +390,7 @@ def test_a_run_makes_the_report_and_a_second_run_does_nothing(work):
     assert {"test PSNR", "mIoU", "Gaussians", "PLY"} <= table
     assert "its 2D teacher" in first.stderr
     times = {p: p.stat().st_mtime_ns for p in work.glob("store/*/*/artifact.json")}
-    assert len(times) == len(MADE)
+    assert len(times) == len(MADE) + 1  # and the knowledge that ships
     second = chebsplat("run", "--scene", "toy", "--set", FAST)
     assert second.returncode == 0
     assert second.stdout.strip() == page
@@ -413,13 +413,10 @@ def test_a_run_makes_the_report_and_a_second_run_does_nothing(work):
 def test_a_failing_stage_gives_its_exit_code_and_nothing_half_made(work):
     failed = chebsplat("run", "--scene", "toy", "--set", "ingest.test_every=10000,ingest.test_offset=9999," + FAST)
     assert failed.returncode == 4
-    told = next(
-        line for line in failed.stderr.splitlines() if line.startswith("evaluate failed with exit code 4; log: ")
-    )
+    told = next(line for line in failed.stderr.splitlines() if line.startswith("ingest failed with exit code 4; log: "))
     with open(told.split("log: ")[1]) as log:
         assert "test view" in log.read()
-    assert list(work.glob("toy*/train"))
-    assert not list(work.glob("store/evaluate/*"))
+    assert not list(work.glob("store/ingest/*"))
 
 
 @pytest.mark.xdist_group("cli")

@@ -21,7 +21,7 @@ from chebsplat.kernels import jit
 from chebsplat.pipelines.running import precompile
 if __name__ == "__main__":
     with precompile.rehearsed(2, True):
-        made = tiny_trainer(steps=30, encoder="points", weight_depth=1.0, depth_every=2)
+        made = tiny_trainer(steps=30, weight_depth=1.0, depth_every=2)
         for _ in made.steps():
             pass
         made.finish()
