@@ -40,4 +40,4 @@ def propagate(encodings: Tensor, shares: Tensor, pairs: tuple[Tensor, Tensor], n
     """f_shape [P, C] of points from encodings [M, C] and `weights` [E] (Eq 9); 0 in no region."""
     point, region = pairs
     shape = encodings.new_zeros(n_points, encodings.shape[1])
-    return shape.index_add(0, point, shares[:, None] * encodings[region])
+    return shape.index_add(0, point, shares[:, None] * encodings.index_select(0, region))

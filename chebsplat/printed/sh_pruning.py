@@ -32,7 +32,7 @@ def region_histograms(bands: list[Tensor], members: Tensor, n_bins: int, softnes
     present, rows = members >= 0, members.clamp_min(0)
     histograms = []
     for band in bands:
-        values = band[rows]
+        values = band.index_select(0, rows.flatten()).reshape(*rows.shape, *band.shape[1:])
         is_there = present[:, :, None, None].expand_as(values).flatten(1)
         values = values.flatten(1)
         low = values.masked_fill(~is_there, torch.inf).amin(-1).nan_to_num(posinf=0.0)
@@ -67,8 +67,8 @@ class BandMasks(nn.Module):
         columns = []
         for degree in DEGREES:
             of_regions = self.embed[degree](histograms[:, degree])
-            none = of_regions.new_zeros(1, of_regions.shape[1])  # row -1
-            eta = torch.cat([of_regions, none])[region]
+            none = of_regions.new_zeros(1, of_regions.shape[1])
+            eta = torch.cat([none, of_regions]).index_select(0, region + 1)
             v = torch.cat([features, logits[:, degree : degree + 1], eta], -1)
             columns.append(self.output[degree](v)[:, 0].sigmoid())
         return torch.stack(columns, -1)

@@ -55,7 +55,7 @@ def test_a_row_of_table_5_leaves_out_one_thing(without):
 @pytest.mark.parametrize("reading", ["means", "features"])
 def test_new_gaussians_are_their_neighbours_elsewhere(reading, monkeypatch):
     monkeypatch.setattr("chebsplat.training.printed.STEEP_FEATURES", 0.0)
-    made = tiny_trainer(**SHORT | {"region_gradient": reading, "densify": "off"})
+    made = tiny_trainer(**SHORT | {"region_gradient": reading, "n_densify": 0})
     for _ in made.steps():
         pass
     gradient = made.population.gradient_sum / made.population.gradient_count.clamp_min(1)
