@@ -96,10 +96,9 @@ def make_cameras():
 
 def make_scene():
     p = gaussian_parameters()
-    for name in ("features", "raw_features"):
-        codes = np.random.default_rng(5).integers(-32767, 32768, (6, 4))
-        codes[0, 0] = 32767
-        p[name] = (codes / 2**15).astype(np.float32)  # what 16-bit fixed point holds exactly
+    codes = np.random.default_rng(5).integers(-32767, 32768, (6, 4))
+    codes[0, 0] = 32767
+    p["features"] = (codes / 2**15).astype(np.float32)  # what 16-bit fixed point holds exactly
     order = np.argsort(np.random.default_rng(6).permutation(p["degrees"]), kind="stable")
     labels = np.array([0, 1, -1, 0, 1, 1], np.int32)
     return scene.Scene(

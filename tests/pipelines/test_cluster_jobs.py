@@ -12,7 +12,7 @@ from chebsplat.pipelines.planning import sequences
 from chebsplat.pipelines.planning.plan import Planner
 from chebsplat.pipelines.running import cluster, job
 from chebsplat.pipelines.running import processes as children
-from chebsplat.pipelines.running.run import device_of, entry, write_plan
+from chebsplat.pipelines.running.run import device_of, entry, wanted_steps, write_plan
 from chebsplat.pipelines.studies.study import checked_study, expand, outstanding
 from chebsplat.pipelines.work import leases, store
 from chebsplat.stages.registry import STAGES
@@ -43,14 +43,14 @@ def test_every_stage_says_what_it_needs():
 
 
 def test_on_one_machine_a_step_is_a_job():
-    entries = entries_of(Planner().plan("office0").steps)
+    entries = entries_of(wanted_steps(Planner().plan("office0"), None))
     assert jobs(entries, "local") == sorted([item["stage"]] for item in entries)
 
 
 def test_steps_of_seconds_go_with_what_they_follow():
     toy = [["ingest", "sfm", "teacher", "agree"], ["train", "lift", "refine", "export", "evaluate"]]
-    assert [some[:6] for some in jobs(entries_of(wanted_steps(Planner().plan("toy"), None)))] == sorted(toy)
-    office = jobs(entries_of(Planner().plan("office0").steps))
+    assert [some[:5] for some in jobs(entries_of(wanted_steps(Planner().plan("toy"), None)))] == sorted(toy)
+    office = jobs(entries_of(wanted_steps(Planner().plan("office0"), None)))
     assert ["ingest", "sfm"] in office and ["train"] in office and ["teacher", "agree"] in office
     assert ["lift", "refine", "export", "evaluate", "report"] in office
 

@@ -278,7 +278,7 @@ def test_lifted_features_reach_the_export_and_trained_ones_do_not_wait_for_them(
     by_stage = {step.stage: set(step.inputs) for step in Planner().plan("toy", "train.features=lifted").steps}
     assert by_stage["train"] == {"capture", "points"}
     assert by_stage["lift"] == {"capture", "gaussians", "features"}
-    assert by_stage["refine"] == {"capture", "gaussians", "features", "lifted", "points", "knowledge"}
+    assert by_stage["refine"] == {"capture", "gaussians", "features", "lifted"}
     assert by_stage["export"] == {"gaussians", "features", "refined"}
     by_stage = {step.stage: set(step.inputs) for step in Planner().plan("toy").steps}
     assert by_stage["export"] == {"gaussians", "features", "refined"}
@@ -390,7 +390,7 @@ def test_a_run_makes_the_report_and_a_second_run_does_nothing(work):
     assert {"test PSNR", "mIoU", "Gaussians", "PLY"} <= table
     assert "its 2D teacher" in first.stderr
     times = {p: p.stat().st_mtime_ns for p in work.glob("store/*/*/artifact.json")}
-    assert len(times) == len(MADE) + 1  # and the knowledge that ships
+    assert len(times) == len(MADE)
     second = chebsplat("run", "--scene", "toy", "--set", FAST)
     assert second.returncode == 0
     assert second.stdout.strip() == page

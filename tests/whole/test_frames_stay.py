@@ -27,8 +27,7 @@ TURN *= np.linalg.det(TURN)  # a rotation
 def moved(mixed, tmp_path_factory):
     """A checkpoint with every SH degree whose poses are of another model of COLMAP's; means [N, 3]; its export."""
     root, checkpoint = tmp_path_factory.mktemp("frames"), deepcopy(mixed[0])
-    for values in ("fused", "features"):
-        checkpoint.parameters.pop(values, None)
+    checkpoint.parameters.pop("features", None)
     means = SCALE * checkpoint.parameters["means"].astype(np.float64) @ TURN.T + SHIFT
     checkpoint.parameters["means"] = means.astype(np.float32)
     checkpoint.parameters["log_scales"] = checkpoint.parameters["log_scales"] + np.float32(np.log(SCALE))
