@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 import re
 from dataclasses import dataclass
 from pathlib import Path
@@ -74,6 +75,10 @@ class TeacherModel:
         weights = self.path.with_name(self.path.name + ".data")  # where torch puts weights that do not fit one file
         named = [getattr(self, name) for name in FILES]
         return [self.path, self.settings, *filter(Path.is_file, [weights]), *(p for p in named if isinstance(p, Path))]
+
+    def digest(self) -> str:
+        """One sha256 over these files."""
+        return hashlib.sha256("\n".join(sha256_file(file) for file in self.files()).encode()).hexdigest()
 
 
 def read_teacher(path: Path) -> TeacherModel:

@@ -8,7 +8,6 @@ learns about shape and meaning carries over to the next.
 
 from __future__ import annotations
 
-import hashlib
 from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
 from functools import partial
@@ -18,7 +17,7 @@ from typing import Any
 import numpy as np
 
 from chebsplat.errors import ConfigError, DataFailure, InputError
-from chebsplat.formats.artifact import read_manifest, sha256_file
+from chebsplat.formats.artifact import read_manifest
 from chebsplat.formats.channels import ChannelMap
 from chebsplat.formats.images import images_below, read_rgb
 from chebsplat.formats.teacher_model import EMBEDDED, TeacherModel, read_label_table, read_teacher
@@ -74,7 +73,7 @@ def run(job: Job) -> None:
     known = np.zeros((0, len(moments.products))) if words is None else words
     matrix, energy = maths.channel_map(moments, known, settings.n_channels)
     notes: dict[str, Any] = {"n_pixels": moments.count, "n_words": len(known), "n_images": count}
-    notes |= {"reference": settings.reference or "generated rooms", "digest": digest(teacher)}
+    notes |= {"reference": settings.reference or "generated rooms", "digest": teacher.digest()}
     lost = float(np.sqrt(max(1 - energy[matrix.shape[1] - 1], 0)))
     job.facts |= notes | {"n_channels": matrix.shape[1], "of": len(matrix), "relative_error": lost}
     if words is not None:
@@ -90,7 +89,7 @@ def shipped(teacher: TeacherModel, settings: ChannelsSection) -> Path | None:
     manifest, unnamed = read_manifest(teacher.channels, ChannelMap.SCHEMA), {"model"}
     asked = settings.model_dump(mode="json", exclude=unnamed)
     given = {name: value for name, value in manifest.config["channels"].items() if name not in unnamed}
-    return teacher.channels if given == asked and manifest.facts.get("digest") == digest(teacher) else None
+    return teacher.channels if given == asked and manifest.facts.get("digest") == teacher.digest() else None
 
 
 def vocabulary(job: Job, teacher: TeacherModel) -> np.ndarray | None:
@@ -103,11 +102,6 @@ def vocabulary(job: Job, teacher: TeacherModel) -> np.ndarray | None:
     if lengths.min() < 1e-6:
         raise InputError(f"{teacher.labels}: the embedding of {names[lengths.argmin()]} is zero; write it again")
     return embeddings / lengths[:, None]
-
-
-def digest(teacher: TeacherModel) -> str:
-    """One sha256 over the teacher's files."""
-    return hashlib.sha256("\n".join(sha256_file(file) for file in teacher.files()).encode()).hexdigest()
 
 
 def reference(settings: ChannelsSection) -> tuple[Iterator[tuple[str, np.ndarray]], int]:

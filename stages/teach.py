@@ -26,7 +26,6 @@ from chebsplat.settings import DescribeSection
 from chebsplat.shape import point_encoder
 from chebsplat.shape.point_encoder import LEAST_VIEWS, Lesson, PointEncoder, cloud_of
 from chebsplat.shape.point_inputs import PointInputs
-from chebsplat.stages.channels import digest
 from chebsplat.stages.runtime.command import Job, n_threads
 from chebsplat.stages.settings import KnowledgeSection
 from chebsplat.stages.shape_models.teaching_rooms import Room, held, kept_as, prepare
@@ -47,7 +46,7 @@ def run(job: Job) -> None:
     teacher = read_teacher(Path(settings.model) if settings.model else EMBEDDED)
     if teacher.output != "features":
         raise ConfigError(f"{teacher.settings}: output is {teacher.output}; knowledge is taught in features")
-    if channels.notes.get("digest") != digest(teacher):
+    if channels.notes.get("digest") != teacher.digest():
         raise InputError(f"{job.inputs['channels']} is of another teacher than {teacher.path}; pass its own")
     clean, worn, few, swept = zip(*prepared(job, settings, channels.matrix), strict=True)
     taught_on, tested_on = slice(settings.n_rooms), slice(settings.n_rooms, None)
@@ -69,7 +68,7 @@ def run(job: Job) -> None:
     weights = {name: value.numpy() for name, value in encoder.state_dict().items()}
     describe = DescribeSection().model_dump(mode="json")
     job.facts["largest_difference"] = exported(job, encoder, clean[0].inputs)
-    of = teacher.name, digest(teacher), encoder.settings, weights
+    of = teacher.name, teacher.digest(), encoder.settings, weights
     write_knowledge(job.out, Knowledge(*of, channels.matrix, describe, words, embeddings.astype(np.float16), card))
 
 
