@@ -29,7 +29,7 @@ THRESHOLD = 0.1  # of soft masks, of Gaussians and of SH bands
 SOFTNESS = 100.0  # gamma of Eq 13: a bin's edge is about a tenth of a colour's usual range
 CANDIDATES, MOST = 8, 32  # in a region of the mean number of points, and in any (Eq 12)
 NEAREST, FARTHEST = 0.5, 2.0  # of a candidate to its neighbour, in the scene's median spacings
-STEEP_FEATURES = 1e-7  # |grad f| that adds Gaussians, where the features' gradient is read
+STEEP_FEATURES = 2.5e-5  # |grad f| that adds Gaussians, where the features' gradient is read: of a quarter of office0
 KAPPA, EPSILON, ETA = 1.0, 0.2, 0.9  # of the knowledge space's growth (Eq 15)
 
 

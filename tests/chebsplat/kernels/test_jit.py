@@ -69,8 +69,8 @@ def test_a_home_folder_that_takes_nothing_costs_no_run(tmp_path, how):
 CLONE = """
 import numpy as np
 from chebsplat.kernels import jit
-from chebsplat.shape.fusion_kernels import _product
-_product(np.ones((4, 4), np.float32), np.ones((4, 8), np.float32))
+from chebsplat.training.loss_kernels import _blur_products
+_blur_products(np.ones((16, 16, 3), np.float32), np.ones((16, 16, 3), np.float32))
 print(jit.__file__, jit.compilation.kernels)
 """
 
