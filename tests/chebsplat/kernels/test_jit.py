@@ -70,7 +70,7 @@ CLONE = """
 import numpy as np
 from chebsplat.kernels import jit
 from chebsplat.training.loss_kernels import _blur_products
-_blur_products(np.ones((16, 16, 3), np.float32), np.ones((16, 16, 3), np.float32))
+_blur_products(np.ones((16, 48), np.float32), np.ones((16, 48), np.float32))
 print(jit.__file__, jit.compilation.kernels)
 """
 
