@@ -20,6 +20,7 @@ PRINTED: dict[str, Any] = {  # train settings that `train.method = "printed"` de
     "densify": "region",
     "sh_freeze": 1.0,
     "sh_guided": False,
+    "sh_degree": 3,
     "exposure": "off",
     "lr_sh_masks": 5e-2,
 }
@@ -176,10 +177,12 @@ class TrainSection(Section):
             for name, value in PRINTED.items():
                 if getattr(self, name) not in (value, type(self).model_fields[name].default):
                     raise ValueError(f"method is printed, which has {name} = {value}; leave {name} out")
+            if self.without == "pruning guidance" and self.region_gradient == "features":
+                raise ValueError("without pruning guidance the colour's gradient decides; leave region_gradient out")
             if not (self.semantics and self.features == "trained"):
                 raise ValueError("method is printed, which trains features; leave semantics and features out")
         elif self.without != "nothing" or self.region_gradient != "means":
             raise ValueError("without and region_gradient are of the printed method; set method = printed")
-        if self.sh_prune and self.densify != "off" and self.densify_until > self.sh_freeze:
+        if self.method == "ours" and self.sh_prune and self.densify != "off" and self.densify_until > self.sh_freeze:
             raise ValueError("densify_until must not lie after sh_freeze, when SH bands are closed for good")
         return self

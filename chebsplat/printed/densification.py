@@ -47,7 +47,7 @@ def ball_volume(radius: float) -> float:
 def accepted(candidates: Tensor, points: Tensor, nearest: float, farthest: float) -> tuple[Tensor, Tensor]:
     """Which candidates [A, 3] to keep, bool [A], and the points i64 [A] that they inherit from.
 
-    Kept is what lies no nearer to its nearest point [N, 3] than `nearest`, nor farther than `farthest`.
+    Kept are those whose nearest point [N, 3] lies between `nearest` and `farthest` away.
     """
     if len(points) == 0 or len(candidates) == 0:
         return torch.zeros(len(candidates), dtype=torch.bool), torch.zeros(len(candidates)).long()

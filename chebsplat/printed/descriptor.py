@@ -17,7 +17,7 @@ CONDITION = 1e-8  # of degrees, the least over the largest, down to which D^-1/2
 
 def metric(covariances: Tensor, beta: float) -> Tensor:
     """M_i = R_i diag(1 / (1 + beta lambda)) R_i^T of covariances [..., 3, 3] (Eq 1)."""
-    values, axes = _eigh(covariances)
+    values, axes = symmetric_eigh(covariances)
     shrunk = 1 / (1 + beta * values.clamp_min(0))
     shaped: Tensor = (axes * shrunk[..., None, :]) @ axes.mT
     return shaped
@@ -62,15 +62,16 @@ def eigenpairs(weights: Tensor, present: Tensor, n_eigs: int) -> tuple[Tensor, T
     attached = degree > 0
     root = torch.where(attached, degree, 1.0).rsqrt()
     beyond = torch.diag_embed(torch.where(present, 1.0, 10.0).to(weights))  # absent members come last
-    values, vectors = _eigh(beyond - root[..., :, None] * weights * root[..., None, :])
+    values, vectors = symmetric_eigh(beyond - root[..., :, None] * weights * root[..., None, :])
     vectors = root[..., None] * vectors
     least = degree.masked_fill(~attached, torch.inf).amin(-1)
-    if (apart := least < CONDITION * degree.amax(-1)).any():
-        shares = torch.where(attached[..., None], weights, 0.0) / torch.where(attached, degree, 1.0)[..., None]
-        found, right = torch.linalg.eig(beyond[apart] - shares[apart])
+    if (ill_conditioned := least < CONDITION * degree.amax(-1)).any():
+        operator = laplacian(weights[ill_conditioned], present[ill_conditioned])
+        absent = torch.where(present[ill_conditioned], 0.0, 10.0).to(weights)
+        found, right = torch.linalg.eig(operator + torch.diag_embed(absent))
         order = found.real.argsort(-1)
-        values[apart] = found.real.gather(-1, order)
-        vectors[apart] = right.real.gather(-1, order[..., None, :].expand_as(right))
+        values[ill_conditioned] = found.real.gather(-1, order)
+        vectors[ill_conditioned] = right.real.gather(-1, order[..., None, :].expand_as(right))
     count = min(n_eigs, n)
     is_there = torch.arange(count) < present.sum(-1, keepdim=True)
     values = torch.where(is_there, values[..., :count], 0.0)
@@ -122,7 +123,7 @@ def descriptor(
     return torch.where(present[..., None], torch.cat(parts, -1), 0.0)
 
 
-def _eigh(matrices: Tensor) -> tuple[Tensor, Tensor]:
+def symmetric_eigh(matrices: Tensor) -> tuple[Tensor, Tensor]:
     """`torch.linalg.eigh` by NumPy: torch wakes all threads for each small matrix, and waits where others compute."""
     values, vectors = np.linalg.eigh(matrices.numpy())
     return torch.from_numpy(values), torch.from_numpy(vectors)

@@ -58,7 +58,8 @@ def spread(descriptors: Tensor, present: Tensor) -> Tensor:
 def update(W: Tensor, B: Tensor | None, sigma_f: float, *, kappa: float, epsilon: float, eta: float) -> Tensor:
     """B <- orth([B, U]) with the top left singular vectors U of R that hold eta of its energy.
 
-    Only if rho' = rho (1 + kappa sigma_f) exceeds epsilon. No basis yet: R = W.
+    Only if rho' = rho (1 + kappa sigma_f) exceeds epsilon. No basis yet: R = W. As printed, nothing
+    keeps r below q: a basis that has reached it misses nothing, and pulls at nothing.
     Returns: [q, r'] orthonormal columns, those of B first.
     """
     W = W.detach()

@@ -1,7 +1,4 @@
-"""The training objective: reconstruction, semantics, pruning of Gaussians and of SH, knowledge.
-
-The print gives no weights and takes the reconstruction loss from 3DGS, where the trainer has it.
-"""
+"""What the printed objective adds to reconstruction (3DGS's) and to the L1 distance of features."""
 
 from __future__ import annotations
 
@@ -10,23 +7,22 @@ from torch import Tensor
 from chebsplat.printed.pruning import mask_loss
 from chebsplat.printed.sh_pruning import sh_loss
 
-WEIGHT_MASK = 1e-2  # of L_mask
-WEIGHT_SH = 4e-5  # of L_SH
-WEIGHT_KNOWLEDGE = 1.0  # of L_reg
 
+def auxiliary_losses(
+    parts: tuple[Tensor | None, Tensor | None, Tensor | None], weights: tuple[float, float]
+) -> dict[str, Tensor]:
+    """L_mask, L_SH and L_reg by name; parts that are switched off are not there.
 
-def semantic_loss(rendered: Tensor, taught: Tensor) -> Tensor:
-    """L1 distance of rendered and teacher's features [H, W, C]."""
-    return (rendered - taught).abs().mean()
-
-
-def auxiliary_losses(soft_mask: Tensor | None, delta: Tensor | None, knowledge: Tensor | None) -> dict[str, Tensor]:
-    """L_mask, L_SH and L_reg by name, weighted; those whose part is switched off are not there."""
+    Args: parts: the soft mask [N], delta [N, 4] and L_reg []; weights: of L_mask and L_SH, of which
+      the print has none. L_reg has that of its alpha.
+    """
+    soft_mask, delta, knowledge = parts
+    weight_mask, weight_sh = weights
     losses = {}
     if soft_mask is not None:
-        losses["mask"] = WEIGHT_MASK * mask_loss(soft_mask)
+        losses["mask"] = weight_mask * mask_loss(soft_mask)
     if delta is not None:
-        losses["sh"] = WEIGHT_SH * sh_loss(delta)
+        losses["sh"] = weight_sh * sh_loss(delta)
     if knowledge is not None:
-        losses["knowledge"] = WEIGHT_KNOWLEDGE * knowledge
+        losses["knowledge"] = knowledge
     return losses

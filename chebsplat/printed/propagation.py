@@ -5,6 +5,8 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
+from chebsplat.printed.descriptor import symmetric_eigh
+
 THINNEST, LEAST = 1e-12, 1e-30  # of a covariance's eigenvalues: relative to its largest, and at all
 
 
@@ -24,16 +26,16 @@ def weights(
       the print is 0/0. The largest exponent is subtracted first, which changes no quotient.
     """
     point, region = pairs
-    values, axes = torch.linalg.eigh(covariances)
+    values, axes = symmetric_eigh(covariances)
     values = torch.maximum(values, (THINNEST * values[:, -1:]).clamp_min(LEAST))
     along = ((points[point] - centers[region])[:, None, :] @ axes[region])[:, 0]
     exponents = -(along.square() / values[region]).sum(-1) / temperature
     largest = torch.full((len(points),), -torch.inf, dtype=points.dtype)
-    largest.scatter_reduce_(0, point, exponents.detach(), "amax")
-    shares = (exponents - largest[point]).exp()
-    total = torch.zeros(len(points), dtype=points.dtype).index_add(0, point, shares)
-    normalised: Tensor = shares / total[point]
-    return normalised
+    largest.scatter_reduce_(0, point, exponents, "amax")
+    unnormalised = (exponents - largest[point]).exp()
+    total = torch.zeros(len(points), dtype=points.dtype).index_add(0, point, unnormalised)
+    shares: Tensor = unnormalised / total[point]
+    return shares
 
 
 def propagate(encodings: Tensor, shares: Tensor, pairs: tuple[Tensor, Tensor], n_points: int) -> Tensor:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor, nn
 
-STARTS_AT = 1.0  # logit of the soft mask: open, alike for all
+STARTS_AT = 1.0  # added to what phi gives the soft mask at the start: open, alike for all
 
 
 class PruningGate(nn.Module):

@@ -121,8 +121,8 @@ class SceneModel:
         """Masks [N, 3] in {0, 1} of SH bands 1 to 3, as they are."""
         return sh_prune.band_mask(self.raw["sh_logits"])
 
-    def settled_degrees(self) -> Tensor:
-        """SH degree u8 [N] that each Gaussian keeps for good."""
+    def close_bands(self) -> Tensor:
+        """Highest open band u8 [N] of each Gaussian, which keeps it for good."""
         return sh_prune.degrees(self.open_bands())
 
     def soft_mask(self, index: Tensor, features: Tensor | None) -> Tensor | None:

@@ -149,7 +149,7 @@ class Population:
     def freeze_bands(self, optimizer: torch.optim.Optimizer) -> None:
         """Fix every Gaussian's SH degree, once: what is closed leaves parameters, moments and memory."""
         raw = self.model.raw
-        degrees = self.model.settled_degrees().clamp_max(self.settings.sh_degree)
+        degrees = self.model.close_bands().clamp_max(self.settings.sh_degree)
         rows = sh_prune.ragged_rows(degrees)
         optimizer_rows.drop(optimizer, raw, "sh_logits")
         bands = {f"sh{band}": rows[band] for band in range(1, 4)}

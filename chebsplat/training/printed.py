@@ -10,7 +10,7 @@ import torch
 from scipy.spatial import cKDTree
 from torch import Tensor, nn
 
-from chebsplat.printed import densification, encoding, knowledge, losses, propagation, pruning, sh_pruning
+from chebsplat.printed import densification, encoding, knowledge, propagation, pruning, sh_pruning
 from chebsplat.printed.descriptor import descriptor
 from chebsplat.printed.fusion import Gate
 from chebsplat.printed.regions import Regions, regions_of
@@ -27,14 +27,16 @@ N_LAYERS, N_HEADS = 2, 4
 TEMPERATURE = 1.0  # tau of Eq 8
 THRESHOLD = 0.1  # of soft masks, of Gaussians and of SH bands
 SOFTNESS = 100.0  # gamma of Eq 13: a bin's edge is about a tenth of a colour's usual range
-CANDIDATES, MOST = 8, 32  # in a region of the mean number of points, and in any (Eq 12)
+CANDIDATES, MOST_CANDIDATES = 8, 32  # in a region of the mean number of points, and in any (Eq 12)
 NEAREST, FARTHEST = 0.5, 2.0  # of a candidate to its neighbour, in the scene's median spacings
-STEEP_FEATURES = 2.5e-5  # |grad f| that adds Gaussians, where the features' gradient is read: of a quarter of office0
+STEEP_FEATURES = 2.5e-5  # |grad f| above which a region grows, by the features' gradient: a quarter of office0's do
 KAPPA, EPSILON, ETA = 1.0, 0.2, 0.9  # of the knowledge space's growth (Eq 15)
 
 
 class Modules(nn.Module):
     """What the printed method learns beside the Gaussians. without: the part of Table 5 that is left out."""
+
+    in_view: Tensor
 
     def __init__(self, n_channels: int, describe: DescribeSection, without: str):
         super().__init__()
@@ -48,18 +50,18 @@ class Modules(nn.Module):
         self.pruning = None if without == "pruning guidance" else pruning.PruningGate(n_channels)
         self.band_masks = None if without == "SH guidance" else sh_pruning.BandMasks(n_channels)
         self.modulation = knowledge.Modulation(self.width)
+        self.register_buffer("in_view", torch.ones(()))  # part of the Gaussians that views see, their running mean
 
 
 class Encoded(NamedTuple):
-    """fused [V, C], shape [V, C] and gate [V, C] of Gaussians; regions of their rows, with encodings [M, C], tokens
-    [M, t, Q] and descriptors [M, n, Q].
+    """Of the Gaussians `index`: fused and shape features [V, C].
+
+    regions: of positions in `index`, not of Gaussians' numbers, with tokens [M, t, Q] and descriptors [M, n, Q].
     """
 
     fused: Tensor
     shape: Tensor
-    gate: Tensor
     regions: Regions
-    encodings: Tensor
     tokens: Tensor
     descriptors: Tensor
 
@@ -85,29 +87,32 @@ class PrintedScene(SceneModel):
         if "sh_logits" in self.raw:
             self.raw["sh_logits"] = torch.zeros(len(self), 4, device=self.device, requires_grad=True)
         self.angles = torch.arange(describe.n_angles) * (2 * math.pi / describe.n_angles)
-        self.draws = torch.Generator()  # the trainer's, once there is one
-        self.bases: dict[str, Tensor] = {}
-        self.keeps_gradient = train.region_gradient == "features"
-        self.n_in_view = len(self)  # Gaussians, in the view before
+        self.draws = torch.Generator()  # the trainer's, once there is one; of steps alone
+        self.seed, self.bases = train.seed, dict[str, Tensor]()
+        self.grows_by_features = train.region_gradient == "features"
 
     @property
     def modules(self) -> dict[str, nn.Module]:
         return {"printed": self.printed}
 
     def encoded(self, index: Tensor, count: int) -> Encoded:
-        """Fused features [V, C] of the Gaussians `index` [V] by `count` regions of them (Eqs 1-10)."""
+        """Fused features of the Gaussians `index` [V] by `count` regions of them (Eqs 1-10).
+
+        Where nothing learns, what is drawn is the same at every call: measuring changes no training.
+        """
         raw, parts = self.raw, self.printed
+        draws = self.draws if torch.is_grad_enabled() else torch.Generator().manual_seed(self.seed)
         with torch.no_grad():
             points = raw["means"][index]
-            spreads = covariances(raw["quats"][index], raw["log_scales"][index].exp())
-            regions = regions_of(points, count, self.describe.region_size, self.draws)
+            spreads = covariances(raw["quats"][index].double(), raw["log_scales"][index].double().exp())
+            regions = regions_of(points, count, self.describe.region_size, draws)
             rows, present = regions.members.clamp_min(0), regions.members >= 0
             largest = raw["log_scales"][index].amax(1).exp().square().median() if len(index) else 1.0
             described = points.new_zeros(*rows.shape, parts.width)
             if self.without != "descriptor":
                 described = descriptor(
                     points[rows],
-                    spreads[rows],
+                    spreads[rows].to(points),
                     present,
                     self.angles,
                     beta=self.describe.anisotropy / float(largest),
@@ -116,15 +121,15 @@ class PrintedScene(SceneModel):
                     degree=self.describe.max_degree,
                 )
             middle = regions.centers
-            shares = propagation.weights(points, points[middle], spreads[middle], regions.pairs, TEMPERATURE)
+            places = points.double(), points[middle].double()
+            shares = propagation.weights(*places, spreads[middle], regions.pairs, TEMPERATURE).to(points)
             covered = torch.zeros(len(index), dtype=torch.bool)
             covered[regions.pairs[0]] = True
         tokens = parts.encoder.tokens(described, points[rows])
         encodings = parts.encoder(tokens, present)
         shape = propagation.propagate(encodings, shares, regions.pairs, len(index))
-        semantic = take(raw["features"], index)
-        fused, gate = parts.gate(shape, semantic, covered), parts.gate.values(shape, semantic).detach()
-        return Encoded(fused, shape, gate, regions, encodings, tokens, described)
+        fused = parts.gate(shape, take(raw["features"], index), covered)
+        return Encoded(fused, shape, regions, tokens, described)
 
     def masks(self, features: Tensor, index: Tensor, regions: Regions) -> tuple[Tensor | None, Tensor | None]:
         """Soft masks [N] of all Gaussians and [N, 4] of their SH bands; None where switched off.
@@ -163,9 +168,10 @@ class PrintedScene(SceneModel):
         raw = self.raw
         with torch.no_grad():
             index = in_frustum(raw["means"], view, 3 * raw["log_scales"].amax(1).exp())
-        self.n_in_view = len(index)
-        fused, _, _, regions, _, tokens, _ = self.encoded(index, REGIONS_IN_VIEW)
-        if self.keeps_gradient and fused.requires_grad:
+        fused, _, regions, tokens, _ = self.encoded(index, REGIONS_IN_VIEW)
+        if fused.requires_grad:
+            self.printed.in_view.lerp_(torch.tensor(len(index) / max(len(self), 1)), 0.1)
+        if self.grows_by_features and fused.requires_grad:
             fused.retain_grad()
         soft = delta = None
         if masked:
@@ -198,14 +204,18 @@ class PrintedScene(SceneModel):
         pulls = [knowledge.regularizer(maps[name], B, alpha) for name, B in self.bases.items()]
         return torch.stack(pulls).mean()
 
+    @property
+    def n_regions(self) -> int:
+        """Regions of the whole scene, as dense as in a view."""
+        return math.ceil(REGIONS_IN_VIEW / max(float(self.printed.in_view), 0.01))
+
     @torch.no_grad()
     def whole(self) -> Encoded:
-        """Of all Gaussians, with regions as dense as in a view.
+        """Of all Gaussians.
 
         Choices: the print fuses within a view's frustum; a scene that is stored has one feature a Gaussian.
         """
-        share = len(self) / max(self.n_in_view, 1)
-        return self.encoded(self.rows, math.ceil(REGIONS_IN_VIEW * share))
+        return self.encoded(self.rows, self.n_regions)
 
     @torch.no_grad()
     def soft_mask(self, index: Tensor, features: Tensor | None) -> Tensor | None:
@@ -220,8 +230,8 @@ class PrintedScene(SceneModel):
         return self._open()[:, 1:].float()
 
     @torch.no_grad()
-    def settled_degrees(self) -> Tensor:
-        """The highest open band u8 [N], once coefficients of closed ones, the lowest included, have been set to 0."""
+    def close_bands(self) -> Tensor:
+        """Set closed bands, the lowest included, to zero; returns each Gaussian's highest open band u8 [N]."""
         is_open = self._open()
         for band, kept in zip(self.bands(), is_open.unbind(1), strict=False):
             band.mul_(kept[:, None, None])
@@ -256,7 +266,8 @@ class PrintedScene(SceneModel):
         """How gates and masks lie once they have learned: shares in ten bins of [0, 1]."""
         whole = self.whole()
         soft, delta = self.masks(whole.fused, self.rows, whole.regions)
-        parts = {"gate": whole.gate, "mask": soft}
+        gate = self.printed.gate.values(whole.shape, self.raw["features"])
+        parts = {"gate": gate, "mask": soft}
         if delta is not None:
             parts |= {f"sh{degree}": column for degree, column in enumerate(delta.unbind(1))}
         return {
@@ -273,15 +284,14 @@ class PrintedScene(SceneModel):
           Bounds of the distance are NEAREST and FARTHEST times the scene's median spacing.
         """
         means = self.raw["means"].detach()
-        count = math.ceil(REGIONS_IN_VIEW * len(self) / max(self.n_in_view, 1))
-        regions = regions_of(means, count, self.describe.region_size, generator)
+        regions = regions_of(means, self.n_regions, self.describe.region_size, generator)
         mean = densification.mean_gradients(gradient, regions.pairs, len(regions.centers))
-        if self.keeps_gradient:
+        if self.grows_by_features:
             threshold = STEEP_FEATURES
         n_points = torch.bincount(regions.pairs[1], minlength=len(regions.centers))
         volume = densification.ball_volume(regions.radius)
         density = CANDIDATES * float(n_points.double().mean()) / volume
-        counts = densification.candidate_counts(torch.full_like(mean, volume), n_points, density, MOST)
+        counts = densification.candidate_counts(torch.full_like(mean, volume), n_points, density, MOST_CANDIDATES)
         order = mean.argsort(descending=True, stable=True)
         order = order[mean[order] > threshold]
         middle = means[regions.centers[order]].repeat_interleave(counts[order], 0)
@@ -297,8 +307,3 @@ def _median_spacing(means: Tensor) -> float:
     """Median distance of points [N, 3] to their nearest other one, scene units."""
     places = means.double().numpy()
     return float(np.median(cKDTree(places).query(places, 2)[0][:, 1])) if len(places) > 1 else 1.0
-
-
-def auxiliary_losses(auxiliary: Auxiliary) -> dict[str, Tensor]:
-    """L_mask, L_SH and L_reg of a rendered view."""
-    return losses.auxiliary_losses(auxiliary.soft_mask, auxiliary.delta, auxiliary.knowledge)

@@ -15,13 +15,14 @@ from torch import Tensor
 from chebsplat.cameras import centers
 from chebsplat.errors import DataFailure
 from chebsplat.evaluation.metrics import psnr
+from chebsplat.printed.losses import auxiliary_losses
 from chebsplat.settings import TrainSection
 from chebsplat.shape.regions import regions_of
 from chebsplat.training import sh_prune
 from chebsplat.training.losses import depth_distance, photometric, semantic_loss
 from chebsplat.training.model import Rendered, SceneModel
 from chebsplat.training.population import Population, broken
-from chebsplat.training.printed import PrintedScene, auxiliary_losses
+from chebsplat.training.printed import PrintedScene
 from chebsplat.training.schedule import Schedule, adam
 from chebsplat.views import Views
 
@@ -96,7 +97,7 @@ class Trainer:
         frozen = self.schedule.freezes_bands(share)  # a training of few steps does not catch up on growth
         growing = not frozen and self.schedule.grown(share) > self.population.n_grown
         removing = growing or (self.schedule.has_grown(share) and self.step % self.settings.remove_every == 0)
-        if growing or due:
+        if growing or due or isinstance(self.model, PrintedScene):  # whose regions need finite Gaussians
             self._drop_broken()
         mask = self._soft_mask(share) if removing else None
         if growing:
@@ -230,7 +231,9 @@ class Trainer:
             labels = None if self.views.labels is None else self.views.labels(view)
             losses["features"] = semantic_loss(rendered.features, wanted, labels, mask, settings, backend)
         if isinstance(self.model, PrintedScene):
-            return losses | auxiliary_losses(auxiliary)
+            parts = auxiliary.soft_mask, auxiliary.delta, auxiliary.knowledge
+            weights = settings.weight_mask, settings.weight_sh
+            return losses | auxiliary_losses(parts, weights)
         if auxiliary.soft_mask is not None:
             losses["mask"] = settings.weight_mask * auxiliary.soft_mask.mean()
         if auxiliary.band_masks is not None:

@@ -138,9 +138,11 @@ def _note_left_out(job: Job, train: TrainSection, has_semantics: bool, no_depth:
         if train.semantics and train.features == "lifted":
             why = "train.features is lifted: they follow the training"
         job.left_out("semantic branch", why)
+    if train.without != "nothing":
+        job.left_out(f"{train.without} of the printed method", "train.without")
     unneeded = {
         "pruning": [(not train.prune, "train.prune is false")],
-        "densification": [(train.densify == "off", "train.densify is off")],
+        "densification": [(given.densify == "off", "train.densify is off")],
         "SH pruning": [(not train.sh_prune, "train.sh_prune is false")],
     }
     for what, reasons in unneeded.items():

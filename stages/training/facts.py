@@ -37,8 +37,8 @@ def facts_of(
 def printed_facts(model: PrintedScene, features: Features) -> dict[str, Any]:
     """What the printed method has learned: how gates and masks lie, and what encodings alone know.
 
-    `agreement`: of the Gaussians, the part whose label by their regions' encodings alone is that by their own features;
-    `commonest`: the part that has the commonest label, which an encoder that knows nothing reaches; `ranks` of bases.
+    `agreement`: share of Gaussians whose label by shape features equals that by their own; `commonest`: share with the
+    commonest label, which an encoder that knows nothing reaches; `ranks_before`: of the bases of the scenes before.
     """
     whole = model.whole()
     named, wanted = (
@@ -47,7 +47,7 @@ def printed_facts(model: PrintedScene, features: Features) -> dict[str, Any]:
     )
     facts = {"histograms": model.histograms(), "agreement": float((named == wanted).mean())}
     facts["commonest"] = float(np.bincount(wanted).max() / len(wanted))
-    return facts | {"ranks": {name: basis.shape[1] for name, basis in model.bases.items()}}
+    return facts | {"ranks_before": {name: basis.shape[1] for name, basis in model.bases.items()}}
 
 
 def guidance(
