@@ -56,8 +56,10 @@ def teacher_kind(config: Any, source: str, probe: dict[str, bool]) -> tuple[str,
 
 
 def left_out_stages(config: Any, kind: str, why: str, probe: dict[str, bool]) -> dict[str, str]:
-    """Stages that this scene does not need, and why."""
+    """Stages that this scene does not need, and why. Raises: ConfigError on the printed method without a teacher."""
     left_out: dict[str, str] = {}
+    if kind == "none" and config.train.method == "printed":
+        raise ConfigError(f"train.method is printed, which needs a teacher, and {why}; name one with teacher.kind")
     if kind == "none":
         left_out |= {"teacher": f"{why}: {HOW}" if why == UNASKED else why}
         left_out |= {"lift": f"no teacher's features to lift ({why})"}

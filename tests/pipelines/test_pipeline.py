@@ -274,6 +274,11 @@ def test_a_scene_leaves_out_what_it_does_not_need_and_says_why(settings, left_ou
     assert PLANNED - left_out == set(plan.targets)
 
 
+def test_the_printed_method_is_refused_where_nothing_teaches_it():
+    with pytest.raises(ConfigError, match=r"needs a teacher, and teacher\.kind is none"):
+        Planner().plan("toy", "teacher.kind=none", "paper")
+
+
 def test_lifted_features_reach_the_export_and_trained_ones_do_not_wait_for_them():
     by_stage = {step.stage: set(step.inputs) for step in Planner().plan("toy", "train.features=lifted").steps}
     assert by_stage["train"] == {"capture", "points"}
