@@ -176,7 +176,7 @@ class RefineSection(Section):
 
     @property
     def changes_nothing(self) -> bool:
-        """Whether features stay as the training left them."""
+        """True where features stay as the training left them."""
         return (self.start, self.smooth, self.knowledge) == ("trained", "off", "none")
 
 

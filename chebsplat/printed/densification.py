@@ -45,7 +45,7 @@ def ball_volume(radius: float) -> float:
 
 
 def accepted(candidates: Tensor, points: Tensor, nearest: float, farthest: float) -> tuple[Tensor, Tensor]:
-    """Which candidates [A, 3] to keep, bool [A], and the points i64 [A] that they inherit from.
+    """Mask [A] of the candidates [A, 3] to keep, and the points i64 [A] that they inherit from.
 
     Kept are those whose nearest point [N, 3] lies between `nearest` and `farthest` away.
     """

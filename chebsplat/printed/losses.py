@@ -1,4 +1,4 @@
-"""What the printed objective adds to reconstruction (3DGS's) and to the L1 distance of features."""
+"""The printed objective beside reconstruction (3DGS's) and the L1 distance of features."""
 
 from __future__ import annotations
 

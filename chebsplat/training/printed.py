@@ -34,7 +34,7 @@ KAPPA, EPSILON, ETA = 1.0, 0.2, 0.9  # of the knowledge space's growth (Eq 15)
 
 
 class Modules(nn.Module):
-    """What the printed method learns beside the Gaussians. without: the part of Table 5 that is left out."""
+    """Learned modules of the printed method. without: the part of Table 5 that is left out."""
 
     in_view: Tensor
 
@@ -239,7 +239,7 @@ class PrintedScene(SceneModel):
         return degrees.amax(1).to(torch.uint8)
 
     def _open(self) -> Tensor:
-        """Whether each Gaussian's SH bands 0 to 3 are open, bool [N, 4]."""
+        """Mask [N, 4], bool, of the SH bands 0 to 3 that are open."""
         whole = self.whole()
         delta = self.masks(whole.fused, self.rows, whole.regions)[1]
         assert delta is not None
@@ -263,7 +263,7 @@ class PrintedScene(SceneModel):
 
     @torch.no_grad()
     def histograms(self) -> dict[str, Any]:
-        """How gates and masks lie once they have learned: shares in ten bins of [0, 1]."""
+        """Histograms of gates and masks: shares in ten bins of [0, 1]."""
         whole = self.whole()
         soft, delta = self.masks(whole.fused, self.rows, whole.regions)
         gate = self.printed.gate.values(whole.shape, self.raw["features"])

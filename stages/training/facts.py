@@ -35,7 +35,7 @@ def facts_of(
 
 
 def printed_facts(model: PrintedScene, features: Features) -> dict[str, Any]:
-    """What the printed method has learned: how gates and masks lie, and what encodings alone know.
+    """Facts of a printed training: histograms of gates and masks, and what encodings alone know.
 
     `agreement`: share of Gaussians whose label by shape features equals that by their own; `commonest`: share with the
     commonest label, which an encoder that knows nothing reaches; `ranks_before`: of the bases of the scenes before.
