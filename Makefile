@@ -17,7 +17,7 @@ unexport PYTHONDONTWRITEBYTECODE
 
 CHEBSPLAT := .venv/bin/chebsplat
 CHOICE := $(if $(scene),--scene '$(scene)') $(if $(sequence),--sequence '$(sequence)') $(if $(set),--set '$(set)') \
-  $(if $(ablation),--ablation '$(ablation)')
+  $(if $(ablation),--ablation '$(ablation)') $(if $(knowledge),--knowledge '$(knowledge)') $(if $(newer),--newer)
 
 CLUSTER := $(if $(filter-out local,$(on)),slurm)
 
@@ -25,7 +25,7 @@ CLUSTER := $(if $(filter-out local,$(on)),slurm)
 .DEFAULT_GOAL := $(if $(study),study,$(if $(bench),bench-$(bench),$(if $(scene)$(sequence),run,help)))
 .PHONY: help run study slurm cluster-test view plan verify status clean-stale setup test test-all test-lowest gpu soak stability bench text-model nouns knowledge calibration teacher teacher-quality lint lock
 
-run: $(READY) $(CLUSTER)  ## make scene=NAME|FOLDER [stage=] [set=a.b=c,...] [ablation=] [cores=] [device=] [on=slurm]; or sequence=NAME ablation=paper
+run: $(READY) $(CLUSTER)  ## make scene=NAME|FOLDER [stage=] [set=a.b=c,...] [ablation=] [cores=] [knowledge=] [newer=1] [device=] [on=slurm]; or sequence=NAME
 	@$(CHEBSPLAT) run $(CHOICE) $(if $(stage),--stage '$(stage)') $(if $(cores),--cores '$(cores)') $(if $(device),--device '$(device)') $(if $(on),--on '$(on)')
 
 study: $(READY) $(CLUSTER)  ## make study=NAME [cores=] [threads=] [on=slurm] [args=--no-run]: its runs, then table, figure, page in build/studies
@@ -97,7 +97,7 @@ nouns: text-model  ## teachers/embedded.npz from teachers/nouns.txt, by the sent
 	@$(PY) -m chebsplat.teachers.words
 
 knowledge: $(READY)  ## teach knowledge of shape over generated rooms for the embedded teacher (teacher=MODEL.onnx, out=FOLDER)
-	@$(CHEBSPLAT) knowledge $(if $(teacher),--teacher '$(teacher)') $(if $(out),--out '$(out)')
+	@$(CHEBSPLAT) knowledge teach $(if $(teacher),--teacher '$(teacher)') $(if $(out),--out '$(out)')
 
 calibration: $(READY)  ## calibrate queries of the embedded teacher on generated rooms (teacher=MODEL.onnx): *.relevancy.json
 	@$(CHEBSPLAT) calibrate --force $(if $(teacher),'$(teacher)')

@@ -1,49 +1,31 @@
-"""`descriptors/1`: regions of the initial Gaussians and their anisotropic Chebyshev descriptors."""
+"""`descriptors/2`: points of a scene's surface, and the shape about each: what the point encoder sees."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from pathlib import Path
-from typing import Any
+from dataclasses import dataclass, field
+from typing import Annotated, Any, ClassVar
 
 import numpy as np
 
-from chebsplat.formats import artifact
-from chebsplat.formats.artifact import read_document, write_document
-from chebsplat.formats.tensors import Spec, read_tensors, write_tensors
-
-SCHEMA = "chebsplat.descriptors/1"
-SPECS: dict[str, Spec] = {
-    "centers": ("int64", "m"),
-    "members": ("int64", "m", "n"),
-    "values": ("float32", "m", "n", "j", "d"),
-}
+from chebsplat.formats.record import Array, Record
 
 
 @dataclass
-class Descriptors:
-    """centers: i64 [M] indices of the points that regions are centred on. members: i64 [M, n], -1 where padded.
-    values: f32 [M, n, J, P], zero where padded; P = D - 1 degrees. settings: the parameters they were
-    computed with, and the regions' radius and share.
+class Descriptors(Record):
+    """N points; their frame is the scene's turned upright, z up, in metres, about `origin`.
+
+    own, means, normals, descriptors, neighbors: as in `shape.point_inputs.PointInputs`.
+    origin: [3] scene units; up: [3] against gravity, in the scene's frame; unit: scene units in a metre.
+    notes:  whose surface it is, how sure up is, what the unit comes from; why there is no point, where there is none.
     """
 
-    centers: np.ndarray
-    members: np.ndarray
-    values: np.ndarray
-    settings: dict[str, Any]
-
-
-def write_descriptors(out: Path, descriptors: Descriptors) -> None:
-    """Fill the directory that `artifact.publish` yields. Raises ValueError on a non-finite value."""
-    arrays = {name: getattr(descriptors, name) for name in SPECS}
-    write_tensors(out / "descriptors.safetensors", arrays)
-    write_document(out / "settings.json", descriptors.settings)
-
-
-def read_descriptors(path: Path) -> Descriptors:
-    """Regions and descriptors at `path`, all in memory. Raises InputError naming the damaged file and the remedy."""
-    path = Path(path)
-    manifest = artifact.read_manifest(path, SCHEMA)
-    arrays = read_tensors(path, manifest, "descriptors.safetensors", SPECS)
-    settings = read_document(path, manifest, "settings.json")
-    return Descriptors(**{name: arrays[name] for name in SPECS}, settings=settings)
+    SCHEMA: ClassVar[str] = "chebsplat.descriptors/2"
+    own: Annotated[np.ndarray, Array("float32", ("point", "number"), "metres, none, none, none, none, log of metres")]
+    means: Annotated[np.ndarray, Array("float32", ("point", 3), "metres")]
+    normals: Annotated[np.ndarray, Array("float32", ("point", 3))]
+    descriptors: Annotated[np.ndarray, Array("float32", ("point", "value"))]
+    neighbors: Annotated[np.ndarray, Array("int32", ("point", "radius", "neighbor"), "index of a point, -1 none")]
+    origin: list[float]
+    up: list[float]
+    unit: float
+    notes: dict[str, Any] = field(default_factory=dict)

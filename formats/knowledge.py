@@ -1,8 +1,8 @@
-"""`knowledge/1`: a point encoder taught over many rooms, for one teacher, and the card that says on what."""
+"""`knowledge/2`: an encoder of shape, and the map from its features to meaning that a set of lessons gives."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -10,42 +10,60 @@ import numpy as np
 
 from chebsplat.formats import artifact
 from chebsplat.formats.artifact import read_document, write_document
-from chebsplat.formats.tensors import read_tensors, write_tensors
+from chebsplat.formats.lesson import Sums, packed, unpacked
+from chebsplat.formats.tensors import Spec, read_tensors, write_tensors
 
-SCHEMA = "chebsplat.knowledge/1"
-ENCODER = "encoder.onnx"  # the same encoder, for onnxruntime; the stage writes it
+SCHEMA = "chebsplat.knowledge/2"
 SHIPPED = Path(__file__).parents[1] / "teachers/knowledge"  # of the embedded teacher; ships with the package
+SPECS: dict[str, Spec] = {"matrix": ("float32", "C", "d"), "embeddings": ("float16", "W", "d"),
+                          "map": ("float32", "p", "2 d"), "basis": ("float32", "p", "r"),
+                          "scale": ("float32", "p")}  # fmt: skip
 
 
 @dataclass
 class Knowledge:
     """What a scene starts from.
 
-    teacher:  its name; digest: of its files, as in `channels/2`.
-    encoder:  constructor settings of the point encoder; weights: its arrays by name.
-    matrix:   f32 [C, d], from the teacher's C channels to the d that the encoder answers in; columns orthonormal.
-    describe: settings of the descriptors that it sees.
-    words:    W that it can name things by; embeddings f16 [W, d] of these, unit in the teacher's channels.
-    card:     rooms, views, steps, errors on rooms held out, and where it fails.
+    teacher:    its name; digest: of its files, as in `channels/2`.
+    encoder:    constructor settings of the point encoder; weights: its arrays by name.
+    matrix:     f32 [C, d], from the teacher's C channels to the d that answers have; columns orthonormal.
+    describe:   settings of the descriptors that it sees.
+    words:      W that it can name things by; embeddings f16 [W, d] of these, unit in the teacher's channels.
+    map:        f32 [p, 2 d], from features of shape to answers: d in the teacher's channels, d in those of words.
+    basis:      f32 [p, r] of what was learned, in features times scale f32 [p] (Eq 15).
+    card:       rooms, views, steps, errors on rooms held out, and where it fails.
+    lessons:    what it was solved from: of each its key, scene, trust and why.
+    shipped:    sums of the generated rooms, by halves of them; none in what a scene has solved.
     """
 
     teacher: str
     digest: str
-    encoder: dict[str, int]
+    encoder: dict[str, Any]
     weights: dict[str, np.ndarray]
     matrix: np.ndarray
     describe: dict[str, Any]
     words: list[str]
     embeddings: np.ndarray
+    map: np.ndarray
+    basis: np.ndarray
+    scale: np.ndarray
     card: dict[str, Any]
+    lessons: dict[str, Any] = field(default_factory=dict)
+    shipped: list[Sums] = field(default_factory=list)
+
+
+DOCUMENT = ("teacher", "digest", "encoder", "describe", "words", "card", "lessons")
 
 
 def write_knowledge(out: Path, knowledge: Knowledge) -> None:
     """Fill the directory that `artifact.publish` yields. Raises ValueError on a non-finite value."""
     write_tensors(out / "weights.safetensors", knowledge.weights)
-    write_tensors(out / "channels.safetensors", {"matrix": knowledge.matrix, "embeddings": knowledge.embeddings})
-    names = ("teacher", "digest", "encoder", "describe", "words", "card")
-    write_document(out / "knowledge.json", {name: getattr(knowledge, name) for name in names})
+    write_tensors(out / "answers.safetensors", {name: getattr(knowledge, name) for name in SPECS})
+    for number, sums in enumerate(knowledge.shipped):
+        write_tensors(out / f"shipped{number}.safetensors", packed(sums))
+    squares = [square for *_, square in knowledge.shipped]
+    document = {name: getattr(knowledge, name) for name in DOCUMENT} | {"squares": squares}
+    write_document(out / "knowledge.json", document)
 
 
 def read_card(path: Path) -> dict[str, Any]:
@@ -58,8 +76,12 @@ def read_knowledge(path: Path) -> Knowledge:
     """The knowledge at `path`. Raises InputError naming the damaged file and the remedy."""
     path = Path(path)
     manifest = artifact.read_manifest(path, SCHEMA)
-    document = read_document(path, manifest, "knowledge.json")
+    document: dict[str, Any] = read_document(path, manifest, "knowledge.json")
+    shipped = [
+        unpacked(read_tensors(path, manifest, f"shipped{number}.safetensors"), square)
+        for number, square in enumerate(document.pop("squares"))
+    ]
     weights = read_tensors(path, manifest, "weights.safetensors")
-    specs: dict[str, tuple[str | int, ...]] = {"matrix": ("float32", "C", "d"), "embeddings": ("float16", "W", "d")}
-    channels = read_tensors(path, manifest, "channels.safetensors", specs)
-    return Knowledge(**document, weights=weights, matrix=channels["matrix"], embeddings=channels["embeddings"])
+    arrays = read_tensors(path, manifest, "answers.safetensors", SPECS)
+    values: dict[str, Any] = document | arrays
+    return Knowledge(**values, weights=weights, shipped=shipped)

@@ -5,7 +5,7 @@ from __future__ import annotations
 from chebsplat.errors import ConfigError
 from chebsplat.formats.names import suggest
 from chebsplat.pipelines.planning import sequences
-from chebsplat.pipelines.planning.plan import Overrides, Plan, Planner
+from chebsplat.pipelines.planning.plan import Overrides, Plan, Planner, merged, overrides
 from chebsplat.stages.registry import STAGES
 
 
@@ -16,11 +16,15 @@ def plans(
     ablation: str,
     running: bool = False,
     device: str = "cpu",
+    knowledge: str = "",
+    newer: bool = False,
 ) -> list[Plan]:
-    """The plan of a scene, or the plans of a sequence."""
+    """The plan of a scene, or the plans of a sequence. knowledge: `knowledge.start`, if any; newer: as of `Planner`."""
     if (scene is None) == (sequence is None):
         raise ConfigError("name one of scene= and sequence=")
-    planner = Planner(running=running, device=device)
+    if knowledge:
+        settings = merged(overrides(settings), {"knowledge": {"start": knowledge}})
+    planner = Planner(running=running, device=device, newer=newer)
     try:
         if sequence is not None:
             return sequences.chain(planner, sequence, settings, ablation)

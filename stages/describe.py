@@ -1,45 +1,44 @@
-"""describe: anisotropic Chebyshev descriptors of the initial Gaussians (Eqs 1-6)."""
+"""describe: the shape about each point of a surface: Chebyshev descriptors at four radii (Eqs 1-6)."""
 
 from __future__ import annotations
 
 import numpy as np
 
 from chebsplat.errors import DataFailure
-from chebsplat.formats.descriptors import Descriptors, write_descriptors
+from chebsplat.formats.capture import Capture
+from chebsplat.formats.descriptors import Descriptors
 from chebsplat.formats.points import Points
-from chebsplat.shape.descriptor import describe_members
-from chebsplat.shape.regions import regions_of
-from chebsplat.splats.gaussians import activated, initial_gaussians
+from chebsplat.shape.point_inputs import N_OWN, RADII, point_inputs
 from chebsplat.stages.runtime.command import Job
+from chebsplat.stages.shape_models.surfaces import Cloud, scene_unit, surface_in, up_of
 
 
 def run(job: Job) -> None:
-    """Anisotropic Chebyshev descriptors of regions of the initial Gaussians (Eqs 1-6; docs/method.md, section 2).
+    """What the point encoder sees of the points that depth or a sweep shows (docs/method.md, section 2).
 
-    Reads `points`. Writes `descriptors`.
+    Reads `capture` and `points`. Writes `descriptors`. They are of no point where a scene shows too
+    little of a surface.
     """
-    settings = job.config.describe
-    points = Points.read(job.inputs["points"])
-    if len(points.means) == 0:
-        raise DataFailure("the points artifact holds no points; nothing can be described")
-    raw = initial_gaussians(points.means, points.colors, points.covariances)
-    regions = regions_of(points.means, settings)
-    # Centred in float64, and only then float32: far from the origin the fractions would be lost.
-    means = (points.means - points.means.mean(0)).astype(np.float32)
-    _, quats, scales, _ = activated(raw)
-    described = describe_members(means, quats.numpy(), scales.numpy(), regions.members, settings)
-    values = described.values
-    if not np.isfinite(values).all():
-        bad = int(np.sum(~np.isfinite(values).all((1, 2, 3))))
-        raise DataFailure(f"{bad} of {len(values)} regions have non-finite descriptors")
+    settings, capture, points = (
+        job.config.describe,
+        Capture.read(job.inputs["capture"]),
+        Points.read(job.inputs["points"]),
+    )
+    unit, unit_from = scene_unit(capture, points.means)
+    up, sure = up_of(points.cam_from_world)
+    notes = {"up_confidence": round(sure, 3), "unit_from": unit_from, "settings": settings.model_dump(mode="json")}
+    try:
+        cloud, notes["of"] = surface_in(capture, points, unit)
+    except DataFailure as error:
+        job.left_out("knowledge of shape", str(error))
+        notes["none"] = str(error)
+        cloud = Cloud(np.zeros((0, 3)), np.zeros((0, 3)), np.zeros((0, 3, 3)))
     if settings.n_angles == 1:
         job.left_out("rotations", "describe.n_angles is 1")
-    job.facts |= {
-        "n_in_float64": described.n_exact,
-        "n_regions": len(values),
-        "radius": regions.radius,
-        "n_values": int(np.prod(values.shape[2:])),
-    }
-    facts = settings.model_dump(mode="json") | {"radius": regions.radius, "share": regions.share}
-    record = Descriptors(regions.centers, regions.members, values, facts)
-    write_descriptors(job.out, record)
+    inputs = point_inputs(*cloud, up=up, unit=unit, describe=settings)
+    origin = cloud.means.mean(0) if len(cloud.means) else np.zeros(3)
+    if not np.isfinite(inputs.descriptors).all():
+        bad = int(np.sum(~np.isfinite(inputs.descriptors).all(1)))
+        raise DataFailure(f"{bad} of {len(inputs.own)} points have descriptors that are not finite; report this")
+    job.facts |= {"n_points": len(inputs.own), "unit": unit, "radii": RADII, "n_own": N_OWN} | notes
+    Descriptors(*inputs, origin.tolist(), up.tolist(), unit, notes).write(job.out)

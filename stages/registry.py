@@ -2,11 +2,20 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any
 
+MANY = "lesson"  # the role of which a stage may read many
+LESSON = f"{MANY}-"  # begins the roles of lessons, each followed by its key
+OF_KNOWLEDGE = ("describe", "encode", "learn", "recall", "onnx")
 MODEL_FREE = ("labels", "given", "none")  # kinds of teacher that run no model
+
+
+def lesson_paths(paths: Mapping[str, Path]) -> dict[str, Path]:
+    """Inputs of the stage `recall` from lessons by key."""
+    return {LESSON + key: path for key, path in paths.items()}
 
 
 @dataclass(frozen=True)
@@ -22,9 +31,15 @@ class Stage:
 
     of_scene: bool = True  # false: never a part of a scene's run, only what such a run is given
     after: tuple[str, ...] = ()  # stages of the scene that come first, although nothing of theirs is read
-    only_asked: bool = False  # no other stage and no report reads it: made where it is asked for by name
     on_device: bool = False  # computes on a GPU where one is used, to other bytes than the CPU's: the key says so then
     device_packages: tuple[str, ...] = ()  # what it computes with there
+
+    def schemas(self, roles: Iterable[str]) -> dict[str, str]:
+        """What each role of an input must be of; of `lesson-KEY`, one of many, what `lesson` is.
+
+        Raises: KeyError on a role that the stage has not.
+        """
+        return {role: STAGES[self.roles[role.partition("-")[0]]].schema for role in roles}
 
     def device(self, wanted: str, sections: Mapping[str, Any]) -> str:
         """What computes it, where `wanted` is there: that, or the CPU, where its settings make no use of a GPU."""
@@ -51,10 +66,20 @@ STAGES: dict[str, Stage] = {
         Stage("agree", "chebsplat.agreement/2", ("agree",),
               (("capture", "ingest"), ("points", "sfm"), ("features", "teacher")),
               help="How far views agree on what the same points are: whether the teacher knows the scene."),
-        Stage("teach", "chebsplat.knowledge/1", ("knowledge",), (("channels", "channels"),), of_scene=False,
-              help="Knowledge that scenes start from: a point encoder, taught over generated rooms."),
-        Stage("describe", "chebsplat.descriptors/1", ("describe",), (("points", "sfm"),), only_asked=True,
-              help="Anisotropic Chebyshev descriptors of the initial Gaussians (Eqs 1-6)."),
+        Stage("teach", "chebsplat.knowledge/2", ("teach",), (("channels", "channels"),), of_scene=False,
+              help="The encoder of shape that scenes start from, taught over generated rooms."),
+        Stage("describe", "chebsplat.descriptors/2", ("describe",), (("capture", "ingest"), ("points", "sfm")),
+              help="Anisotropic Chebyshev descriptors of the surface's points at four radii (Eqs 1-6)."),
+        Stage("encode", "chebsplat.encoding/1", (), (("descriptors", "describe"), ("start", "teach")),
+              help="Features of the shape about each point, by the knowledge's transformers (Eq 7)."),
+        Stage("learn", "chebsplat.lesson/1", ("scene", "learn"),
+              (("capture", "ingest"), ("points", "sfm"), ("descriptors", "describe"), ("encoding", "encode"),
+               ("features", "teacher"), ("start", "teach")),
+              help="What the scene teaches about shape, for the scenes after it."),
+        Stage("recall", "chebsplat.knowledge/2", (), (("start", "teach"),), (("lesson", "learn"),),
+              help="What the scene starts from: what ships, and the lessons that it is pinned to (Eqs 14-15)."),
+        Stage("onnx", "chebsplat.encoder/3", (), (("knowledge", "recall"), ("descriptors", "describe")),
+              help="The encoder of shape and the scene's knowledge as one ONNX graph, compared with torch."),
         Stage("train", "chebsplat.gaussians/2", ("describe", "train"),
               (("capture", "ingest"), ("points", "sfm")),
               (("features", "teacher"), ("earlier", "train")), after=("agree",), on_device=True,
@@ -63,7 +88,8 @@ STAGES: dict[str, Stage] = {
               (("capture", "ingest"), ("gaussians", "train"), ("features", "teacher")),
               help="Features of the teacher on trained Gaussians, and how much the views agree, without training."),
         Stage("refine", "chebsplat.refined/2", ("refine",), (("gaussians", "train"), ("lifted", "lift")),
-              (("capture", "ingest"), ("points", "sfm"), ("features", "teacher"), ("knowledge", "teach")),
+              (("capture", "ingest"), ("descriptors", "describe"), ("encoding", "encode"), ("features", "teacher"),
+               ("knowledge", "recall")),
               help="Smooth the features of a finished scene and blend them with knowledge, as its training views ask."),
         Stage("export", "chebsplat.scene/3", (), (("gaussians", "train"),),
               (("features", "teacher"), ("lifted", "lift"), ("refined", "refine")),
@@ -73,7 +99,9 @@ STAGES: dict[str, Stage] = {
               help="Measure the exported scene on the test views."),
         Stage("report", "chebsplat.report/1", (), (("evaluation", "evaluate"), ("gaussians", "train")),
               (("capture", "ingest"), ("points", "sfm"), ("channels", "channels"), ("features", "teacher"),
-               ("agreement", "agree"), ("lifted", "lift"), ("refined", "refine"), ("scene", "export")),
+               ("agreement", "agree"), ("descriptors", "describe"), ("encoding", "encode"), ("learned", "learn"),
+               ("knowledge", "recall"), ("encoder", "onnx"), ("lifted", "lift"), ("refined", "refine"),
+               ("scene", "export")),
               help="One self-contained HTML page with pictures, tables and error against run time."),
     )
 }  # fmt: skip

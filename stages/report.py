@@ -15,6 +15,7 @@ from chebsplat.formats.gaussians import Gaussians
 from chebsplat.stages.pages import parts
 from chebsplat.stages.pages import pictures as draw
 from chebsplat.stages.pages.parts import REPORT, rendered
+from chebsplat.stages.pages.started import started
 from chebsplat.stages.runtime.command import Job
 
 N_PICTURES = 4  # test views in the report
@@ -25,6 +26,11 @@ STAGE_OF = {
     "channels": "channels",
     "features": "teacher",
     "agreement": "agree",
+    "descriptors": "describe",
+    "encoding": "encode",
+    "learned": "learn",
+    "knowledge": "recall",
+    "encoder": "onnx",
     "gaussians": "train",
     "lifted": "lift",
     "refined": "refine",
@@ -45,14 +51,16 @@ FRAMES = {"color": "colour", "color_and_features": "colour and features"}
 def run(job: Job) -> None:
     """One HTML page, and the figures as CSV, of what was measured and where it comes from.
 
-    Reads `evaluation` and `gaussians`, and of `capture`, `points`, `channels`, `features`, `agreement`, `lifted`,
-    `refined` and `scene` what there is. Writes `report`.
+    Reads `evaluation` and `gaussians`, and of `capture`, `points`, `channels`, `features`, `agreement`, `descriptors`,
+    `encoding`, `lesson`, `knowledge`, `encoder`, `lifted`, `refined` and `scene` what there is. Writes `report`.
     """
     evaluation = Evaluation.read(job.inputs["evaluation"])
     gaussians = Gaussians.read(job.inputs["gaussians"])
     if not gaussians.trace:
         raise DataFailure("the training left no trace of error against run time; train the scene again")
     manifests = {role: read_manifest(job.inputs[role]) for role in STAGE_OF if role in job.inputs}
+    if "knowledge" in manifests and manifests["knowledge"].stage != STAGE_OF["knowledge"]:
+        del manifests["knowledge"]  # it ships, or was given: no stage of this scene has made it
     facts, figures = {role: manifest.facts for role, manifest in manifests.items()}, evaluation.figures
     left_out = absent_stages(job, gaussians) | figures["left_out"]
     for of_input in facts.values():
@@ -90,6 +98,7 @@ def run(job: Job) -> None:
         total=sum(seconds for _, seconds, *_ in stages),
         left_out=sorted(left_out.items()),
         decided=decided_rows(facts["gaussians"]),
+        started=started(job.inputs, facts),
         versions=sorted(versions.items()),
         code=next((m.code for m in manifests.values() if "commit" in m.code), None),
         settings=json.dumps(settings, indent=1, sort_keys=True),

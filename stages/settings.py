@@ -163,32 +163,43 @@ class RefineSection(Section):
     smooth: Literal["auto", "on", "off"] = setting(
         "auto", "bilateral smoothing; auto: where half the training views agree better with it with the other half"
     )
-    knowledge: Text | None = setting(
-        None,
-        "folder of a knowledge artifact (`chebsplat knowledge`), or none; default: the one that is shipped for the "
-        "teacher",
-    )
-    surface: Literal["depth", "rendered"] = setting(
-        "depth",
-        "whose shape knowledge is asked of: the capture's depth, or that of a sweep of its photos; or what Gaussians "
-        "show, where it has none",
-    )
 
     @property
     def changes_nothing(self) -> bool:
-        """True where features stay as the training left them."""
-        return (self.start, self.smooth, self.knowledge) == ("trained", "off", "none")
+        """True where features stay as the training left them, if there is no knowledge either."""
+        return (self.start, self.smooth) == ("trained", "off")
 
 
 class KnowledgeSection(Section):
-    """What scenes start from: a point encoder, taught once a teacher over generated rooms."""
+    """docs/method.md, section 14."""
+
+    start: Text = setting(
+        "rooms",
+        "what a scene starts from: none; shipped, to which nothing is added; the name of a set of lessons in the "
+        "work folder, which its own joins; or folder/ of a knowledge artifact",
+    )
+
+
+class LearnSection(Section):
+    """docs/method.md, section 14."""
+
+    points: Text | None = setting(
+        None, "a CSV of x, y, z in the scene's frame and a word: only these points teach; default: what views say"
+    )
+
+
+class TeachSection(Section):
+    """The encoder that ships: taught once, over generated rooms."""
 
     model: Text | None = setting(None, ".onnx of the teacher; default: the embedded one")
     n_rooms: int = number(80, "generated rooms to teach on", 1, 900)
     n_held_out: int = number(8, "rooms that the card's figures are of; eight kinds of room take turns", 1, 100)
     n_views: int = number(40, "photos of a room", 2, 1000)
     n_points: int = number(14_500, "points of a room, drawn within 0.62 to 1.38 of it", 100, 200_000)
-    steps: int = number(8000, "of teaching", 1, 1_000_000)
+    steps: int = number(6000, "of teaching", 1, 1_000_000)
+    without: Literal["nothing", "descriptor", "transformer"] = setting(
+        "nothing", "what the encoder does without, to measure it by: it sees no descriptors; it pools its neighbours"
+    )
     seed: int = seed("of what is drawn in teaching")
 
 

@@ -1,11 +1,11 @@
-"""teach: knowledge that scenes start from: a point encoder, taught over generated rooms what a 2D teacher says of them.
+"""teach: the encoder that scenes start from, taught over generated rooms what a 2D teacher says of them, and what these
+rooms teach as lessons.
 
 See docs/method.md, section 14.
 """
 
 from __future__ import annotations
 
-import json
 import logging
 import multiprocessing
 import os
@@ -19,22 +19,36 @@ import torch
 
 from chebsplat.errors import ConfigError, DataFailure, InputError
 from chebsplat.formats.channels import ChannelMap
-from chebsplat.formats.knowledge import ENCODER, Knowledge, write_knowledge
+from chebsplat.formats.knowledge import Knowledge, write_knowledge
 from chebsplat.formats.teacher_model import EMBEDDED, TeacherModel, read_label_table, read_teacher
 from chebsplat.labels.decode import decode_labels
 from chebsplat.settings import DescribeSection
 from chebsplat.shape import point_encoder
-from chebsplat.shape.point_encoder import LEAST_VIEWS, Lesson, PointEncoder, cloud_of
-from chebsplat.shape.point_inputs import PointInputs
+from chebsplat.shape.lessons import (
+    LEAST_VIEWS,
+    Sums,
+    basis,
+    combined,
+    mapped,
+    novelty,
+    odds,
+    scale_of,
+    scaled_novelty,
+    summed,
+)
+from chebsplat.shape.point_encoder import Example, PointEncoder, cloud_of
 from chebsplat.stages.runtime.command import Job, n_threads
-from chebsplat.stages.settings import KnowledgeSection
+from chebsplat.stages.settings import TeachSection
+from chebsplat.stages.shape_models.answers import SEEN, units
 from chebsplat.stages.shape_models.teaching_rooms import Room, held, kept_as, prepare
 from chebsplat.stages.teacher_models.text_encoder import found, text_embeddings
 from chebsplat.synthetic import CLASS_NAMES
 from chebsplat.synthetic.layout import KNOWLEDGE
 
 log = logging.getLogger("chebsplat")
-TOLERANCE = 1e-5  # of the ONNX file: largest difference from torch
+KINDS = ("held_out", "held_out_worn", "held_out_few", "held_out_swept")
+N_DRAWN = 3000  # points of a room that its lesson is of
+PARTS = 2  # that the rooms' sums are kept in
 
 
 def run(job: Job) -> None:
@@ -42,55 +56,74 @@ def run(job: Job) -> None:
 
     Reads `channels`. Writes `knowledge`. Rooms that are finished survive a kill.
     """
-    settings, channels = job.config.knowledge, ChannelMap.read(job.inputs["channels"])
+    settings, channels = job.config.teach, ChannelMap.read(job.inputs["channels"])
     teacher = read_teacher(Path(settings.model) if settings.model else EMBEDDED)
     if teacher.output != "features":
         raise ConfigError(f"{teacher.settings}: output is {teacher.output}; knowledge is taught in features")
     if channels.notes.get("digest") != teacher.digest():
         raise InputError(f"{job.inputs['channels']} is of another teacher than {teacher.path}; pass its own")
-    clean, worn, few, swept = zip(*prepared(job, settings, channels.matrix), strict=True)
-    taught_on, tested_on = slice(settings.n_rooms), slice(settings.n_rooms, None)
+    rooms = prepared(job, settings, channels.matrix)
+    lessons, tested = rooms[: settings.n_rooms], rooms[settings.n_rooms :]
     words, embeddings = vocabulary(teacher, list(CLASS_NAMES), channels.matrix)
     named = found(list(CLASS_NAMES), words)
     if -1 in named:
         job.left_out("figures on rooms held out", f"the teacher has no word for {CLASS_NAMES[named.index(-1)]}")
     classes = embeddings if -1 in named else embeddings[named]
-    kinds = (clean, worn, few, swept)
-    lessons = [lesson_of(room, classes) for rooms in kinds for room in rooms[taught_on]]
-    if bare := sum(bool((lesson.n_views < LEAST_VIEWS).all()) for lesson in lessons):
-        raise DataFailure(f"{bare} rooms have no point that {LEAST_VIEWS} photos see; raise knowledge.n_views")
-    encoder = taught(job, settings, lessons)
+    examples = [example_of(room, classes) for kinds in zip(*lessons, strict=True) for room in kinds]
+    if bare := sum(bool((example.n_views < LEAST_VIEWS).all()) for example in examples):
+        raise DataFailure(f"{bare} rooms have no point that {LEAST_VIEWS} photos see; raise teach.n_views")
+    encoder = taught(job, settings, examples)
+    weights = {name: value.numpy() for name, value in encoder.state_dict().items() if not name.startswith("head.")}
+    of_rooms = [mean_lesson(job, encoder, lessons[part::PARTS], classes) for part in range(min(PARTS, len(lessons)))]
+    found_map = mapped(of_rooms, [], []).astype(np.float32)
+    whole = combined(of_rooms, [1 / len(of_rooms)] * len(of_rooms))
+    scale = scale_of(whole)
+    known = basis(whole, scale)
     card = settings.model_dump(mode="json", exclude={"model", "seed"})
-    if -1 not in named:
-        names = ("held_out", "held_out_worn", "held_out_few", "held_out_swept")
-        card |= {of: measured(encoder, rooms[tested_on], classes) for of, rooms in zip(names, kinds, strict=True)}
+    newest: dict[str, float] = {}
+    for name, of in zip(KINDS, zip(*tested, strict=True), strict=True):
+        encoded = [encoder.encode(room.inputs) for room in of]
+        sums = [lesson_of(z, room, classes) for z, room in zip(encoded, of, strict=True)]
+        newest[name] = max(scaled_novelty(novelty(one, scale, known), one.spread()) for one in sums)
+        if -1 not in named:
+            card[name] = measured([z @ found_map[:, : len(classes[0])] for z in encoded], of, classes)
+    card["novelty"] = newest
     job.facts |= card
-    weights = {name: value.numpy() for name, value in encoder.state_dict().items()}
-    describe = DescribeSection().model_dump(mode="json")
-    job.facts["largest_difference"] = exported(job, encoder, clean[0].inputs)
-    of = teacher.name, teacher.digest(), encoder.settings, weights
-    write_knowledge(job.out, Knowledge(*of, channels.matrix, describe, words, embeddings.astype(np.float16), card))
+    describe = {name: value for name, value in DescribeSection().model_dump(mode="json").items() if name in SEEN}
+    write_knowledge(
+        job.out,
+        Knowledge(
+            teacher.name, teacher.digest(), encoder.settings, weights, channels.matrix, describe, words,
+            embeddings.astype(np.float16), found_map, known.astype(np.float32), scale.astype(np.float32), card,
+            shipped=[(of.gram, of.cross, of.square) for of in of_rooms],
+        ),
+    )  # fmt: skip
 
 
-def exported(job: Job, encoder: PointEncoder, inputs: PointInputs) -> float:
-    """Write the encoder in ONNX; its largest difference from torch on a room's points.
+def mean_lesson(job: Job, encoder: PointEncoder, rooms: Sequence[Sequence[Room]], embeddings: np.ndarray) -> Sums:
+    """The mean lesson of rooms, each as depth has it, worn, half seen and swept."""
+    flat = [room for kinds in rooms for room in kinds]
+    parts = (drawn_lesson(encoder, room, embeddings) for room, _ in job.progress.track(flat, len(flat), "lessons"))
+    total = combined([next(parts)], [1 / len(flat)])
+    for one in parts:
+        total = combined([total, one], [1.0, 1 / len(flat)])
+    return total
 
-    Raises: DataFailure where that is more than TOLERANCE.
-    """
-    import onnx
-    import onnxruntime
 
-    from chebsplat.stages.shape_models.point_graph import point_contract, point_model
+def drawn_lesson(encoder: PointEncoder, room: Room, embeddings: np.ndarray) -> Sums:
+    """What N_DRAWN points of a room teach, drawn by how much each teaches: among many rooms as good as all of them."""
+    labels = decode_labels(room.features, embeddings)
+    chances = odds(room.n_views, labels)
+    rows = np.random.default_rng(0).choice(len(chances), N_DRAWN, p=chances)
+    meanings = np.concatenate([room.features[rows], units(embeddings)[labels[rows]]], 1)
+    return summed(encoder.encode(room.inputs, rows), meanings, np.ones(N_DRAWN))
 
-    path, model = job.out / ENCODER, point_model(encoder)
-    onnx.helper.set_model_props(model, {"chebsplat.contract": json.dumps(point_contract(encoder))})
-    onnx.save(model, path)
-    runner = onnxruntime.InferenceSession(str(path), providers=["CPUExecutionProvider"])
-    answers = runner.run(None, {name: value.numpy() for name, value in cloud_of(inputs)._asdict().items()})[0]
-    difference = float(np.abs(answers - encoder.predict(inputs)).max())
-    if not difference <= TOLERANCE:
-        raise DataFailure(f"{ENCODER} differs from torch by {difference:.1e}, more than {TOLERANCE:.1e}; report this")
-    return difference
+
+def lesson_of(z: np.ndarray, room: Room, embeddings: np.ndarray) -> Sums:
+    """What one room teaches, by its features of shape [N, p]."""
+    labels = decode_labels(room.features, embeddings)
+    meanings = np.concatenate([room.features, units(embeddings)[labels]], 1)
+    return summed(z, meanings, odds(room.n_views, labels))
 
 
 def vocabulary(teacher: TeacherModel, names: list[str], matrix: np.ndarray) -> tuple[list[str], np.ndarray]:
@@ -99,7 +132,7 @@ def vocabulary(teacher: TeacherModel, names: list[str], matrix: np.ndarray) -> t
     return words, text_embeddings(words, teacher) @ matrix
 
 
-def prepared(job: Job, settings: KnowledgeSection, matrix: np.ndarray) -> list[list[Room]]:
+def prepared(job: Job, settings: TeachSection, matrix: np.ndarray) -> list[list[Room]]:
     """The rooms to teach on, then those held out: clean, worn, half seen, swept; a process for each thread."""
     seeds = [*KNOWLEDGE[: settings.n_rooms], *KNOWLEDGE[-settings.n_held_out :]]
     folder = job.scratch / "rooms"
@@ -116,33 +149,34 @@ def prepared(job: Job, settings: KnowledgeSection, matrix: np.ndarray) -> list[l
     return [held(folder, seed) for seed in seeds]
 
 
-def lesson_of(room: Room, embeddings: np.ndarray) -> Lesson:
-    """A room as it is taught: labels are the teacher's."""
+def example_of(room: Room, embeddings: np.ndarray) -> Example:
+    """A room as the encoder is taught it: labels are the teacher's."""
     labels = decode_labels(room.features, embeddings)
-    return Lesson(cloud_of(room.inputs), torch.from_numpy(room.features), room.n_views, labels)
+    return Example(cloud_of(room.inputs), torch.from_numpy(room.features), room.n_views, labels)
 
 
-def taught(job: Job, settings: KnowledgeSection, lessons: list[Lesson]) -> PointEncoder:
+def taught(job: Job, settings: TeachSection, examples: list[Example]) -> PointEncoder:
     """The encoder after the whole course."""
     torch.set_num_threads(n_threads())
     torch.manual_seed(settings.seed)
-    clouds = [lesson.cloud for lesson in lessons]
-    encoder = PointEncoder(lessons[0].features.shape[1], clouds[0].descriptors.shape[1])
+    clouds = [example.cloud for example in examples]
+    n_descriptors = 0 if settings.without == "descriptor" else clouds[0].descriptors.shape[1]
+    attends = settings.without != "transformer"
+    encoder = PointEncoder(examples[0].features.shape[1], n_descriptors, attends=attends)
     encoder.set_inputs(clouds)
     course = point_encoder.Course(steps=settings.steps, seed=settings.seed)
     losses: deque[float] = deque(maxlen=100)
-    steps = point_encoder.taught(encoder, lessons, course)
+    steps = point_encoder.taught(encoder, examples, course)
     for loss, status in job.progress.track(steps, settings.steps, "teach"):
         losses.append(loss)
         status["mean loss"] = f"{sum(losses) / len(losses):.4f}"
     return encoder.eval()
 
 
-def measured(encoder: PointEncoder, rooms: Sequence[Room], embeddings: np.ndarray) -> dict[str, float]:
+def measured(answers: Sequence[np.ndarray], rooms: Sequence[Room], embeddings: np.ndarray) -> dict[str, float]:
     """Of points of rooms held out, the share whose label is right: by the teacher's averages, by shape, and by both."""
     right: dict[str, list[float]] = {"teacher": [], "shape": [], "both": []}
-    for room in rooms:
-        shape = encoder.predict(room.inputs)
+    for shape, room in zip(answers, rooms, strict=True):
         known = (room.labels >= 0) & (room.n_views > 0)
         for name, features in (("teacher", room.features), ("shape", shape), ("both", room.features + shape)):
             right[name].append(float((decode_labels(features, embeddings) == room.labels)[known].mean()))

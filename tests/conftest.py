@@ -26,7 +26,7 @@ def toy(tmp_path_factory):
     root = tmp_path_factory.mktemp("toy")
     model, reference = knowing_rooms(color_teacher(root)), color_reference(root / "reference")
     config = TOY | {"channels": {"model": str(model), "reference": str(reference)}}
-    config["knowledge"] = TOY["knowledge"] | {"model": str(model)}
+    config["teach"] = TOY["teach"] | {"model": str(model)}
     made = {}
     for stage, roles in INPUTS.items():
         made[stage] = root / stage

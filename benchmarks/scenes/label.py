@@ -26,7 +26,7 @@ from chebsplat.formats.ply import write_ply
 from chebsplat.lifting.observations import to_cells
 from chebsplat.rasterize.lift import lift
 from chebsplat.splats.gaussians import activated
-from chebsplat.stages.shape_models.predictions import up_of
+from chebsplat.stages.shape_models.surfaces import up_of
 from chebsplat.stages.tools.lift_ply import label_ply
 
 SCENES = {"office0": 0.8, "room0": 0.8, "shuffled0": 0.8, "shuffled1": 0.8, "kitchen": 0.6}  # and what is asked of each

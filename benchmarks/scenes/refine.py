@@ -1,8 +1,7 @@
-"""Error against run time of what follows a training: the lift, smoothing, and knowledge by encoders of several sizes.
+"""Error against run time of what follows a training: the lift, smoothing, and knowledge of shape.
 
 mIoU is of rendered test views, beside the processor seconds that each form takes once kernels are compiled, all that it
-needs included: knowledge needs the lift, for its evidence, and smoothing. Encoders are taught alike, for a short course
-on a few rooms; the shipped one, longer, on many. Figures and picture go to `--out`.
+needs included: knowledge needs the lift, for its evidence, and smoothing. Figures and picture go to `--out`.
 """
 
 from __future__ import annotations
@@ -15,36 +14,25 @@ from typing import Any, TypeVar
 import numpy as np
 
 from benchmarks import shared
-from benchmarks.teachers.teaching import made, taught
 from chebsplat.evaluation.metrics import confusion, segmentation
 from chebsplat.formats.capture import Capture
+from chebsplat.formats.descriptors import Descriptors
 from chebsplat.formats.features import Features
 from chebsplat.formats.gaussians import Gaussians
 from chebsplat.formats.knowledge import SHIPPED, read_knowledge
-from chebsplat.formats.points import Points
 from chebsplat.labels.decode import decode_labels
 from chebsplat.lifting.blend import blend, calibrate, effective, familiar, reliable, trusted
 from chebsplat.lifting.observations import carry
 from chebsplat.lifting.smoothing import affinities, smooth
 from chebsplat.render import SceneRenderer
-from chebsplat.shape.point_encoder import PointEncoder
-from chebsplat.shape.point_inputs import point_inputs
 from chebsplat.splats.gaussians import surface_of
 from chebsplat.stages.evaluate import camera
 from chebsplat.stages.runtime.progress import Progress
-from chebsplat.stages.settings import KnowledgeSection, LiftSection
-from chebsplat.stages.shape_models.predictions import into_channels, up_of
-from chebsplat.stages.teacher_models.text_encoder import found
+from chebsplat.stages.settings import LiftSection
+from chebsplat.stages.shape_models.answers import answered, inputs_of, into_channels
+from chebsplat.stages.shape_models.surfaces import in_scene
 from chebsplat.stages.training.lifting import lifted_from
-from chebsplat.synthetic import CLASS_NAMES
-from chebsplat.synthetic.layout import KNOWLEDGE
 
-SIZES: dict[str, dict[str, Any]] = {
-    "1 radius": {"n_scales": 1},
-    "2 radii": {"n_scales": 2},
-    "4 radii, 8 wide": {"hidden": 8},
-    "4 radii, 32 wide": {},
-}
 Result = TypeVar("Result")
 
 
@@ -53,7 +41,7 @@ class Scene:
 
     def __init__(self, work: Path):
         self.capture, self.gaussians = Capture.read(work / "ingest"), Gaussians.read(work / "train")
-        self.points, self.taught = Points.read(work / "sfm"), Features.read(work / "teacher")
+        self.taught = Features.read(work / "teacher")
         parameters = self.gaussians.parameters
         self.means, self.surface = parameters["means"], surface_of(parameters)
         self.features: np.ndarray = parameters["features"]
@@ -84,15 +72,8 @@ def timed(make: Callable[[], Result]) -> tuple[Result, float]:
 
 def main(arguments: Sequence[str]) -> None:
     parser = shared.parser("refine", __doc__, work=True)
-    parser.add_argument("--rooms", type=int, default=8, help="that the encoders by size are taught on")
-    parser.add_argument("--steps", type=int, default=400)
-    parser.add_argument("--rooms-in", type=Path, default=Path("build/bench/teaching"))
     options = parser.parse_args(arguments)
     scene, shipped = Scene(options.work), read_knowledge(SHIPPED)
-    words = shipped.embeddings[found(list(CLASS_NAMES), shipped.words)].astype(np.float32)
-    rooms = made(options.rooms_in, KNOWLEDGE[: options.rooms], KnowledgeSection(), shipped.matrix)
-    encoders = {name: taught(rooms, variant, options.steps, words, 0)[0] for name, variant in SIZES.items()}
-    encoders["as shipped"] = PointEncoder.restored(shipped.encoder, shipped.weights)
     told = scene.capture, scene.gaussians.cameras, scene.gaussians.parameters, scene.taught
     lifted, to_lift = timed(lambda: lifted_from(*told, LiftSection().gate, Progress(False)))
     near, to_compare = timed(lambda: affinities(scene.means, *scene.surface))
@@ -107,28 +88,25 @@ def main(arguments: Sequence[str]) -> None:
     add("features as trained", 0.0, scene.features)
     add("lifted features", to_lift, lifted.features)
     add("smoothed", to_lift + to_compare + to_smooth, smoothed)
-    translated, (up, _) = into_channels(SHIPPED, shipped, scene.taught), up_of(scene.points.cam_from_world)
-    points = scene.points.means, scene.points.normals, scene.points.covariances
-    for name, encoder in encoders.items():
+    translated, described = into_channels(SHIPPED, shipped, scene.taught), Descriptors.read(options.work / "describe")
+    inputs, (means, normals) = inputs_of(SHIPPED, described, shipped), in_scene(described)
 
-        def known(encoder: PointEncoder = encoder) -> np.ndarray:
-            inputs = point_inputs(*points, up=up, n_scales=encoder.settings["n_scales"])
-            answers = translated(encoder.predict(inputs))
-            return carry(answers, *points[:2], scene.means, scene.surface[0])[0]
+    def known() -> np.ndarray:
+        return carry(translated(answered(shipped, inputs)), means, normals, scene.means, scene.surface[0])[0]
 
-        knowledge, to_know = timed(known)
+    knowledge, to_know = timed(known)
 
-        def blended(knowledge: np.ndarray = knowledge) -> np.ndarray:
-            chosen = calibrate(lifted.halves, lifted.half_views, near, knowledge)
-            evidence = effective(lifted.n_views) * reliable(lifted.halves, lifted.half_views)
-            evidence = evidence * familiar(lifted.features, knowledge, scene.taught.label_embeddings)
-            start = smoothed if chosen.smooth else scene.features
-            result = blend(start, evidence, knowledge, chosen.strength)
-            votes = evidence + trusted(knowledge, chosen.strength)
-            return smooth(result, votes, near) if chosen.smooth else result
+    def blended() -> np.ndarray:
+        chosen = calibrate(lifted.halves, lifted.half_views, near, knowledge)
+        evidence = effective(lifted.n_views) * reliable(lifted.halves, lifted.half_views)
+        evidence = evidence * familiar(lifted.features, knowledge, scene.taught.label_embeddings)
+        start = smoothed if chosen.smooth else scene.features
+        result = blend(start, evidence, knowledge, chosen.strength)
+        votes = evidence + trusted(knowledge, chosen.strength)
+        return smooth(result, votes, near) if chosen.smooth else result
 
-        result, to_blend = timed(blended)
-        add(f"and knowledge: {name}", to_lift + to_compare + to_smooth + to_know + to_blend, result)
+    result, to_blend = timed(blended)
+    add("and knowledge", to_lift + to_compare + to_smooth + to_know + to_blend, result)
     shared.write_csv(options.out / "refine.csv", rows)
     draw(options.out / "refine.png", rows, options.work.resolve().name)
 

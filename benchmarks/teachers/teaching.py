@@ -1,10 +1,10 @@
-"""What an encoder of points owes to rooms, radii, descriptor and size: error on rooms held out, against seconds.
+"""What an encoder of points owes to its transformers and its descriptors: error on rooms held out, against seconds.
 
-Rooms are made once and kept (--rooms-in). Variants are taught alike, with each seed; a figure is the mIoU of a room's
-points that some view sees, averaged over the rooms held out and the seeds: of shape alone, where depth shows the room,
-where few photos do, and where a sweep of its photos does; and of both, blended with the teacher's averages as in a
-scene whose training views ask for k = 2. In brackets the difference to the first variant, with its 95 % interval over
-rooms.
+Rooms are made once and kept (--rooms-in). Variants are taught alike, with each seed, have as many features, and answer
+by the map that the rooms' lessons give in closed form. A figure is the mIoU of a room's points that some view sees,
+averaged over the rooms held out and the seeds: of shape alone, where depth shows the room, where few photos do, and
+where a sweep of its photos does; and of both, blended with the teacher's averages as in a scene whose training views
+ask for k = 2. In brackets the difference to pooling, with its 95 % interval over rooms.
 """
 
 from __future__ import annotations
@@ -23,19 +23,34 @@ import torch
 from benchmarks import shared
 from chebsplat.evaluation.metrics import confusion, segmentation
 from chebsplat.evaluation.statistics import paired_difference
+from chebsplat.formats.capture import Capture
+from chebsplat.formats.descriptors import Descriptors
+from chebsplat.formats.features import Features
 from chebsplat.formats.knowledge import SHIPPED, read_knowledge
+from chebsplat.formats.points import Points
 from chebsplat.labels.decode import decode_labels
+from chebsplat.lifting.averages import averaged
 from chebsplat.lifting.blend import blend, effective
+from chebsplat.pipelines.work.finished import artifact_of
 from chebsplat.shape import point_encoder
+from chebsplat.shape.lessons import RIDGE, combined, solved
 from chebsplat.shape.point_encoder import PointEncoder
 from chebsplat.shape.point_inputs import PointInputs
-from chebsplat.stages.settings import KnowledgeSection
+from chebsplat.stages.settings import TeachSection
+from chebsplat.stages.shape_models.surfaces import in_scene
 from chebsplat.stages.shape_models.teaching_rooms import Room, held, prepare
-from chebsplat.stages.teach import lesson_of
+from chebsplat.stages.teach import drawn_lesson, example_of
 from chebsplat.stages.teacher_models.text_encoder import found
 from chebsplat.synthetic import CLASS_NAMES
 from chebsplat.synthetic.layout import KNOWLEDGE
 
+BASELINE = "pooling"
+VARIANTS: dict[str, dict[str, Any]] = {
+    BASELINE: {"attends": False},
+    "transformers": {},
+    "transformers, no descriptor": {"described": False},
+    "pooling, no descriptor": {"attends": False, "described": False},
+}
 K = 2.0  # views that knowledge counts for
 KINDS = {"depth": 0, "few photos": 2, "swept": 3}  # of `rooms_of` that are measured
 
@@ -50,7 +65,7 @@ def scores(features: Sequence[np.ndarray], rooms: Sequence[Room], embeddings: np
     return figures
 
 
-def made(folder: Path, seeds: Sequence[int], settings: KnowledgeSection, matrix: np.ndarray) -> list[list[Room]]:
+def made(folder: Path, seeds: Sequence[int], settings: TeachSection, matrix: np.ndarray) -> list[list[Room]]:
     """The rooms of these seeds, as `rooms_of` gives them; kept in the folder."""
     folder.mkdir(parents=True, exist_ok=True)
     with ProcessPoolExecutor(torch.get_num_threads(), mp_context=get_context("spawn")) as pool:
@@ -58,33 +73,24 @@ def made(folder: Path, seeds: Sequence[int], settings: KnowledgeSection, matrix:
     return [held(folder, seed) for seed in seeds]
 
 
-def narrowed(room: Room, n_scales: int, described: bool) -> Room:
-    """The room as an encoder of fewer radii, or without descriptors, sees it."""
-    inputs = room.inputs
-    width = inputs.descriptors.shape[1] // inputs.neighbors.shape[1]
-    descriptors = inputs.descriptors[:, : n_scales * width if described else 0]
-    return room._replace(
-        inputs=PointInputs(*inputs[:3], np.ascontiguousarray(descriptors), inputs.neighbors[:, :n_scales])
-    )
-
-
 def main(arguments: Sequence[str]) -> None:
     parser = shared.parser("teaching", __doc__)
-    parser.add_argument("--rooms", type=int, nargs="*", default=[1, 4, 16, 64])
+    parser.add_argument("--rooms", type=int, default=64)
     parser.add_argument("--seeds", type=int, nargs="*", default=[0, 1, 2])
     parser.add_argument("--steps", type=int, default=1000)
     parser.add_argument("--held-out", type=int, default=8)
     parser.add_argument("--rooms-in", type=Path, default=Path("build/bench/teaching"))
+    parser.add_argument("--scenes", nargs="*", default=[], help="finished scenes of the teacher, to be measured in too")
     parser.add_argument("--only", help="variants whose names hold this")
     options = parser.parse_args(arguments)
-    knowledge = read_knowledge(SHIPPED)
+    knowledge, settings = read_knowledge(SHIPPED), TeachSection()
     embeddings = knowledge.embeddings[found(list(CLASS_NAMES), knowledge.words)].astype(np.float32)
-    most, settings = max(options.rooms), KnowledgeSection()
-    seeds = [*KNOWLEDGE[:most], *KNOWLEDGE[-options.held_out :]]
+    seeds = [*KNOWLEDGE[: options.rooms], *KNOWLEDGE[-options.held_out :]]
     rooms = made(options.rooms_in, seeds, settings, knowledge.matrix)
-    tested = {name: [room[kind] for room in rooms[most:]] for name, kind in KINDS.items()}
-    print(f"{options.steps} steps, seeds {options.seeds}, {options.held_out} rooms held out, {torch.get_num_threads()} "
-          f"threads, {shared.processor()}")  # fmt: skip
+    tested = {name: [room[kind] for room in rooms[options.rooms :]] for name, kind in KINDS.items()}
+    tested |= {name: [scene_room(name)] for name in options.scenes}
+    print(f"{options.steps} steps, seeds {options.seeds}, {options.rooms} rooms, {options.held_out} held out, "
+          f"{torch.get_num_threads()} threads, {shared.processor()}")  # fmt: skip
     rows: list[dict[str, Any]] = []
 
     def add(variant: str, measure: str, seed: int, seconds: float, values: Sequence[float]) -> None:
@@ -93,66 +99,81 @@ def main(arguments: Sequence[str]) -> None:
 
     for measure, of in tested.items():
         add("the teacher", measure, 0, 0.0, scores([room.features for room in of], of, embeddings))
-    variants: list[tuple[str, dict[str, Any]]] = [(f"{most} rooms, 4 radii", {})]
-    variants += [(f"{n} rooms", {"n_rooms": n}) for n in options.rooms if n != most]
-    variants += [(f"{n} radii", {"n_scales": n}) for n in (1, 2)]
-    variants += [(f"{n} radii, no descriptor", {"n_scales": n, "described": False}) for n in (1, 2, 4)]
-    variants += [("half as wide", {"hidden": 32}), ("twice as wide", {"hidden": 128})]
-    variants += [("no worn rooms", {"kinds": (0, 2, 3)}), ("no half-seen rooms", {"kinds": (0, 1, 3)})]
-    variants += [("no swept rooms", {"kinds": (0, 1, 2)}), ("as shipped", {})]
-    for name, variant in variants:
-        if options.only and options.only not in name and name != variants[0][0]:
+    for name, variant in VARIANTS.items():
+        if options.only and options.only not in name and name != BASELINE:
             continue
-        for seed in options.seeds[: 1 if name == "as shipped" else None]:
-            if name == "as shipped":
-                encoder, seconds = PointEncoder.restored(knowledge.encoder, knowledge.weights), 0.0
-            else:
-                encoder, seconds = taught(rooms[:most], variant, options.steps, embeddings, seed)
-            seen = variant.get("n_scales", 4), variant.get("described", True)
+        for seed in options.seeds:
+            encoder, found_map, seconds = taught(rooms[: options.rooms], variant, options.steps, embeddings, seed)
             for measure, of in tested.items():
-                answers = [encoder.predict(narrowed(room, *seen).inputs) for room in of]
+                answers = [encoder.encode(room.inputs) @ found_map[:, : embeddings.shape[1]] for room in of]
                 add(name, measure, seed, seconds, scores(answers, of, embeddings))
-                if measure == "depth":
-                    pairs = zip(of, answers, strict=True)
-                    both = [blend(room.features, effective(room.n_views), says, K) for room, says in pairs]
-                    add(name, "both", seed, seconds, scores(both, of, embeddings))
-        print(line(rows, name, variants[0][0]), flush=True)
-    print(line(rows, "the teacher", variants[0][0]))
+                pairs = zip(of, answers, strict=True)
+                both = [blend(room.features, effective(room.n_views), says, K) for room, says in pairs]
+                add(name, f"{measure}, both", seed, seconds, scores(both, of, embeddings))
+        for text in lines(rows, name):
+            print(text, flush=True)
+    for text in lines(rows, "the teacher"):
+        print(text)
     shared.write_csv(options.out / "teaching.csv", rows)
 
 
-def line(rows: Sequence[dict[str, Any]], name: str, baseline: str) -> str:
+def scene_room(name: str) -> Room:
+    """A finished scene's described points as a room: what its teacher says of each, and its true label."""
+    capture, points, features, described = (
+        kind.read(artifact_of(name, stage))
+        for kind, stage in ((Capture, "ingest"), (Points, "sfm"), (Features, "teacher"), (Descriptors, "describe"))
+    )
+    assert capture.labels is not None and capture.depth is not None and capture.class_names is not None
+    row, place = ({name: k for k, name in enumerate(names)} for names in (capture.names, features.names))
+    used = [k for k, name in enumerate(points.names) if not capture.is_test[row[name]]]
+    depth = [capture.depth[row[points.names[k]]] for k in used]
+    means, cameras = in_scene(described)[0], (points.Ks[used], points.cam_from_world[used])
+    said = [features.features[place[points.names[k]]].astype(np.float32) for k in used]
+    mean, n_views = averaged(means, depth, said, features.features.shape[-1], *cameras)
+    known = found(capture.class_names, list(CLASS_NAMES))
+    one_hot = np.eye(len(CLASS_NAMES) + 1, dtype=np.float32)[[*known, -1]]  # -1: none, the last
+    truth = (one_hot[capture.labels[row[points.names[k]]]] for k in used)
+    votes, _ = averaged(means, depth, truth, one_hot.shape[1], *cameras)
+    labels = np.where(votes.argmax(1) < len(CLASS_NAMES), votes.argmax(1), -1)
+    of = described
+    return Room(PointInputs(of.own, of.means, of.normals, of.descriptors, of.neighbors), mean, n_views, labels)
+
+
+def lines(rows: Sequence[dict[str, Any]], name: str) -> list[str]:
     """A variant's means, and how they differ from the baseline's."""
     by: dict[tuple[str, str, int], list[float]] = defaultdict(list)
     for row in rows:
         by[row["variant"], row["measure"], row["room"]].append(row["miou"])
-    parts, own = [f"{name:26s}"], [row for row in rows if row["variant"] == name]
-    for measure in (*KINDS, "both"):
+    own = [row for row in rows if row["variant"] == name]
+    found_lines = [f"{name}, {np.mean([row['seconds'] for row in own]):.0f} s"]
+    for measure in dict.fromkeys(row["measure"] for row in own):
         tested = sorted({row["room"] for row in own if row["measure"] == measure})
-        if not tested:
-            continue
-        means, beside = ([float(np.mean(by[of, measure, room])) for room in tested] for of in (name, baseline))
-        text = f"{measure} {np.mean(means):5.1f}"
-        if name != baseline:
+        means, beside = ([float(np.mean(by[of, measure, room])) for room in tested] for of in (name, BASELINE))
+        text = f"  {measure:24s} {np.mean(means):5.1f}"
+        if name != BASELINE and (BASELINE, measure, 0) in by:
             apart = paired_difference(means, beside, [str(room) for room in tested])
             text += f" ({apart.mean:+.1f}; {apart.low:+.1f} to {apart.high:+.1f})"
-        parts.append(text)
-    return "   ".join([*parts, f"{np.mean([row['seconds'] for row in own]):5.0f} s"])
+        found_lines.append(text)
+    return found_lines
 
 
 def taught(
     rooms: list[list[Room]], variant: dict[str, Any], steps: int, embeddings: np.ndarray, seed: int
-) -> tuple[PointEncoder, float]:
-    """An encoder that was taught so in these rooms, and the seconds of teaching."""
-    n_scales, described = variant.get("n_scales", 4), variant.get("described", True)
-    kinds, n_rooms = variant.get("kinds", (0, 1, 2, 3)), variant.get("n_rooms", len(rooms))
-    chosen = [room[kind] for kind in kinds for room in rooms[:n_rooms]]
-    lessons = [lesson_of(narrowed(room, n_scales, described), embeddings) for room in chosen]
+) -> tuple[PointEncoder, np.ndarray, float]:
+    """An encoder that was taught so in these rooms, the map of their lessons, and the seconds of teaching."""
+    chosen = [room[kind] for kind in variant.get("kinds", (0, 1, 2, 3)) for room in rooms]
+    examples = [example_of(room, embeddings) for room in chosen]
     torch.manual_seed(seed)
-    width = lessons[0].cloud.descriptors.shape[1]
-    encoder = PointEncoder(embeddings.shape[1], width, n_scales=n_scales, hidden=variant.get("hidden", 64))
-    encoder.set_inputs([lesson.cloud for lesson in lessons])
+    width = examples[0].cloud.descriptors.shape[1] if variant.get("described", True) else 0
+    encoder = PointEncoder(embeddings.shape[1], width, attends=variant.get("attends", True))
+    encoder.set_inputs([example.cloud for example in examples])
     began = time.perf_counter()
-    for _ in point_encoder.taught(encoder, lessons, point_encoder.Course(steps=steps, seed=seed)):
+    for _ in point_encoder.taught(encoder, examples, point_encoder.Course(steps=steps, seed=seed)):
         pass
-    return encoder.eval(), time.perf_counter() - began
+    encoder.eval()
+    seconds = time.perf_counter() - began
+    sums = (drawn_lesson(encoder, room, embeddings) for room in chosen)
+    total = next(sums)
+    for one in sums:
+        total = combined([total, one], [1.0, 1.0])
+    return encoder, solved(total, RIDGE).astype(np.float32), seconds

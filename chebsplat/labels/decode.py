@@ -46,11 +46,11 @@ def decode_labels(features: np.ndarray, embeddings: np.ndarray) -> np.ndarray:
     return labels
 
 
-def shares(features: np.ndarray, embeddings: np.ndarray) -> np.ndarray:
+def shares(features: np.ndarray, embeddings: np.ndarray, temperature: float = TEMPERATURE) -> np.ndarray:
     """How likely each label is, f32 [..., L], rows of sum 1: the softmax that `decode` takes the largest entry of."""
     found = np.zeros((*features.shape[:-1], len(embeddings)), np.float32)
     for rows, cosines in _cosines(features, embeddings):
-        weights = np.exp((cosines - cosines.max(-1, keepdims=True)) / TEMPERATURE)
+        weights = np.exp((cosines - cosines.max(-1, keepdims=True)) / temperature)
         found.reshape(-1, len(embeddings))[rows] = weights / weights.sum(-1, keepdims=True)
     return found
 

@@ -1,7 +1,8 @@
-"""The point encoder: what surrounds a point at several radii in, the 2D teacher's semantic vector of it out (Eq 7).
+"""The point encoder: what surrounds a point at several radii in, features of its shape out (Eq 7).
 
-It sees geometry alone, answers for every point, and is taught (`taught`) over many rooms, so that it cannot repeat what
-a teacher gets wrong for reasons of texture or of view (docs/method.md, section 14).
+It sees geometry alone and is taught (`taught`) once, over many rooms, so that it cannot repeat what a 2D teacher gets
+wrong for reasons of texture or of view. From then on it stays as it is: what its features mean, scenes teach by sums
+(`shape.lessons`; docs/method.md, section 14).
 """
 
 from __future__ import annotations
@@ -9,17 +10,18 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator
 from dataclasses import dataclass
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch
 from torch import Tensor, nn
 
+from chebsplat.shape.lessons import odds
 from chebsplat.shape.point_inputs import N_OWN, RADII, PointInputs
 
 N_RELATIVE = 10
-CHUNK = 4096  # points encoded at once
-LEAST_VIEWS = 2  # that a point to learn from was seen in
+N_HEADS = 4
+CHUNK = 1024  # points encoded at once
 WARM_UP = 50  # steps
 
 
@@ -63,32 +65,67 @@ class Standardize(nn.Module):
 
 
 class Scale(nn.Module):
-    """One radius: an MLP of each neighbour, then mean and maximum over them; zero where there is none."""
+    """One radius: a learned token attends to the neighbours' tokens (Eq 7), and beside it stands the mean of these.
 
-    def __init__(self, width: int, hidden: int):
+    Choices: a neighbour's token is f(G_i) + PE(c_i): its embedding and the point's own, and where it lies. One block,
+      normalised before; only the learned token is read of its attention, so that one query a head asks every point, and
+      keys and values need no matrix a neighbour. Where a radius holds nobody the token attends to itself alone.
+      Without attention, to measure it by, the largest of the tokens stands in the learned one's place.
+    """
+
+    def __init__(self, width: int, hidden: int, attends: bool = True):
         super().__init__()
+        self.attends = attends
+        self.token = nn.Parameter(torch.randn(hidden) / hidden**0.5)
         self.point, self.neighbor = nn.Linear(width, hidden), nn.Linear(width, hidden, bias=False)
-        self.relative, self.mix = nn.Linear(N_RELATIVE, hidden, bias=False), nn.Linear(hidden, hidden)
+        self.place = nn.Sequential(nn.Linear(N_RELATIVE, hidden), nn.SiLU(), nn.Linear(hidden, hidden, bias=False))
+        self.norm, self.norm_after = nn.LayerNorm(hidden), nn.LayerNorm(hidden)
+        self.query, self.key = (nn.Linear(hidden, hidden, bias=False) for _ in range(2))
+        self.value, self.out = (nn.Linear(hidden, hidden, bias=False) for _ in range(2))
+        self.feed = nn.Sequential(nn.Linear(hidden, hidden), nn.SiLU(), nn.Linear(hidden, hidden))
+
+    def asked(self) -> Tensor:
+        """[h, heads]: W_kᵀ of each head's part of the learned token's query, over √(h / heads)."""
+        query = self.query(self.norm(self.token)).reshape(N_HEADS, -1)
+        keys = self.key.weight.reshape(N_HEADS, -1, self.key.in_features)
+        asked: Tensor = torch.einsum("hq,hqd->dh", query, keys) / query.shape[1] ** 0.5
+        return asked
+
+    def answered(self) -> Tensor:
+        """[heads, h, h]: from what each head has gathered of tokens to what it adds to the learned one, W_o W_v."""
+        values = self.value.weight.reshape(N_HEADS, -1, self.value.in_features)
+        out = self.out.weight.reshape(self.out.out_features, N_HEADS, -1)
+        answered: Tensor = torch.einsum("hqd,ohq->hdo", values, out)
+        return answered
 
     def forward(self, embedded: Tensor, centers: Tensor, neighbors: Tensor, relative: Tensor) -> Tensor:
         """embedded [U, width], centers [B], neighbors [B, K] rows of it, -1: none; relative [B, K, 10] -> [B, 2 h]."""
-        present, rows = (neighbors >= 0)[..., None], neighbors.clamp_min(0)
-        tokens = self.point(embedded[centers])[:, None] + self.neighbor(embedded)[rows] + self.relative(relative)
-        tokens = nn.functional.silu(self.mix(nn.functional.silu(tokens)))
-        mean = (tokens * present).sum(1) / present.sum(1).clamp_min(1)
-        largest = tokens.masked_fill(~present, -1e9).amax(1)
-        return torch.cat([mean, torch.where(present.any(1), largest, torch.zeros_like(largest))], 1)
+        present, rows = neighbors >= 0, neighbors.clamp_min(0)
+        tokens = self.point(embedded[centers])[:, None] + self.neighbor(embedded)[rows] + self.place(relative)
+        fed = (tokens + self.feed(self.norm_after(tokens))) * present[..., None]
+        mean = fed.sum(1) / present.sum(1, keepdim=True).clamp_min(1)
+        if not self.attends:
+            largest = fed.masked_fill(~present[..., None], -1e9).amax(1)
+            return torch.cat([torch.where(present.any(1, keepdim=True), largest, 0.0), mean], 1)
+        normal, own = self.norm(tokens), self.norm(self.token)
+        scores = (normal @ self.asked()).masked_fill(~present[..., None], -math.inf)
+        scores = torch.cat([scores, (own @ self.asked()).expand(len(scores), 1, -1)], 1).softmax(1)
+        gathered = scores[:, :-1].transpose(1, 2) @ normal + scores[:, -1, :, None] * own  # [B, heads, h]
+        token = self.token + torch.einsum("bhd,hdo->bo", gathered, self.answered())
+        token = token + self.feed(self.norm_after(token))
+        return torch.cat([token, mean], 1)
 
 
 class PointEncoder(nn.Module):
-    """An answer per point.
+    """Features z of a point's shape, and while it is taught, what a teacher says of such a point.
 
     Args:
       n_descriptors: values of a point's descriptors over all radii; 0: it sees none.
       n_components:  that these are reduced to, whitened (`set_inputs`).
-      n_channels:    of the answer; n_scales: radii, the first of `RADII`.
-    Choices: pooling over neighbours, where attention gained nothing at equal seconds. The answer is the mean of unit
-      vectors of a teacher over views; its length says how alike these were, and so how sure it is.
+      n_channels:    of the teacher; n_scales: radii, the first of `RADII`.
+      attends:       false: neighbours are pooled, not attended to.
+    Choices: z holds what the decoder sees and its last layer: the one carries over to other worlds better, the other is
+      better within one. A last 1 makes room for a constant.
     """
 
     components: Tensor
@@ -101,19 +138,20 @@ class PointEncoder(nn.Module):
         width: int = 48,
         hidden: int = 64,
         n_scales: int = len(RADII),
+        attends: bool = True,
     ):
         super().__init__()
         n_components = min(n_components, n_descriptors)
         self.settings = {"n_channels": n_channels, "n_descriptors": n_descriptors, "n_components": n_components}
-        self.settings |= {"width": width, "hidden": hidden, "n_scales": n_scales}
+        self.settings |= {"width": width, "hidden": hidden, "n_scales": n_scales, "attends": attends}
         self.norm_own, self.norm_descriptors = Standardize(N_OWN), Standardize(n_descriptors)
         self.register_buffer("components", torch.zeros(n_descriptors, n_components))
         self.embed = nn.Sequential(nn.Linear(N_OWN + n_components, 64), nn.SiLU(), nn.Linear(64, width))
-        self.scales = nn.ModuleList(Scale(width, hidden) for _ in range(n_scales))
+        self.scales = nn.ModuleList(Scale(width, hidden, attends) for _ in range(n_scales))
         total = width + 2 * hidden * n_scales
-        self.decode = nn.Sequential(
-            nn.Linear(total, 96), nn.SiLU(), nn.Linear(96, 96), nn.SiLU(), nn.Linear(96, n_channels)
-        )
+        self.decode = nn.Sequential(nn.Linear(total, 96), nn.SiLU(), nn.Linear(96, 96), nn.SiLU())
+        self.head = nn.Linear(96, n_channels)
+        self.n_features = total + 96 + 1
 
     @torch.no_grad()
     def set_inputs(self, clouds: list[Cloud], sample: int = 11) -> None:
@@ -142,30 +180,38 @@ class PointEncoder(nn.Module):
         return embedded
 
     def forward(self, cloud: Cloud, embedded: Tensor, centers: Tensor, neighbors: Tensor) -> Tensor:
-        """Answers [B, C] for rows `centers` [B]; `neighbors` [B, S, K] are rows of cloud and of embedded [U, width]."""
+        """z [B, p] for rows `centers` [B]; `neighbors` [B, S, K] are rows of cloud and of embedded [U, width]."""
         parts = [embedded[centers]]
         for index, scale in enumerate(self.scales):
             rows = neighbors[:, index]
             parts.append(scale(embedded, centers, rows, relative(cloud, centers, rows, RADII[index])))
-        answers: Tensor = self.decode(torch.cat(parts, 1))
-        return answers
+        seen = torch.cat(parts, 1)
+        return torch.cat([seen, self.decode(seen), torch.ones(len(seen), 1)], 1)
+
+    def answers(self, features: Tensor) -> Tensor:
+        """What the teacher that it was taught by says of points with features z [B, p]: [B, C]."""
+        said: Tensor = self.head(features[:, -1 - self.head.in_features : -1])
+        return said
 
     @torch.no_grad()
-    def predict(self, inputs: PointInputs) -> np.ndarray:
-        """Answers f32 [N, C] of all points."""
+    def encode(self, inputs: PointInputs, rows: np.ndarray | None = None) -> np.ndarray:
+        """z f32 [N, p] of these points, all by default."""
         cloud = cloud_of(inputs)
+        wanted = torch.arange(len(cloud.own)) if rows is None else torch.from_numpy(rows)
         embedded = self.embedded(cloud.own, cloud.descriptors)
-        parts = [torch.zeros(0, self.settings["n_channels"])]
-        for start in range(0, len(cloud.own), CHUNK):
-            rows = torch.arange(start, min(start + CHUNK, len(cloud.own)))
-            parts.append(self(cloud, embedded, rows, cloud.neighbors[rows]))
+        parts = [torch.zeros(0, self.n_features)]
+        parts += [self(cloud, embedded, some, cloud.neighbors[some]) for some in wanted.split(CHUNK)]
         return torch.cat(parts).numpy()
 
     @classmethod
-    def restored(cls, settings: dict[str, int], weights: dict[str, np.ndarray]) -> PointEncoder:
-        """Constructor settings, and weights by name. Raises RuntimeError on a misfit."""
+    def restored(cls, settings: dict[str, Any], weights: dict[str, np.ndarray]) -> PointEncoder:
+        """Constructor settings, and weights by name; the head, which only teaching needs, may be missing. Raises
+        RuntimeError on a misfit.
+        """
         encoder = cls(**settings)
-        encoder.load_state_dict({name: torch.from_numpy(value) for name, value in weights.items()})
+        missing, extra = encoder.load_state_dict({n: torch.from_numpy(v) for n, v in weights.items()}, strict=False)
+        if extra or any(not name.startswith("head.") for name in missing):
+            raise RuntimeError(f"weights do not fit the encoder: {[*missing, *extra][0]}")
         return encoder.eval()
 
 
@@ -194,7 +240,7 @@ def relative(cloud: Cloud, centers: Tensor, neighbors: Tensor, radius: float) ->
 
 
 @dataclass
-class Lesson:
+class Example:
     """A room to learn from: its cloud of N points, the mean of a teacher's unit features over the views that see a
     point [N, C], how many these are [N], and the label that the teacher gives it [N], by which rare things are drawn
     more often.
@@ -205,14 +251,6 @@ class Lesson:
     n_views: np.ndarray
     labels: np.ndarray
 
-    def odds(self) -> np.ndarray:
-        """How often each point is drawn: half alike, half by 1 / sqrt(frequency of its label)."""
-        seen = (self.n_views >= LEAST_VIEWS).astype(np.float64)
-        rare = seen / np.sqrt(np.bincount(self.labels, minlength=1)[self.labels])
-        if not seen.any():
-            raise ValueError(f"no point of a room is seen in {LEAST_VIEWS} views")
-        return np.asarray(0.5 * seen / seen.sum() + 0.5 * rare / rare.sum())
-
 
 @dataclass(frozen=True)
 class Course:
@@ -221,31 +259,31 @@ class Course:
     steps: int = 3000
     batch: int = 640
     n_neighbors: int = 12  # of those that a cloud has, drawn anew at every step
-    rate: float = 3e-3
+    rate: float = 2e-3
     decay: float = 1e-3
     seed: int = 0
 
 
-def taught(encoder: PointEncoder, lessons: list[Lesson], course: Course) -> Iterator[float]:
+def taught(encoder: PointEncoder, examples: list[Example], course: Course) -> Iterator[float]:
     """Train in place; yields the loss of each step, the mean length of the difference to the teacher's mean features.
 
     Choices: one room a step, turned about the vertical and mirrored at random. AdamW, half a cosine.
     """
     torch.manual_seed(course.seed)
     rng = np.random.default_rng(course.seed)
-    odds = [lesson.odds() for lesson in lessons]
+    drawn = [odds(example.n_views, example.labels) for example in examples]
     optimizer = torch.optim.AdamW(encoder.parameters(), lr=course.rate, weight_decay=course.decay)
     for step in range(course.steps):
         fraction = 0.5 * (1 + math.cos(math.pi * step / course.steps))
         optimizer.param_groups[0]["lr"] = course.rate * min(1.0, (step + 1) / WARM_UP) * fraction
-        index = int(rng.integers(len(lessons)))
-        lesson = lessons[index]
-        rows = torch.from_numpy(rng.choice(len(odds[index]), course.batch, p=odds[index]))
-        chosen = np.sort(rng.permutation(lesson.cloud.neighbors.shape[2])[: course.n_neighbors])
-        part, centers, neighbors = excerpt(lesson.cloud, rows, torch.from_numpy(chosen))
+        index = int(rng.integers(len(examples)))
+        example = examples[index]
+        rows = torch.from_numpy(rng.choice(len(drawn[index]), course.batch, p=drawn[index]))
+        chosen = np.sort(rng.permutation(example.cloud.neighbors.shape[2])[: course.n_neighbors])
+        part, centers, neighbors = excerpt(example.cloud, rows, torch.from_numpy(chosen))
         part = turned(part, rng.uniform(0, 2 * math.pi), mirrored=bool(rng.random() < 0.5))
-        answers = encoder(part, encoder.embedded(part.own, part.descriptors), centers, neighbors)
-        loss = (answers - lesson.features[rows]).norm(dim=1).mean()
+        answers = encoder.answers(encoder(part, encoder.embedded(part.own, part.descriptors), centers, neighbors))
+        loss = (answers - example.features[rows]).norm(dim=1).mean()
         optimizer.zero_grad()
         loss.backward()
         optimizer.step()

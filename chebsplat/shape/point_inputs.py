@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from typing import NamedTuple
 
 import numpy as np
@@ -66,7 +67,7 @@ def point_inputs(
         raise ValueError("points, normals, covariances and up must be finite, and the unit positive")
 
     turn = upright(up)
-    where = ((means - means.mean(0)) @ turn.T) / unit
+    where = ((means - means.mean(0)) @ turn.T) / unit if len(means) else means
     facing = normals.astype(np.float64) @ turn.T
     values, axes = np.linalg.eigh(np.einsum("ij,njk,lk->nil", turn, covariances.astype(np.float64), turn) / unit**2)
     deviations = np.sqrt(np.clip(values, 1e-14, None))
@@ -110,4 +111,4 @@ def _scale(
     order = np.argsort(others < 0, axis=1, kind="stable")
     members = np.concatenate([own, np.take_along_axis(others, order, 1)[:, : MEMBERS - 1]], 1)
     values = describe_members(*shape, members, describe).values[:, 0]
-    return neighbors.astype(np.int32), values.reshape(n, -1)
+    return neighbors.astype(np.int32), values.reshape(n, math.prod(values.shape[1:]))

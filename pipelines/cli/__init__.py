@@ -8,7 +8,7 @@ from typing import Any, NoReturn
 
 import click
 
-from chebsplat.pipelines.cli import about, renders, runs, upkeep, uses
+from chebsplat.pipelines.cli import about, knowledge, renders, runs, upkeep, uses
 from chebsplat.pipelines.cli.group import Guarded, logged
 from chebsplat.stages.registry import STAGES
 
@@ -49,5 +49,12 @@ def main() -> None:
     """Semantic 3D Gaussian Splatting that understands shape."""
 
 
-for _command in (*runs.COMMANDS, *about.COMMANDS, *upkeep.COMMANDS, *uses.COMMANDS, *renders.COMMANDS):
+for _command in (
+    *runs.COMMANDS,
+    *about.COMMANDS,
+    *upkeep.COMMANDS,
+    *uses.COMMANDS,
+    *renders.COMMANDS,
+    *knowledge.COMMANDS,
+):
     main.add_command(_command)

@@ -4,7 +4,6 @@ check-teacher, get-teacher, knowledge, calibrate.
 
 from __future__ import annotations
 
-import os
 import sys
 from collections.abc import Mapping
 from pathlib import Path
@@ -121,33 +120,6 @@ def lift(ply: Path, capture: str | None, teacher: Path | None, out: Path) -> Non
 
 
 @click.command()
-@click.option("--teacher", type=click.Path(path_type=Path), help=".onnx; default: the embedded teacher")
-@click.option("--set", "settings", default="", help="section.key=value,... of knowledge and channels")
-@click.option("--out", type=NewPath(), help="folder to copy it to; later: refine.knowledge=FOLDER")
-@click.option("--cores", type=click.IntRange(1), default=os.cpu_count())
-def knowledge(teacher: Path | None, settings: str, out: Path | None, cores: int) -> int:
-    """Teach what shapes look like to a TEACHER, over generated rooms; scenes of that teacher start from it."""
-    from chebsplat.formats import artifact
-    from chebsplat.pipelines.planning.plan import Planner
-    from chebsplat.pipelines.planning.sequences import teaching
-    from chebsplat.pipelines.running.run import execute
-    from chebsplat.pipelines.work import store
-
-    planner = Planner(running=True)
-    try:
-        store.make_work()
-        plan = teaching(planner, teacher, settings)
-    finally:
-        planner.save()
-    code = execute([plan], "teach", cores)
-    if code == 0 and out is not None:
-        made = plan.targets["teach"]
-        artifact.copy(made, out, artifact.verify(made))
-        print(out.absolute())
-    return code
-
-
-@click.command()
 @click.argument("model", type=click.Path(path_type=Path), required=False)
 @click.option("--rooms", type=int, default=12, show_default=True, help="generated rooms")
 @click.option("--force", is_flag=True, help="replace the calibration that is there")
@@ -215,4 +187,4 @@ def mesh(scene: str, out: Path, voxel: float | None, triangles: int, raw: bool) 
     told(facts, out)
 
 
-COMMANDS = (query, calibrate, check_teacher, get_teacher, extract, lift, label, knowledge, mesh)
+COMMANDS = (query, calibrate, check_teacher, get_teacher, extract, lift, label, mesh)

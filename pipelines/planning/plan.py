@@ -7,7 +7,7 @@ import json
 import os
 import re
 import tomllib
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from importlib import import_module
 from pathlib import Path
@@ -18,19 +18,20 @@ from chebsplat.formats.names import unprintable
 from chebsplat.formats.teacher_model import EMBEDDED, read_teacher
 from chebsplat.pipelines.planning.code import PACKAGE, PLACES, Code, step_key
 from chebsplat.pipelines.planning.needs import (
-    knowledge_given,
+    Start,
     left_out_channels,
     left_out_stages,
     media_packages,
     source_sentence,
+    start_given,
     teacher_kind,
     text_packages,
     unread_inputs,
 )
 from chebsplat.pipelines.planning.raw import Hashes, content_hash, hashes, raw_files
-from chebsplat.pipelines.work import folders, store
+from chebsplat.pipelines.work import folders, heads, store
 from chebsplat.pipelines.work.scenes import absent, expanded, folder_of, is_source, read_toml, scene_values
-from chebsplat.stages.registry import STAGES, Stage
+from chebsplat.stages.registry import OF_KNOWLEDGE, STAGES, Stage, lesson_paths
 from chebsplat.stages.runtime import config as configs
 from chebsplat.stages.settings import SourceSection
 from chebsplat.stages.sources.common import resolve_source
@@ -62,6 +63,19 @@ class Step:
 
 
 @dataclass
+class Learned:
+    """The lesson that a scene's run makes: the set that it is added to (None: to none), where it will lie, the identity
+    of the photos, the key of the encoder, and the scene's name.
+    """
+
+    lessons: str | None
+    path: Path
+    capture: str
+    start: str
+    scene: str
+
+
+@dataclass
 class Plan:
     """Steps in order, with what is left out and why. `title` names the links: scene[@ablation]."""
 
@@ -69,10 +83,18 @@ class Plan:
     source: str
     steps: list[Step]
     left_out: dict[str, str] = field(default_factory=dict)
+    lesson: Learned | None = None
 
     @property
     def targets(self) -> dict[str, Path]:
         return {step.stage: step.path for step in self.steps}
+
+
+def identity_of(source: SourceSection, ingest: Step) -> str:
+    """What tells photos from others: their content; of a generated scene what it is made from."""
+    if source.kind == "generated":
+        return f"{source.preset} {source.seed}"
+    return content_hash(ingest.raw, None)
 
 
 def placed(config: Config) -> Config:
@@ -145,13 +167,14 @@ class Planner:
     """Plans scenes; remembers hashes of code and raw files between runs.
 
     Args: code: the folder of `chebsplat`; running: what is planned will run, so that the work folder is made, and a
-          folder gets its name for good; device: that steps which can use a GPU run on.
+          folder gets its name for good; device: that steps which can use a GPU run on; newer: scenes are pinned to the
+          lessons that there are now.
     """
 
-    def __init__(self, code: Path = PACKAGE, running: bool = False, device: str = "cpu"):
+    def __init__(self, code: Path = PACKAGE, running: bool = False, device: str = "cpu", newer: bool = False):
         self.code_memo, self.file_memo = store.Memo("code"), store.Memo("files")
         self.code, self.running = Code(code, self.code_memo.values), running
-        self.device = device
+        self.device, self.newer = device, newer
 
     def save(self) -> None:
         self.code_memo.save()
@@ -164,11 +187,14 @@ class Planner:
         ablation: str = "",
         earlier: Path | None = None,
         values: dict[str, Any] | None = None,
+        place: str = "",
+        lessons: Sequence[Learned] = (),
     ) -> Plan:
         """The steps of one scene.
 
-        Args: settings: over the scene's own; earlier: the training of the scene before, in a sequence; values: config
-              sections that replace the scene's own, before ablation and settings (a study's).
+        Args: settings: over the scene's own; earlier: the training of the scene before, in a printed sequence; values:
+              config sections that replace the scene's own, before ablation and settings (a study's); place: begins the
+              plan's title, in a sequence; lessons: of scenes before it.
         Raises: ConfigError, InputError.
         """
         name, own = scene_values(scene)
@@ -191,27 +217,54 @@ class Planner:
         config = config.model_copy(update={"source": source, "teacher": teacher, "channels": channels})
         model = read_teacher(Path(teacher.model)) if kind == "onnx" and teacher.model else None
         left_out = left_out_stages(config, kind, why, probe) | left_out_channels(kind, model)
-        known, unknown = knowledge_given(config, kind, self.running) if "refine" not in left_out else (None, "")
-        left_out |= {"knowledge of shape": unknown} if unknown else {}
-        config = config.model_copy(update={"refine": config.refine.model_copy(update={"knowledge": None})})  # an input
+        title = place + self._named(scene) + title
+        start = Start(why=left_out["refine"]) if "refine" in left_out else start_given(config, kind, self.running)
+        left_out |= dict.fromkeys(OF_KNOWLEDGE, start.why) if start.path is None else {}
+        if start.path is not None and start.lessons is None:
+            left_out["learn"] = start.why
         steps: dict[str, Step] = {}
         used = {"teacher": text_packages(model, teacher.labels)}
+        given = {} if start.path is None else {"start": start.path}
+        lesson, identity = None, ""
         for stage in STAGES.values():
             if stage.name in left_out or not stage.of_scene:
                 continue
             unread = unread_inputs(config, stage.name)
-            inputs = {role: steps[of].path for role, of in stage.roles.items() if of in steps and role not in unread}
+            inputs = {role: given[role] for role in stage.roles if role in given}
+            inputs |= {role: steps[of].path for role, of in stage.roles.items() if of in steps and role not in unread}
             if stage.name == "train" and earlier is not None:
                 inputs["earlier"] = earlier
-            if stage.name == "refine" and known is not None:
-                inputs["knowledge"] = known
-            elif stage.name == "refine":
-                inputs.pop("points", None)
+            if stage.name == "recall":
+                inputs.pop("lesson", None)
+                inputs |= lesson_paths(self._lessons(place, scene, start, identity, lessons))
+                if inputs.keys() == {"start"}:
+                    given["knowledge"], left_out["recall"] = inputs["start"], "no lesson to add to what ships"
+                    continue
             keys = {role: path.name for role, path in inputs.items()}
-            steps[stage.name] = self.step(stage, config, inputs, keys, used.get(stage.name, ()))
-            steps[stage.name].after = [steps[before].path for before in stage.after if before in steps]
-        title = self._named(scene) + title
-        return Plan(title, source_sentence(name, asked, source), list(steps.values()), left_out)
+            step = steps[stage.name] = self.step(stage, config, inputs, keys, used.get(stage.name, ()))
+            step.after = [steps[before].path for before in stage.after if before in steps]
+            if stage.name == "ingest":
+                identity = identity_of(source, step)
+            if stage.name == "learn" and start.path is not None:
+                lesson = Learned(start.lessons, step.path, identity, start.path.name, self._named(scene))
+        return Plan(title, source_sentence(name, asked, source), list(steps.values()), left_out, lesson)
+
+    def _lessons(
+        self, place: str, scene: str, start: Start, capture: str, earlier: Sequence[Learned]
+    ) -> dict[str, Path]:
+        """Lessons of a scene by key: those that it is pinned to, and those of the scenes before it in a
+        sequence; none of its own photos, and of those of a scene before it only that one's.
+        """
+        if start.path is None or start.lessons is None:
+            return {}
+        title = place + self._named(scene)
+        of = start.lessons, start.path.name, capture, self._named(scene)
+        keys = heads.pinned(title, *of, running=self.running, newer=self.newer)
+        found = {one.path.name: one.path for one in earlier if one.capture != capture}
+        if earlier:
+            held, seen = heads.members(start.lessons), {one.capture for one in earlier}
+            keys = [key for key in keys if key not in held or held[key]["capture"] not in seen]
+        return {key: heads.taken(title, start.lessons, key, self.running) for key in keys} | found
 
     def _named(self, scene: str) -> str:
         """The name of a scene's links."""

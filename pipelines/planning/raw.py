@@ -39,8 +39,10 @@ def raw_files(stage: str, sections: dict[str, Any]) -> tuple[Path | None, list[P
         return None, _of_teacher(sections["teacher"])
     if stage == "train" and sections["train"]["start"]:
         return None, [_named(sections["train"]["start"], "train.start")]
+    if stage == "learn" and sections["learn"]["points"]:
+        return None, [_named(sections["learn"]["points"], "learn.points")]
     if stage == "teach":
-        return None, _of_model(sections["knowledge"]["model"])
+        return None, _of_model(sections["teach"]["model"])
     if stage == "evaluate" and sections["evaluate"]["lpips_weights"]:
         return None, [_named(sections["evaluate"]["lpips_weights"], "evaluate.lpips_weights")]
     return None, []

@@ -6,9 +6,12 @@ from pathlib import Path
 from typing import Any
 
 from chebsplat.errors import ConfigError
+from chebsplat.formats import artifact
+from chebsplat.formats.knowledge import SCHEMA, SHIPPED
 from chebsplat.formats.names import unprintable
 from chebsplat.formats.teacher_model import EMBEDDED, read_teacher
-from chebsplat.pipelines.planning.plan import Overrides, Plan, Planner, merged, overrides, placed
+from chebsplat.pipelines.planning.plan import Learned, Overrides, Plan, Planner, merged, overrides, placed
+from chebsplat.pipelines.work import heads, store
 from chebsplat.pipelines.work.scenes import read_named
 from chebsplat.stages.registry import STAGES
 from chebsplat.stages.runtime import config as configs
@@ -32,18 +35,14 @@ def scenes_of(name: str) -> list[str]:
 
 
 def chain(planner: Planner, name: str, settings: Overrides = "", ablation: str = "") -> list[Plan]:
-    """Plans of a sequence's scenes, each of whose trainings reads that of the scene before.
-
-    Raises: ConfigError without the ablation `paper`, whose printed form alone carries knowledge.
+    """Plans of a sequence's scenes, each with what those before it have taught: their lessons, or in the printed form
+    the bases that the training before has left.
     """
-    scenes = scenes_of(name)
-    if ablation != "paper":
-        raise ConfigError("sequences carry knowledge in the paper's printed form only; add ablation=paper")
     found: list[Plan] = []
-    for place, scene in enumerate(scenes, start=1):
-        plan = planner.plan(scene, settings, ablation, earlier=found[-1].targets["train"] if found else None)
-        plan.title = f"{Path(name).stem}-{place}-{plan.title}"
-        found.append(plan)
+    for number, scene in enumerate(scenes_of(name), start=1):
+        earlier = found[-1].targets["train"] if found and ablation == "paper" else None
+        lessons, place = [plan.lesson for plan in found if plan.lesson is not None], f"{Path(name).stem}-{number}-"
+        found.append(planner.plan(scene, settings, ablation, earlier=earlier, place=place, lessons=lessons))
     return found
 
 
@@ -56,9 +55,34 @@ def teaching(planner: Planner, model: Path | None, settings: str = "") -> Plan:
     teacher = read_teacher(file)
     if teacher.output != "features":
         raise ConfigError(f"{teacher.settings}: output is {teacher.output}; knowledge is taught in features")
-    of: dict[str, Any] = {"channels": {"model": str(file)}, "knowledge": {"model": str(file)} if model else {}}
+    of: dict[str, Any] = {"channels": {"model": str(file)}, "teach": {"model": str(file)} if model else {}}
     config = placed(configs.build(merged(of, overrides(settings)), f"knowledge for {teacher.name}"))
     channels = planner.step(STAGES["channels"], config, {}, {})
     inputs = {"channels": channels.path}
     teach = planner.step(STAGES["teach"], config, inputs, {"channels": channels.key})
     return Plan(f"knowledge-{teacher.name}", f"knowledge for the teacher {teacher.name}", [channels, teach])
+
+
+def relearning(planner: Planner, name: str) -> list[Plan]:
+    """The steps that learn the lessons of a set again by the encoder that ships now, from what the store holds; those
+    that it made itself, and those whose scene's artifacts are gone, stay as they are.
+    """
+    found: list[Plan] = []
+    start = store.taken_in(SHIPPED, "teach", SCHEMA, planner.running)
+    for key, record in heads.members(name).items():
+        manifest = artifact.read_manifest(heads.folder(name) / key)
+        made = {role: store.artifact_path(STAGES["learn"].roles[role], entry["key"])
+                for role, entry in manifest.inputs.items() if role not in ("start", "encoding")}  # fmt: skip
+        if record["start"] == start.name:
+            continue
+        if not all(map(store.is_fresh, made.values())):
+            store.say(f"{record['scene']}: its artifacts are gone; run the scene again, and it is learned anew")
+            continue
+        config = configs.build(manifest.config, f"lesson {key}")
+        of = {"descriptors": made["descriptors"], "start": start}
+        encode = planner.step(STAGES["encode"], config, of, {role: path.name for role, path in of.items()})
+        of = made | {"encoding": encode.path, "start": start}
+        learn = planner.step(STAGES["learn"], config, of, {role: path.name for role, path in of.items()})
+        lesson = Learned(name, learn.path, record["capture"], start.name, record["scene"])
+        found.append(Plan(f"learned-{key}", f"the lesson of {record['scene']}", [encode, learn], {}, lesson))
+    return found

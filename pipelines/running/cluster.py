@@ -48,13 +48,25 @@ NEEDS = {  # measured in 18 scenes on two EPYC cores: seconds (median, most); mo
     "teacher": Need(15, 4000),  # 9, 66; 1088 MB
     "agree": Need(5, 2000),  # 1, 3; 121 MB
     "teach": Need(600, 8000),  # 3142
-    "describe": Need(5, 2000),
+    "describe": Need(5, 4000),
+    "encode": Need(5, 4000),
+    "learn": Need(5, 4000),
+    "recall": Need(5, 4000),
+    "onnx": Need(5, 4000),
     "train": Need(15, 4000),  # and by its steps: 80, 239 for 3000; 693 MB
     "lift": Need(5, 2000),  # 5, 12; 571 MB
     "refine": Need(5, 4000),  # 9, 22; 1083 MB
     "export": Need(5, 2000),  # 1, 2; 138 MB
     "evaluate": Need(5, 2000),  # 5, 27; 646 MB
     "report": Need(5, 2000),  # 2, 7; 144 MB
+}
+BESIDE = {  # the inputs beside which a step runs, as part of its job: the first that is made
+    "describe": ("points", "capture"),
+    "encode": ("descriptors",),
+    "learn": ("features", "encoding"),
+    "onnx": ("knowledge", "descriptors"),
+    "agree": ("features",),
+    "evaluate": ("scene",),
 }
 STEP_SECONDS = 0.08  # of a training, at most
 SHORT = 60.0  # seconds of a training that is no job of its own
@@ -150,10 +162,8 @@ def together(entries: list[dict[str, Any]]) -> list[str]:
             return "capture", inputs["capture"]
         if stage == "train":
             return "train", entry["path"]
-        if before := by_path.get(
-            inputs.get({"describe": "points", "agree": "features", "evaluate": "scene"}.get(stage))
-        ):
-            return group(before)
+        if before := [by_path[inputs[role]] for role in BESIDE.get(stage, ()) if inputs.get(role) in by_path]:
+            return group(before[0])
         if "gaussians" in inputs:
             train = by_path.get(inputs["gaussians"])
             return ("train" if train and seconds_of(train) <= SHORT else "after"), inputs["gaussians"]

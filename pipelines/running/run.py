@@ -19,7 +19,7 @@ from typing import Any
 from chebsplat.formats.files import atomic_write, explained
 from chebsplat.pipelines.planning.plan import Plan, Step
 from chebsplat.pipelines.running import cluster, job, processes
-from chebsplat.pipelines.work import leases, store, summary
+from chebsplat.pipelines.work import heads, leases, store, summary
 from chebsplat.pipelines.work.store import say
 from chebsplat.pipelines.work.summary import aligned
 from chebsplat.stages.registry import STAGES
@@ -64,6 +64,7 @@ def execute(plans: list[Plan], stage: str | None, cores: int, device: str = "cpu
     finally:  # a run that is stopped names what it has finished
         for plan in plans:
             store.link(plan.title, plan.targets)
+            add_lesson(plan)
     if code:
         return code
     if stale:
@@ -71,6 +72,13 @@ def execute(plans: list[Plan], stage: str | None, cores: int, device: str = "cpu
     for plan in plans:
         say_result(plan, stage)
     return 0
+
+
+def add_lesson(plan: Plan) -> None:
+    """The lesson of a scene, if its run has made one, joins the set that scenes after it start from."""
+    made = plan.lesson
+    if made is not None and made.lessons is not None and store.is_fresh(made.path):
+        heads.add(made.lessons, made.path, made.capture, made.start, made.scene)
 
 
 def say_result(plan: Plan, stage: str | None) -> None:
@@ -86,7 +94,7 @@ def say_result(plan: Plan, stage: str | None) -> None:
 def wanted_steps(plan: Plan, stage: str | None, others: Iterable[Plan] = ()) -> list[Step]:
     """All steps of a plan, or its `stage`, and what they need, of other plans too."""
     by_path = {step.path: step for some in (*others, plan) for step in some.steps}
-    asked = {stage} if stage else {step.stage for step in plan.steps if not STAGES[step.stage].only_asked}
+    asked = {stage} if stage else {step.stage for step in plan.steps}
     waiting, needed = [step for step in plan.steps if step.stage in asked], set()
     while waiting:
         step = waiting.pop()

@@ -5,6 +5,7 @@ from __future__ import annotations
 import itertools
 import threading
 import time
+from collections import defaultdict
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
@@ -60,6 +61,7 @@ class Study(Section):
     settings: Sections = Field({})
     conditions: dict[Name, Sections] = Field({"": {}}, max_length=1000)
     variants: dict[Name, dict[str, Any]] = Field(min_length=1, max_length=1000)
+    grows: bool = False  # each scene starts from the lessons of those before it, too, where its variant takes lessons
     against: str = ""  # section.key whose value is the figure's horizontal axis, instead of run time
 
     @model_validator(mode="after")
@@ -84,10 +86,11 @@ class Run:
     scene: str
     seed: int
     plan: Plan = field(compare=False)
+    before: tuple[Plan, ...] = field(default=(), compare=False)  # of the scenes whose lessons it starts from
 
     @property
     def steps(self) -> list[Step]:
-        return wanted_steps(self.plan, LAST)
+        return wanted_steps(self.plan, LAST, self.before)
 
     @property
     def protocol(self) -> str:
@@ -143,13 +146,21 @@ def expand(study: Study, running: bool = False, device: str = "cpu") -> list[Run
     """
     planner = Planner(running=running, device=device)
     runs: list[Run] = []
+    before: dict[tuple[Any, ...], list[Plan]] = defaultdict(list)
     try:
         for scene, seed, condition in itertools.product(study.scenes, study.seeds, study.conditions):
             for budget, spent in study.budgets.settings().items():
                 for variant in study.variants:
                     values = merged(_values(study, condition, variant), {"train": spent})
-                    plan = planner.plan(scene, values=merged(values, seeded(scene, values, seed)))
-                    runs.append(Run(condition, variant, budget, plan.title, seed, plan))
+                    earlier = before[seed, condition, budget, variant]
+                    lessons = [one.lesson for one in earlier if one.lesson is not None and one.lesson.lessons]
+                    own = {"start": "shipped"} | scene_values(scene)[1].get("knowledge", {})
+                    values = merged({"knowledge": own}, merged(values, seeded(scene, values, seed)))
+                    place = suffix(f"study-{variant}-seed{seed}-") if study.grows else ""
+                    plan = planner.plan(scene, values=values, place=place, lessons=lessons)
+                    named = plan.title.removeprefix(place)
+                    runs.append(Run(condition, variant, budget, named, seed, plan, tuple(earlier)))
+                    earlier += [plan] * study.grows
     finally:
         planner.save()
     for condition in study.conditions:

@@ -17,7 +17,7 @@ import click
 
 from chebsplat.formats import artifact
 from chebsplat.formats.manifest import Manifest
-from chebsplat.stages.registry import STAGES
+from chebsplat.stages.registry import MANY, STAGES, lesson_paths
 from chebsplat.stages.runtime import config as configs
 from chebsplat.stages.runtime.device import DEVICES, resolve
 from chebsplat.stages.runtime.progress import Progress
@@ -54,8 +54,9 @@ def command(name: str, run: Callable[[Job], None]) -> click.Command:
 
     def invoke(out: Path, **options: Any) -> None:
         def action() -> None:
-            inputs = {role: path for role in stage.roles if (path := options.pop(f"in_{role}"))}
-            publish(name, run, out, inputs, **options)
+            inputs = {role: given for role in stage.roles if (given := options.pop(f"in_{role}"))}
+            lessons = {artifact.read_manifest(path).key: path for path in inputs.pop(MANY, ())}
+            publish(name, run, out, inputs | lesson_paths(lessons), **options)
             print(out.absolute())
 
         sys.exit(exit_code(action, out.absolute().parent))
@@ -65,7 +66,10 @@ def command(name: str, run: Callable[[Job], None]) -> click.Command:
             [f"--in-{role}"],
             type=click.Path(path_type=Path),
             required=(role, of) in stage.inputs,
-            help=f"artifact of `{of}`" + ("" if (role, of) in stage.inputs else " (optional)"),
+            multiple=role == MANY,
+            help=f"artifact of `{of}`"
+            + ("" if (role, of) in stage.inputs else " (optional)")
+            + (", once for each" if role == MANY else ""),
         )
         for role, of in (*stage.inputs, *stage.optional)
     ]
@@ -114,7 +118,7 @@ def publish(
         return
     inputs, shown = {role: path.absolute() for role, path in inputs.items()}, Progress()
     chosen = configs.load(config) if config else configs.Config()
-    schemas = {role: STAGES[of].schema for role, of in stage.roles.items()}
+    schemas = stage.schemas(inputs)
     manifests = {role: artifact.read_manifest(path, schemas[role]) for role, path in inputs.items()}
     settings = chosen.sections(stage.sections)
     sources = {role: {"key": m.key, "schema": m.schema} for role, m in manifests.items()}

@@ -42,6 +42,8 @@ class Config(Section):
     lift: parts.LiftSection = parts.LiftSection()
     refine: parts.RefineSection = parts.RefineSection()
     knowledge: parts.KnowledgeSection = parts.KnowledgeSection()
+    learn: parts.LearnSection = parts.LearnSection()
+    teach: parts.TeachSection = parts.TeachSection()
     evaluate: parts.EvaluateSection = parts.EvaluateSection()
 
     def sections(self, names: tuple[str, ...]) -> dict[str, Any]:

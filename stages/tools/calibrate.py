@@ -115,13 +115,14 @@ def asked_words(teacher: TeacherModel) -> Asked:
 
 def points(seed: int, network: Any) -> Points:
     """A room's points with what the teacher says of them, averaged over its views."""
-    from chebsplat.stages.shape_models.teaching_rooms import averaged, photographed, surface
+    from chebsplat.lifting.averages import averaged
+    from chebsplat.stages.shape_models.teaching_rooms import photographed, surface
 
     images, depth, labels, K, poses = photographed(seed, N_VIEWS)
     grid, _ = network.grid(images[0], 4)
     seen = np.stack([network.features(image, grid, (1.0,), False, f"room {seed}") for image in images])
     means, _, named = surface(depth, labels, K, poses, N_POINTS, np.random.default_rng([seed, 5]))
-    features, n_views = averaged(means, depth, seen, K, poses)
+    features, n_views = averaged(means, depth, seen, seen.shape[-1], np.tile(K, (len(poses), 1, 1)), poses)
     features, named = features[n_views > 0], named[n_views > 0]
     return Points(features / np.linalg.norm(features, axis=1, keepdims=True).clip(1e-6), named)
 

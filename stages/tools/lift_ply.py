@@ -29,10 +29,13 @@ from chebsplat.labels.decode import decode
 from chebsplat.lifting.observations import carry
 from chebsplat.lifting.smoothing import room_unit
 from chebsplat.lifting.surface import LOOKOUT_SIZE, lookouts
+from chebsplat.settings import DescribeSection
+from chebsplat.shape.point_inputs import point_inputs
 from chebsplat.splats.gaussians import surface_of
 from chebsplat.stages import export, lift
 from chebsplat.stages.runtime.command import publish
-from chebsplat.stages.shape_models.predictions import answered, shown
+from chebsplat.stages.shape_models.answers import answered, units
+from chebsplat.stages.shape_models.surfaces import shown
 from chebsplat.stages.teacher_models.text_encoder import found
 from chebsplat.stages.tools.page import foreign
 
@@ -147,11 +150,11 @@ def label_ply(
     poses, Ks = lookouts(parameters["means"].astype(np.float64), expit(parameters["logit_opacities"]), up)
     cloud = shown(parameters, poses, Ks, LOOKOUT_SIZE, unit)
     log.info("%d points of a surface, %.3g units a metre", len(cloud.means), unit)
-    answers = answered(knowledge, held, cloud, up, unit)
+    answers = answered(held, point_inputs(*cloud, up=up, unit=unit, describe=DescribeSection(**held.describe)))
     normals = surface_of(parameters)[0]
     carried, _ = carry(answers, cloud.means, cloud.normals, parameters["means"], normals, unit)
-    labels, sure = decode(carried, held.embeddings[rows].astype(np.float32))
-    confidence = sure * np.linalg.norm(carried, axis=1).clip(0, 1)
+    labels, sure = decode(carried[:, carried.shape[1] // 2 :], units(held.embeddings[rows]))
+    confidence = sure * np.linalg.norm(carried[:, carried.shape[1] // 2 :], axis=1).clip(0, 1)
     with atomic_path(beside) as temporary, temporary.open("wb") as stream:
         np.savez(stream, names=np.array(words), labels=labels, confidence=confidence.astype(np.float32))
     with atomic_path(out) as temporary:

@@ -138,7 +138,7 @@ def are_words(texts: list[str], teacher: TeacherModel) -> list[bool]:
     """Whether each is one of the words that a calibration speaks for: those of the teacher's table, if it has one."""
     if teacher.labels is None:
         return [True] * len(texts)
-    return [row >= 0 for row in found(texts, read_label_table(teacher.labels)[0])]
+    return [row >= 0 for row in found(texts, read_label_table(teacher.labels)[0], False)]
 
 
 def embedded(words: list[str], features: Features, model: str | None) -> np.ndarray:
@@ -154,7 +154,7 @@ def embedded(words: list[str], features: Features, model: str | None) -> np.ndar
 def among_labels(features: Features, text: str, phrases: list[str]) -> Query:
     """A query of a scene whose teacher knows its labels and no other words."""
     names = features.label_names
-    rows = found([text, *phrases], names)
+    rows = found([text, *phrases], names, last_word=False)
     target, others = rows[0], rows[1:]
     for word, row in zip((text, *phrases), rows, strict=True):
         if row < 0:

@@ -15,9 +15,11 @@ from chebsplat.formats import (
     artifact,
     capture,
     descriptors,
+    encoding,
     evaluation,
     features,
     knowledge,
+    lesson,
     lifted,
     ply,
     points,
@@ -82,12 +84,23 @@ def make_features():
 
 def make_descriptors():
     rng = np.random.default_rng(4)
-    return descriptors.Descriptors(
-        np.array([0, 3]),
-        np.array([[0, 1, -1], [3, 4, 5]]),
-        rng.normal(size=(2, 3, 4, 7)).astype(np.float32),
-        {"n_angles": 4, "radius": 0.5, "share": 1.0},
-    )
+    arrays = [rng.normal(size=(5, width)).astype(np.float32) for width in (6, 3, 3, 8)]
+    neighbors = rng.integers(-1, 5, (5, 4, 2)).astype(np.int32)
+    return descriptors.Descriptors(*arrays, neighbors, [0.0, 1, 2], [0.0, 0, 1], 2.5, {"of": "depth"})
+
+
+def make_encoding():
+    return encoding.Encoding(np.random.default_rng(9).normal(size=(5, 7)).astype(np.float16), {"none": "why"})
+
+
+def make_sums():
+    z = np.random.default_rng(10).normal(size=(20, 7)).astype(np.float32)
+    gram, cross = (z.T @ z).astype(np.float64), (z.T @ z[:, :3]).astype(np.float64)  # what float32 holds exactly
+    return np.tril(gram) + np.tril(gram, -1).T, cross, 1.1
+
+
+def make_lesson():
+    return lesson.Lesson(make_sums(), {"scene": "a", "given": True, "rho": 0.25})
 
 
 def make_cameras():
@@ -149,9 +162,11 @@ def make_refined():
 
 def make_knowledge():
     weights = {"embed.0.weight": np.random.default_rng(8).normal(size=(4, 6)).astype(np.float32)}
-    matrix = np.eye(7, 3, dtype=np.float32)
+    matrix, answers = np.eye(7, 3, dtype=np.float32), [np.eye(7, n, dtype=np.float32) for n in (3, 2)]
     of = "a", "b", {"n_channels": 3}, weights, matrix, {"n_angles": 8}
-    return knowledge.Knowledge(*of, ["sofa", "wall"], np.eye(2, 3, dtype=np.float16), {"n_rooms": 2})
+    words = ["sofa", "wall"], np.eye(2, 3, dtype=np.float16)
+    card = {"n_rooms": 2}, {"share": 3.0}
+    return knowledge.Knowledge(*of, *words, *answers, np.ones(7, np.float32), *card, [make_sums()] * 2)
 
 
 CASES = {
@@ -164,10 +179,12 @@ CASES = {
     "refined": make_refined,
     "evaluation": make_evaluation,
     "descriptors": make_descriptors,
+    "encoding": make_encoding,
+    "lesson": make_lesson,
     "knowledge": make_knowledge,
 }
 OTHERS = {  # no record of zarr's yet
-    "descriptors": (descriptors.write_descriptors, descriptors.read_descriptors, descriptors.SCHEMA),
+    "lesson": (lesson.write_lesson, lesson.read_lesson, lesson.SCHEMA),
     "knowledge": (knowledge.write_knowledge, knowledge.read_knowledge, knowledge.SCHEMA),
 }
 
@@ -188,6 +205,8 @@ def same(a, b):
         return same(vars(a), vars(b))
     if isinstance(a, dict):
         return set(a) <= set(b) and all(same(a[k], b[k]) for k in a)
+    if isinstance(a, list | tuple):
+        return len(a) == len(b) and all(map(same, a, b))
     if isinstance(a, np.ndarray):
         return np.array_equal(np.asarray(b), a, equal_nan=a.dtype.kind == "f")
     return a == b
@@ -234,7 +253,7 @@ def test_damage_to_any_file_is_named_with_its_remedy(case, damage):
 @pytest.mark.xdist_group("toy")
 def test_every_numeric_artifact_of_a_scene_opens_as_a_zarr_group(toy):
     kinds = {"features/2", "gaussians/2", "scene/3", "capture/2", "points/2", "channels/2", "agreement/2", "lifted/2"}
-    kinds |= {"refined/2", "evaluation/2"}
+    kinds |= {"refined/2", "evaluation/2", "descriptors/2", "encoding/1"}
     opened = set()
     for path in toy.values():
         if (path / "zarr.json").is_file():

@@ -18,11 +18,13 @@ import numpy as np
 from chebsplat.formats import artifact
 from chebsplat.formats.cameras import Cameras
 from chebsplat.formats.capture import Capture
-from chebsplat.formats.descriptors import Descriptors, write_descriptors
+from chebsplat.formats.descriptors import Descriptors
+from chebsplat.formats.encoding import Encoding
 from chebsplat.formats.evaluation import Evaluation, ViewAgreement
 from chebsplat.formats.features import Features
 from chebsplat.formats.gaussians import Gaussians
 from chebsplat.formats.knowledge import Knowledge, write_knowledge
+from chebsplat.formats.lesson import Lesson, write_lesson
 from chebsplat.formats.lifted import Lifted, Refined
 from chebsplat.formats.manifest import Manifest
 from chebsplat.formats.points import Points
@@ -33,7 +35,7 @@ from chebsplat.stages.runtime.config import Config
 from malformed.edits import DEEP, Edit, changed, cut, flipped, no_file, put, remove
 from malformed.row import Arguments, Row, stage
 
-N, V, C, SIZE = 40, 3, 5, (24, 16)  # Gaussians, views, channels, width and height
+N, V, C, FEATURES, SIZE = 40, 3, 5, 7, (24, 16)  # Gaussians, views, channels, of shape, width and height
 KEY = "0123456789abcdef"
 MEMBER = "data/values.bin"
 VIEWS, LABELS = [f"view_{k}" for k in range(V)], ["wall", "floor", "sofa"]
@@ -120,7 +122,7 @@ def met(name: str, ask: Callable[[Path], Arguments], word: str, edit: Edit, of: 
 
 
 def planned(folder: Path) -> Arguments:
-    return ["plan", "--scene", "toy", "--set", f"refine.knowledge={folder}/in"]
+    return ["plan", "--scene", "toy", "--set", f"knowledge.start={folder}/in"]
 
 
 def rows() -> Iterator[Row]:
@@ -229,9 +231,20 @@ def _features(out: Path) -> None:
 
 
 def _descriptors(out: Path) -> None:
-    members = np.arange(4 * 8).reshape(4, 8)
-    settings = DESCRIBED | {"n_regions": 4, "region_size": 8, "seed": 0, "radius": 1.0, "share": 0.5}
-    write_descriptors(out, Descriptors(members[:, 0], members, np.zeros((4, 8, 2, 2), np.float32), settings))
+    own, place, values = (np.zeros((N, width), np.float32) for width in (6, 3, 8))
+    neighbors = np.full((N, 4, 2), -1, np.int32)
+    notes = {"settings": DESCRIBED, "of": "depth"}
+    Descriptors(own, place, place, values, neighbors, [0.0] * 3, [0.0, 0.0, 1.0], 1.0, notes).write(out)
+
+
+def _encoding(out: Path) -> None:
+    Encoding(np.ones((N, FEATURES), np.float16)).write(out)
+
+
+def _lesson(out: Path) -> None:
+    sums = np.eye(FEATURES), np.ones((FEATURES, C)), 1.0
+    notes = {"scene": "toy", "given": True, "novelty": 0.5, "n_points": N}
+    write_lesson(out, Lesson(sums, notes))
 
 
 def _gaussians(out: Path) -> None:
@@ -265,7 +278,9 @@ def _knowledge(out: Path) -> None:
     describe, card = DescribeSection().model_dump(mode="json"), {"n_rooms": 1}
     matrix = np.eye(C + 2, C, dtype=np.float32)
     words = ["wall"], np.ones((1, C), np.float16)
-    write_knowledge(out, Knowledge("tiny", "0" * 64, encoder, weights, matrix, describe, *words, card))
+    answers = np.ones((FEATURES, C), np.float32), np.eye(FEATURES, 2, dtype=np.float32), np.ones(FEATURES, np.float32)
+    knowledge = Knowledge("tiny", "0" * 64, encoder, weights, matrix, describe, *words, *answers, card)
+    write_knowledge(out, knowledge)
 
 
 def _scene(out: Path) -> None:
@@ -294,6 +309,8 @@ WRITERS: dict[str, Callable[[Path], None]] = {
     "teacher": _features,
     "agree": _agreement,
     "describe": _descriptors,
+    "encode": _encoding,
+    "learn": _lesson,
     "teach": _knowledge,
     "train": _gaussians,
     "lift": _lifted,

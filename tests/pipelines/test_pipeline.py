@@ -7,11 +7,16 @@ import shutil
 import subprocess
 import sys
 
+import numpy as np
+import onnxruntime
 import pytest
 from malformed.sources import write_slam
 from shared import ROOT, finish, photo_folder, remember
 
 from chebsplat.errors import ConfigError, InputError
+from chebsplat.formats.descriptors import Descriptors
+from chebsplat.formats.encoding import Encoding
+from chebsplat.formats.knowledge import SHIPPED, read_knowledge
 from chebsplat.formats.teacher_model import EMBEDDED
 from chebsplat.pipelines.planning.code import PACKAGE
 from chebsplat.pipelines.planning.plan import Planner, suffix
@@ -19,11 +24,13 @@ from chebsplat.pipelines.planning.raw import content_hash, hashes
 from chebsplat.pipelines.running.run import failures, wanted_steps
 from chebsplat.pipelines.work import store
 from chebsplat.pipelines.work.scenes import CONFIGS, names, read_toml
-from chebsplat.stages.registry import STAGES
+from chebsplat.stages.registry import OF_KNOWLEDGE, STAGES
+from chebsplat.stages.shape_models.answers import answered, inputs_of
 
 PLANNED = {name for name, stage in STAGES.items() if stage.of_scene}
-ALL = [name for name in STAGES if name in PLANNED - {"channels"}]
-MADE = [name for name in ALL if not STAGES[name].only_asked]  # by a run that names no stage
+KNOWING = "knowledge.start=rooms"  # the toy starts from none by itself
+ALL = [name for name in STAGES if name in PLANNED - {"channels", "recall"}]  # of a first scene
+ABOUT_SHAPE = ["describe", "encode", "learn", "onnx"]
 AFTER_TRAIN = ["train", "lift", "refine", "export", "evaluate", "report"]
 
 
@@ -41,9 +48,9 @@ def source_tree(tmp_path):
     return shutil.copytree(PACKAGE, tmp_path / "code/chebsplat", ignore=shutil.ignore_patterns("__pycache__"))
 
 
-def stale(package=PACKAGE, scene="toy", **options):
+def stale(package=PACKAGE, scene="toy", settings=KNOWING):
     planner = Planner(package)
-    plan = planner.plan(scene, **options)
+    plan = planner.plan(scene, settings)
     planner.save()
     return [step.stage for step in plan.steps if not step.fresh]
 
@@ -98,14 +105,14 @@ CODE_CHANGES = [
     (report_code, ["report"]),
     (format_code, ["export", "evaluate", "report"]),
     (trainer_code, AFTER_TRAIN),
-    (descriptor_code, ["describe", "refine", "export", "evaluate", "report"]),
+    (descriptor_code, [*ABOUT_SHAPE, "refine", "export", "evaluate", "report"]),
     (deep_code, ALL),
 ]
 
 
 @pytest.mark.parametrize(("change", "expected"), CODE_CHANGES, ids=lambda v: getattr(v, "__name__", ""))
 def test_a_change_of_code_makes_exactly_these_stages_stale(tmp_path, source_tree, change, expected):
-    finish(Planner(source_tree).plan("toy"))
+    finish(Planner(source_tree).plan("toy", KNOWING))
     assert stale(source_tree) == []
     before = shutil.copytree(tmp_path / "code", tmp_path / "before")
     change(source_tree)
@@ -117,10 +124,10 @@ def test_a_change_of_code_makes_exactly_these_stages_stale(tmp_path, source_tree
 SETTING_CHANGES = [
     ("train.steps=61", AFTER_TRAIN),
     ("train.prune=off", AFTER_TRAIN),
-    ("teacher.confusion=0.2", ["teacher", "agree", *AFTER_TRAIN]),
+    ("teacher.confusion=0.2", ["teacher", "agree", "learn", *AFTER_TRAIN]),
     ("agree.n_points=700", ["agree", "report"]),
-    ("describe.bandwidth=0.8", ["describe", *AFTER_TRAIN]),
-    ("sfm.max_points=700", ["sfm", "agree", "describe", *AFTER_TRAIN]),
+    ("describe.bandwidth=0.8", [*ABOUT_SHAPE, *AFTER_TRAIN]),
+    ("sfm.max_points=700", ["sfm", "agree", *ABOUT_SHAPE, *AFTER_TRAIN]),
     ("lift.gate=0.3", ["lift", "refine", "export", "evaluate", "report"]),
     ("refine.smooth=on", ["refine", "export", "evaluate", "report"]),
     ("evaluate.boundary=3", ["evaluate", "report"]),
@@ -131,7 +138,8 @@ SETTING_CHANGES = [
 
 @pytest.mark.parametrize(("settings", "expected"), SETTING_CHANGES, ids=lambda v: v if isinstance(v, str) else "")
 def test_a_change_of_setting_makes_exactly_these_stages_stale(settings, expected):
-    finish(Planner().plan("toy"))
+    settings = f"{KNOWING},{settings}"
+    finish(Planner().plan("toy", KNOWING))
     assert stale(settings=settings) == expected
     finish(Planner().plan("toy", settings))
     assert stale() == []
@@ -149,7 +157,7 @@ def test_content_of_raw_files_counts_and_their_time_and_place_do_not(tmp_path):
     shutil.move(tmp_path / "photos", moved / "photos")
     assert stale(scene=f"{moved}/photos/") == []
     shutil.copy(moved / "photos/1.jpg", moved / "photos/2.jpg")
-    semantic = ("teacher", "agree", "lift", "refine")  # left out: nobody named a teacher
+    semantic = ("teacher", "agree", "lift", "refine", *OF_KNOWLEDGE)  # left out: nobody named a teacher
     assert stale(scene=f"{moved}/photos/") == [stage for stage in ALL if stage not in semantic]
 
 
@@ -261,6 +269,7 @@ def test_generated_and_replica_scenes_never_share_a_key(tmp_path, monkeypatch):
     ("settings", "left_out"),
     [
         ("", {"channels"}),
+        (KNOWING, {"channels"}),
         ("train.semantics=false", {"channels", "teacher", "agree", "lift", "refine"}),
         ("teacher.kind=none", {"channels", "teacher", "agree", "lift", "refine"}),
         ("train.features=lifted", {"channels"}),
@@ -269,6 +278,7 @@ def test_generated_and_replica_scenes_never_share_a_key(tmp_path, monkeypatch):
 )
 def test_a_scene_leaves_out_what_it_does_not_need_and_says_why(settings, left_out):
     plan = Planner().plan("toy", settings)
+    left_out |= {"recall"} if settings == KNOWING else set(OF_KNOWLEDGE)
     assert {what for what in plan.left_out if what in STAGES} == left_out
     assert all(plan.left_out.values())
     assert PLANNED - left_out == set(plan.targets)
@@ -383,9 +393,22 @@ def chebsplat(*arguments, **environment):
 FAST = "train.steps=12,train.n_densify=1,sfm.max_points=200,describe.n_regions=12"
 
 
+def check_encoder(scene):
+    """The graph in a scene's folder answers as torch does."""
+    knowledge, described = read_knowledge(SHIPPED), Descriptors.read(scene / "describe")
+    wanted = Encoding.read(scene / "encode").features.astype(np.float32) @ knowledge.map
+    assert len(wanted) > 100
+    inputs = inputs_of(scene, described, knowledge)
+    given = inputs._asdict() | {"neighbors": inputs.neighbors.astype(np.int64)}
+    runner = onnxruntime.InferenceSession(scene / "onnx/encoder.onnx", providers=["CPUExecutionProvider"])
+    answers = runner.run(None, given)[0]
+    np.testing.assert_allclose(answers, answered(knowledge, inputs), atol=1e-4)
+    np.testing.assert_allclose(answers, wanted, atol=2e-2)  # of features in half precision
+
+
 @pytest.mark.xdist_group("cli")
 def test_a_run_makes_the_report_and_a_second_run_does_nothing(work):
-    first = chebsplat("run", "--scene", "toy", "--set", FAST)
+    first = chebsplat("run", "--scene", "toy", "--set", FAST, "--knowledge", "rooms")
     assert first.returncode == 0, first.stderr
     page = first.stdout.strip()
     assert page == str(next(work.glob("toy@*")) / "report/report.html")
@@ -395,19 +418,25 @@ def test_a_run_makes_the_report_and_a_second_run_does_nothing(work):
     assert {"test PSNR", "mIoU", "Gaussians", "PLY"} <= table
     assert "its 2D teacher" in first.stderr
     times = {p: p.stat().st_mtime_ns for p in work.glob("store/*/*/artifact.json")}
-    assert len(times) == len(MADE)
-    second = chebsplat("run", "--scene", "toy", "--set", FAST)
+    assert len(times) == len(ALL) + 1  # what ships is in the store, too
+    assert list(json.loads((work / "toy/pin.json").read_text()).values()) == [[]]
+    check_encoder(next(work.glob("toy@*")))
+    assert chebsplat("knowledge", "verify").stdout == "rooms: 1 lessons, whole\n"
+    shown = chebsplat("knowledge", "show").stdout.splitlines()[1].split()
+    assert shown[:2] == chebsplat("knowledge", "log").stdout.split()[1:]
+    assert "its labels were given" in " ".join(shown)
+    second = chebsplat("run", "--scene", "toy", "--set", f"{FAST},{KNOWING}")
     assert second.returncode == 0
     assert second.stdout.strip() == page
     assert "to run" not in second.stderr
     assert times == {p: p.stat().st_mtime_ns for p in work.glob("store/*/*/artifact.json")}
-    only = chebsplat("run", "--scene", "toy", "--set", FAST + ",evaluate.boundary=3")
-    assert f"to run: evaluate report   fresh: {len(MADE) - 2}" in only.stderr
+    only = chebsplat("run", "--scene", "toy", "--set", f"{FAST},{KNOWING},evaluate.boundary=3")
+    assert f"to run: evaluate report   fresh: {len(ALL) - 2}" in only.stderr
     assert "report: done" in only.stderr
     assert "already there" not in only.stderr
     assert "profile" not in first.stderr + only.stderr
     assert not list(work.glob(".plans/*"))
-    part = chebsplat("run", "--scene", "toy", "--set", FAST, "--stage", "sfm")
+    part = chebsplat("run", "--scene", "toy", "--set", f"{FAST},{KNOWING}", "--stage", "sfm")
     assert part.stdout.endswith(f"{os.sep}sfm\n")
     assert chebsplat("clean-stale").stdout.split()[:2] == ["0.0", "MB"]
     checked = chebsplat("verify", *(str(p.parent) for p in times))
@@ -427,7 +456,7 @@ def test_a_failing_stage_gives_its_exit_code_and_nothing_half_made(work):
 @pytest.mark.xdist_group("cli")
 def test_runs_at_the_same_time_make_every_artifact_once(work):
     command = [sys.executable, "-m", "chebsplat.pipelines.cli", "run", "--scene", "toy", "--stage", "describe", "--set"]
-    settings = [FAST, FAST, FAST, FAST + ",describe.bandwidth=0.8"]
+    settings = [f"{FAST},{KNOWING}"] * 3 + [f"{FAST},{KNOWING},describe.bandwidth=0.8"]
     runs = [
         subprocess.Popen([*command, some], cwd=ROOT, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
         for some in settings

@@ -8,7 +8,7 @@ from chebsplat.pipelines.planning.plan import Planner, overrides
 from chebsplat.pipelines.planning.sequences import chain, scenes_of
 from chebsplat.pipelines.running.run import wanted_steps
 
-BEFORE_TRAIN = {"ingest", "sfm", "teacher", "agree", "describe"}
+BEFORE_TRAIN = {"ingest", "sfm", "teacher", "agree"}
 LABELS = "teacher.kind=labels"
 
 
@@ -78,14 +78,6 @@ def test_scene_k_reads_the_training_of_scene_k_minus_one_and_the_first_none(sequ
 def test_the_first_scene_of_a_sequence_is_the_scene_alone(sequence):
     (first, _), alone = chain(Planner(), sequence("toy", "office0"), "", "paper"), Planner().plan("toy", "", "paper")
     assert first.targets == alone.targets
-
-
-@pytest.mark.parametrize("ablation", ["", "no-shape"])
-def test_only_the_printed_form_has_sequences(ablation):
-    with pytest.raises(
-        ConfigError, match="sequences carry knowledge in the paper's printed form only; add ablation=pa"
-    ):
-        chain(Planner(), "toys", ablation=ablation)
 
 
 def test_settings_may_have_spaces_about_their_commas_and_are_given_once():

@@ -35,7 +35,7 @@ def test_status_tells_what_runs_waits_and_has_failed_with_the_end_of_its_log():
         base.with_suffix(".log").write_text("begun")
         plan.steps = [step for step in plan.steps if step.stage == "ingest"]
         finish(plan)
-        elsewhere = store.lease(store.work(), cluster.name_of(entries["describe"]))
+        elsewhere = store.lease(store.work(), cluster.name_of(entries["agree"]))
         elsewhere.write_text("filelock/2\npid=17\nhost=node7\nmode=lease\ntoken=0\nduration=60.0\n")
         began = time.time() - 42
         os.utime(file.parent / f"{elsewhere.name}.exit", (began, began))
@@ -44,7 +44,7 @@ def test_status_tells_what_runs_waits_and_has_failed_with_the_end_of_its_log():
         assert lines[0].endswith(f"1 done, 1 runs, {n_waiting} waits, 1 failed")
         assert any(line.split()[:2] == ["failed", "sfm"] and "exit code 4" in line for line in lines)
         assert "    line 8" in lines and "    line 3" not in lines
-        assert re.search(r"\n  runs +describe +[0-9a-f]{16}  4\d s on node7\n", told("status"))
+        assert re.search(r"\n  runs +agree +[0-9a-f]{16}  4\d s on node7\n", told("status"))
         assert "1 teacher" in lines[-1]
     lines = told("status").splitlines()
     assert ", over: " in lines[0] and f"{n_waiting - 1} not begun, 2 failed" in lines[0]

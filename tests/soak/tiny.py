@@ -16,7 +16,7 @@ from chebsplat.errors import InputError
 from chebsplat.formats import artifact
 
 ROOT = Path(__file__).parents[2]
-SET = ("train.steps=12,train.n_densify=1,sfm.max_points=200,evaluate.timing_repeats=0,refine.knowledge=none,"
+SET = ("train.steps=12,train.n_densify=1,sfm.max_points=200,evaluate.timing_repeats=0,knowledge.start=none,"
        "train.seed={seed}")  # fmt: skip
 MARKER = "CHEBSPLAT_SOAK"  # in the environment of a run and of all that it starts
 LOGS = ("log.jsonl", "trace.csv")  # hold seconds

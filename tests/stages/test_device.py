@@ -88,7 +88,7 @@ def test_a_run_says_it_once_for_all_its_stages(machine):
 def test_the_device_is_in_the_keys_of_what_it_computes_and_of_all_that_follows(quick_plans):
     on_cpu, on_gpu = ({step.stage: step for step in Planner(device=name).plan("toy").steps} for name in ("cpu", "cuda"))
     same = {stage for stage in on_cpu if on_cpu[stage].key == on_gpu[stage].key}
-    assert same == {"ingest", "sfm", "teacher", "agree", "describe"}
+    assert same == {"ingest", "sfm", "teacher", "agree"}
     computing = {step.stage: entry(step, {}, "cuda")["device"] for step in on_gpu.values()}
     assert {stage for stage, used in computing.items() if used == "cuda"} == {"train", "evaluate"}
     seen = {step.stage: step for step in Planner(device="cuda").plan("office0").steps}

@@ -17,7 +17,7 @@ from chebsplat.formats.capture import Capture
 from chebsplat.formats.evaluation import Evaluation
 from chebsplat.formats.gaussians import Gaussians
 from chebsplat.formats.points import Points
-from chebsplat.stages.registry import STAGES
+from chebsplat.stages.registry import OF_KNOWLEDGE, STAGES
 
 pytestmark = pytest.mark.xdist_group("toy")
 
@@ -82,15 +82,11 @@ def teacher_of_nothing(toy, tmp):
 
 def photos_apart(toy, tmp):
     model = knowing_rooms(color_teacher(tmp))
-    return {}, changed(knowledge={"model": str(model), "n_views": 2, "n_points": 100})
+    return {}, changed(teach={"model": str(model), "n_views": 2, "n_points": 100})
 
 
 def without_depth(capture):
     return {"depth": np.full(capture.depth.shape, np.nan, np.float32)}
-
-
-def without_points(points):
-    return {name: getattr(points, name)[:0] for name in ("means", "colors", "normals", "covariances")}
 
 
 def without_gaussians(checkpoint):
@@ -105,7 +101,6 @@ FAILURES = {  # the inputs of a stage that are others than the toy scene's, and 
     "teacher": but_for("capture", lambda capture: {"labels": None}),
     "agree": only_test_views,
     "teach": photos_apart,
-    "describe": but_for("points", without_points),
     "train": only_test_views,
     "lift": only_test_views,
     "refine": but_for("gaussians", without_gaussians),
@@ -115,11 +110,24 @@ FAILURES = {  # the inputs of a stage that are others than the toy scene's, and 
 }
 
 
-@pytest.mark.parametrize("stage", STAGES)
+@pytest.mark.parametrize("stage", FAILURES)
 def test_data_that_cannot_be_worked_with_is_exit_4(toy, stage, tmp_path):
     changes, config = FAILURES[stage](toy, tmp_path)
     assert run_stage(stage, tmp_path / "out", inputs_of(toy, stage) | changes, config) == 4
     assert not (tmp_path / "out").exists()
+
+
+def test_a_scene_without_a_surface_is_known_by_views_alone_and_says_so(toy, tmp_path):
+    points = Points.read(toy["sfm"])
+    few = {name: getattr(points, name)[:9] for name in ("means", "colors", "normals", "covariances")}
+    made = toy | {"sfm": published(tmp_path / "few", dataclasses.replace(points, **few))}
+    for stage in (*OF_KNOWLEDGE, "refine"):
+        made[stage] = tmp_path / stage
+        assert run_stage(stage, made[stage], inputs_of(made, stage)) == 0
+        facts = artifact.read_manifest(made[stage]).facts
+        assert stage == "recall" or "9 points of a surface" in str(facts["left_out"]), stage
+    assert facts["changed_by_knowledge"] == 0
+    assert artifact.read_manifest(made["recall"]).facts["of"] == []  # a lesson of nothing teaches nothing
 
 
 def test_rendering_only_scenes_leave_the_semantic_branch_out(toy, tmp_path):

@@ -161,12 +161,12 @@ def test_a_stage_is_known_by_every_kernel_it_runs_and_every_package_it_loads():
 
     found: dict[str, list] = {}
     code = Code(PACKAGE, found)
-    for stage in ("sfm", "train", "lift", "refine"):
+    for stage in ("sfm", "describe", "train", "lift", "refine"):
         code.stage(stage)
     kernels = [path for path in PACKAGE.rglob("*.py") if "chebsplat.kernels.jit import" in path.read_text()]
     assert len(kernels) > 8
     assert not [path for path in kernels if str(path) not in found]
-    assert {"onnx", "onnxruntime", "torch"} <= set(code.stage("teach")["packages"])
+    assert {"onnx", "onnxruntime", "torch"} <= set(code.stage("onnx")["packages"])
 
 
 def test_tools_that_walk_the_links_see_each_file_once(tmp_path):

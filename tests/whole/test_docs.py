@@ -9,6 +9,8 @@ from shared import ROOT
 
 from chebsplat.formats.capture import Capture
 from chebsplat.formats.channels import ChannelMap
+from chebsplat.formats.descriptors import Descriptors
+from chebsplat.formats.encoding import Encoding
 from chebsplat.formats.evaluation import Pictures, ViewAgreement
 from chebsplat.formats.features import Features
 from chebsplat.formats.gaussians import Checkpoint
@@ -25,7 +27,10 @@ from chebsplat.stages.training.defaults import DEFAULTS, OPEN
 PAGES = [ROOT / name for name in ("README.md", "CONTRIBUTING.md")] + sorted((ROOT / "docs").rglob("*.md"))
 CODE = re.compile(r"`([\w/]+\.py)(?::([\w.]+))?`|\b((?:chebsplat|formats|stages|pipelines)/[\w/]+\.py):(\w+)")
 LINK = re.compile(r"\]\(([^)#:]+)\)")
-RECORDS = (Capture, Points, ChannelMap, Features, ViewAgreement, Checkpoint, Lifted, Refined, RaggedScene, Pictures)
+RECORDS = (
+    Capture, Points, ChannelMap, Features, ViewAgreement, Descriptors, Encoding, Checkpoint, Lifted, Refined,
+    RaggedScene, Pictures,
+)  # fmt: skip
 
 
 def defined(path):

@@ -1,15 +1,13 @@
 """The point encoder sees shape alone: whichever way a room stands, in whatever unit, and however dense its points."""
 
-import math
-from dataclasses import replace
-
 import numpy as np
 import pytest
 import torch
 
 from chebsplat.cameras import common_up, upright
 from chebsplat.shape import point_encoder
-from chebsplat.shape.point_encoder import PointEncoder, Standardize, cloud_of
+from chebsplat.shape.lessons import solved, summed
+from chebsplat.shape.point_encoder import N_HEADS, PointEncoder, Standardize, cloud_of
 from chebsplat.shape.point_inputs import RADII, REACH, point_inputs
 from chebsplat.splats.gaussians import local_shape
 from chebsplat.synthetic.rays import look_at, walk
@@ -77,38 +75,63 @@ def test_neighbours_lie_within_reach_and_far_ones_are_seen_at_large_radii(seen):
     assert np.median(far.max(1)) > 0.5 * RADII[2]  # 24 neighbours reach as far as the radius, not as the spacing
 
 
-def test_the_answer_is_the_written_formula(seen, encoder):
-    """One point in float64, neighbour by neighbour."""
+def attended(scale, tokens):
+    """Textbook attention of the learned token to itself and to neighbours' tokens [K, h], in NumPy: [2 h]."""
+    w = {name: value.detach().double().numpy() for name, value in scale.state_dict().items()}
+
+    def normal(rows, name):
+        less = rows - rows.mean(-1, keepdims=True)
+        return less / np.sqrt((less**2).mean(-1, keepdims=True) + 1e-5) * w[f"{name}.weight"] + w[f"{name}.bias"]
+
+    def fed(rows):
+        hidden = normal(rows, "norm_after") @ w["feed.0.weight"].T + w["feed.0.bias"]
+        return rows + (hidden / (1 + np.exp(-hidden))) @ w["feed.2.weight"].T + w["feed.2.bias"]
+
+    rows = normal(np.vstack([w["token"], tokens]), "norm")
+    q, k, v = ((rows @ w[f"{name}.weight"].T).reshape(len(rows), N_HEADS, -1) for name in ("query", "key", "value"))
+    scores = np.exp(np.einsum("hd,khd->kh", q[0], k) / np.sqrt(q.shape[2]))
+    heads = np.einsum("kh,khd->hd", scores / scores.sum(0), v).ravel()
+    mean = fed(tokens).mean(0) if len(tokens) else np.zeros(len(w["token"]))
+    return np.concatenate([fed(w["token"] + heads @ w["out.weight"].T), mean])
+
+
+def test_features_are_the_written_formula(seen, encoder):
+    """In float64, neighbour by neighbour; of a point whose neighbours are whole, masked in the midst, or none."""
     point, double = 17, PointEncoder(**encoder.settings).double()
     double.load_state_dict(encoder.state_dict())
     cloud = point_encoder.Cloud(*(v.double() if v.is_floating_point() else v for v in cloud_of(seen)))
     embedded = double.embedded(cloud.own, cloud.descriptors)
-    parts = [embedded[point]]
-    for index, (radius, scale) in enumerate(zip(RADII, double.scales, strict=True)):
-        tokens = []
-        for j in seen.neighbors[point, index][seen.neighbors[point, index] >= 0]:
-            o = (cloud.means[j] - cloud.means[point]) / radius
-            n, m = cloud.normals[point], cloud.normals[j]
-            along = o @ n
-            lengths = [o.norm(), o[:2].norm(), o[2].abs(), along, (o - along * n).norm(), n @ m, m[2] - n[2]]
-            between = torch.cat([o, torch.stack(lengths)])
-            hidden = scale.point(embedded[point]) + scale.neighbor(embedded[j]) + scale.relative(between)
-            tokens.append(torch.nn.functional.silu(scale.mix(torch.nn.functional.silu(hidden))))
-        stacked = torch.stack(tokens)
-        parts += [stacked.mean(0), stacked.amax(0)]
-    wanted = double.decode(torch.cat(parts)).detach()
-    answer = double(cloud, embedded, torch.tensor([point]), cloud.neighbors[[point]])[0].detach()
-    torch.testing.assert_close(answer, wanted, rtol=1e-12, atol=1e-12)
-    np.testing.assert_allclose(encoder.predict(seen)[point], wanted.numpy(), atol=1e-5)
+    for missing in ([], [0, 3, 4], range(seen.neighbors.shape[2])):
+        neighbors = cloud.neighbors[[point]].clone()
+        neighbors[:, :, list(missing)] = -1
+        parts = [embedded[point].detach()]
+        for index, (radius, scale) in enumerate(zip(RADII, double.scales, strict=True)):
+            tokens = []
+            for j in neighbors[0, index][neighbors[0, index] >= 0]:
+                o = (cloud.means[j] - cloud.means[point]) / radius
+                n, m = cloud.normals[point], cloud.normals[j]
+                along = o @ n
+                lengths = [o.norm(), o[:2].norm(), o[2].abs(), along, (o - along * n).norm(), n @ m, m[2] - n[2]]
+                between = torch.cat([o, torch.stack(lengths)])
+                token = scale.point(embedded[point]) + scale.neighbor(embedded[j]) + scale.place(between)
+                tokens.append(token.detach().numpy())
+            stacked = np.array(tokens).reshape(len(tokens), encoder.settings["hidden"])
+            parts.append(torch.from_numpy(attended(scale, stacked)))
+        whole = torch.cat(parts)
+        wanted = torch.cat([whole, double.decode(whole).detach(), torch.ones(1)])
+        found = double(cloud, embedded, torch.tensor([point]), neighbors)[0].detach()
+        torch.testing.assert_close(found, wanted.double(), rtol=1e-12, atol=1e-12)
+        if not missing:
+            np.testing.assert_allclose(encoder.encode(seen)[point], wanted.numpy(), atol=2e-5)
 
 
 def test_a_point_without_neighbours_and_coincident_points_have_finite_answers(encoder):
     for means in (np.zeros((1, 3)), np.zeros((40, 3)), np.array([[0.0, 0, 0], [1e4, 0, 0]])):
         n = len(means)
         inputs = point_inputs(means, np.tile(UP, (n, 1)), np.tile(1e-4 * np.eye(3), (n, 1, 1)), up=UP)
-        answers = encoder.predict(inputs)
-        assert answers.shape == (n, 5)
-        assert np.isfinite(answers).all()
+        features = encoder.encode(inputs)
+        assert features.shape == (n, encoder.n_features)
+        assert np.isfinite(features).all()
     with pytest.raises(ValueError, match="finite"):
         point_inputs(np.array([[np.nan, 0, 0]]), np.array([UP]), np.eye(3)[None], up=UP)
 
@@ -117,32 +140,25 @@ def test_it_learns_what_shape_tells(seen):
     """Floor, wall and box top have a vector each; taught on one room, the encoder knows them in another."""
     codes = np.eye(5, dtype=np.float32)[:3]
 
-    def lesson(seed):
+    def example(seed):
         means, normals, covariances = corner(seed=seed)
         labels = np.where(np.abs(normals[:, 2]) < 0.5, 0, np.where(means[:, 2] > 0.2, 1, 2))
         inputs = point_inputs(means, normals, covariances, up=UP)
-        return point_encoder.Lesson(
-            cloud_of(inputs), torch.from_numpy(codes[labels]), np.full(len(means), 3), labels
-        ), inputs
+        features, n_views = torch.from_numpy(codes[labels]), np.full(len(means), 3)
+        return point_encoder.Example(cloud_of(inputs), features, n_views, labels), inputs
 
-    (first, _), (second, inputs) = lesson(1), lesson(2)
+    (first, seen), (second, inputs) = example(1), example(2)
     torch.manual_seed(0)
     encoder = PointEncoder(5, first.cloud.descriptors.shape[1])
     encoder.set_inputs([first.cloud], sample=1)
-    losses = list(point_encoder.taught(encoder, [first], point_encoder.Course(steps=120, batch=128)))
+    losses = list(point_encoder.taught(encoder, [first], point_encoder.Course(steps=60, batch=128)))
     assert np.mean(losses[-10:]) < 0.5 * np.mean(losses[:3])
-    found = (encoder.predict(inputs)[:, :3]).argmax(1)
-    assert (found == second.labels).mean() > 0.9
-    with pytest.raises(ValueError, match="seen in 2 views"):
-        replace(first, n_views=np.zeros(len(first.labels), np.int64)).odds()
-
-
-def test_rare_things_are_drawn_more_often_and_what_no_view_saw_never():
-    lesson = point_encoder.Lesson(None, None, np.array([3] * 90 + [3] * 9 + [1]), np.array([0] * 90 + [1] * 9 + [2]))
-    odds = lesson.odds()
-    assert odds.sum() == pytest.approx(1)
-    assert odds[-1] == 0
-    assert 1.5 < odds[95] / odds[0] < math.sqrt(10)
+    of_room = summed(encoder.eval().encode(seen), codes[first.labels], np.ones(len(first.labels)))
+    for answers in (
+        encoder.answers(torch.from_numpy(encoder.encode(inputs))).detach().numpy(),  # of the course
+        encoder.encode(inputs) @ solved(of_room, 1e-2),  # of a lesson
+    ):
+        assert (answers.argmax(1) == second.labels).mean() > 0.9
 
 
 def test_up_is_where_the_cameras_tops_point():

@@ -101,8 +101,8 @@ def test_a_study_is_every_combination_and_each_step_once():
     assert len({run.name for run in runs}) == len({run.plan.targets["evaluate"] for run in runs}) == 16
     counts = [step.stage for step in outstanding(runs)]
     assert {stage: counts.count(stage) for stage in counts} == {
-        "ingest": 1, "sfm": 1, "teacher": 4, "agree": 4, "train": 16, "lift": 8, "refine": 8,
-        "export": 16, "evaluate": 16,
+        "ingest": 1, "sfm": 1, "teacher": 4, "agree": 4, "train": 16, "lift": 8,
+        "refine": 8, "export": 16, "evaluate": 16,
     }  # fmt: skip
     settings = [step.sections["train"] for step in outstanding(runs) if step.stage == "train"]
     assert {(s["steps"], s["seed"], s["prune"]) for s in settings} == {

@@ -1,0 +1,48 @@
+"""What views say of points of a surface: the mean of their unit features over the views that see a point."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+
+import numpy as np
+
+NEAREST = 0.05  # metres before a camera
+SEEN_WITHIN = (0.03, 0.01)  # metres, and share of the depth: how far a point may lie from what a view sees
+SWEPT_WITHIN = (0.08, 0.02)  # the same of points of swept depth, which is off by more
+
+
+def averaged(
+    means: np.ndarray,
+    depth: Iterable[np.ndarray],
+    features: Iterable[np.ndarray],
+    n_channels: int,
+    Ks: np.ndarray,
+    poses: np.ndarray,
+    within: tuple[float, float] = SEEN_WITHIN,
+    unit: float = 1.0,
+) -> tuple[np.ndarray, np.ndarray]:
+    """Mean f32 [N, d] of the unit features of the views that see a point, and how many these are [N].
+
+    Args:
+      means:    [N, 3] scene units; unit: of these in a metre.
+      depth:    of each view, [H, W] scene units; nan or 0: unknown, where a view sees nothing.
+      features: of each view, [h, w, n_channels = d]; a row of zeros says nothing. Read view by view.
+      Ks:       [V, 3, 3] pixels of the depth; poses [V, 4, 4].
+      within:   metres, and share of the depth, by which a point may lie off what a view sees.
+    """
+    total, n_views = np.zeros((len(means), n_channels), np.float32), np.zeros(len(means), np.int64)
+    for z_of, said, K, pose in zip(depth, features, Ks, poses, strict=True):
+        (height, width), (rows, columns) = z_of.shape, said.shape[:2]
+        camera = means @ pose[:3, :3].T + pose[:3, 3]
+        z = np.maximum(camera[:, 2], 1e-6 * unit)
+        u, v = ((camera / z[:, None]) @ K.T)[:, :2].T
+        inside = (camera[:, 2] > NEAREST * unit) & (u >= 0) & (u < width) & (v >= 0) & (v < height)
+        index = np.flatnonzero(inside)
+        hit = z_of[v[index].astype(int), u[index].astype(int)]
+        index = index[np.abs(hit - z[index]) < within[0] * unit + within[1] * z[index]]
+        seen = said[(v[index] * rows / height).astype(int), (u[index] * columns / width).astype(int)].astype(np.float32)
+        lengths = np.linalg.norm(seen, axis=1)
+        index, seen = index[lengths > 0], seen[lengths > 0] / lengths[lengths > 0, None]
+        total[index] += seen
+        n_views[index] += 1
+    return total / np.maximum(n_views, 1)[:, None], n_views

@@ -1,0 +1,113 @@
+"""What scenes teach about shape, in closed form: sums over a scene's points, and the map from shape to meaning that
+many scenes' sums give. They commute, so that no scene is forgotten and no order matters (docs/method.md, section 14).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import numpy as np
+from scipy.linalg import cho_factor, cho_solve, eigh
+
+SHARE = 3.0  # scenes that what ships counts for
+RIDGE = 1e-2  # in units of the diagonal of A
+LEAST_VIEWS = 2  # that a point to learn from was seen in
+ENERGY = 0.99  # of what was learned, that the basis holds
+KAPPA = 0.1  # of ρ′ = ρ (1 + κ σ_f)
+
+
+class Sums(NamedTuple):
+    """Of N points with features z [p] of shape and y [C] of meaning, weights w that add up to 1.
+
+    gram:  A = Σ w z zᵀ, f64 [p, p]; cross: b = Σ w z yᵀ, f64 [p, C]; square: c = Σ w |y|².
+    """
+
+    gram: np.ndarray
+    cross: np.ndarray
+    square: float
+
+    def spread(self) -> float:
+        """σ_f = √(Σ w |y − ȳ|²) of the meanings (Eq 15); the last feature is 1, so that the last row of b is ȳ."""
+        return float(np.sqrt(max(self.square - float(self.cross[-1] @ self.cross[-1]), 0.0)))
+
+
+def summed(features: np.ndarray, meanings: np.ndarray, weights: np.ndarray) -> Sums:
+    """Sums of points with z [N, p], y [N, C] and w [N] >= 0, not all zero.
+
+    Raises: ValueError where no point has a weight.
+    """
+    total = float(weights.sum())
+    if not total > 0:
+        raise ValueError("no point has a weight: nothing can be learned")
+    w = (weights / total).astype(np.float64)[:, None]
+    z, y = features.astype(np.float64), meanings.astype(np.float64)
+    return Sums(z.T @ (w * z), z.T @ (w * y), float(np.sum(w * y * y)))
+
+
+def odds(n_views: np.ndarray, labels: np.ndarray) -> np.ndarray:
+    """How much each of N points teaches, f64 [N], sum 1: half alike, half by 1 / sqrt(frequency of its label).
+
+    Args: n_views [N], that see it; labels [N] that its teacher gives it.
+    Raises: ValueError where none is seen in LEAST_VIEWS views.
+    """
+    seen = (n_views >= LEAST_VIEWS).astype(np.float64)
+    rare = seen / np.sqrt(np.bincount(labels, minlength=1)[labels])
+    if not seen.any():
+        raise ValueError(f"no point is seen in {LEAST_VIEWS} views")
+    return np.asarray(0.5 * seen / seen.sum() + 0.5 * rare / rare.sum())
+
+
+def combined(sums: Sequence[Sums], weights: Sequence[float]) -> Sums:
+    """Σ g_k of sums, in their order. Choices: in the order given, so that equal sets in equal order give equal bits."""
+    gram, cross = np.zeros_like(sums[0].gram), np.zeros_like(sums[0].cross)
+    square = 0.0
+    for of, weight in zip(sums, weights, strict=True):
+        gram += weight * of.gram
+        cross += weight * of.cross
+        square += weight * of.square
+    return Sums(gram, cross, square)
+
+
+def solved(sums: Sums, ridge: float) -> np.ndarray:
+    """W = (A + λ diag A)⁻¹ b, f64 [p, C]. Features that are zero everywhere get no weight."""
+    diagonal = np.diag(sums.gram).copy()
+    alive = diagonal > 1e-12 * diagonal.max()
+    scale = 1 / np.sqrt(np.where(alive, diagonal, 1))
+    correlation = sums.gram * scale[:, None] * scale + np.diag(np.where(alive, ridge, 1.0))
+    found = cho_solve(cho_factor(correlation, lower=True), sums.cross * scale[:, None])
+    return np.asarray(found * (scale * alive)[:, None])
+
+
+def mapped(shipped: Sequence[Sums], lessons: Sequence[Sums], trust: Sequence[float]) -> np.ndarray:
+    """The map W f64 [p, C] that shipped sums and lessons give, these by how far each is trusted (in [0, 1]).
+
+    Choices: what ships counts for SHARE scenes, and the ridge is RIDGE. Leaving out one lesson after the other, which
+      A, b and c allow without a point, finds what errs least in squares; that names fewer points right.
+    """
+    return solved(combined([*shipped, *lessons], [*[SHARE / len(shipped)] * len(shipped), *trust]), RIDGE)
+
+
+def scale_of(sums: Sums) -> np.ndarray:
+    """1 / √diag A [p], by which features are compared; 0 for those that are zero everywhere."""
+    diagonal = np.diag(sums.gram)
+    return np.where(diagonal > 1e-12 * diagonal.max(), 1 / np.sqrt(np.maximum(diagonal, 1e-300)), 0.0)
+
+
+def basis(sums: Sums, scale: np.ndarray) -> np.ndarray:
+    """B [p, r]: eigenvectors of the correlation of what was learned, to ENERGY of it, columns orthonormal (Eq 15)."""
+    values, vectors = eigh(sums.gram * scale[:, None] * scale)
+    share = np.cumsum(values[::-1]) / values.sum()
+    return np.ascontiguousarray(vectors[:, ::-1][:, : int(np.searchsorted(share, ENERGY)) + 1])
+
+
+def novelty(sums: Sums, scale: np.ndarray, known: np.ndarray) -> float:
+    """ρ = √(share of a scene's energy that lies outside B) in [0, 1] (Eq 15)."""
+    correlation = sums.gram * scale[:, None] * scale
+    inside = float(np.sum(known * (correlation @ known)))
+    return float(np.sqrt(np.clip(1 - inside / np.trace(correlation), 0, 1)))
+
+
+def scaled_novelty(rho: float, spread: float) -> float:
+    """ρ′ = ρ (1 + κ σ_f) (Eq 15)."""
+    return rho * (1 + KAPPA * spread)

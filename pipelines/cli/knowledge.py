@@ -1,0 +1,135 @@
+"""What scenes start from: the lessons of a set, what each is trusted, taking one out, and a new encoder."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+
+import click
+
+from chebsplat.pipelines.cli.group import NewPath
+from chebsplat.pipelines.work.heads import ROOMS
+
+NAME = click.option("--set", "name", default=ROOMS, show_default=True, help="of lessons, in the work folder")
+
+
+@click.group()
+def knowledge() -> None:
+    """What scenes start from, and what they have taught: show, verify, forget, rebuild; teach a new encoder."""
+
+
+@knowledge.command()
+@NAME
+def log(name: str) -> None:
+    """The lessons of a set, in the order that they were added in."""
+    from chebsplat.pipelines.work import heads
+
+    for key, record in sorted(heads.members(name).items(), key=lambda entry: entry[1]["date"]):
+        print(f"{record['date']}  {key}  {record['scene']}")
+
+
+@knowledge.command()
+@NAME
+def show(name: str) -> None:
+    """What each lesson of a set teaches, how far it is trusted, and why."""
+    from chebsplat.formats.lesson import read_notes
+    from chebsplat.pipelines.work import heads
+    from chebsplat.pipelines.work.summary import aligned
+    from chebsplat.stages.recall import trusted, why
+
+    rows = [("lesson", "scene", "points", "novelty", "trust", "because")]
+    for key, record in heads.members(name).items():
+        notes = read_notes(heads.folder(name) / key)
+        figures = f"{notes['n_points']}", f"{notes['novelty']:.3f}", f"{trusted(notes):.2f}"
+        rows.append((key, record["scene"], *figures, why(notes)))
+    for line in aligned(rows):
+        print(line)
+
+
+@knowledge.command()
+@NAME
+def verify(name: str) -> None:
+    """Recompute every digest of a set's lessons."""
+    from chebsplat.formats import artifact
+    from chebsplat.formats.lesson import SCHEMA
+    from chebsplat.pipelines.work import heads
+
+    held = heads.members(name)
+    for key in held:
+        artifact.verify(heads.folder(name) / key, SCHEMA)
+    print(f"{name}: {len(held)} lessons, whole")
+
+
+@knowledge.command()
+@click.argument("lesson")
+@NAME
+def forget(lesson: str, name: str) -> None:
+    """Take a LESSON out of a set: scenes that are pinned from now on start as if it had never been learned."""
+    from chebsplat.pipelines.work import heads
+
+    heads.forget(name, lesson)
+    print(f"{name}: {len(heads.members(name))} lessons")
+
+
+@knowledge.command()
+@NAME
+@click.option("--cores", type=click.IntRange(1), default=os.cpu_count())
+def rebuild(name: str, cores: int) -> int:
+    """Learn every lesson of a set again, by the encoder that ships now, from artifacts that are there."""
+    from chebsplat.pipelines.planning.plan import Planner
+    from chebsplat.pipelines.planning.sequences import relearning
+    from chebsplat.pipelines.running.run import execute
+
+    planner = Planner(running=True)
+    try:
+        chosen = relearning(planner, name)
+    finally:
+        planner.save()
+    return execute(chosen, "learn", cores) if chosen else 0
+
+
+@knowledge.command()
+@click.option("--teacher", type=click.Path(path_type=Path), help=".onnx; default: the embedded teacher")
+@click.option("--set", "settings", default="", help="section.key=value,... of teach and channels")
+@click.option("--out", type=NewPath(), help="folder to copy it to; later: --knowledge FOLDER/")
+@click.option("--cores", type=click.IntRange(1), default=os.cpu_count())
+def teach(teacher: Path | None, settings: str, out: Path | None, cores: int) -> int:
+    """Teach an encoder what shapes look like to a TEACHER, over generated rooms; its scenes start from it."""
+    from chebsplat.formats import artifact
+    from chebsplat.pipelines.planning.plan import Planner
+    from chebsplat.pipelines.planning.sequences import teaching
+    from chebsplat.pipelines.running.run import execute
+    from chebsplat.pipelines.work import store
+
+    planner = Planner(running=True)
+    try:
+        store.make_work()
+        plan = teaching(planner, teacher, settings)
+    finally:
+        planner.save()
+    code = execute([plan], "teach", cores)
+    if code == 0 and out is not None:
+        made = plan.targets["teach"]
+        artifact.copy(made, out, artifact.verify(made))
+        print(out.absolute())
+    return code
+
+
+@click.command("teach")
+@click.argument("scene")
+@click.option("--points", type=click.Path(path_type=Path), required=True, help="a CSV of x, y, z, word in its frame")
+@NAME
+@click.option("--cores", type=click.IntRange(1), default=os.cpu_count())
+def teach_points(scene: str, points: Path, name: str, cores: int) -> int:
+    """Teach other scenes what labelled points of a SCENE are: its lesson is of these, in place of its teacher's.
+
+    Without a SCENE, the stage of this name: --help says more.
+    """
+    from chebsplat.pipelines.running.run import execute
+    from chebsplat.pipelines.selection import checked_stage, plans
+
+    chosen = plans(scene, None, {"learn": {"points": str(points)}}, "", running=True, knowledge=name)
+    return execute(chosen, checked_stage("learn", chosen), cores)
+
+
+COMMANDS = (knowledge, teach_points)

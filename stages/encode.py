@@ -1,0 +1,34 @@
+"""encode: features of the shape about each point, by the transformers of the knowledge that ships (Eq 7)."""
+
+from __future__ import annotations
+
+import numpy as np
+import torch
+
+from chebsplat.errors import DataFailure
+from chebsplat.formats.descriptors import Descriptors
+from chebsplat.formats.encoding import Encoding
+from chebsplat.formats.knowledge import read_knowledge
+from chebsplat.shape.point_encoder import PointEncoder
+from chebsplat.stages.runtime.command import Job, n_threads
+from chebsplat.stages.shape_models.answers import inputs_of
+
+
+def run(job: Job) -> None:
+    """What shape says of a scene before any teacher does (docs/method.md, section 14).
+
+    Reads `descriptors`, and the encoder of the `knowledge` that ships. Writes `encoding`. It is of no point where shape
+    cannot be told.
+    Choices: half precision, whose error is a hundredth of what one point's features differ from the next one's by.
+    """
+    start, descriptors = read_knowledge(job.inputs["start"]), Descriptors.read(job.inputs["descriptors"])
+    torch.set_num_threads(n_threads())
+    try:
+        inputs = inputs_of(job.inputs["start"], descriptors, start)
+    except DataFailure as error:
+        job.left_out("knowledge of shape", str(error))
+        Encoding(np.zeros((0, len(start.map)), np.float16), {"none": str(error)}).write(job.out)
+        return
+    features = PointEncoder.restored(start.encoder, start.weights).encode(inputs)
+    job.facts |= {"n_points": len(features), "n_features": features.shape[1]}
+    Encoding(features.astype(np.float16)).write(job.out)

@@ -1,0 +1,176 @@
+"""learn: what a scene teaches about shape, for the scenes after it: sums over its points (Eqs 14-15)."""
+
+from __future__ import annotations
+
+import csv
+from collections.abc import Iterable
+from pathlib import Path
+
+import numpy as np
+from scipy.spatial import cKDTree
+
+from chebsplat.cameras import resized
+from chebsplat.errors import DataFailure, InputError
+from chebsplat.formats.artifact import read_manifest
+from chebsplat.formats.capture import Capture
+from chebsplat.formats.descriptors import Descriptors
+from chebsplat.formats.encoding import Encoding
+from chebsplat.formats.features import Features
+from chebsplat.formats.knowledge import Knowledge, read_knowledge
+from chebsplat.formats.lesson import Lesson, write_lesson
+from chebsplat.formats.names import suggest
+from chebsplat.formats.points import Points
+from chebsplat.labels.decode import decode_labels
+from chebsplat.lifting.averages import SEEN_WITHIN, SWEPT_WITHIN, averaged
+from chebsplat.lifting.blend import familiar
+from chebsplat.shape.lessons import LEAST_VIEWS, novelty, odds, scaled_novelty, summed
+from chebsplat.stages.runtime.command import Job
+from chebsplat.stages.shape_models.answers import (
+    into_meanings,
+    of_features,
+    restored,
+    units,
+    unnamed,
+    words_by_label,
+    words_of,
+)
+from chebsplat.stages.shape_models.surfaces import in_scene
+from chebsplat.stages.teacher_models.text_encoder import found
+
+REACH = 0.3  # metres from a label to the described point that it is of
+KINDS = {"depth": ("held_out",), "swept depth": ("held_out_swept",)}  # rooms of a surface's kind
+KNOWN = 1.05  # times the largest novelty of such rooms, which were held out: what is newer is of another kind
+VOUCHED = ("labels", "given")  # kinds of teacher that the user answers for
+
+
+def run(job: Job) -> None:
+    """The lesson of a scene, and the evidence by which later scenes trust it.
+
+    Reads `capture`, `points`, `descriptors`, `encoding`, `features`, and the `knowledge` that ships, beside whose
+    answers it is judged. Writes `lesson`. It is of nothing where a scene shows too little of a surface.
+    Choices: trust is measured beside what ships, not beside what the lessons before have made of it: so it is the same
+      in whatever order scenes are learned.
+    """
+    settings, start = job.config.learn, read_knowledge(job.inputs["start"])
+    capture = Capture.read(job.inputs["capture"])
+    points, features = Points.read(job.inputs["points"]), Features.read(job.inputs["features"])
+    descriptors = Descriptors.read(job.inputs["descriptors"])
+    notes = {
+        "scene": job.config.scene.name,
+        "capture": read_manifest(job.inputs["capture"]).key,
+        "teacher": features.convention.get("teacher", features.convention["kind"]),
+        "given": features.convention["kind"] in VOUCHED,
+        "unnamed": [],
+    }
+    encoding = Encoding.read(job.inputs["encoding"])
+    z = encoding.features.astype(np.float32)
+    try:
+        if not len(z):
+            raise DataFailure(encoding.notes["none"])
+        if settings.points is not None:
+            said, n_views, embeddings = labelled(Path(settings.points), start, descriptors)
+            notes |= {"given": True, "teacher": "labelled points"}
+        else:
+            said, n_views = meant(job, start, capture, points, features, descriptors)
+            embeddings = named_embeddings(job, start, features)
+            notes["unnamed"] = unnamed(start, features)
+        labels = decode_labels(said, embeddings)
+        weights = odds(n_views, labels)
+        in_channels = settings.points is None and of_features(features)
+        words = words_by_label(start, features)[labels] if in_channels else said
+    except (DataFailure, ValueError) as error:
+        job.left_out("a lesson", str(error))
+        p, d = start.map.shape
+        write_lesson(job.out, Lesson((np.zeros((p, p)), np.zeros((p, d)), 0.0), notes | {"none": str(error)}))
+        return
+    if notes["unnamed"]:
+        job.left_out(
+            "labels without a word", f"knowledge has no word for {', '.join(notes['unnamed'])}: no vote from shape"
+        )
+    sums = summed(z, np.concatenate([said, words], 1), weights)
+    seen, half = n_views >= LEAST_VIEWS, said.shape[1]
+    answers = z @ (start.map[:, :half] if in_channels else start.map[:, half:])
+    rho, spread = novelty(sums, start.scale, start.basis), sums.spread()
+    notes |= {
+        "n_points": int(seen.sum()),
+        "n_labels": len(embeddings),
+        "rho": rho,
+        "sigma": spread,
+        "novelty": scaled_novelty(rho, spread),
+        "known": KNOWN * max(start.card["novelty"][kind] for kind in KINDS[descriptors.notes["of"]]),
+        "familiar": familiar(said[seen], answers[seen], embeddings),
+        "alike": float((decode_labels(answers[seen], embeddings) == labels[seen]).mean()),
+    }
+    job.facts |= notes
+    write_lesson(job.out, Lesson((sums.gram, sums.cross, sums.square), notes))
+
+
+def meant(
+    job: Job, start: Knowledge, capture: Capture, points: Points, features: Features, descriptors: Descriptors
+) -> tuple[np.ndarray, np.ndarray]:
+    """The mean of what training views mean by each described point, f32 [N, d], and how many see it [N]."""
+    row = {name: view for view, name in enumerate(capture.names)}
+    place = {name: view for view, name in enumerate(features.names)}
+    used = [k for k, name in enumerate(points.names) if not capture.is_test[row[name]] and name in place]
+    if not used:
+        raise DataFailure("no training view has a camera and features")
+    Ks, within = points.Ks[used], SEEN_WITHIN
+    depth: Iterable[np.ndarray]
+    if capture.depth is not None:
+        depth = (capture.depth[row[points.names[k]]] for k in used)
+    else:
+        assert points.depths is not None
+        depth, within = points.depths[used], SWEPT_WITHIN
+        factor = capture.size[0] // points.depths.shape[2]
+        Ks = resized(Ks, 1 / factor, 1 / factor)
+    meaning = into_meanings(job.inputs["start"], start, features)
+    views = (meaning(place[points.names[k]]) for k in used)
+    means, _ = in_scene(descriptors)
+    return averaged(
+        means, depth, views, start.matrix.shape[1], Ks, points.cam_from_world[used], within, descriptors.unit
+    )
+
+
+def named_embeddings(job: Job, start: Knowledge, features: Features) -> np.ndarray:
+    """What the scene's labels mean in the channels of knowledge, f32 [L, d]."""
+    if not of_features(features):
+        return words_of(job.inputs["start"], start, features)[1]
+    return np.asarray(features.label_embeddings @ restored(start, features))
+
+
+def labelled(path: Path, start: Knowledge, descriptors: Descriptors) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """What a user says of points: the words f32 [N, d] of the described points, zero of the others; n_views,
+    LEAST_VIEWS of those; and the unit embeddings f32 [L, d] of the words.
+
+    Raises: InputError naming the line that is no point, the word that knowledge lacks, or that nothing lies beside.
+    Choices: a label is of the described point nearest to it, within REACH.
+    """
+    where, words = read_labels(path)
+    rows = found(words, start.words)
+    if -1 in rows:
+        word = words[rows.index(-1)]
+        near = ", ".join(suggest(word, start.words))
+        raise InputError(f"{path}: knowledge has no word {word}" + (f"; near: {near}" if near else ""))
+    means, _ = in_scene(descriptors)
+    away, nearest = cKDTree(means).query(where)
+    beside = away <= REACH * descriptors.unit
+    if not beside.any():
+        raise InputError(f"{path}: no point lies within {REACH} m of the scene's surface; give x, y, z in its frame")
+    said, embeddings = np.zeros((len(means), start.matrix.shape[1]), np.float32), units(start.embeddings[rows])
+    np.add.at(said, nearest[beside], embeddings[beside])
+    return units(said), np.where(said.any(1), LEAST_VIEWS, 0), np.unique(embeddings, axis=0)
+
+
+def read_labels(path: Path) -> tuple[np.ndarray, list[str]]:
+    """Points f64 [M, 3] and a word each, of a CSV with columns x, y, z, word. Raises InputError naming the line."""
+    where, words = [], []
+    with path.open(newline="", encoding="utf-8") as handle:
+        for number, row in enumerate(csv.DictReader(handle), start=2):
+            try:
+                where.append([float(row[axis]) for axis in "xyz"])
+                words.append(row["word"].strip())
+            except (KeyError, TypeError, ValueError, AttributeError):
+                raise InputError(f"{path}, line {number}: x, y, z and a word are needed, under these names") from None
+    if not where or not np.isfinite(where).all():
+        raise InputError(f"{path} holds no points, or some that are not finite; give x, y, z and a word a line")
+    return np.array(where), words

@@ -1,0 +1,69 @@
+"""What a scene started from, and what it leaves to the scenes after it, for the report's page."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any, NamedTuple
+
+from chebsplat.formats.knowledge import read_card
+
+
+class Started(NamedTuple):
+    """rows: (what, in words); lessons: (scene, trust, because, new in kind), most trusted first."""
+
+    rows: list[tuple[str, str]]
+    lessons: list[tuple[str, str, str, str]]
+
+
+def started(inputs: dict[str, Path], facts: dict[str, dict[str, Any]]) -> Started | None:
+    """None where the scene has no knowledge, or could make no use of it.
+
+    Args: inputs: of the report; facts: of their manifests; both by role.
+    """
+    refined = facts.get("refined", {"knowledge": {}})
+    if "knowledge" not in inputs or "knowledge" not in refined:
+        return None
+    document = read_card(inputs["knowledge"])
+    card, solved = document["card"], document["lessons"]
+    taught = f"taught over {card['n_rooms']} generated rooms" if "n_rooms" in card else document["teacher"]
+    rows = [("the encoder of shape", taught)]
+    of = solved.get("of", [])
+    used = sum(lesson["trust"] > 0 for lesson in of)
+    count = f"{used} of {len(of)} are trusted" if of else "none: what ships, and nothing else"
+    rows.append(("lessons of other scenes", count))
+    rows += worth(refined) + left_behind(facts.get("learned", {}))
+    shown = [
+        (lesson["scene"], f"{lesson['trust']:.2f}", lesson["why"], "yes" if lesson["new"] else "no")
+        for lesson in sorted(of, key=lambda lesson: -lesson["trust"])
+    ]
+    return Started(rows, shown)
+
+
+def worth(refined: dict[str, Any]) -> list[tuple[str, str]]:
+    """What knowledge was worth: how far half the training views foretell the other half, without it and with it."""
+    if "curve" not in refined:
+        return []
+    curve, strength = refined["curve"]["off"], f"{refined['strength']:g}"
+    if strength not in curve or strength == "0":
+        return [("worth on training views held out", "not told: it counts for nothing here")]
+    agreed = f"agreement {curve['0']:.4f} without it, {curve[strength]:.4f} with it"
+    views = "1 view" if strength == "1" else f"{strength} views"
+    return [("worth on training views held out", f"{agreed}, counting as {views}")]
+
+
+def left_behind(lesson: dict[str, Any]) -> list[tuple[str, str]]:
+    """What the scene adds, by what later scenes trust it, and whether it is of a kind that was not known."""
+    if "rho" not in lesson:
+        return []
+    figures = f"ρ {lesson['rho']:.3f}, σ_f {lesson['sigma']:.3f}, ρ′ {lesson['novelty']:.3f}"
+    new = "new in kind" if lesson["novelty"] > lesson["known"] else "of a known kind"
+    figures += f": {new}; what is known stays below {lesson['known']:.3f}"
+    added = f"{lesson['n_points']:,} points, {lesson['n_labels']} labels"
+    if lesson["unnamed"]:
+        added += f"; without a word, and so not learned: {', '.join(lesson['unnamed'])}"
+    alike = f"shape has {lesson['alike']:.0%} of its labels alike, and is {lesson['familiar']:.2f} as sure"
+    return [
+        ("novelty of this scene (Eq 15)", figures),
+        ("what this scene adds", added),
+        ("by which later scenes trust it", f"its labels were given; {alike}" if lesson["given"] else alike),
+    ]

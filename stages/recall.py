@@ -1,0 +1,84 @@
+"""recall: what a scene starts from: the encoder that ships, and the map that it and the lessons of others give."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+
+from chebsplat.errors import InputError
+from chebsplat.formats.artifact import read_manifest
+from chebsplat.formats.knowledge import Knowledge, read_knowledge, write_knowledge
+from chebsplat.formats.lesson import Lesson, read_lesson
+from chebsplat.shape.lessons import Sums, basis, combined, mapped
+from chebsplat.stages.registry import LESSON
+from chebsplat.stages.runtime.command import Job
+
+ALIKE = 0.5, 0.75  # share of labels that shape and teacher have alike: below it no trust, above it all
+GIVEN = 0.1, 0.2  # the same of labels that were given: what is as good as drawn at random is no label of this room
+FAMILIAR = 0.4  # above it all
+
+
+def run(job: Job) -> None:
+    """The map of the lessons that a scene is pinned to, each by its trust (docs/method.md, section 14).
+
+    Reads the `knowledge` that ships, and of each such scene its `lesson`. Writes `knowledge`.
+    """
+    start = read_knowledge(job.inputs["start"])
+    paths = {role.removeprefix(LESSON): path for role, path in job.inputs.items() if role.startswith(LESSON)}
+    lessons = {key: read_lesson(path) for key, path in sorted(paths.items())}
+    for key, lesson in lessons.items():
+        if lesson.sums[0].shape != (len(start.map),) * 2:
+            raise InputError(
+                f"{paths[key]} is a lesson of another encoder; learn it again (`chebsplat knowledge rebuild`)"
+            )
+    knowledge = taught(start, lessons)
+    job.facts |= knowledge.lessons | {"n_lessons": len(lessons), "encoder": read_manifest(job.inputs["start"]).key}
+    write_knowledge(job.out, knowledge)
+
+
+def taught(start: Knowledge, lessons: Mapping[str, Lesson]) -> Knowledge:
+    """What ships, and what lessons add, taken in the order of their keys.
+
+    Choices: the basis grows by lessons that are trusted, and newer in kind than what ships calls known.
+    """
+    shipped = [Sums(*of) for of in start.shipped]
+    used = {key: of for key, of in sorted(lessons.items()) if "none" not in of.notes}
+    sums, trust = [Sums(*of.sums) for of in used.values()], [trusted(of.notes) for of in used.values()]
+    new = [of.notes["novelty"] > of.notes["known"] for of in used.values()]
+    grown = [combined(shipped, [1 / len(shipped)] * len(shipped))]
+    grown += [of for of, weight, novel in zip(sums, trust, new, strict=True) if novel and weight > 0]
+    weights = [1.0, *(weight for weight, novel in zip(trust, new, strict=True) if novel and weight > 0)]
+    return dataclasses.replace(
+        start,
+        map=mapped(shipped, sums, trust).astype(np.float32),
+        basis=basis(combined(grown, weights), start.scale).astype(np.float32),
+        shipped=[],
+        lessons={
+            "of": [
+                {"key": key, "scene": of.notes["scene"], "trust": weight, "why": why(of.notes), "new": novel}
+                for (key, of), weight, novel in zip(used.items(), trust, new, strict=True)
+            ]
+        },
+    )
+
+
+def trusted(notes: Mapping[str, Any]) -> float:
+    """How far a lesson is trusted, in [0, 1].
+
+    Choices: by the labels that shape and teacher have alike, and by how sure the teacher is beside shape: a
+      teacher out of its depth says the same wrong things from every view, which no agreement of views
+      tells. Fully where the user answers for the labels, unless shape has next to none of them alike.
+    """
+    least, enough = GIVEN if notes["given"] else ALIKE
+    alike = float(np.clip((notes["alike"] - least) / (enough - least), 0, 1))
+    return alike if notes["given"] else alike * float(np.clip(notes["familiar"] / FAMILIAR, 0, 1))
+
+
+def why(notes: Mapping[str, Any]) -> str:
+    """What a lesson's trust comes from, in words."""
+    if notes["given"]:
+        return f"its labels were given, and shape has {notes['alike']:.0%} of them alike"
+    return f"shape has {notes['alike']:.0%} of its labels alike, and is {notes['familiar']:.2f} as sure"
