@@ -15,7 +15,17 @@ from chebsplat.formats.gaussians import Gaussians
 from chebsplat.formats.knowledge import read_knowledge
 from chebsplat.formats.lifted import Lifted, Refined
 from chebsplat.labels.decode import decode_labels
-from chebsplat.lifting.blend import blend, calibrate, confidence, effective, familiar, reliable, start, trusted
+from chebsplat.lifting.blend import (
+    believed,
+    blend,
+    calibrate,
+    confidence,
+    effective,
+    familiar,
+    reliable,
+    start,
+    trusted,
+)
 from chebsplat.lifting.observations import carry
 from chebsplat.lifting.smoothing import affinities, smooth
 from chebsplat.splats.gaussians import surface_of
@@ -57,16 +67,20 @@ def run(job: Job) -> None:
     choice = calibrate(lifted.halves, lifted.half_views, near, knowledge)
     smoothed = choice.smooth if settings.smooth == "auto" else settings.smooth == "on"
     strength = choice.strength
-    known_to_teacher = 1.0
+    known_to_teacher = belief = 1.0
     made = [features, smooth(features, lifted.n_views, near) if smoothed else features]
     made.append(made[1])
     if knowledge is not None:
-        known_to_teacher = familiar(lifted.features, knowledge, Features.read(job.inputs["features"]).label_embeddings)
+        embeddings = Features.read(job.inputs["features"]).label_embeddings
+        known_to_teacher = familiar(lifted.features, knowledge, embeddings)
+        belief = believed(lifted.features, lifted.n_views, knowledge, embeddings, known_to_teacher)
+        strength *= belief
         evidence = effective(lifted.n_views) * reliable(lifted.halves, lifted.half_views) * known_to_teacher
         blended = blend(made[1], evidence, knowledge, strength)
         made[2] = smooth(blended, evidence + trusted(knowledge, strength), near) if smoothed else blended
     curve = {name: {f"{k:g}": value for k, value in row.items()} for name, row in choice.curve.items()}
-    notes = {"start": started, "smooth": smoothed, "strength": strength, "familiar": known_to_teacher, "curve": curve}
+    notes = {"start": started, "smooth": smoothed, "strength": strength, "curve": curve}
+    notes |= {"familiar": known_to_teacher, "believed": belief}
     sure = confidence(made[1], lifted.n_views, lifted.agreement, knowledge, strength, known_to_teacher)
     Refined(made[2], sure, notes).write(job.out)
     job.facts |= {"n_gaussians": len(features), "unit": unit, **notes} | shares(job, made)

@@ -7,7 +7,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from chebsplat.labels.decode import decode
+from chebsplat.labels.decode import decode, decode_labels
 from chebsplat.lifting.smoothing import Affinities, smooth
 
 STRENGTHS = (0.0, 0.5, 1.0, 2.0, 4.0, 8.0)  # views that knowledge may count for
@@ -16,6 +16,7 @@ SURE = 3  # power of its length by which knowledge counts
 AGREED = 6  # power by which views count of how far their halves agree, and of how sure they are beside shape
 # What a teacher gets wrong alike in both halves counts as right when they are asked, however many views there are.
 LEAST = 1.0  # strength
+BELIEVED = 0.55, 0.65  # share of labels that shape has alike with a teacher who knows the scene
 LEAST_SHARE = 0.5  # strength, in mean evidence of a Gaussian that is seen
 
 
@@ -89,6 +90,26 @@ def familiar(lifted: np.ndarray, knowledge: np.ndarray, embeddings: np.ndarray) 
         return 1.0
     sure, beside = (float(decode(rows[seen], embeddings)[1].mean()) for rows in (lifted, knowledge))
     return min(sure / beside, 1.0) ** AGREED
+
+
+def believed(
+    lifted: np.ndarray, n_views: np.ndarray, knowledge: np.ndarray, embeddings: np.ndarray, worth: float
+) -> float:
+    """How far shape is believed in a scene, in [0, 1], before its strength is chosen.
+
+    Args: as for `familiar`; n_views [N] that see each Gaussian; worth: of `familiar`.
+    Choices: where a teacher knows the scene and many labels of shape, weighed by how sure it is of them, are not
+      its own, it is shape that is wrong: another world than it was taught in. Below BELIEVED it has no say, above it
+      all. A teacher that is unsure of the scene is no judge.
+    """
+    seen = (n_views >= 2) & lifted.any(1)
+    if not seen.any():
+        return 1.0
+    alike = decode_labels(lifted[seen], embeddings) == decode_labels(knowledge[seen], embeddings)
+    sure = trusted(knowledge[seen], 1.0)
+    share = float(alike @ sure / max(float(sure.sum()), 1e-12))
+    alike_enough = float(np.clip((share - BELIEVED[0]) / (BELIEVED[1] - BELIEVED[0]), 0, 1))
+    return max(alike_enough, 1 - worth)
 
 
 def calibrate(

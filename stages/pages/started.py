@@ -43,11 +43,13 @@ def worth(refined: dict[str, Any]) -> list[tuple[str, str]]:
     """What knowledge was worth: how far half the training views foretell the other half, without it and with it."""
     if "curve" not in refined:
         return []
-    curve, strength = refined["curve"]["off"], f"{refined['strength']:g}"
+    curve, belief = refined["curve"]["off"], refined["believed"]
+    strength = f"{refined['strength'] / belief:g}" if belief else "0"
     if strength not in curve or strength == "0":
         return [("worth on training views held out", "not told: it counts for nothing here")]
     agreed = f"agreement {curve['0']:.4f} without it, {curve[strength]:.4f} with it"
     views = "1 view" if strength == "1" else f"{strength} views"
+    views += "" if belief == 1 else f", of which {belief:.0%} is believed: the teacher says otherwise"
     return [("worth on training views held out", f"{agreed}, counting as {views}")]
 
 

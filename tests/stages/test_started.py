@@ -8,7 +8,14 @@ from chebsplat.formats.artifact import publish, write_document
 from chebsplat.formats.manifest import Manifest
 
 CURVE = {"off": {"0": 0.9012, "2": 0.9134}, "on": {"0": 0.91, "2": 0.92}}
-REFINED = {"smooth": True, "strength": 2.0, "familiar": 1.0, "curve": CURVE, "knowledge": {"of": "depth"}}
+REFINED = {
+    "smooth": True,
+    "strength": 2.0,
+    "familiar": 1.0,
+    "believed": 1.0,
+    "curve": CURVE,
+    "knowledge": {"of": "depth"},
+}
 LESSON = {"given": False, "alike": 0.7, "familiar": 0.5, "n_points": 1234, "n_labels": 5, "unnamed": ["yoke"]}
 LESSON |= {"rho": 0.2, "sigma": 0.9, "novelty": 0.218, "known": 0.16}
 SOLVED = {
