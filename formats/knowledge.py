@@ -10,7 +10,7 @@ import numpy as np
 
 from chebsplat.formats import artifact
 from chebsplat.formats.artifact import read_document, write_document
-from chebsplat.formats.lesson import Sums, packed, unpacked
+from chebsplat.formats.lesson import PlainSums, packed, unpacked
 from chebsplat.formats.tensors import Spec, read_tensors, write_tensors
 
 SCHEMA = "chebsplat.knowledge/2"
@@ -31,9 +31,11 @@ class Knowledge:
     words:      W that it can name things by; embeddings f16 [W, d] of these, unit in the teacher's channels.
     map:        f32 [p, 2 d], from features of shape to answers: d in the teacher's channels, d in those of words.
     basis:      f32 [p, r] of what was learned, in features times scale f32 [p] (Eq 15).
-    card:       rooms, views, steps, errors on rooms held out, and where it fails.
-    lessons:    what it was solved from: of each its key, scene, trust and why.
-    shipped:    sums of the generated rooms, by halves of them; none in what a scene has solved.
+    card:       how it was taught; of each kind of room held out, the shares of points named right
+                (`stages.teach.measured`) and, in `novelty`, the largest ρ′.
+    lessons:    what it was solved from, `of`: of each its key, scene, trust, why that, and whether
+                it is new in kind. Empty in what ships.
+    shipped:    mean sums of the generated rooms, by parts of them; none in what a scene has solved.
     """
 
     teacher: str
@@ -49,7 +51,7 @@ class Knowledge:
     scale: np.ndarray
     card: dict[str, Any]
     lessons: dict[str, Any] = field(default_factory=dict)
-    shipped: list[Sums] = field(default_factory=list)
+    shipped: list[PlainSums] = field(default_factory=list)
 
 
 DOCUMENT = ("teacher", "digest", "encoder", "describe", "words", "card", "lessons")

@@ -13,7 +13,8 @@ from chebsplat.formats.artifact import read_document, write_document
 from chebsplat.formats.tensors import Spec, read_tensors, write_tensors
 
 SCHEMA = "chebsplat.lesson/1"
-Sums = tuple[np.ndarray, np.ndarray, float]  # A f64 [p, p], b f64 [p, 2 d] and c, as in `shape.lessons.Sums`
+# `shape.lessons.Sums`, which formats do not import: A f64 [p, p], b f64 [p, 2 d] and c
+PlainSums = tuple[np.ndarray, np.ndarray, float]
 SPECS: dict[str, Spec] = {"gram": ("float32", "half"), "cross": ("float32", "p", "2 d")}
 
 
@@ -23,17 +24,17 @@ class Lesson:
     for its trust: whether its labels were given, `familiar`, and the share of labels that shape and teacher have alike.
     """
 
-    sums: Sums
+    sums: PlainSums
     notes: dict[str, Any]
 
 
-def packed(sums: Sums) -> dict[str, np.ndarray]:
+def packed(sums: PlainSums) -> dict[str, np.ndarray]:
     """The lower half of A row by row, and b, f32."""
     gram, cross, _ = sums
     return {"gram": gram[np.tril_indices(len(gram))].astype(np.float32), "cross": cross.astype(np.float32)}
 
 
-def unpacked(arrays: dict[str, np.ndarray], square: float) -> Sums:
+def unpacked(arrays: dict[str, np.ndarray], square: float) -> PlainSums:
     """What `packed` made. Raises: ValueError where the sizes do not fit."""
     p = len(arrays["cross"])
     gram = np.zeros((p, p))

@@ -19,11 +19,8 @@ def run(job: Job) -> None:
     Reads `capture` and `points`. Writes `descriptors`. They are of no point where a scene shows too
     little of a surface.
     """
-    settings, capture, points = (
-        job.config.describe,
-        Capture.read(job.inputs["capture"]),
-        Points.read(job.inputs["points"]),
-    )
+    settings = job.config.describe
+    capture, points = Capture.read(job.inputs["capture"]), Points.read(job.inputs["points"])
     unit, unit_from = scene_unit(capture, points.means)
     up, sure = up_of(points.cam_from_world)
     notes = {"up_confidence": round(sure, 3), "unit_from": unit_from, "settings": settings.model_dump(mode="json")}

@@ -9,7 +9,6 @@ from pathlib import Path
 import numpy as np
 from scipy.spatial import cKDTree
 
-from chebsplat.cameras import resized
 from chebsplat.errors import DataFailure, InputError
 from chebsplat.formats.artifact import read_manifest
 from chebsplat.formats.capture import Capture
@@ -23,22 +22,22 @@ from chebsplat.formats.points import Points
 from chebsplat.labels.decode import decode_labels
 from chebsplat.lifting.averages import SEEN_WITHIN, SWEPT_WITHIN, averaged
 from chebsplat.lifting.blend import familiar
-from chebsplat.shape.lessons import LEAST_VIEWS, novelty, odds, scaled_novelty, summed
+from chebsplat.shape.lessons import LEAST_VIEWS, Sums, novelty, odds, scaled_novelty, summed
 from chebsplat.stages.runtime.command import Job
 from chebsplat.stages.shape_models.answers import (
     into_meanings,
     of_features,
-    restored,
+    to_knowledge,
     units,
     unnamed,
     words_by_label,
     words_of,
 )
-from chebsplat.stages.shape_models.surfaces import in_scene
+from chebsplat.stages.shape_models.surfaces import in_scene, swept_Ks
 from chebsplat.stages.teacher_models.text_encoder import found
 
 REACH = 0.3  # metres from a label to the described point that it is of
-KINDS = {"depth": ("held_out",), "swept depth": ("held_out_swept",)}  # rooms of a surface's kind
+KIND = {"depth": "held_out", "swept depth": "held_out_swept"}  # of rooms, by kind of surface
 KNOWN = 1.05  # times the largest novelty of such rooms, which were held out: what is newer is of another kind
 VOUCHED = ("labels", "given")  # kinds of teacher that the user answers for
 
@@ -81,7 +80,8 @@ def run(job: Job) -> None:
     except (DataFailure, ValueError) as error:
         job.left_out("a lesson", str(error))
         p, d = start.map.shape
-        write_lesson(job.out, Lesson((np.zeros((p, p)), np.zeros((p, d)), 0.0), notes | {"none": str(error)}))
+        nothing = Sums(np.zeros((p, p)), np.zeros((p, d)), 0.0)
+        write_lesson(job.out, Lesson(nothing, notes | {"none": str(error)}))
         return
     if notes["unnamed"]:
         job.left_out(
@@ -97,18 +97,22 @@ def run(job: Job) -> None:
         "rho": rho,
         "sigma": spread,
         "novelty": scaled_novelty(rho, spread),
-        "known": KNOWN * max(start.card["novelty"][kind] for kind in KINDS[descriptors.notes["of"]]),
+        "known": KNOWN * start.card["novelty"][KIND[descriptors.notes["of"]]],
         "familiar": familiar(said[seen], answers[seen], embeddings),
         "alike": float((decode_labels(answers[seen], embeddings) == labels[seen]).mean()),
     }
     job.facts |= notes
-    write_lesson(job.out, Lesson((sums.gram, sums.cross, sums.square), notes))
+    write_lesson(job.out, Lesson(sums, notes))
 
 
 def meant(
     job: Job, start: Knowledge, capture: Capture, points: Points, features: Features, descriptors: Descriptors
 ) -> tuple[np.ndarray, np.ndarray]:
-    """The mean of what training views mean by each described point, f32 [N, d], and how many see it [N]."""
+    """What training views mean by each described point, on average, f64 [N, d], and how
+    many see it [N].
+
+    Raises: DataFailure where no training view has a camera and features.
+    """
     row = {name: view for view, name in enumerate(capture.names)}
     place = {name: view for view, name in enumerate(features.names)}
     used = [k for k, name in enumerate(points.names) if not capture.is_test[row[name]] and name in place]
@@ -121,8 +125,7 @@ def meant(
     else:
         assert points.depths is not None
         depth, within = points.depths[used], SWEPT_WITHIN
-        factor = capture.size[0] // points.depths.shape[2]
-        Ks = resized(Ks, 1 / factor, 1 / factor)
+        Ks = swept_Ks(points, capture.size[0])[used]
     meaning = into_meanings(job.inputs["start"], start, features)
     views = (meaning(place[points.names[k]]) for k in used)
     means, _ = in_scene(descriptors)
@@ -132,10 +135,12 @@ def meant(
 
 
 def named_embeddings(job: Job, start: Knowledge, features: Features) -> np.ndarray:
-    """What the scene's labels mean in the channels of knowledge, f32 [L, d]."""
+    """What a point's meaning is compared with, f32: the scene's labels in the channels of knowledge
+    [L, d]; where the scene has codes of classes, the words of those that knowledge has a word for.
+    """
     if not of_features(features):
         return words_of(job.inputs["start"], start, features)[1]
-    return np.asarray(features.label_embeddings @ restored(start, features))
+    return np.asarray(features.label_embeddings @ to_knowledge(start, features))
 
 
 def labelled(path: Path, start: Knowledge, descriptors: Descriptors) -> tuple[np.ndarray, np.ndarray, np.ndarray]:

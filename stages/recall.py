@@ -12,13 +12,13 @@ from chebsplat.errors import InputError
 from chebsplat.formats.artifact import read_manifest
 from chebsplat.formats.knowledge import Knowledge, read_knowledge, write_knowledge
 from chebsplat.formats.lesson import Lesson, read_lesson
-from chebsplat.shape.lessons import Sums, basis, combined, mapped
+from chebsplat.shape.lessons import Sums, basis, combined, mapped, mean_of
 from chebsplat.stages.registry import LESSON
 from chebsplat.stages.runtime.command import Job
 
 ALIKE = 0.5, 0.75  # share of labels that shape and teacher have alike: below it no trust, above it all
 GIVEN = 0.1, 0.2  # the same of labels that were given: what is as good as drawn at random is no label of this room
-FAMILIAR = 0.4  # above it all
+FAMILIAR = 0.4  # the same of how sure the teacher is beside shape (`blend.familiar`), from 0 up
 
 
 def run(job: Job) -> None:
@@ -48,13 +48,15 @@ def taught(start: Knowledge, lessons: Mapping[str, Lesson]) -> Knowledge:
     used = {key: of for key, of in sorted(lessons.items()) if "none" not in of.notes}
     sums, trust = [Sums(*of.sums) for of in used.values()], [trusted(of.notes) for of in used.values()]
     new = [of.notes["novelty"] > of.notes["known"] for of in used.values()]
-    grown = [combined(shipped, [1 / len(shipped)] * len(shipped))]
-    grown += [of for of, weight, novel in zip(sums, trust, new, strict=True) if novel and weight > 0]
-    weights = [1.0, *(weight for weight, novel in zip(trust, new, strict=True) if novel and weight > 0)]
+    growing = [k for k, weight in enumerate(trust) if new[k] and weight > 0]
+    known = combined(
+        [mean_of(shipped), *(sums[k] for k in growing)],
+        [1.0, *(trust[k] for k in growing)],
+    )
     return dataclasses.replace(
         start,
         map=mapped(shipped, sums, trust).astype(np.float32),
-        basis=basis(combined(grown, weights), start.scale).astype(np.float32),
+        basis=basis(known, start.scale).astype(np.float32),
         shipped=[],
         lessons={
             "of": [

@@ -87,8 +87,11 @@ def run(job: Job) -> None:
 
 
 def known(job: Job, parameters: dict[str, np.ndarray], unit: float) -> np.ndarray | None:
-    """What knowledge of shape says of the Gaussians, f32 [N, C]: of the described points beside them.
+    """What knowledge of shape says of the Gaussians, f32 [N, C], by the described points beside
+    them; None where the scene has no knowledge, or none of it reaches the scene.
 
+    Args: parameters: of the Gaussians; unit: scene units in a metre.
+    Raises: ConfigError where an input that knowledge needs is missing.
     Choices: where a sweep found the points, an answer's length, by which it counts, falls with the distance to them:
       what no photo's depth shows is the views' to tell.
     """

@@ -30,6 +30,7 @@ from chebsplat.shape.lessons import (
     basis,
     combined,
     mapped,
+    mean_of,
     novelty,
     odds,
     scale_of,
@@ -76,7 +77,7 @@ def run(job: Job) -> None:
     weights = {name: value.numpy() for name, value in encoder.state_dict().items() if not name.startswith("head.")}
     of_rooms = [mean_lesson(job, encoder, lessons[part::PARTS], classes) for part in range(min(PARTS, len(lessons)))]
     found_map = mapped(of_rooms, [], []).astype(np.float32)
-    whole = combined(of_rooms, [1 / len(of_rooms)] * len(of_rooms))
+    whole = mean_of(of_rooms)
     scale = scale_of(whole)
     known = basis(whole, scale)
     card = settings.model_dump(mode="json", exclude={"model", "seed"})
@@ -95,7 +96,7 @@ def run(job: Job) -> None:
         Knowledge(
             teacher.name, teacher.digest(), encoder.settings, weights, channels.matrix, describe, words,
             embeddings.astype(np.float16), found_map, known.astype(np.float32), scale.astype(np.float32), card,
-            shipped=[(of.gram, of.cross, of.square) for of in of_rooms],
+            shipped=list(of_rooms),
         ),
     )  # fmt: skip
 
@@ -112,18 +113,25 @@ def mean_lesson(job: Job, encoder: PointEncoder, rooms: Sequence[Sequence[Room]]
 
 def drawn_lesson(encoder: PointEncoder, room: Room, embeddings: np.ndarray) -> Sums:
     """What N_DRAWN points of a room teach, drawn by how much each teaches: among many rooms as good as all of them."""
-    labels = decode_labels(room.features, embeddings)
-    chances = odds(room.n_views, labels)
+    meanings, chances = told(room, embeddings)
     rows = np.random.default_rng(0).choice(len(chances), N_DRAWN, p=chances)
-    meanings = np.concatenate([room.features[rows], units(embeddings)[labels[rows]]], 1)
-    return summed(encoder.encode(room.inputs, rows), meanings, np.ones(N_DRAWN))
+    return summed(encoder.encode(room.inputs, rows), meanings[rows], np.ones(N_DRAWN))
 
 
 def lesson_of(z: np.ndarray, room: Room, embeddings: np.ndarray) -> Sums:
-    """What one room teaches, by its features of shape [N, p]."""
+    """What one room teaches, by the features z [N, p] of its shape."""
+    meanings, weights = told(room, embeddings)
+    return summed(z, meanings, weights)
+
+
+def told(room: Room, embeddings: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """What the teacher says of a room's points, [N, 2 d], and how much each teaches, [N], sum 1.
+
+    Args: embeddings [L, d], of the labels that it gives. The halves: its features, and unit words.
+    """
     labels = decode_labels(room.features, embeddings)
     meanings = np.concatenate([room.features, units(embeddings)[labels]], 1)
-    return summed(z, meanings, odds(room.n_views, labels))
+    return meanings, odds(room.n_views, labels)
 
 
 def vocabulary(teacher: TeacherModel, names: list[str], matrix: np.ndarray) -> tuple[list[str], np.ndarray]:

@@ -16,7 +16,16 @@ from benchmarks.teachers.teaching import K, scene_room, scores
 from chebsplat.formats.knowledge import SHIPPED, Knowledge, read_knowledge
 from chebsplat.labels.decode import decode_labels
 from chebsplat.lifting.blend import blend, effective
-from chebsplat.shape.lessons import RIDGE, SHARE, Sums, combined, odds, solved, summed
+from chebsplat.shape.lessons import (
+    RIDGE,
+    SHIPPED_WORTH,
+    Sums,
+    combined,
+    mean_of,
+    odds,
+    solved,
+    summed,
+)
 from chebsplat.shape.point_encoder import PointEncoder
 from chebsplat.stages.shape_models.answers import units
 from chebsplat.stages.shape_models.teaching_rooms import Room
@@ -36,13 +45,14 @@ def main(arguments: Sequence[str]) -> None:
     asked = Asked(knowledge, rooms, features, classes)
     print(f"{len(rooms)} scenes; {shared.machine()}")
     rows = [{"variant": "the teacher's averages", "shape": "", "both": asked.teacher()}]
-    rows.append({"variant": "what ships"} | asked.figures([[] for _ in rooms], SHARE))
+    rows.append({"variant": "what ships"} | asked.figures([[] for _ in rooms], SHIPPED_WORTH))
     everyone = [asked.taught(k) for k in range(len(rooms))]
     for count in (1, 2, 4, 8, 16):
         if count < len(rooms):
             chosen = [[everyone[(k + 1 + step) % len(rooms)] for step in range(count)] for k in range(len(rooms))]
             rows.append({"variant": f"{count} lessons alone"} | asked.figures(chosen, 0.0))
-            rows.append({"variant": f"{count} lessons and what ships"} | asked.figures(chosen, SHARE))
+            name = f"{count} lessons and what ships"
+            rows.append({"variant": name} | asked.figures(chosen, SHIPPED_WORTH))
     for points in (300, 1000, 3000):
         fewer = [asked.taught(k, points) for k in range(len(rooms))]
         chosen = [[of for other, of in enumerate(fewer) if other != k] for k in range(len(rooms))]
@@ -51,7 +61,8 @@ def main(arguments: Sequence[str]) -> None:
         marked = [asked.labelled(k, points) for k in range(len(rooms))]
         chosen = [[marked[(k + 1) % len(rooms)]] for k in range(len(rooms))]
         rows.append({"variant": f"{points} labelled points of one scene, alone"} | asked.figures(chosen, 0.0))
-        rows.append({"variant": f"{points} labelled points, and what ships"} | asked.figures(chosen, SHARE))
+        name = f"{points} labelled points, and what ships"
+        rows.append({"variant": name} | asked.figures(chosen, SHIPPED_WORTH))
     for row in rows:
         print(f"{row['variant']:42s} shape {row['shape']:>5}   both {row['both']:>5}")
     shared.write_csv(options.out / "lessons.csv", rows)
@@ -62,9 +73,7 @@ class Asked:
 
     def __init__(self, knowledge: Knowledge, rooms: list[Room], features: list[np.ndarray], classes: np.ndarray):
         self.rooms, self.features, self.classes = rooms, features, classes
-        self.shipped = combined(
-            [Sums(*of) for of in knowledge.shipped], [1 / len(knowledge.shipped)] * len(knowledge.shipped)
-        )
+        self.shipped = mean_of([Sums(*of) for of in knowledge.shipped])
 
     def teacher(self) -> str:
         """mIoU of the teacher's averages."""
@@ -91,11 +100,11 @@ class Asked:
         words = units(self.classes)[room.labels[rows]]
         return summed(self.features[scene][rows], np.concatenate([words, words], 1), weights)
 
-    def figures(self, lessons: list[list[Sums]], share: float) -> dict[str, str]:
-        """mIoU of shape alone and of both, each scene by its lessons and `share` times what ships."""
+    def figures(self, lessons: list[list[Sums]], worth: float) -> dict[str, str]:
+        """mIoU of shape alone and of both, each scene by its lessons and `worth` of what ships."""
         answers = []
         for z, of in zip(self.features, lessons, strict=True):
-            whole = combined([self.shipped, *of], [share if of else 1.0, *[1.0] * len(of)])
+            whole = combined([self.shipped, *of], [worth if of else 1.0, *[1.0] * len(of)])
             answers.append(z @ solved(whole, RIDGE).astype(np.float32))
         half, named = len(self.classes[0]), units(self.classes)
         pairs = list(zip(self.rooms, answers, strict=True))

@@ -21,13 +21,15 @@ def averaged(
     within: tuple[float, float] = SEEN_WITHIN,
     unit: float = 1.0,
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Mean f32 [N, d] of the unit features of the views that see a point, and how many these are [N].
+    """Mean of the unit features of the views that see a point, and how many these are.
+
+    Returns: f64 [N, d], zero where no view sees a point; i64 [N].
 
     Args:
-      means:    [N, 3] scene units; unit: of these in a metre.
+      means:    [N, 3] scene units; unit: scene units in a metre.
       depth:    of each view, [H, W] scene units; nan or 0: unknown, where a view sees nothing.
       features: of each view, [h, w, n_channels = d]; a row of zeros says nothing. Read view by view.
-      Ks:       [V, 3, 3] pixels of the depth; poses [V, 4, 4].
+      Ks:       [V, 3, 3] pixels of the depth; poses [V, 4, 4] camera from world.
       within:   metres, and share of the depth, by which a point may lie off what a view sees.
     """
     total, n_views = np.zeros((len(means), n_channels), np.float32), np.zeros(len(means), np.int64)

@@ -10,10 +10,11 @@ from typing import NamedTuple
 import numpy as np
 from scipy.linalg import cho_factor, cho_solve, eigh
 
-SHARE = 3.0  # scenes that what ships counts for
+SHIPPED_WORTH = 3.0  # scenes that what ships counts for
 RIDGE = 1e-2  # in units of the diagonal of A
 LEAST_VIEWS = 2  # that a point to learn from was seen in
 ENERGY = 0.99  # of what was learned, that the basis holds
+ZERO = 1e-12  # of the largest of diag A, up to which a feature counts as zero everywhere
 KAPPA = 0.1  # of ρ′ = ρ (1 + κ σ_f)
 
 
@@ -59,7 +60,10 @@ def odds(n_views: np.ndarray, labels: np.ndarray) -> np.ndarray:
 
 
 def combined(sums: Sequence[Sums], weights: Sequence[float]) -> Sums:
-    """Σ g_k of sums, in their order. Choices: in the order given, so that equal sets in equal order give equal bits."""
+    """Σ g_k S_k of sums S_k with weights g_k.
+
+    Choices: added in the order given, so that equal sets in equal order give equal bits.
+    """
     gram, cross = np.zeros_like(sums[0].gram), np.zeros_like(sums[0].cross)
     square = 0.0
     for of, weight in zip(sums, weights, strict=True):
@@ -69,40 +73,61 @@ def combined(sums: Sequence[Sums], weights: Sequence[float]) -> Sums:
     return Sums(gram, cross, square)
 
 
+def mean_of(sums: Sequence[Sums]) -> Sums:
+    """The mean of sums, one or more."""
+    return combined(sums, [1 / len(sums)] * len(sums))
+
+
+def alive(diagonal: np.ndarray) -> np.ndarray:
+    """Which features are not zero everywhere, bool [p], by diag A [p]."""
+    return np.asarray(diagonal > ZERO * diagonal.max())
+
+
 def solved(sums: Sums, ridge: float) -> np.ndarray:
-    """W = (A + λ diag A)⁻¹ b, f64 [p, C]. Features that are zero everywhere get no weight."""
-    diagonal = np.diag(sums.gram).copy()
-    alive = diagonal > 1e-12 * diagonal.max()
-    scale = 1 / np.sqrt(np.where(alive, diagonal, 1))
-    correlation = sums.gram * scale[:, None] * scale + np.diag(np.where(alive, ridge, 1.0))
+    """W = (A + λ diag A)⁻¹ b, f64 [p, C], λ the ridge.
+
+    Features that are zero everywhere get no weight.
+    """
+    diagonal = np.diag(sums.gram)
+    used = alive(diagonal)
+    scale = 1 / np.sqrt(np.where(used, diagonal, 1))
+    correlation = sums.gram * scale[:, None] * scale + np.diag(np.where(used, ridge, 1.0))
     found = cho_solve(cho_factor(correlation, lower=True), sums.cross * scale[:, None])
-    return np.asarray(found * (scale * alive)[:, None])
+    return np.asarray(found * (scale * used)[:, None])
 
 
 def mapped(shipped: Sequence[Sums], lessons: Sequence[Sums], trust: Sequence[float]) -> np.ndarray:
-    """The map W f64 [p, C] that shipped sums and lessons give, these by how far each is trusted (in [0, 1]).
+    """The map W f64 [p, C] that shipped sums and lessons give.
 
-    Choices: what ships counts for SHARE scenes, and the ridge is RIDGE. Leaving out one lesson after the other, which
-      A, b and c allow without a point, finds what errs least in squares; that names fewer points right.
+    Args: trust: of each lesson, in [0, 1].
+    Choices: SHIPPED_WORTH and RIDGE are the same for every scene (docs/method.md, section 14).
     """
-    return solved(combined([*shipped, *lessons], [*[SHARE / len(shipped)] * len(shipped), *trust]), RIDGE)
+    weights = [*[SHIPPED_WORTH / len(shipped)] * len(shipped), *trust]
+    return solved(combined([*shipped, *lessons], weights), RIDGE)
 
 
 def scale_of(sums: Sums) -> np.ndarray:
     """1 / √diag A [p], by which features are compared; 0 for those that are zero everywhere."""
     diagonal = np.diag(sums.gram)
-    return np.where(diagonal > 1e-12 * diagonal.max(), 1 / np.sqrt(np.maximum(diagonal, 1e-300)), 0.0)
+    return np.where(alive(diagonal), 1 / np.sqrt(np.maximum(diagonal, 1e-300)), 0.0)
 
 
 def basis(sums: Sums, scale: np.ndarray) -> np.ndarray:
-    """B [p, r]: eigenvectors of the correlation of what was learned, to ENERGY of it, columns orthonormal (Eq 15)."""
+    """B f64 [p, r]: eigenvectors of the correlation of what was learned, to ENERGY of it (Eq 15).
+
+    Args: sums: of what was learned; scale [p]: of its features, by `scale_of`.
+    Returns: orthonormal columns, the one of most energy first.
+    """
     values, vectors = eigh(sums.gram * scale[:, None] * scale)
     share = np.cumsum(values[::-1]) / values.sum()
     return np.ascontiguousarray(vectors[:, ::-1][:, : int(np.searchsorted(share, ENERGY)) + 1])
 
 
 def novelty(sums: Sums, scale: np.ndarray, known: np.ndarray) -> float:
-    """ρ = √(share of a scene's energy that lies outside B) in [0, 1] (Eq 15)."""
+    """ρ = √(share of a scene's energy that lies outside B) in [0, 1] (Eq 15).
+
+    Args: sums: of the scene; scale [p]: that B was made with; known [p, r]: B, by `basis`.
+    """
     correlation = sums.gram * scale[:, None] * scale
     inside = float(np.sum(known * (correlation @ known)))
     return float(np.sqrt(np.clip(1 - inside / np.trace(correlation), 0, 1)))

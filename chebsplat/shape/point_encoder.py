@@ -216,7 +216,9 @@ class PointEncoder(nn.Module):
 
 
 def relative(cloud: Cloud, centers: Tensor, neighbors: Tensor, radius: float) -> Tensor:
-    """How neighbours [B, K] lie about points [B], in radii: [B, K, 10].
+    """How neighbours [B, K] lie about points [B], in radii: [B, K, N_RELATIVE].
+
+    Args: neighbors: rows of the cloud; -1 is none, whose values mean nothing; radius: metres.
 
     Choices: the offset itself, its length, its length in the horizontal and its height's size; along the point's normal
       and across it; the product of both normals, and the difference of normal · up. Teaching turns rooms about the
@@ -291,7 +293,11 @@ def taught(encoder: PointEncoder, examples: list[Example], course: Course) -> It
 
 
 def excerpt(cloud: Cloud, rows: Tensor, chosen: Tensor) -> tuple[Cloud, Tensor, Tensor]:
-    """The points `rows` [B] and their neighbours in columns `chosen` [k], each once; rows and neighbours in these."""
+    """The points `rows` [B] and their neighbours in columns `chosen` [k], each once.
+
+    Returns: the cloud of these; which of its rows the points are [B]; and their neighbours,
+             rows of it too, [B, S, k], -1 none.
+    """
     neighbors = cloud.neighbors[rows][:, :, chosen]
     present = neighbors >= 0
     distinct, inverse = torch.cat([rows, neighbors[present]]).unique(return_inverse=True)
@@ -303,7 +309,7 @@ def excerpt(cloud: Cloud, rows: Tensor, chosen: Tensor) -> tuple[Cloud, Tensor, 
 
 
 def turned(cloud: Cloud, angle: float, *, mirrored: bool) -> Cloud:
-    """About the vertical."""
+    """The cloud turned by an angle [rad] about the vertical; mirrored in x before, if at all."""
     c, s = math.cos(angle), math.sin(angle)
     turn = torch.tensor([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]], dtype=cloud.means.dtype)
     if mirrored:

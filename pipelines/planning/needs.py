@@ -141,8 +141,9 @@ def source_sentence(name: str, asked: Any, source: Any) -> str:
 
 @dataclass
 class Start:
-    """What a scene's knowledge starts from: the artifact, in the store, and the set of lessons that its
-    own is added to; or why there is none, or no such set.
+    """What a scene's knowledge starts from: the artifact's place in the store, and the name of the
+    set of lessons that it starts from, too, and adds its own to; `why` there is no artifact, or
+    no set.
     """
 
     path: Path | None = None
@@ -153,6 +154,7 @@ class Start:
 def start_given(config: Any, kind: str, running: bool) -> Start:
     """What a scene starts from.
 
+    Args: kind: of its teacher; running: the artifact is copied into the store.
     Raises: InputError on a damaged artifact.
     Choices: a scene of labels or of a segmenter is given that of the embedded teacher, which reaches it through words.
     """

@@ -235,7 +235,7 @@ class Planner:
             if stage.name == "train" and earlier is not None:
                 inputs["earlier"] = earlier
             if stage.name == "recall":
-                inputs.pop("lesson", None)
+                inputs.pop("lesson", None)  # its own, which is for the scenes after it
                 inputs |= lesson_paths(self._lessons(place, scene, start, identity, lessons))
                 if inputs.keys() == {"start"}:
                     given["knowledge"], left_out["recall"] = inputs["start"], "no lesson to add to what ships"
@@ -253,12 +253,15 @@ class Planner:
         self, place: str, scene: str, start: Start, capture: str, earlier: Sequence[Learned]
     ) -> dict[str, Path]:
         """Lessons of a scene by key: those that it is pinned to, and those of the scenes before it in a
-        sequence; none of its own photos, and of those of a scene before it only that one's.
+        sequence, which stand in for pinned ones of the same photos; none of its own photos.
+
+        Args: place: begins the plan's title, in a sequence; capture: identity of the photos;
+              earlier: of the scenes before it.
         """
         if start.path is None or start.lessons is None:
             return {}
-        title = place + self._named(scene)
-        of = start.lessons, start.path.name, capture, self._named(scene)
+        named = self._named(scene)
+        title, of = place + named, (start.lessons, start.path.name, capture, named)
         keys = heads.pinned(title, *of, running=self.running, newer=self.newer)
         found = {one.path.name: one.path for one in earlier if one.capture != capture}
         if earlier:
@@ -293,7 +296,6 @@ class Planner:
         """What the source has."""
         if source.kind == "generated":
             return {"poses": True, "depth": True, "labels": True}
-
         folder = Path(source.path)
         if not is_source(folder):
             raise absent(scene, folder)

@@ -1,4 +1,6 @@
-"""Plans of more than a scene: scenes in order, each with the knowledge of the one before; what teaches knowledge."""
+"""Plans of more than a scene: scenes in order, each with what those before it have taught; and
+plans of no scene: what teaches knowledge, and what learns lessons again.
+"""
 
 from __future__ import annotations
 
@@ -64,8 +66,8 @@ def teaching(planner: Planner, model: Path | None, settings: str = "") -> Plan:
 
 
 def relearning(planner: Planner, name: str) -> list[Plan]:
-    """The steps that learn the lessons of a set again by the encoder that ships now, from what the store holds; those
-    that it made itself, and those whose scene's artifacts are gone, stay as they are.
+    """The steps that learn the lessons of a set again by the encoder that ships now, from what the
+    store holds. Lessons by that encoder, and of scenes whose artifacts are gone, stay as they are.
     """
     found: list[Plan] = []
     start = store.taken_in(SHIPPED, "teach", SCHEMA, planner.running)

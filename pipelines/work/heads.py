@@ -38,19 +38,15 @@ def folder(name: str) -> Path:
     return store.work() / ".heads" / name
 
 
-def names() -> list[str]:
-    """Sets that there are."""
-    return sorted(path.name for path in (store.work() / ".heads").glob("*") if path.is_dir())
-
-
 def members(name: str) -> dict[str, dict[str, Any]]:
     """By key what each lesson of a set is of: the photos' identity (`capture`), the encoder's key (`start`), the scene,
     and when it was added. Raises InputError naming a record that is damaged.
     """
     found = {}
     for path in sorted(folder(name).glob("[!.]*.json")):
-        record = _record(path.with_suffix(""))
-        if store.is_fresh(path.with_suffix("")) and FORGOTTEN not in record:
+        place = path.with_suffix("")
+        record = _record(place)
+        if store.is_fresh(place) and FORGOTTEN not in record:
             if not set(RECORD) <= set(record):
                 raise InputError(f"{path} is no record of a lesson; {REMEDY}")
             found[path.stem] = record
@@ -124,7 +120,11 @@ def pinned(title: str, name: str, start: str, capture: str, scene: str, *, runni
 
 
 def taken(title: str, name: str, key: str, running: bool) -> Path:
-    """The place in the store of a pinned lesson. Raises ConfigError where it is nowhere any more."""
+    """The place in the store of a pinned lesson, copied there from the set if it is to run.
+
+    Args: title: of the scene that is pinned; name: of the set.
+    Raises: ConfigError where the lesson is nowhere any more.
+    """
     path = store.artifact_path("learn", key)
     if store.is_fresh(path):
         return path

@@ -21,7 +21,7 @@ SEEN = ("n_angles", "max_degree", "anisotropy", "bandwidth")  # settings of desc
 
 
 def inputs_of(path: Path, descriptors: Descriptors, knowledge: Knowledge) -> PointInputs:
-    """What the encoder of `knowledge` sees of a scene.
+    """What the encoder of `knowledge`, which was read from `path`, sees of a scene.
 
     Raises: DataFailure where the scene shows no surface, or was described with other settings than it was taught with.
     """
@@ -66,7 +66,7 @@ def into_meanings(path: Path, knowledge: Knowledge, features: Features) -> Calla
     """
     if of_features(features):
         check_teacher(path, knowledge, features)
-        matrix = restored(knowledge, features)
+        matrix = to_knowledge(knowledge, features)
         return lambda view: features.features[view].astype(np.float32) @ matrix
     words = words_by_label(knowledge, features)
 
@@ -78,8 +78,8 @@ def into_meanings(path: Path, knowledge: Knowledge, features: Features) -> Calla
     return meanings
 
 
-def restored(knowledge: Knowledge, features: Features) -> np.ndarray:
-    """From the channels of a scene to those of knowledge, f32 [C, d], of a teacher of features."""
+def to_knowledge(knowledge: Knowledge, features: Features) -> np.ndarray:
+    """The matrix f32 [C, d] from a scene's channels, of a teacher's features, to knowledge's."""
     return knowledge.matrix if features.channels is None else features.channels.inverse @ knowledge.matrix
 
 

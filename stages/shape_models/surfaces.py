@@ -67,11 +67,18 @@ def swept(points: Points, width: int, unit: float) -> Cloud:
     Raises: DataFailure where that is too little of one.
     """
     assert points.depths is not None
-    factor = width // points.depths.shape[2]  # of the blocks of pixels that a swept one stands for
-    means, eyes = swept_surface(points.depths, resized(points.Ks, 1 / factor, 1 / factor), points.cam_from_world, unit)
+    Ks = swept_Ks(points, width)
+    means, eyes = swept_surface(points.depths, Ks, points.cam_from_world, unit)
     if len(means) <= N_NEIGHBORS:
         raise DataFailure(f"the photos' depth shows {len(means)} points of a surface; shape cannot be told")
     return facing(means, eyes)
+
+
+def swept_Ks(points: Points, width: int) -> np.ndarray:
+    """Intrinsics [V, 3, 3] in pixels of swept depth, of photos of this width in pixels."""
+    assert points.depths is not None
+    factor = width // points.depths.shape[2]  # of the block of pixels that a swept one stands for
+    return resized(points.Ks, 1 / factor, 1 / factor)
 
 
 def facing(means: np.ndarray, eyes: np.ndarray) -> Cloud:

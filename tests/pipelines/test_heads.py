@@ -85,7 +85,6 @@ def test_what_a_kill_leaves_between_record_and_lesson_is_no_member_and_is_added_
     assert heads.members("rooms").keys() == {key}
     heads.add("rooms", made("nothing", none="no surface"), "photos b", START, "b")
     assert heads.members("rooms").keys() == {key}
-    assert heads.names() == ["rooms"]
 
 
 def recalled(scene, settings="", **options):

@@ -8,7 +8,7 @@ import pytest
 from chebsplat.shape.lessons import (
     KAPPA,
     RIDGE,
-    SHARE,
+    SHIPPED_WORTH,
     basis,
     combined,
     mapped,
@@ -67,7 +67,7 @@ def test_what_ships_counts_for_so_many_scenes_and_the_order_of_lessons_is_no_mat
         again = mapped(lessons[:2], [lessons[k] for k in order], [trust[k] for k in order])
         np.testing.assert_allclose(again, found, rtol=0, atol=1e-12 * abs(found).max())
     one = mapped(lessons[:2], lessons[2:3], [0.5])
-    wanted = solved(combined(lessons[:3], [SHARE / 2, SHARE / 2, 0.5]), RIDGE)
+    wanted = solved(combined(lessons[:3], [SHIPPED_WORTH / 2, SHIPPED_WORTH / 2, 0.5]), RIDGE)
     np.testing.assert_allclose(one, wanted, rtol=1e-10)
 
 
