@@ -16,7 +16,7 @@ SURE = 3  # power of its length by which knowledge counts
 AGREED = 6  # power by which views count of how far their halves agree, and of how sure they are beside shape
 # What a teacher gets wrong alike in both halves counts as right when they are asked, however many views there are.
 LEAST = 1.0  # strength
-BELIEVED = 0.55, 0.65  # share of labels that shape has alike with a teacher who knows the scene
+BELIEVED = 0.6, 0.7  # share of labels that shape has alike with a teacher who knows the scene
 LEAST_SHARE = 0.5  # strength, in mean evidence of a Gaussian that is seen
 
 
