@@ -10,6 +10,7 @@ import numpy as np
 
 from chebsplat.formats import artifact
 from chebsplat.formats.artifact import read_document, write_document
+from chebsplat.formats.lesson import SPECS as SUMS
 from chebsplat.formats.lesson import PlainSums, packed, unpacked
 from chebsplat.formats.tensors import Spec, read_tensors, write_tensors
 
@@ -80,7 +81,7 @@ def read_knowledge(path: Path) -> Knowledge:
     manifest = artifact.read_manifest(path, SCHEMA)
     document: dict[str, Any] = read_document(path, manifest, "knowledge.json")
     shipped = [
-        unpacked(read_tensors(path, manifest, f"shipped{number}.safetensors"), square)
+        unpacked(read_tensors(path, manifest, f"shipped{number}.safetensors", SUMS), square)
         for number, square in enumerate(document.pop("squares"))
     ]
     weights = read_tensors(path, manifest, "weights.safetensors")

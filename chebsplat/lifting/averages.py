@@ -41,7 +41,8 @@ def averaged(
         inside = (camera[:, 2] > NEAREST * unit) & (u >= 0) & (u < width) & (v >= 0) & (v < height)
         index = np.flatnonzero(inside)
         hit = z_of[v[index].astype(int), u[index].astype(int)]
-        index = index[np.abs(hit - z[index]) < within[0] * unit + within[1] * z[index]]
+        near = np.abs(hit - z[index]) < within[0] * unit + within[1] * z[index]
+        index = index[(hit > 0) & near]
         seen = said[(v[index] * rows / height).astype(int), (u[index] * columns / width).astype(int)].astype(np.float32)
         lengths = np.linalg.norm(seen, axis=1)
         index, seen = index[lengths > 0], seen[lengths > 0] / lengths[lengths > 0, None]

@@ -5,7 +5,18 @@ import math
 import numpy as np
 import pytest
 
-from chebsplat.lifting.blend import LEAST, STRENGTHS, blend, calibrate, confidence, effective, familiar, reliable, start
+from chebsplat.lifting.blend import (
+    LEAST,
+    STRENGTHS,
+    believed,
+    blend,
+    calibrate,
+    confidence,
+    effective,
+    familiar,
+    reliable,
+    start,
+)
 from chebsplat.lifting.observations import carry
 from chebsplat.lifting.smoothing import N_NEIGHBORS, REACH, Affinities, affinities, room_unit, smooth
 
@@ -233,3 +244,15 @@ def test_a_room_has_about_its_own_unit():
         chosen = corners[rng.choice(len(areas), 5000, p=areas / areas.sum())]
         means = np.einsum("nk,nkd->nd", rng.dirichlet(np.ones(3), 5000), chosen)
         assert room_unit(40 * means) == pytest.approx(40, rel=0.25)
+
+
+def test_shape_is_believed_where_its_labels_are_a_knowing_teachers_or_the_teacher_is_unsure():
+    rng = np.random.default_rng(0)
+    codes, labels = np.eye(5, dtype=np.float32), rng.integers(0, 5, 2000)
+    views, seen = codes[labels], np.full(2000, 3)
+    for share, least, most in ((0.9, 1, 1), (0.65, 0.4, 0.6), (0.4, 0, 0)):
+        said = np.where(rng.random(2000) < share, labels, (labels + 1) % 5)
+        found = believed(views, seen, codes[said], codes, worth=1.0)
+        assert least <= found <= most
+        assert believed(views, seen, codes[said], codes, worth=0.1) == max(found, 0.9)
+    assert believed(views, 0 * seen, codes[said], codes, worth=1.0) == 1  # nobody to ask
