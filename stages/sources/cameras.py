@@ -13,8 +13,13 @@ from chebsplat.errors import InputError
 from chebsplat.formats.images import MAX_PIXELS, MAX_SIDE
 from chebsplat.stages.sources.texts import number
 
-PINHOLES = {"SIMPLE_PINHOLE": 3, "PINHOLE": 4}  # model: number of parameters
-DISTORTED = {"SIMPLE_RADIAL": 4, "RADIAL": 5, "OPENCV": 8}
+# COLMAP's models in the order of their ids: number of parameters
+MODELS = {"SIMPLE_PINHOLE": 3, "PINHOLE": 4, "SIMPLE_RADIAL": 4, "RADIAL": 5, "OPENCV": 8, "OPENCV_FISHEYE": 8,
+          "FULL_OPENCV": 12, "FOV": 5, "SIMPLE_RADIAL_FISHEYE": 4, "RADIAL_FISHEYE": 5, "THIN_PRISM_FISHEYE": 12,
+          "RAD_TAN_THIN_PRISM_FISHEYE": 16, "SIMPLE_DIVISION": 4, "DIVISION": 5, "SIMPLE_FISHEYE": 3, "FISHEYE": 4,
+          "EUCM": 6, "EQUIRECTANGULAR": 2}  # fmt: skip
+PINHOLES = ("SIMPLE_PINHOLE", "PINHOLE")
+DISTORTED = tuple(name for name in MODELS if name not in (*PINHOLES, "EQUIRECTANGULAR"))
 ROTATION_TOLERANCE = 1e-2  # of RᵀR − I: rows written with three decimals pass, a scale of 1 % does not
 FOCAL = (0.01, 100.0)  # of the longer side: fields of view of 178 and of 0.6 degrees
 OFF_CENTRE = 1.5  # sides by which a principal point may lie off the middle: crops have it outside
@@ -34,8 +39,8 @@ class Camera:
     @property
     def pinhole(self) -> tuple[float, float, float, float]:
         """fx, fy, cx, cy."""
-        p = self.params
-        return (p[0], p[1], p[2], p[3]) if self.model in ("PINHOLE", "OPENCV") else (p[0], p[0], p[1], p[2])
+        p, one = self.params, self.model.startswith(("SIMPLE_", "RADIAL"))
+        return (p[0], p[0], p[1], p[2]) if one else (p[0], p[1], p[2], p[3])
 
     @property
     def colmap(self) -> Any:
@@ -49,7 +54,7 @@ def camera_of(origin: Path, model: str, params: Any, width: Any, height: Any) ->
     if model not in PINHOLES and model not in DISTORTED:
         raise InputError(
             f"{origin}: camera model {model} is not supported ({', '.join([*PINHOLES, *DISTORTED])} are); "
-            "undistort the images first, for example with `colmap image_undistorter`"
+            "make perspective images first, for example with `colmap image_undistorter`"
         )
     try:
         camera = Camera(model, tuple(number(v) for v in params), int(number(width)), int(number(height)))
@@ -66,7 +71,7 @@ def camera_of(origin: Path, model: str, params: Any, width: Any, height: Any) ->
 def fault(camera: Camera) -> str:
     """What is wrong with a camera; nothing of a usable one."""
     width, height = camera.width, camera.height
-    if len(camera.params) != (PINHOLES | DISTORTED)[camera.model]:
+    if len(camera.params) != MODELS[camera.model]:
         return f"{len(camera.params)} parameters"
     if min(width, height) < 1 or max(width, height) > MAX_SIDE or width * height > MAX_PIXELS:
         return f"a photo has 1 to {MAX_SIDE} pixels a side and at most {MAX_PIXELS // 10**6} million"

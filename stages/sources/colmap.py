@@ -154,7 +154,9 @@ def _listing(folder: Path) -> tuple[Listing, Model]:
                 )
             )
         found.discard(image.name)
-    notes = [f"{absent} of {len(model.images)} images of the model are absent on disk."] if absent else []
+    notes = list(model.notes)
+    if absent:
+        notes.append(f"{absent} of {len(model.images)} images of the model are absent on disk.")
     if found:
         notes.append(f"{len(found)} of {on_disk} images on disk are not in the model and are left out.")
     if masks and unmasked:

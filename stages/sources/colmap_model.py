@@ -22,10 +22,7 @@ from chebsplat.stages.sources.texts import LONGEST
 
 LARGEST = 512 << 20  # bytes of a file: a million images, or five million points
 AGAIN = "copy it again"
-# id in binary files: (name, number of parameters)
-MODELS = {0: ("SIMPLE_PINHOLE", 3), 1: ("PINHOLE", 4), 2: ("SIMPLE_RADIAL", 4), 3: ("RADIAL", 5), 4: ("OPENCV", 8),
-          5: ("OPENCV_FISHEYE", 8), 6: ("FULL_OPENCV", 12), 7: ("FOV", 5), 8: ("SIMPLE_RADIAL_FISHEYE", 4),
-          9: ("RADIAL_FISHEYE", 5), 10: ("THIN_PRISM_FISHEYE", 12), 11: ("RAD_TAN_THIN_PRISM_FISHEYE", 16)}  # fmt: skip
+SHORT = 0.01  # of a quaternion's length: what few decimals take from it
 
 
 @dataclass(frozen=True)
@@ -51,12 +48,27 @@ class Cloud:
 
 @dataclass(frozen=True, eq=False)
 class Model:
-    """origin: the cameras' file; cameras: (model, parameters, width, height) by id; images in the file's order."""
+    """origin: the cameras' file; cameras: (model, parameters, width, height) by id; images in the file's order;
+    notes: what of the files was not read.
+    """
 
     origin: Path
     cameras: dict[int, tuple[str, tuple[float, ...], int, int]]
     images: list[Image]
     cloud: Cloud
+    notes: tuple[str, ...] = ()
+
+
+def size_of(place: Path) -> int:
+    """How many images the model in a folder has, by what its files say; 0 of what cannot be read."""
+    try:
+        if common.present(place / "images.bin"):
+            regular(place / "images.bin")
+            with (place / "images.bin").open("rb") as stream:
+                return int.from_bytes(stream.read(8), "little")
+        return sum(1 for _ in _text_images(place / "images.txt", []))
+    except (InputError, ValueError, OSError):
+        return 0
 
 
 def read_model(place: Path) -> Model:
@@ -69,9 +81,10 @@ def read_model(place: Path) -> Model:
     if end == "bin":
         read = (_binary_cameras, _binary_images, _binary_points)
     found: list[list[Any]] = []
+    notes: list[str] = []
     for path, entries in zip(paths, read, strict=True):
         try:
-            found.append(list(entries(path)))
+            found.append(list(entries(path, notes)))
         except (ValueError, IndexError, OverflowError, struct.error) as error:
             raise InputError(f"{path} is cut or no COLMAP model ({str(error)[:LONGEST]}); {AGAIN}") from None
     known = dict(found[0])
@@ -82,7 +95,7 @@ def read_model(place: Path) -> Model:
         images.append(Image(name, camera, _pose(paths[1], name, quaternion, translation)))
     cameras.near(paths[1], np.array([image.pose[:3, 3] for image in images]).reshape(-1, 3), [i.name for i in images])
     position = {key: row for row, (key, *_) in enumerate(found[1])}
-    return Model(paths[0], known, images, _cloud(paths[2], found[2], position))
+    return Model(paths[0], known, images, _cloud(paths[2], found[2], position), tuple(notes))
 
 
 def _cloud(path: Path, entries: list[Any], position: dict[int, int]) -> Cloud:
@@ -107,7 +120,7 @@ def _pose(path: Path, name: str, quaternion: Any, translation: Any) -> np.ndarra
     """
     q, t = np.array(quaternion, float), np.array(translation, float)
     off = abs(math.hypot(*q) - 1)
-    if not (off < 0.01 and np.isfinite(t).all()):
+    if not (off < SHORT and np.isfinite(t).all()):
         raise InputError(f"{path}: the pose of {name[:LONGEST]!r} is no rotation and translation; {AGAIN}")
     w, x, y, z = q if off < 1e-9 else q / math.hypot(*q)
     pose = np.eye(4)
@@ -126,7 +139,7 @@ class _Bytes:
     def __init__(self, path: Path):
         if regular(path).st_size > LARGEST:
             raise ValueError(f"more than {LARGEST >> 20} MiB")
-        self.data, self.at = path.read_bytes(), 0
+        self.path, self.data, self.at = path, path.read_bytes(), 0
 
     def take(self, layout: struct.Struct) -> tuple[Any, ...]:
         found = layout.unpack_from(self.data, self.at)
@@ -151,70 +164,103 @@ class _Bytes:
             raise ValueError(f"it counts {n} records in {len(self.data)} bytes")
         return range(n)
 
-    def end(self) -> None:
-        if self.at != len(self.data):
-            raise ValueError(f"{len(self.data) - self.at} bytes follow its last record")
+    def end(self, notes: list[str]) -> None:
+        """Note bytes beyond the last record, which COLMAP passes over, too."""
+        if rest := len(self.data) - self.at:
+            notes.append(f"{rest} bytes follow the last record of {self.path.name} and are not read.")
 
 
 _COUNT, _CAMERA, _IMAGE, _POINT = (struct.Struct(f"<{layout}") for layout in ("Q", "IiQQ", "I4d3dI", "Q3d3BdQ"))
 
 
-def _binary_cameras(path: Path) -> Iterator[tuple[int, tuple[str, tuple[float, ...], int, int]]]:
+def _binary_cameras(path: Path, notes: list[str]) -> Iterator[tuple[int, tuple[str, tuple[float, ...], int, int]]]:
     data = _Bytes(path)
     for _ in data.count(_CAMERA.size):
         key, kind, width, height = data.take(_CAMERA)
-        if kind not in MODELS:
+        if not 0 <= kind < len(cameras.MODELS):
             raise ValueError(f"camera {key} is of no known model ({kind})")
-        name, n = MODELS[kind]
+        name, n = list(cameras.MODELS.items())[kind]
         yield key, (name, data.take(struct.Struct(f"<{n}d")), width, height)
-    data.end()
+    data.end(notes)
 
 
-def _binary_images(path: Path) -> Iterator[tuple[int, str, int, tuple[float, ...], tuple[float, ...]]]:
+def _binary_images(
+    path: Path, notes: list[str]
+) -> Iterator[tuple[int, str, int, tuple[float, ...], tuple[float, ...]]]:
     data = _Bytes(path)
     for _ in data.count(_IMAGE.size):
         values = data.take(_IMAGE)
         name = data.word()
         data.skip(24 * len(data.count(24)))  # its keypoints
         yield values[0], name, values[8], values[1:5], values[5:8]
-    data.end()
+    data.end(notes)
 
 
-def _binary_points(path: Path) -> Iterator[tuple[tuple[float, ...], np.ndarray]]:
+def _binary_points(path: Path, notes: list[str]) -> Iterator[tuple[tuple[float, ...], np.ndarray]]:
     data = _Bytes(path)
     for _ in data.count(_POINT.size):
         _, *values, length = data.take(_POINT)
         start = data.at
         data.skip(8 * length)
         yield tuple(values), np.frombuffer(data.data, "<u4", 2 * length, start)[::2]
-    data.end()
+    data.end(notes)
 
 
-def _lines(path: Path) -> list[str]:
-    lines = read_text(path, AGAIN, largest=LARGEST // 8).splitlines()
-    return [line for line in lines if not line.startswith("#")]
+def _lines(path: Path) -> Iterator[tuple[int, str]]:
+    """Each line and its number, without what surrounds it; comments are left out."""
+    for number, line in enumerate(read_text(path, AGAIN, largest=LARGEST // 8).splitlines(), 1):
+        if not (bare := line.strip()).startswith("#"):
+            yield number, bare
 
 
-def _text_cameras(path: Path) -> Iterator[tuple[int, tuple[str, tuple[float, ...], int, int]]]:
-    for line in _lines(path):
+def _whole(word: str) -> int:
+    """A whole number, which some write as 320.0. Raises ValueError."""
+    value = float(word)
+    if not value.is_integer():
+        raise ValueError(f"{word[:LONGEST]} is no whole number")
+    return int(value)
+
+
+def _text_cameras(path: Path, notes: list[str]) -> Iterator[tuple[int, tuple[str, tuple[float, ...], int, int]]]:
+    for _, line in _lines(path):
         if words := line.split():
-            yield int(words[0]), (words[1], tuple(map(float, words[4:])), int(words[2]), int(words[3]))
+            yield int(words[0]), (words[1], tuple(map(float, words[4:])), _whole(words[2]), _whole(words[3]))
 
 
-def _text_images(path: Path) -> Iterator[tuple[int, str, int, list[float], list[float]]]:
-    """Every second line lists keypoints, and may be empty."""
-    lines = iter(_lines(path))
-    for line in lines:
-        if line.strip():
-            words = line.split(maxsplit=9)
-            values = [float(v) for v in words[1:8]]
-            yield int(words[0]), words[9].strip(), int(words[8]), values[:4], values[4:]
-            next(lines, "")
+def _text_images(path: Path, notes: list[str]) -> Iterator[tuple[int, str, int, list[float], list[float]]]:
+    """Images, each followed by a line of its keypoints.
+
+    Choices: the line after an image lists its keypoints if it is empty or of numbers alone, three each; scripts that
+      thin out a model leave it away, and a line that reads as an image is one. Anything else is refused.
+    """
+    follows = False
+    for number, line in _lines(path):
+        words, n = line.split(maxsplit=9), _numbers(line)
+        if follows and n is not None and n % 3 == 0:
+            follows = False
+        elif words:
+            try:
+                values = [float(v) for v in words[1:8]]
+                entry = int(words[0]), words[9], int(words[8]), values[:4], values[4:]
+            except (ValueError, IndexError):
+                entry = None
+            if entry is None or (n is not None and abs(math.hypot(*values[:4]) - 1) > SHORT):
+                raise ValueError(f"line {number} is neither an image nor keypoints of three numbers each")
+            follows = True
+            yield entry
 
 
-def _text_points(path: Path) -> Iterator[tuple[list[float], np.ndarray]]:
-    for line in _lines(path):
+def _numbers(line: str) -> int | None:
+    """How many numbers a line holds; None where it holds something else, too."""
+    try:
+        return len([float(word) for word in line.split()])
+    except ValueError:
+        return None
+
+
+def _text_points(path: Path, notes: list[str]) -> Iterator[tuple[list[float], np.ndarray]]:
+    for number, line in _lines(path):
         if words := line.split():
-            if len(words) < 8:
-                raise ValueError(f"a point of {len(words)} words")
+            if len(words) < 8 or len(words) % 2:
+                raise ValueError(f"line {number} is a point of {len(words)} words")
             yield [float(v) for v in words[1:8]], np.array([int(v) for v in words[8::2]], np.uint32)

@@ -160,7 +160,7 @@ def companions() -> Iterator[Row]:
 
 # COLMAP
 
-PINHOLE, OPENCV, FISHEYE = 1, 4, 5
+PINHOLE, OPENCV, PANORAMA = 1, 4, 17
 MODEL = "sparse/0"
 NAMES = (b"a.png", b"b.png", b"c.png")
 
@@ -208,12 +208,11 @@ def colmap() -> Iterator[Row]:
         cases += [
             (place, "empty", b"", NO_MODEL),
             (place, "cut in a record", content[:-30], NO_MODEL),
-            (place, "a byte too long", content + b"\0", NO_MODEL),
             (place, "2^64 - 1 records", struct.pack("<Q", 2**64 - 1), NO_MODEL),
         ]
     for what, values, word in (
         ("no known model", (99,), "no known model"),
-        ("a fisheye", (FISHEYE, (8, 6), (10, 10, 4, 3, 0, 0, 0, 0)), "OPENCV_FISHEYE is not supported"),
+        ("a panorama", (PANORAMA, (8, 6), (8, 6)), "EQUIRECTANGULAR is not supported"),
         ("2^63 rows", (PINHOLE, (8, 2**63)), NO_CAMERA),
         ("f = 1e300", (PINHOLE, (8, 6), (1e300, 10, 4, 3)), "focal length"),
         ("f = nan", (PINHOLE, (8, 6), (NAN, 10, 4, 3)), "no numbers"),
@@ -248,8 +247,12 @@ def colmap() -> Iterator[Row]:
                       (f"1 PINHOLE {'9' * 5000} 6 10 10 4 3", NO_MODEL)):  # fmt: skip
         as_text.append((f"{MODEL}/cameras.txt", row[:24], f"{row}\n", word))
     kept = "1 1 0 0 0 0 0 0 1 a.png\n\n2 1 0 0 0 1 0 0 1 b.png\n\n"
-    for row, word in (("3 nan 0 0 0 2 0 0 1 c.png", NO_POSE), ("3 1 0 0 0 2 0 0 1", NO_MODEL)):
+    for row, word in (("3 nan 0 0 0 2 0 0 1 c.png", NO_POSE), ("3 1 0 0 0 2 0 0 1", "line 5 is neither"),
+                      ("3 1 0 0 0 2 0 0 1 c.png\n4 5 -1 6 7 -1 8", "line 6 is neither"),
+                      ("3 1 0 0 0 2 0 0 1 c.png\n4 5 -1 6 7 -1 8 9 -1 4", "line 6 is neither")):  # fmt: skip
         as_text.append((f"{MODEL}/images.txt", row, f"{kept}{row}\n", word))
+    as_text.append((f"{MODEL}/points3D.txt", "half a track", "1 0 0 2 9 9 9 .5 1 0 2\n", "a point of 11 words"))
+    as_text.append((f"{MODEL}/cameras.txt", "half a pixel", "1 PINHOLE 8.5 6 10 10 4 3\n", "no whole number"))
     as_text += [("scene.json", f"test_every = {value!r}", keys("scene.json", test_every=value), "test_every")
                 for value in (True, 0, "8")]  # fmt: skip
     as_text += [("scene.json", f"frames = {value!r}", keys("scene.json", test_every=8, frames=value), "frames")

@@ -66,6 +66,74 @@ def test_models_that_colmap_writes_today_read(tmp_path, suffix):
         assert np.allclose(pose[:3], expected[name])
 
 
+IMAGES = ["1 1 0 0 0 0 0 0 1 a.png", "2 1 0 0 0 1 0 0 1 b c.png", "3 1 0 0 0 2 0 0 1 0003"]
+KEYPOINTS = "3 4 -1 5 6 -1 7 8 1 2 3 -1"  # 12 numbers: more words than an image has
+
+
+@pytest.mark.parametrize("between", [
+    ["", "", ""], [KEYPOINTS] * 3, ["", KEYPOINTS, ""], [None] * 3, [None, KEYPOINTS, None], ["# 3 keypoints"] * 3,
+    [" # none", "", "  "], [f"# of a\n{KEYPOINTS}", "#", KEYPOINTS], ["1.5 2.5 -1\n\n # end", "\n", None],
+])  # fmt: skip
+def test_no_view_of_a_text_model_is_lost_whatever_follows_it(tmp_path, between):
+    """Keypoints, an empty line, a comment, or nothing at all, as scripts that thin out a model leave it."""
+    lines = ["#IMAGE_ID, ...", " # thinned"]
+    lines += [part for pair in zip(IMAGES, between, strict=True) for part in pair if part is not None]
+    write_colmap(tmp_path)
+    (tmp_path / "sparse/0/cameras.txt").write_text("1 PINHOLE 320.0 240.0 200 200 160 120\n")
+    (tmp_path / "sparse/0/images.txt").write_text("\n".join(lines))
+    model = colmap_model.read_model(tmp_path / "sparse/0")
+    assert [image.name for image in model.images] == ["a.png", "b c.png", "0003"]
+    assert [image.pose[0, 3] for image in model.images] == [0, 1, 2]
+    assert model.cameras[1][2:] == (320, 240)
+    assert colmap_model.size_of(tmp_path / "sparse/0") == 3
+
+
+def test_bytes_after_a_models_last_record_are_counted(tmp_path):
+    """As COLMAP's own reader, which passes over them."""
+    options = pycolmap.SyntheticDatasetOptions()
+    options.num_rigs, options.num_cameras_per_rig, options.num_frames_per_rig, options.num_points3D = 1, 1, 4, 9
+    pycolmap.synthesize_dataset(options).write_binary(tmp_path)
+    with (tmp_path / "images.bin").open("ab") as stream:
+        stream.write(b"ended")
+    found, theirs = colmap_model.read_model(tmp_path), pycolmap.Reconstruction(tmp_path)
+    assert {image.name for image in found.images} == {image.name for image in theirs.images.values()}
+    assert found.notes == ("5 bytes follow the last record of images.bin and are not read.",)
+
+
+LENSES = {
+    "FULL_OPENCV": [200, 210, 120, 90, -0.2, 0.05, 0.001, 0.002, 0.01, 0, 0, 0],
+    "OPENCV_FISHEYE": [200, 210, 120, 90, 0.01, 0.002, 0, 0], "FOV": [200, 210, 120, 90, 0.7],
+    "SIMPLE_RADIAL_FISHEYE": [200, 120, 90, 0.02], "RADIAL_FISHEYE": [200, 120, 90, 0.02, 0.01],
+    "THIN_PRISM_FISHEYE": [200, 210, 120, 90] + [0.01] * 8,
+    "RAD_TAN_THIN_PRISM_FISHEYE": [200, 210, 120, 90] + [0.001] * 12,
+    "SIMPLE_DIVISION": [200, 120, 90, -0.1], "DIVISION": [200, 210, 120, 90, -0.1],
+    "SIMPLE_FISHEYE": [200, 120, 90], "FISHEYE": [200, 210, 120, 90], "EUCM": [200, 210, 120, 90, 0.6, 1.1],
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("suffix", ["bin", "txt"])
+@pytest.mark.parametrize("lens", LENSES)
+def test_every_lens_that_colmap_writes_is_undone(tmp_path, lens, suffix):
+    """Photos whose value is their own coordinate: pycolmap says where each of our pixels lies in them."""
+    camera = pycolmap.Camera(camera_id=1, model=lens, width=240, height=180, params=LENSES[lens])
+    model = pycolmap.Reconstruction()
+    model.add_camera_with_trivial_rig(camera)
+    for k in range(3):
+        image_of = pycolmap.Image(f"{k}.png", camera_id=1, image_id=k + 1)
+        model.add_image_with_trivial_frame(image_of, pycolmap.Rigid3d())
+        ys, xs = np.mgrid[:180, :240]
+        save(tmp_path / f"images/{k}.png", np.stack([xs, ys, 0 * xs], -1).astype(np.uint8))
+    (tmp_path / "sparse/0").mkdir(parents=True)
+    model.write_text(tmp_path / "sparse/0") if suffix == "txt" else model.write_binary(tmp_path / "sparse/0")
+    fields = colmap.read(tmp_path, IngestSection(max_side=400))
+    height, width = fields["images"].shape[1:3]
+    pixels = np.stack([*np.meshgrid(np.arange(width) + 0.5, np.arange(height) + 0.5), np.ones((height, width))], -1)
+    at = camera.img_from_cam(pixels.reshape(-1, 3) @ np.linalg.inv(fields["Ks"][0]).T).reshape(height, width, 2)
+    inner = np.s_[3:-3, 3:-3]
+    found = fields["images"][0, ..., :2] + 0.5
+    assert np.abs(found - at)[inner].max() < 1
+
+
 def cloud_of(rng, n, n_views, length):
     """A model's cloud of points near the origin, each seen by `length` of its images."""
     views = np.concatenate([rng.choice(n_views, length, replace=False) for _ in range(n)]) if length else []
