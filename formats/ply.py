@@ -5,6 +5,7 @@
 
 from __future__ import annotations
 
+import logging
 import re
 from pathlib import Path
 from typing import Any
@@ -15,10 +16,14 @@ from plyfile import PlyData, PlyElement, PlyListProperty, PlyParseError
 from chebsplat.errors import InputError
 from chebsplat.formats.files import regular
 
+log = logging.getLogger("chebsplat")
+
 REST = {0: 0, 1: 3, 2: 8, 3: 15}  # coefficients beyond band 0, by degree
 _FIXED = ["x", "y", "z", "nx", "ny", "nz", "f_dc_0", "f_dc_1", "f_dc_2"]
 _TAIL = ["opacity", "scale_0", "scale_1", "scale_2", "rot_0", "rot_1", "rot_2", "rot_3"]
 HEADER = 1 << 20  # bytes that a header may take
+THIN = 1e-3  # of the smaller scale of a disc (2DGS): how thick it is taken
+MOST_UNUSABLE = 0.5  # of the Gaussians of a file: beyond it the file is damaged, and not only some of them
 _PART = re.compile(rb"^[ \t]*(?:element[ \t]+\S+[ \t]+(\d{1,30})|(property))\b", re.MULTILINE)
 
 
@@ -69,14 +74,15 @@ def write_ply(
 def read_ply(path: Path) -> tuple[dict[str, np.ndarray], int, np.ndarray | None]:
     """Raw parameters, file degree, and labels where the file has them. Normals and tags are optional.
 
-    Raises: InputError naming the file: not a PLY, truncated, not a 3DGS layout, or non-finite values.
-    Choices: an infinite logit, which converters write for 8-bit opacities of exactly 0 or 1, becomes ±20: the same
-      opacity in float32.
+    Raises: InputError naming the file: not a PLY, truncated, not a 3DGS layout, or most values not finite.
+    Choices: discs of two scales (2DGS) are THIN across them. The filter that mip-splatting, GOF and RaDe-GS keep beside
+      the scales is fused into scales and opacities, as these export it. `usable` says what is left out.
     """
     path = Path(path)
     vertex = read_vertices(path, "export the scene again")
     names = [p.name for p in vertex.properties]
-    absent = [name for name in (*_FIXED[:3], *_FIXED[6:], *_TAIL) if name not in names]
+    flat = "scale_2" not in names
+    absent = [name for name in (*_FIXED[:3], *_FIXED[6:], *_TAIL) if name not in names and name != "scale_2"]
     if absent:
         raise InputError(f"{path} has no property {absent[0]}: not an uncompressed 3DGS PLY; convert it first")
     n_rest = sum(name.startswith("f_rest_") for name in names)
@@ -89,7 +95,7 @@ def read_ply(path: Path) -> tuple[dict[str, np.ndarray], int, np.ndarray | None]
             return np.stack([np.asarray(vertex[name], np.float32) for name in wanted], 1)
 
     def whole(name: str, low: int, high: int) -> np.ndarray:
-        values = np.asarray(vertex[name])
+        values: np.ndarray = np.asarray(vertex[name])[kept]
         if not ((values >= low) & (values <= high) & (values == np.round(values))).all():
             raise InputError(f"{path}: {name} holds more than whole numbers {low} to {high}; export the scene again")
         return values
@@ -98,23 +104,60 @@ def read_ply(path: Path) -> tuple[dict[str, np.ndarray], int, np.ndarray | None]
     rest = block([f"f_rest_{i}" for i in range(n_rest)]) if n_rest else np.zeros((n, 0), np.float32)
     shN = np.zeros((n, 15, 3), np.float32)
     shN[:, : n_rest // 3] = rest.reshape(n, 3, n_rest // 3).transpose(0, 2, 1)
-    opacity = block(["opacity"])[:, 0]
-    opacity = np.where(np.isinf(opacity), np.copysign(np.float32(20), opacity), opacity)
     parameters = {
         "means": block(["x", "y", "z"]),
-        "log_scales": block(_TAIL[1:4]),
+        "log_scales": block(_TAIL[1 : 3 if flat else 4]),
         "quats": block(_TAIL[4:]),
-        "logit_opacities": opacity,
+        "logit_opacities": block(["opacity"])[:, 0],
         "sh0": block(_FIXED[6:])[:, None],
         "shN": shN,
     }
-    for name, values in parameters.items():
-        if not np.isfinite(values).all():
-            raise InputError(f"{path}: {name} holds non-finite values; export the scene again")
+    if flat:
+        log.info("%s holds discs of two scales, which are taken %g times as thick as wide", path, THIN)
+        thin = parameters["log_scales"].min(1, keepdims=True) + np.float32(np.log(THIN))
+        parameters["log_scales"] = np.concatenate([parameters["log_scales"], thin], 1)
+    if "filter_3D" in names:
+        log.info("%s: its filter_3D is fused into scales and opacities", path)
+        parameters |= fused(parameters["log_scales"], parameters["logit_opacities"], np.asarray(vertex["filter_3D"]))
+    parameters, kept = usable(path, parameters)
     if "sh_degree" in names:
         parameters["degrees"] = whole("sh_degree", 0, degree).astype(np.uint8)
     labels = whole("label", -1, 2**24).astype(np.int32) if "label" in names else None
     return parameters, degree, labels
+
+
+def fused(log_scales: np.ndarray, logits: np.ndarray, size: np.ndarray) -> dict[str, np.ndarray]:
+    """Gaussians widened by an isotropic one of standard deviation `size` [N] (scene units), their integral kept.
+
+    Choices: scale² + size² for each scale², and opacities times the root of the ratio of the determinants, as
+      mip-splatting fuses its 3D filter. log_scales [N, 3], logits [N]; float64 within.
+    """
+    with np.errstate(divide="ignore", over="ignore", invalid="ignore"):
+        wide = 0.5 * np.logaddexp(2 * log_scales.astype(float), 2 * np.log(np.abs(size.astype(float)))[:, None])
+        log_opacity = -np.logaddexp(0, -logits.astype(float)) + (log_scales - wide).sum(1)
+        opacity = log_opacity - np.log(-np.expm1(log_opacity))
+    return {"log_scales": wide.astype(np.float32), "logit_opacities": opacity.astype(np.float32)}
+
+
+def usable(path: Path, parameters: dict[str, np.ndarray]) -> tuple[dict[str, np.ndarray], np.ndarray]:
+    """The parameters of the Gaussians that are finite, and which these are, bool [N]; a line says how many are not.
+
+    Raises:  InputError where more than MOST_UNUSABLE are not.
+    Choices: an infinite logit, which converters write for 8-bit opacities of exactly 0 or 1, becomes ±20: the same
+      opacity in float32. A scale of 0, -inf as its logarithm, is left out: nothing can be computed of it.
+    """
+    logits = parameters["logit_opacities"]
+    infinite = np.isinf(logits)
+    parameters = parameters | {"logit_opacities": np.where(infinite, np.copysign(np.float32(20), logits), logits)}
+    finite = {name: np.isfinite(values).reshape(len(values), -1).all(1) for name, values in parameters.items()}
+    kept = np.logical_and.reduce(list(finite.values()))
+    if kept.all():
+        return parameters, kept
+    worst = min(finite, key=lambda name: finite[name].sum())
+    if kept.mean() < MOST_UNUSABLE:
+        raise InputError(f"{path}: {worst} holds non-finite values in {(~kept).sum()} rows; export the scene again")
+    log.warning("%s: %d of %d Gaussians are not finite (%s) and left out", path, (~kept).sum(), len(kept), worst)
+    return {name: values[kept] for name, values in parameters.items()}, kept
 
 
 def read_vertices(path: Path, remedy: str) -> Any:

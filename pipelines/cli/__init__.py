@@ -8,6 +8,7 @@ from typing import Any, NoReturn
 
 import click
 
+from chebsplat.formats.splats import is_splat
 from chebsplat.pipelines.cli import about, knowledge, renders, runs, upkeep, uses
 from chebsplat.pipelines.cli.group import Guarded, logged
 from chebsplat.stages.registry import STAGES
@@ -29,7 +30,7 @@ class Commands(Guarded):
         return super().get_command(context, name)
 
     def resolve_command(self, context: click.Context, args: list[str]) -> Any:
-        of_a_file = any(word.startswith("--capture") or word.endswith(".ply") for word in args[1:]) or (
+        of_a_file = any(word.startswith("--capture") or is_splat(word) for word in args[1:]) or (
             len(args) > 1 and not args[1].startswith("-")
         )
         if args[0] in STAGES and not (of_a_file and args[0] in self.commands):  # `lift` is of a file, too

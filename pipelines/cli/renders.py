@@ -12,6 +12,7 @@ from typing import Any
 import click
 
 from chebsplat.errors import InputError
+from chebsplat.formats.splats import is_splat
 from chebsplat.pipelines.cli.group import AGAINST, NewPath
 
 PATH = click.option(
@@ -112,7 +113,7 @@ def view(scene: str, sh: int, words: Path | None, against: list[str]) -> None:
     from chebsplat.pipelines.work.inventory import PAGE
 
     out = Path(f"{_name(scene)}.{PAGE}")
-    if not scene.endswith(".ply"):
+    if not is_splat(scene):
         with suppress(InputError):  # an artifact of no scene
             out = scene_folder(scene) / PAGE
     out = out.absolute()
@@ -124,7 +125,7 @@ def view(scene: str, sh: int, words: Path | None, against: list[str]) -> None:
 
 def _name(scene: str) -> str:
     path = Path(os.path.abspath(scene))
-    return path.stem if path.suffix == ".ply" else path.name
+    return path.stem if path.suffix and is_splat(scene) else path.name
 
 
 def _write_page(scene: str, out: Path, sh: int, words: Path | None, against: list[str]) -> None:
@@ -134,8 +135,7 @@ def _write_page(scene: str, out: Path, sh: int, words: Path | None, against: lis
     from chebsplat.pipelines.work.finished import artifact_of, teacher_of
     from chebsplat.stages.tools.page import foreign, write_page
 
-    theirs = scene.endswith(".ply")
-    if theirs:
+    if is_splat(scene):
         opened, teacher = foreign(Path(scene).expanduser()), None
     else:
         opened, teacher = Scene.read(artifact_of(scene, "export")), teacher_of(scene)

@@ -15,6 +15,7 @@ from chebsplat.errors import InputError
 from chebsplat.formats.artifact import sha256_file
 from chebsplat.formats.files import regular
 from chebsplat.formats.images import images_below
+from chebsplat.formats.splats import splat_file
 from chebsplat.formats.teacher_model import EMBEDDED, read_teacher
 
 SETTLED = 2_000_000_000  # ns; no file system's clock is coarser. What changed later than this may yet change unseen
@@ -38,7 +39,7 @@ def raw_files(stage: str, sections: dict[str, Any]) -> tuple[Path | None, list[P
     if stage == "teacher" and sections["teacher"]["model"]:
         return None, _of_teacher(sections["teacher"])
     if stage == "train" and sections["train"]["start"]:
-        return None, [_named(sections["train"]["start"], "train.start")]
+        return None, [splat_file(Path(sections["train"]["start"]))]
     if stage == "learn" and sections["learn"]["points"]:
         return None, [_named(sections["learn"]["points"], "learn.points")]
     if stage == "teach":

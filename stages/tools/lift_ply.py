@@ -22,8 +22,9 @@ from chebsplat.formats.gaussians import Gaussians
 from chebsplat.formats.knowledge import read_knowledge
 from chebsplat.formats.manifest import Manifest
 from chebsplat.formats.names import suggest
-from chebsplat.formats.ply import read_ply, write_ply
+from chebsplat.formats.ply import write_ply
 from chebsplat.formats.points import Points
+from chebsplat.formats.splats import read_splats, splat_file
 from chebsplat.formats.teacher_model import EMBEDDED, read_teacher
 from chebsplat.labels.decode import decode
 from chebsplat.lifting.observations import carry
@@ -87,7 +88,7 @@ def import_ply(ply: Path, out: Path) -> dict[str, Any]:
 def taken_over(ply: Path, parameters: dict[str, np.ndarray], cameras: Cameras, out: Path) -> None:
     """Make the folder `out`, and in it `gaussians` of what a PLY holds."""
     out.mkdir(parents=True)
-    given = {"path": ply.name, "sha256": artifact.sha256_file(ply)}
+    given = {"path": ply.name, "sha256": artifact.sha256_file(splat_file(ply))}
     manifest = Manifest(Gaussians.SCHEMA, artifact.digest(given), "train", facts={"source": given})
     with artifact.publish(out / "gaussians", manifest) as tmp:
         Gaussians(parameters, cameras, notes={"left_out": {"training": "the splat was given"}}).write(tmp)
@@ -143,7 +144,7 @@ def label_ply(
         word = words[rows.index(-1)]
         near = ", ".join(suggest(word, held.words))
         raise ConfigError(f"{knowledge} has no word {word}" + (f"; near: {near}" if near else ""))
-    parameters, degree, _ = read_ply(ply)
+    parameters, degree, _ = read_splats(ply)
     if not len(parameters["means"]):
         raise InputError(f"{ply} holds no Gaussians; choose another")
     unit = room_unit(parameters["means"]) if unit is None else unit

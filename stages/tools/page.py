@@ -17,8 +17,8 @@ from chebsplat.formats.calibration import calibration_of
 from chebsplat.formats.cameras import Cameras
 from chebsplat.formats.files import atomic_path
 from chebsplat.formats.packed import pack, signed, to_bytes
-from chebsplat.formats.ply import read_ply
 from chebsplat.formats.scene import Scene
+from chebsplat.formats.splats import read_splats
 from chebsplat.formats.teacher_model import EMBEDDED, read_label_set, read_label_table, read_teacher
 from chebsplat.labels.calibration import Calibration
 from chebsplat.stages.pages.parts import rendered
@@ -112,11 +112,11 @@ def write_page(
 
 
 def foreign(ply: Path) -> Scene:
-    """A scene of a 3DGS PLY from elsewhere: no semantics, and one camera that sees its middle half.
+    """A scene of a splat from elsewhere: no semantics, and one camera that sees its middle half.
 
     Raises: InputError naming the file. Choices: up is -y, as in COLMAP's and 3DGS' own frames.
     """
-    parameters, degree, _ = read_ply(ply)
+    parameters, degree, _ = read_splats(ply)
     if not len(parameters["means"]):
         raise InputError(f"{ply} holds no Gaussians; choose another")
     degrees = parameters.setdefault("degrees", np.full(len(parameters["means"]), degree, np.uint8))

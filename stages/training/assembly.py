@@ -16,8 +16,8 @@ from chebsplat.formats.cameras import Cameras
 from chebsplat.formats.capture import Capture
 from chebsplat.formats.features import Features
 from chebsplat.formats.gaussians import Gaussians
-from chebsplat.formats.ply import read_ply
 from chebsplat.formats.points import Points, thinned
+from chebsplat.formats.splats import read_splats
 from chebsplat.settings import DescribeSection, TrainSection
 from chebsplat.splats.gaussians import initial_gaussians
 from chebsplat.stages.runtime.command import Job, n_threads
@@ -195,11 +195,11 @@ def start_features(model: SceneModel, capture: Capture, points: Points, features
 
 
 def started(ply: Path, train: TrainSection) -> dict[str, Tensor]:
-    """Raw parameters of the Gaussians of a 3DGS PLY, in the frame of the scene's cameras, with its SH bands.
+    """Raw parameters of the Gaussians of a splat, in the frame of the scene's cameras, with its SH bands.
 
     Raises: InputError naming the file; ConfigError where they are more than `train.max_gaussians`.
     """
-    parameters, degree, _ = read_ply(ply)
+    parameters, degree, _ = read_splats(ply)
     n = len(parameters["means"])
     if n == 0:
         raise InputError(f"{ply} holds no Gaussians; choose another train.start")

@@ -13,7 +13,7 @@ from shared import INPUTS, TOY, data, run_stage
 
 from chebsplat.formats.gaussians import Gaussians
 from chebsplat.formats.packed import Packed, unpack
-from chebsplat.formats.ply import read_ply
+from chebsplat.formats.ply import read_ply, write_ply
 from chebsplat.pipelines.cli import main
 from chebsplat.pipelines.planning.plan import Planner
 from chebsplat.render import SceneRenderer
@@ -109,6 +109,22 @@ def test_training_goes_on_from_a_splat_that_others_made(toy, tmp_path):
     (tmp_path / "cut.ply").write_bytes(ply.read_bytes()[:400])
     config = TOY | {"train": TOY["train"] | {"start": str(tmp_path / "cut.ply")}}
     assert run_stage("train", tmp_path / "no", inputs, config) == 3
+
+
+@pytest.mark.parametrize("name", ["a.splat", "theirs"])
+def test_a_splat_file_and_a_folder_of_3dgs_become_a_scene_and_a_page(tmp_path, name):
+    """Whose name says nothing of a PLY."""
+    path = tmp_path / name
+    if path.suffix:
+        row = np.array([(0, 0, 1, 0.1, 0.1, 0.1)], "<f4").tobytes() + bytes([9, 99, 200, 255, 255, 128, 128, 128])
+        path.write_bytes(row * 9)
+    else:
+        (path / "point_cloud/iteration_7").mkdir(parents=True)
+        write_ply(path / "point_cloud/iteration_7/point_cloud.ply", room(9)[0], 1)
+    for command, out in (("lift", "made"), ("page", "made.html")):
+        done = CliRunner().invoke(main, [command, str(path), "--out", str(tmp_path / out)])
+        assert done.exit_code == 0, done.output
+    assert len(Gaussians.read(tmp_path / "made/gaussians").parameters["means"]) == 9
 
 
 def test_a_key_holds_what_training_starts_from_and_not_where_that_lies(tmp_path, quick_plans):
