@@ -5,7 +5,7 @@ from __future__ import annotations
 import functools
 import itertools
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -13,9 +13,10 @@ from PIL import Image
 from scipy.ndimage import map_coordinates
 
 from chebsplat.errors import DataFailure, InputError
+from chebsplat.formats.images import header
 from chebsplat.stages.settings import IngestSection
-from chebsplat.stages.sources.cameras import DISTORTED, Camera, undistorted
-from chebsplat.stages.sources.common import Frame, Listing, natural
+from chebsplat.stages.sources.cameras import DISTORTED, Camera, scaled, undistorted
+from chebsplat.stages.sources.common import Frame, Listing, natural, sureness
 from chebsplat.stages.sources.pictures import (
     DEEP,
     GREY,
@@ -35,7 +36,7 @@ def assemble(listing: Listing, settings: IngestSection, class_names: tuple[str, 
 
     Choices: `max_views` picks evenly from the naturally sorted frames. Images are reduced to `max_side` by averaging
       and then undistorted; depth, labels and masks take the nearest pixel of the file. Smaller views are padded at
-      the right and the bottom, where the loss mask is false, as it is where an image is transparent. Depth and
+      the right and the bottom, where the loss mask is false, as it is in a photo that is all transparent. Depth and
       labels are taken only if every frame of the source has them.
     Raises:  InputError naming a bad file, DataFailure under `min_views` or where no label has a name.
     """
@@ -51,8 +52,11 @@ def assemble(listing: Listing, settings: IngestSection, class_names: tuple[str, 
             notes.append(f"Only {n} of {len(listing.frames)} frames have {name.replace('_', ' ')}, which are left out.")
     lookup = functools.lru_cache(8)(positions)  # frames of one camera share it
 
+    clear = []
+
     def fill(k: int) -> None:
         view = read_view(frames[k], listing, shapes[k], lookup(frames[k].camera, shapes[k]), set(stacks))
+        clear.extend([k] if view["opaque"] < 1 else [])
         for name in stacks:
             stacks[name][k, : shapes[k].height, : shapes[k].width] = view[name]
 
@@ -75,6 +79,8 @@ def assemble(listing: Listing, settings: IngestSection, class_names: tuple[str, 
         notes += remarks
     if not stacks["loss_mask"].any():
         raise DataFailure(f"{frames[0].mask or frames[0].image}: no pixel of any view counts; correct the masks")
+    if clear:
+        notes.append(f"{len(clear)} of {len(frames)} photos have transparent pixels, which are empty space.")
     if not stacks["loss_mask"].all():
         fields["loss_mask"] = stacks["loss_mask"]
         notes.append(f"{1 - stacks['loss_mask'].mean():.1%} of the pixels are masked.")
@@ -111,6 +117,12 @@ def chosen(listing: Listing, settings: IngestSection) -> tuple[list[Frame], list
         picked = np.linspace(0, len(frames) - 1, settings.max_views).round().astype(int)
         notes.append(f"{len(picked)} of {len(frames)} views are used (ingest.max_views).")
         frames = [frames[k] for k in picked]
+    if not listing.upright:  # plain photos have the cameras that they are given
+        given_frames = frames
+        frames = [replace(frame, camera=scaled(frame.camera, header(frame.image)[0])) for frame in frames]
+        changed = [new for new, old in zip(frames, given_frames, strict=True) if new.camera != old.camera]
+        if changed:
+            notes.append(f"Cameras of {len(changed)} views are scaled to their photos, which have another size.")
     return frames, notes
 
 
@@ -155,12 +167,14 @@ def positions(camera: Camera, view: Geometry) -> np.ndarray:
 def read_view(
     frame: Frame, listing: Listing, view: Geometry, at: np.ndarray, wanted: set[str]
 ) -> dict[str, np.ndarray]:
-    """images u8 [H, W, 3], loss_mask bool [H, W]; where `wanted`, depth, labels, pseudo_labels, confidence [H, W]."""
+    """images u8 [H, W, 3], loss_mask bool [H, W], opaque: a share; where `wanted`, depth, labels, pseudo_labels,
+    confidence [H, W].
+    """
     camera, size = frame.camera, (frame.camera.width, frame.camera.height)
     inside = within(at, size)
-    pixels, counts = photo(frame, listing, view, at)
-    counts &= inside
-    fields = {"images": pixels, "loss_mask": counts}
+    pixels, opaque = photo(frame, listing, view, at)
+    counts = inside & (opaque > 0)
+    fields = {"images": pixels, "loss_mask": counts, "opaque": np.array(opaque)}
     if frame.mask is not None:
         counts &= companion(frame.mask, size, at) > 0
     if "depth" in wanted and frame.depth is not None:
@@ -169,23 +183,24 @@ def read_view(
             place, field = moved(at, camera, listing.depth_camera)
         stored = companion(frame.depth, field, place, DEEP, "16-bit depth").astype(np.float32)
         known = within(place, field) & inside & ~np.isin(stored, listing.no_depth)
+        if (sure := sureness(frame.depth)) is not None:
+            known &= companion(sure, field, place) > 0
         fields["depth"] = np.where(known, stored / np.float32(listing.depth_scale), np.float32(np.nan))
     if "labels" in wanted and frame.labels is not None:
         fields["labels"] = np.where(inside, label_ids(frame, listing, size, at), np.int32(-1))
     if "pseudo_labels" in wanted and frame.pseudo_labels is not None and frame.confidence is not None:
-        ids = companion(frame.pseudo_labels, size, at, GREY, "8- or 16-bit ids", listing.any_label_size)
+        ids = companion(frame.pseudo_labels, size, at, GREY, "8- or 16-bit ids")
         fields["pseudo_labels"] = np.where(inside, ids.astype(np.int32), np.int32(0))
         sure = nearest(confidences(frame.confidence), at, size)
         fields["confidence"] = np.where(inside & (fields["pseudo_labels"] > 0), sure, 0).astype(np.float16)
     return fields
 
 
-def photo(frame: Frame, listing: Listing, view: Geometry, at: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """The view's pixels u8 [H, W, 3] and where they are opaque, bool [H, W]; the whole photo is gone on return."""
+def photo(frame: Frame, listing: Listing, view: Geometry, at: np.ndarray) -> tuple[np.ndarray, float]:
+    """The view's pixels u8 [H, W, 3] and the photo's opaque share; the whole photo is gone on return."""
     size = (frame.camera.width, frame.camera.height)
     with open_photo(frame.image, size, listing.upright) as (image, opaque):
-        seen = np.ones(at.shape[1:], bool) if opaque is None else nearest(opaque, at, size)
-        return resampled(image, frame.camera, view, at), seen
+        return resampled(image, frame.camera, view, at), opaque
 
 
 def within(at: np.ndarray, size: tuple[int, int]) -> np.ndarray:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import functools
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -24,6 +24,7 @@ ROTATION_TOLERANCE = 1e-2  # of RᵀR − I: rows written with three decimals pa
 FOCAL = (0.01, 100.0)  # of the longer side: fields of view of 178 and of 0.6 degrees
 OFF_CENTRE = 1.5  # sides by which a principal point may lie off the middle: crops have it outside
 LEAST_KEPT = 0.25  # of each side: a distortion that leaves less of a photo is none that a lens has
+SAME_SHAPE = 0.02  # difference in aspect ratio that still counts as another resolution of the same picture
 FARTHEST = 1e6  # scene units from the origin: in float32, points that far out are 0.06 apart
 
 
@@ -89,6 +90,21 @@ def fault(camera: Camera) -> str:
         if plain.width < LEAST_KEPT * width or plain.height < LEAST_KEPT * height:
             return f"its distortion leaves {plain.width}x{plain.height} pixels"
     return ""
+
+
+def scaled(camera: Camera, size: tuple[int, int]) -> Camera:
+    """The camera of a photo of (width, height) `size` that was made smaller or larger since the camera was written.
+
+    Choices: it stays as it is where the photo has its size, either way up, or another shape, which is no such photo.
+    """
+    if (camera.width, camera.height) in (size, size[::-1]):
+        return camera
+    for width, height in (size, size[::-1]):
+        if abs(width * camera.height / (height * camera.width) - 1) < SAME_SHAPE:
+            held = camera.colmap
+            held.rescale(width, height)
+            return replace(camera, params=tuple(float(v) for v in held.params), width=width, height=height)
+    return camera
 
 
 @functools.lru_cache(64)

@@ -1,7 +1,8 @@
-"""The COLMAP source: images/ and a model in sparse/0, with depth/, semantic/ and masks/ where they are given."""
+"""The COLMAP source: images/ and models in sparse/, with depth/, semantic/ and masks/ where they are given."""
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -9,7 +10,7 @@ import numpy as np
 
 from chebsplat.errors import InputError
 from chebsplat.stages.sources import assembly, cameras, common, texts
-from chebsplat.stages.sources.colmap_model import Model, read_model
+from chebsplat.stages.sources.colmap_model import Model, read_model, size_of
 from chebsplat.stages.sources.common import Frame, Listing
 from chebsplat.stages.sources.pictures import names_by_id
 
@@ -27,7 +28,7 @@ def read(folder: Path, settings: Any, class_names: tuple[str, ...] | None = None
     Choices: scene.json's split counts all of its frames, so `max_views` never moves a view from one side to the
       other; if it leaves one side empty, the split is not given and a note says so. The model's points are taken
       unless there is depth, which gives more; of those with tracks the ones that fewer than MIN_TRACK images see, or
-      that lie farther than MAX_ERROR pixels off on average, are left out.
+      that are known to lie farther than MAX_ERROR pixels off on average, are left out.
     """
     listing, model = _listing(folder)
     fields = assembly.assemble(listing, settings, class_names)
@@ -49,22 +50,37 @@ def probe(folder: Path) -> dict[str, bool]:
 
 def files(folder: Path) -> list[Path]:
     """The model, scene.json, labels.json, and every image, depth, label and mask."""
-    model = [path for path in _model_folder(folder).iterdir() if path.suffix in (".bin", ".txt")]
+    model = [path for place in _models(folder) for path in place.iterdir() if path.suffix in (".bin", ".txt")]
     documents = [folder / name for name in ("scene.json", "labels.json") if common.present(folder / name)]
-    data = [folder / place / name for place in ("images", *COMPANIONS, "masks")
-            for name in common.names_below(folder / place)]  # fmt: skip
+    places = [common.photo_folder(folder), *(folder / name for name in (*COMPANIONS, "masks", "confidence"))]
+    data = [place / name for place in places for name in common.names_below(place)]
     return sorted([*model, *documents, *data])
 
 
-def _pngs(folder: Path) -> set[str]:
-    return {name[:-4] for name in common.names_below(folder) if name.endswith(".png")}
+def _models(folder: Path) -> list[Path]:
+    """The folders of all models: sparse/0 and its neighbours, sparse/ itself, and where nerfstudio puts them."""
+    roots = [root for root in (folder / "sparse", folder / "colmap/sparse") if root.is_dir()]
+    places = [place for root in roots for place in (*sorted(root.iterdir(), key=_natural), root)]
+    found = [p for p in places if any(common.present(p / f"cameras.{end}") for end in ("bin", "txt"))]
+    if not found:
+        raise InputError(f"{folder / 'sparse/0'} holds no COLMAP model (cameras.bin or cameras.txt); {HELP}")
+    return found
 
 
-def _model_folder(folder: Path) -> Path:
-    for place in ("sparse/0", "sparse"):
-        if any(common.present(folder / place / f"cameras.{end}") for end in ("bin", "txt")):
-            return folder / place
-    raise InputError(f"{folder / 'sparse/0'} holds no COLMAP model (cameras.bin or cameras.txt); {HELP}")
+def _natural(path: Path) -> Any:
+    return common.natural(path.name)
+
+
+def _model_folder(folder: Path) -> tuple[Path, list[str]]:
+    """The model with the most images, the first of equals; a note that names the others, if there are any."""
+    places = _models(folder)
+    if len(places) == 1:
+        return places[0], []
+    sizes = [size_of(place) for place in places]
+    best = sizes.index(max(sizes))
+    told = [f"{place.relative_to(folder)} ({size} images)" for place, size in zip(places, sizes, strict=True)]
+    others = ", ".join(told[:best] + told[best + 1 :])
+    return places[best], [f"The largest model is taken, {told[best]}; left out: {others}."]
 
 
 def _document(folder: Path) -> dict[str, Any]:
@@ -102,19 +118,24 @@ def _label_names(folder: Path) -> dict[int, str] | None:
 
 
 def _points(model: Model, names: list[str], notes: list[str]) -> dict[str, Any]:
-    """points, point_colors and tracks (point, view) of a capture with views of these names; nothing of few points."""
+    """points, point_colors and tracks (point, view) of a capture with views of these names; nothing of few points.
+
+    Choices: a point whose error is not known is taken.
+    """
     cloud = model.cloud
     good = np.abs(cloud.means).max(1, initial=0) < cameras.FARTHEST
     if len(cloud.tracks):
         length = np.bincount(cloud.tracks[:, 0], minlength=len(good))
-        good &= (length >= MIN_TRACK) & (cloud.errors <= MAX_ERROR)
-    if good.sum() < LEAST:
-        return {}
+        good &= (length >= MIN_TRACK) & ~(cloud.errors > MAX_ERROR)
     if not good.all():
         notes.append(
             f"{len(good) - good.sum()} of the model's {len(good)} points are left out: fewer than {MIN_TRACK} images "
             f"see them, or they lie more than {MAX_ERROR:g} pixels off."
         )
+    if good.sum() < LEAST:
+        if len(good):
+            notes.append(f"{good.sum()} points are left, fewer than {LEAST}: none is used, and photos are matched.")
+        return {}
     view = {name: row for row, name in enumerate(names)}
     of_image = np.array([view.get(common.stem(image.name), -1) for image in model.images])
     of_point = np.where(good, np.cumsum(good) - 1, -1)
@@ -127,41 +148,43 @@ def _points(model: Model, names: list[str], notes: list[str]) -> dict[str, Any]:
 
 
 def _listing(folder: Path) -> tuple[Listing, Model]:
-    place, images = _model_folder(folder), folder / "images"
+    """The frames, and the model with its images called by their files; those that are absent have no name."""
+    place, notes = _model_folder(folder)
+    images = common.photo_folder(folder)
     if not images.is_dir() and (undistorted := sorted(path.parent for path in folder.glob("dense/**/images"))):
         raise InputError(f"{images} is missing; {undistorted[0]} holds undistorted images and their model: name that")
     model = read_model(place)
-    found = set(common.images_in(images))
-    on_disk, has = len(found), probe(folder)
-    masks = _pngs(folder / "masks")
-    frames, absent, unmasked = [], 0, 0
+    notes += model.notes
+    on_disk, wanted = common.images_in(images), [image.name for image in model.images]
+    files = common.matched(wanted, on_disk)
+    has = probe(folder)
+    masks, unmasked = common.masks_in(folder, files.values())
+    frames = []
     for image in model.images:
-        name = common.stem(image.name)
-        if image.name not in found:
-            absent += 1
-        else:
-            mask = next((stem for stem in (image.name, name) if stem in masks), None)
-            unmasked += mask is None
+        if file := files.get(image.name):
+            name = common.stem(file)
             frames.append(
                 Frame(
                     name,
-                    images / image.name,
+                    images / file,
                     cameras.camera_of(model.origin, *model.cameras[image.camera]),
                     image.pose,
                     folder / f"depth/{name}.png" if has["depth"] else None,
                     folder / f"semantic/{name}.png" if has["labels"] else None,
-                    folder / f"masks/{mask}.png" if mask else None,
+                    masks.get(file),
                 )
             )
-        found.discard(image.name)
-    notes = list(model.notes)
+    rest = set(on_disk) - set(files.values())
+    absent = [name for name in wanted if name not in files]
     if absent:
-        notes.append(f"{absent} of {len(model.images)} images of the model are absent on disk.")
-    if found:
-        notes.append(f"{len(found)} of {on_disk} images on disk are not in the model and are left out.")
-    if masks and unmasked:
-        notes.append(f"{unmasked} of {len(frames)} views have no mask; all their pixels count.")
-    others = sum(path.is_dir() for path in (folder / "sparse").iterdir()) - 1
-    if place.name == "0" and others > 0:
-        notes.append(f"{others} further models beside sparse/0 are left out.")
-    return Listing("colmap", frames, _label_names(folder), notes=notes), model
+        notes.append(f"{len(absent)} of {len(wanted)} images of the model are absent on disk ({common.few(absent)}).")
+    if rest:
+        notes.append(
+            f"{len(rest)} of {len(on_disk)} images on disk are not in the model and are left out ({common.few(rest)})."
+        )
+    if by_stem := sum(name != file for name, file in files.items()):
+        notes.append(f"{by_stem} of the model's images have another path on disk and are told by their names.")
+    if images.name != "images":
+        notes.append(f"Photos are those of {images.name}/.")
+    model = replace(model, images=[replace(image, name=files.get(image.name, "")) for image in model.images])
+    return Listing("colmap", frames, _label_names(folder), notes=notes + unmasked), model

@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import os
+import re
 from collections import Counter
-from collections.abc import Iterable, Iterator
+from collections.abc import Collection, Iterable, Iterator, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -18,6 +19,10 @@ from chebsplat.formats.videos import is_video
 from chebsplat.stages.settings import SourceSection
 from chebsplat.stages.sources.cameras import Camera
 
+# folders of what belongs to photos, or is made of them
+BESIDE = {"masks", "mask", "depth", "depths", "confidence", "semantic", "labels", "instance", "normals", "thumbs",
+          "thumbnails"}  # fmt: skip
+ENDING = re.compile(r"\.[a-zA-Z]\w{1,4}$")  # of an image's name
 # What cameras leave beside photos, or instead of them, and what makes JPEGs of it.
 UNREAD = (
     dict.fromkeys((".dng", ".cr2", ".cr3", ".nef", ".arw", ".raf", ".orf", ".rw2"), "darktable-cli a{0} a.jpg")
@@ -34,7 +39,7 @@ class Frame:
     image: Path
     camera: Camera
     pose: np.ndarray | None = None
-    depth: Path | None = None
+    depth: Path | None = None  # where `confidence/` lies beside its folder, that says where it is sure
     labels: Path | None = None
     mask: Path | None = None
     objects: Path | None = None  # ids of objects, as large as the labels
@@ -49,7 +54,6 @@ class Listing:
     label_names:  by raw id. class_names: all classes in order; None: those that occur.
     corrections:  object id -> raw id of the label that its pixels take instead.
     pseudo_names: by id in the pseudo labels; 0 is none.
-    any_label_size: label images may have another resolution than their photos.
     depth_scale:  stored units in one scene unit; no_depth: stored values that mean "unknown".
     depth_camera: a pinhole camera of the depth images, at the photo's place; None: the photo's own.
     """
@@ -60,7 +64,6 @@ class Listing:
     class_names: tuple[str, ...] | None = None
     corrections: dict[int, int] = field(default_factory=dict)
     pseudo_names: dict[int, str] | None = None
-    any_label_size: bool = False
     depth_scale: float = 1000.0
     no_depth: tuple[int, ...] = (0,)
     depth_camera: Camera | None = None
@@ -70,6 +73,12 @@ class Listing:
     def has(self, what: str) -> bool:
         """Whether every frame has a "pose", "depth", "labels" and so on."""
         return bool(self.frames) and all(getattr(frame, what) is not None for frame in self.frames)
+
+
+def sureness(depth: Path) -> Path | None:
+    """The image beside a LiDAR's depth that is 0 where that is not to be believed: confidence/ beside its folder."""
+    path = depth.parent.with_name("confidence") / depth.name
+    return path if depth.parent.name.startswith("depth") and present(path) else None
 
 
 def stem(name: str) -> str:
@@ -97,23 +106,24 @@ def detect(folder: Path) -> str:
         return "replica"
     if all((folder / part).is_dir() for part in ("color", "pose", "intrinsic")):
         return "scannet"
-    if (folder / "sparse").is_dir():
+    if (folder / "sparse").is_dir() or (folder / "colmap/sparse").is_dir():
         return "colmap"
     if any(path.is_file() for place in ("", "seq-*/") for path in folder.glob(f"{place}frame-*.color.*")):
         return "seven_scenes"
-    if folder.is_dir() and any(is_image(name) for name in os.listdir(folder)):
+    if folder.is_dir() and (any(map(is_image, os.listdir(folder))) or any(names_below(photo_folder(folder)))):
         return "photos"
     if is_video(folder.name) and folder.is_file():
         return "video"
     if folder.is_dir() and sum(is_video(name) for name in os.listdir(folder)) == 1:
         return "video"
+    if folder.is_dir() and set(with_photos(folder)) - BESIDE:
+        return "photos"
     if others := unread(folder):
         raise InputError(f"{folder} holds no .jpg, .png or .heic photo: {others}")
-    hint = f"; {folder / 'images'} may be meant" if (folder / "images").is_dir() else ""
     raise InputError(
         f"{folder} is no source: it holds neither transforms.json, traj.txt, results/, Sequence_1/, "
         f"color/ with pose/ and intrinsic/, frame-*.color.jpg or .png, sparse/0/cameras.bin or .txt, "
-        f"nor a .jpg, .png or .heic photo, nor one video{hint}"
+        f"nor a .jpg, .png or .heic photo, nor one video"
     )
 
 
@@ -158,6 +168,58 @@ def images_in(folder: Path) -> list[str]:
     if not found:
         raise InputError(f"{folder} holds no .jpg, .png or .heic image; correct source.path")
     return found
+
+
+def photo_folder(folder: Path) -> Path:
+    """Where a source's photos lie: images/, or what 3DGS' converter reads, or a reduced copy that stands alone."""
+    places = [folder / name for name in ("images", "input", "images_2", "images_4", "images_8")]
+    return next((place for place in places if any(names_below(place))), places[0])
+
+
+def with_photos(folder: Path) -> list[str]:
+    """Subfolders that hold images, masks/ left out, in natural order."""
+    with os.scandir(folder) as entries:
+        names = [entry.name for entry in entries if entry.is_dir() and entry.name[0] != "." and entry.name != "masks"]
+    return sorted((name for name in names if any(map(is_image, os.listdir(folder / name)))), key=natural)
+
+
+def matched(wanted: Sequence[str], there: Collection[str]) -> dict[str, str]:
+    """The file that each of the names which a model holds means; names that mean none are left away.
+
+    Args: there: POSIX paths of files below the folder that the names are relative to.
+    Choices: a name is a path with either separator. Where that is no file, endings are left away, and then folders, one
+      by one from the front, until it is one file's alone, and no other name's.
+    """
+    files = set(there)
+    found = {name: path for name in wanted if (path := name.replace("\\", "/")) in files}
+    for depth in range(1 + max((name.count("/") for name in files), default=0), 0, -1):
+        places: list[dict[tuple[str, ...], list[str]]] = []
+        for names in (set(wanted) - set(found), files - set(found.values())):
+            places.append({})
+            for name in names:
+                parts = tuple(ENDING.sub("", name.replace("\\", "/")).casefold().split("/"))
+                if len(parts) >= depth:
+                    places[-1].setdefault(parts[-depth:], []).append(name)
+        for key, names_of in places[0].items():
+            if len(names_of) == len(places[1].get(key, ())) == 1:
+                found[names_of[0]] = places[1][key][0]
+    return found
+
+
+def few(names: Iterable[str]) -> str:
+    """Three of some names, for a message, and whether there are more."""
+    ordered = sorted(names, key=natural)
+    shown = [f"{name!a}"[1:-1] if unprintable(name) else name for name in ordered[:3]]
+    return ", ".join(shown) + ", ..." * (len(ordered) > 3)
+
+
+def masks_in(folder: Path, names: Iterable[str]) -> tuple[dict[str, Path], list[str]]:
+    """The masks of photos by the photos' names, in masks/ and called like a photo or its stem; a note if some lack."""
+    held = {stem(name): folder / "masks" / name for name in names_below(folder / "masks")}
+    given = list(names)
+    found = {name: path for name in given if (path := held.get(name) or held.get(stem(name)))}
+    lacking = len(given) - len(found)
+    return found, [f"{lacking} of {len(given)} views have no mask; all their pixels count."] if held and lacking else []
 
 
 def resolve_source(name: str, source: SourceSection) -> SourceSection:

@@ -53,29 +53,49 @@ def probe(folder: Path) -> dict[str, bool]:
 
 
 def files(folder: Path) -> list[Path]:
-    """The photos; subfolders are not searched. Raises InputError if there are none."""
+    """The photos and their masks. Raises InputError if there are no photos."""
+    place, names = _photos(folder)
+    masks = common.names_below(folder / "masks")
+    return sorted([*(place / name for name in names), *(folder / "masks" / name for name in masks)])
+
+
+def _photos(folder: Path) -> tuple[Path, list[str]]:
+    """The folder of the photos, and their paths below it: those that lie in it; otherwise in images/ or the like;
+    otherwise in its subfolders, one for each camera. Raises InputError if there are none.
+    """
     try:
         names = [name for name in os.listdir(folder) if is_image(name)]
     except OSError as error:
         raise InputError(f"{folder}: {error.strerror}; correct source.path") from None
+    place = folder
+    if not names:
+        place = common.photo_folder(folder)
+        names = list(common.names_below(place))
+    if not names:
+        place, inner = folder, [name for name in common.with_photos(folder) if name not in common.BESIDE]
+        names = [f"{name}/{file}" for name in inner for file in common.names_below(folder / name)]
     if not names:
         raise InputError(f"{folder} holds no .jpg, .png or .heic image; correct source.path")
-    return sorted(folder / name for name in common.printable(folder, names))
+    return place, sorted(common.printable(place, names))
 
 
 def _listing(folder: Path) -> Listing:
     frames, guessed = [], 0
-    for path in files(folder):
+    place, names = _photos(folder)
+    masks, notes = common.masks_in(folder, names)
+    for name in names:
+        path = place / name
         (width, height), focal = header(path)
         guessed += focal is None
         pixels = max(width, height) * (GUESS if focal is None else focal / FILM)
         camera = cameras.camera_of(path, "SIMPLE_PINHOLE", (pixels, width / 2, height / 2), width, height)
-        frames.append(Frame(path.stem, path, camera))
-    notes = []
+        frames.append(Frame(common.stem(name), path, camera, mask=masks.get(name)))
     if guessed:
         notes.append(
             f"{guessed} of {len(frames)} photos have no focal length; {GUESS} times the longer side is the first guess."
         )
+    if place == folder and (beside := set(common.with_photos(folder)) - {name.partition("/")[0] for name in names}):
+        notes.append(f"Photos in these folders are not read: {', '.join(sorted(beside, key=common.natural))}.")
     return Listing("photos", frames, notes=notes, upright=True)
 
 

@@ -8,28 +8,29 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from PIL import Image
 
 from chebsplat.errors import DataFailure, InputError
 from chebsplat.formats.images import opened, seen_size, turned
 from chebsplat.formats.tensors import finite32, read_npz
+from chebsplat.stages.sources.cameras import SAME_SHAPE
 from chebsplat.stages.sources.common import Frame, Listing
 from chebsplat.stages.sources.texts import LONGEST, shortened, whole
 
 EIGHT_BIT = {"1", "L", "LA", "P", "PA", "RGB", "RGBA", "CMYK", "YCbCr"}  # PIL's modes of photos
 DEEP = {"I", "I;16", "I;16B"}  # 16-bit
 GREY = DEEP | {"L", "P"}
-SAME_SHAPE = 0.02  # difference in aspect ratio that still counts as another resolution of the same picture
 LARGEST = 16 << 20  # bytes of a view's confidences: 4 million in single precision
 IGNORED = {"void", "ignore", "ignored", "unlabeled", "unlabelled", "undefined", "unknown"}
 MAX_ID = 65_535  # what 16 bits hold
 
 
 @contextmanager
-def open_photo(path: Path, size: tuple[int, int], upright: bool) -> Iterator[tuple[Any, np.ndarray | None]]:
-    """An RGB image of (width, height) `size`, and where it is opaque (None: everywhere), as `opened` gives one.
+def open_photo(path: Path, size: tuple[int, int], upright: bool) -> Iterator[tuple[Any, float]]:
+    """An RGB image of (width, height) `size`, and the opaque share of its pixels, as `opened` gives one.
 
     Choices: a model's own photos are turned by EXIF only if they fit its camera no other way, since COLMAP counts
-      pixels as they are stored; alpha under one half is transparent.
+      pixels as they are stored. What is transparent is empty: it lies before black, as what is rendered does.
     """
 
     def check(image: Any) -> None:
@@ -43,12 +44,13 @@ def open_photo(path: Path, size: tuple[int, int], upright: bool) -> Iterator[tup
         if upright or image.size != size:
             image = turned(image)
         if "A" not in image.mode and "transparency" not in image.info:
-            yield (image if image.mode == "RGB" else image.convert("RGB")), None
+            yield (image if image.mode == "RGB" else image.convert("RGB")), 1.0
             return
         image = image if image.mode == "RGBA" else image.convert("RGBA")
-        opaque = np.asarray(image.getchannel("A")) >= 128
-        image = image.convert("RGB")
-        yield image, None if opaque.all() else opaque
+        alpha = image.getchannel("A")
+        black = Image.new("RGB", image.size)
+        black.paste(image, mask=alpha)
+        yield black, float(np.asarray(alpha).mean() / 255)
 
 
 def companion(
@@ -57,12 +59,11 @@ def companion(
     at: np.ndarray,
     modes: set[str] | None = None,
     wanted: str = "",
-    any_size: bool = False,
 ) -> np.ndarray:
-    """The pixels at `at` [2, H, W] of a one-channel image that belongs to a photo of (width, height) `size`.
+    """The pixels at `at` [2, H, W] of a one-channel image that belongs to a photo of (width, height) `size`, in any
+    resolution of that photo's shape.
 
-    Args: modes: PIL's, that are taken as they are; None: all, as grey values. any_size: it may have another
-          resolution, but must have the photo's shape.
+    Args: modes: PIL's, that are taken as they are; None: all, as grey values.
     Raises: InputError naming the file.
     """
 
@@ -70,7 +71,7 @@ def companion(
         if modes is not None and image.mode not in modes:
             raise InputError(f"{path} has mode {image.mode}, not {wanted} in one channel; convert it")
         alike = abs(image.width * size[1] / (image.height * size[0]) - 1) < SAME_SHAPE
-        if image.size != size and not (any_size and alike):
+        if image.size != size and not alike:
             raise InputError(f"{path} is {_by(image.size)}, its photo {_by(size)}; restore it")
 
     with opened(path, "add it, or take its folder away to do without", check) as image:
@@ -102,9 +103,9 @@ def _by(size: tuple[int, int]) -> str:
 def label_ids(frame: Frame, listing: Listing, size: tuple[int, int], at: np.ndarray) -> np.ndarray:
     """Raw ids i32 [H, W] at positions `at` [2, H, W] of a frame's label image, its corrected objects replaced."""
     assert frame.labels is not None
-    ids = companion(frame.labels, size, at, GREY, "8- or 16-bit ids", listing.any_label_size).astype(np.int32)
+    ids = companion(frame.labels, size, at, GREY, "8- or 16-bit ids").astype(np.int32)
     if frame.objects is not None and listing.corrections:
-        objects = companion(frame.objects, size, at, GREY, "8- or 16-bit ids", listing.any_label_size)
+        objects = companion(frame.objects, size, at, GREY, "8- or 16-bit ids")
         for which, value in listing.corrections.items():
             ids[objects == which] = value
     return ids

@@ -157,7 +157,7 @@ def _listing(folder: Path) -> Listing:
     ]
     reduced = _is_reduced(folder)
     protocol = scannet_closed if reduced else scannet_open
-    listing = Listing("scannet", frames, class_names=protocol.CLASSES if place or pseudo else None, any_label_size=True)
+    listing = Listing("scannet", frames, class_names=protocol.CLASSES if place or pseudo else None)
     by_id = dict(enumerate(("void", *scannet_closed.CLASSES)))
     listing.pseudo_names = by_id if pseudo else None
     listing.notes.append(f"ScanNet as {'Panoptic Lifting' if reduced else 'Semantic Gaussians'} lays it out.")

@@ -228,7 +228,7 @@ def colmap() -> Iterator[Row]:
         (images, "a name without an end", views()[:72] + b"a" * 10**6, NO_MODEL),
         (cloud, "missing", remove(cloud), "is missing"),
         (cloud, "a track of 2^40", points(2**40), NO_MODEL),
-        ("images/a.png", "another size", put(cameras, camera(size=(80, 60), params=(100, 100, 40, 30))), "80x60"),
+        ("images/a.png", "another size", put(cameras, camera(size=(80, 66), params=(100, 100, 40, 30))), "80x66"),
     ]
     yield from met(write_model, cases)
     outside = {"climb out": b"../../../etc/x.png", "are absolute": b"/etc/x.png", "are no UTF-8": b"\xff"}
@@ -501,9 +501,9 @@ def seven_scenes() -> Iterator[Row]:
         (intrinsics, "f = -10", "-10 0 4\n0 10 3\n0 0 1\n", "focal length"),
         (intrinsics, "f = nan", "nan 0 4\n0 10 3\n0 0 1\n", "no numbers"),
         (color, "cut short", cut(color, 30), BROKEN),
-        (color, "another size", picture(color, (16, 12)), "its camera 8x6"),
+        (color, "another size", picture(color, (16, 9)), "its camera 8x6"),
         (depth, "missing", remove(depth), "is missing"),
-        (depth, "another size", picture(depth, (4, 3), "I;16"), "its photo 8x6"),
+        (depth, "another size", picture(depth, (4, 4), "I;16"), "its photo 8x6"),
         ("frame-000001", "two pictures", picture("frame-000001.color.jpg", form="JPEG"), "are both view"),
     ])  # fmt: skip
 

@@ -165,8 +165,9 @@ def test_images_that_model_and_disk_do_not_share_are_counted(tmp_path):
     fields = colmap.read(folder, SETTINGS)
     assert fields["names"] == ["b", "c"]
     assert "labels" in fields
-    assert [note.split(" of the")[0] for note in fields["source"]["notes"]] == [
-        "1 of 3 images", "1 of 3 images on disk are not in the model and are left out."]  # fmt: skip
+    assert fields["source"]["notes"] == [
+        "1 of 3 images of the model are absent on disk (a.png).",
+        "1 of 3 images on disk are not in the model and are left out (z.png)."]  # fmt: skip
 
 
 def test_a_split_of_scene_json_does_not_move_with_max_views(tmp_path):
@@ -263,6 +264,7 @@ def test_photos_have_no_poses_and_mixed_sizes_are_masked(tmp_path):
     assert fields["loss_mask"].sum() == 80 * 60 * 2 + 40 * 30
     assert fields["Ks"][0][0, 0] == pytest.approx(1.2 * 80)
     assert "3 of 3 photos" in fields["source"]["notes"][0]
+    assert fields["source"]["notes"][-2] == "Photos in these folders are not read: thumbs."
     assert photos.probe(tmp_path)["poses"] is False
     assert len(photos.files(tmp_path)) == 3
 
@@ -282,12 +284,17 @@ def test_exif_turns_a_photo_and_gives_its_focal_length(tmp_path):
     assert "1 of 3 photos have no focal length" in fields["source"]["notes"][0]
 
 
-def test_transparent_pixels_do_not_count(tmp_path):
-    for k in range(3):
+def test_transparent_pixels_are_empty_and_count(tmp_path):
+    """They are black, as a render of nothing is; half alpha is half of the colour; a photo of nothing says nothing."""
+    for k, alpha in enumerate((255, 128, 0)):
         pixels = np.full((6, 8, 4), 255, np.uint8)
-        pixels[:, : 2 * k, 3] = 0
+        pixels[:, :4, 3] = alpha
+        pixels[:, 4:, 3] = 255 if k < 2 else 0
         save(tmp_path / f"{k}.png", pixels)
-    assert photos.read(tmp_path, SETTINGS)["loss_mask"].sum((1, 2)).tolist() == [48, 36, 24]
+    fields = photos.read(tmp_path, SETTINGS)
+    assert fields["images"][:, 0, [0, 7], 0].tolist() == [[255, 255], [128, 255], [0, 0]]
+    assert fields["loss_mask"].mean((1, 2)).tolist() == [1, 1, 0]
+    assert "2 of 3 photos have transparent pixels, which are empty space." in fields["source"]["notes"]
 
 
 def test_images_are_reduced_but_never_enlarged(tmp_path):

@@ -128,8 +128,8 @@ def test_no_name_of_a_view_tells_where_the_folder_lies(tmp_path):
 def test_a_folder_without_photos_is_no_source(tmp_path):
     with pytest.raises(InputError, match=r"transforms\.json"):
         common.detect(tmp_path)
-    image(tmp_path / "images/a.png")
-    with pytest.raises(InputError, match="images may be meant"):
+    image(tmp_path / "masks/a.png")
+    with pytest.raises(InputError, match=r"transforms\.json"):
         common.detect(tmp_path)
 
 
