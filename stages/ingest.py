@@ -14,10 +14,10 @@ from chebsplat.errors import ConfigError, DataFailure, InputError
 from chebsplat.evaluation import protocols
 from chebsplat.formats.capture import MAPS, Capture
 from chebsplat.formats.names import natural
+from chebsplat.formats.photo_model import PhotoModel
 from chebsplat.photos.exposures import relit
 from chebsplat.photos.frames import blurred, detail
 from chebsplat.stages.runtime.command import Job
-from chebsplat.stages.runtime.progress import Progress
 from chebsplat.stages.settings import IngestSection, SourceSection
 from chebsplat.stages.sources import (
     colmap,
@@ -34,29 +34,36 @@ from chebsplat.stages.sources.common import resolve_source
 
 log = logging.getLogger("chebsplat")
 
+ALONE = ("photos", "video")  # kinds of source whose poses are not known
 NAMED = 20  # blurred views in a message
 SEED = 0  # of all disturbances: the studies compare trainings on the same ones
 
 
-def read(name: str, source: SourceSection, settings: IngestSection, progress: Progress | None = None) -> dict[str, Any]:
-    """The fields of a capture, as its source gives them. Raises InputError if the source's folder is absent."""
+def read(name: str, source: SourceSection, settings: IngestSection, model: PhotoModel | None = None) -> dict[str, Any]:
+    """The fields of a capture, as its source gives them. model: of photos that come alone.
+
+    Raises: InputError if the source's folder is absent; ConfigError if photos that come alone have no model.
+    """
     if source.kind == "generated":
         return generated.capture(name, source.seed, source.preset)
 
     folder = Path(str(source.path)).expanduser()
-    if source.kind == "video":
-        return video.read(folder, settings, progress)
+    if source.kind == "video" and model is not None:
+        return video.read(folder, settings, model)
     if not folder.is_dir():
         raise InputError(f"{folder} is not a folder; correct source.path")
+    if source.kind in ALONE and model is None:
+        raise ConfigError(f"{source.kind} bring no poses; give the artifact of stage pose (--in-model)")
     modules = {
         "colmap": colmap,
         "transforms": transforms,
-        "photos": photos,
         "replica": replica,
         "scannet": scannet,
         "seven_scenes": seven_scenes,
     }
-    fields: dict[str, Any] = modules[source.kind].read(folder, settings)
+    fields: dict[str, Any] = (
+        modules[source.kind].read(folder, settings) if model is None else photos.read(folder, settings, model)
+    )
     if unread := common.unread(folder):
         fields["source"]["notes"].append(f"{unread[0].upper()}{unread[1:]}.")
     return fields
@@ -148,11 +155,12 @@ def renamed(fields: dict[str, Any], classes: dict[str, list[str]]) -> dict[str, 
 def run(job: Job) -> None:
     """Take a source's images, cameras, depth and labels as one capture, and choose the views that are tested.
 
-    Reads a source, of files or generated. Writes `capture`.
+    Reads a source, of files or generated, and the `model` of photos that come alone. Writes `capture`.
     """
     name, settings = job.config.scene.name, job.config.ingest
     source = resolve_source(name, job.config.source)
-    fields = read(name, source, settings, job.progress)
+    model = PhotoModel.read(job.inputs["model"]) if "model" in job.inputs else None
+    fields = read(name, source, settings, model)
     fields["source"] = {"name": name} | fields["source"]
     for note in fields["source"].get("notes", []):
         log.info("%s", note)

@@ -55,7 +55,9 @@ class Stage:
 STAGES: dict[str, Stage] = {
     stage.name: stage
     for stage in (
-        Stage("ingest", "chebsplat.capture/2", ("scene", "source", "ingest"),
+        Stage("pose", "chebsplat.model/1", ("source", "pose"),
+              help="Cameras and poses of photos or a video that come alone."),
+        Stage("ingest", "chebsplat.capture/2", ("scene", "source", "ingest"), optional=(("model", "pose"),),
               help="Read a source into a capture: images, cameras and, where given, depth and labels."),
         Stage("sfm", "chebsplat.points/2", ("sfm",), (("capture", "ingest"),),
               help="Cameras and points with normals and local anisotropic covariances."),

@@ -47,16 +47,11 @@ class IngestSection(Section):
     test_every: int | None = number(None, "every so many views one is tested; default: the protocol's own", 2, 10_000)
     test_offset: int | None = number(None, "the first view that is tested; default: the protocol's own", 0, 10_000)
     max_side: int = number(640, "pixels; images are reduced to this, never enlarged", 16, 8192)
-    max_views: int | None = number(
-        None, "at most so many views, evenly chosen; default: all, of a video 150", 2, 100_000
-    )
+    max_views: int | None = number(None, "at most so many views, evenly chosen; default: all", 2, 100_000)
     max_train_views: int | None = number(
         None, "at most so many that are trained on, evenly chosen; all test views stay", 2, 100_000
     )
     depth: Literal["auto", "off"] = setting("auto", "that the source brings: taken, or left out as if it brought none")
-    lens: Literal["estimated", "straight"] = setting(
-        "estimated", "of plain photos: distortion estimated from them, and undone; or none assumed"
-    )
     classes: dict[Text, list[Text]] | None = setting(
         None, "names, each with the source's classes that it stands for; what stands for none is not counted"
     )
@@ -65,6 +60,28 @@ class IngestSection(Section):
     disturb_degrees: float = number(0.0, "turns of the cameras at random", 0, 180)
     disturb_shift: float = number(0.0, "shifts of the cameras at random, in scene units", 0, 1e6)
     min_views: int = number(3, "fewer usable views are an error", 1, 100_000)
+
+
+class PoseSection(Section):
+    """Of photos and videos that come alone."""
+
+    max_side: int = number(1600, "pixels; photos are matched at this, never enlarged", 16, 8192)
+    max_views: int | None = number(
+        None, "at most so many photos or frames, evenly chosen; default: all, of a video 150", 2, 100_000
+    )
+    camera: Literal[
+        "auto", "SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV", "OPENCV_FISHEYE", "EQUIRECTANGULAR"
+    ] = setting(
+        "auto", "COLMAP's model of the lens; auto: SIMPLE_RADIAL, a fisheye's where that fails; of panoramas theirs"
+    )
+    peak_threshold: float = number(0.0067, "of SIFT; where few photos register, .002 is tried", 1e-6, 1)
+    max_features: int = number(8192, "of a photo: the largest are kept; matching takes their square", 64, 100_000)
+    matching: Literal["auto", "exhaustive", "sequential"] = setting(
+        "auto", "which photos: all, or those next in order and alike; auto: all of up to 100"
+    )
+    n_matched: int = number(10, "most alike photos that each is matched with, where not all are", 2, 1000)
+    min_registered: float = number(0.5, "fraction of the photos that must register", 1e-3, 1)
+    seed: int = seed("of the reconstruction")
 
 
 class SfmSection(Section):
@@ -76,7 +93,7 @@ class SfmSection(Section):
     max_features: int = number(8192, "of a view: the largest are kept; matching takes their square", 64, 100_000)
     matching: Literal["auto", "exhaustive", "posed", "sequential"] = setting(
         "auto",
-        "which views: all, those with near poses, or those next in order and alike; auto: by poses and count",
+        "which views: all, those with near poses, or those next in order and alike; auto: by poses",
     )
     n_matched: int = number(10, "views that each is matched with, where not all are: nearest, or most alike", 2, 1000)
     poses: Literal["auto", "given", "adjusted"] = setting(
@@ -86,8 +103,7 @@ class SfmSection(Section):
         "auto",
         "depth of a plane sweep of the photos; auto: where a fifth of their cells hold no point, and no depth is given",
     )
-    min_registered: float = number(0.5, "fraction of the views that a reconstruction must register", 1e-3, 1)
-    seed: int = seed("of the choice among points, and of the reconstruction")
+    seed: int = seed("of the choice among points, and of the matches")
 
 
 class TeacherSection(Section):

@@ -12,10 +12,10 @@ from chebsplat.errors import DataFailure
 from chebsplat.formats.capture import Capture
 from chebsplat.formats.points import Points
 from chebsplat.splats.gaussians import local_shape
-from chebsplat.stages.reconstruction import mapping
 from chebsplat.stages.reconstruction.dense import MOST, swept, wants_more
 from chebsplat.stages.reconstruction.pose_check import wants_adjustment
 from chebsplat.stages.reconstruction.thinning import by_color, edge_of, thin
+from chebsplat.stages.reconstruction.triangulation import reconstruct
 from chebsplat.stages.runtime.command import Job
 from chebsplat.stages.settings import SfmSection
 
@@ -44,7 +44,7 @@ def run(job: Job) -> None:
         job.left_out("feature matching", "poses and depth are given: points come from depth")
         _, cloud = reduced(from_depth(job, capture, settings), settings.max_points, settings.spacing)
     else:
-        cloud = mapping.reconstruct(job, capture, settings, adjusted)
+        cloud = reconstruct(job, capture, settings, adjusted)
         if "poses_kept" in cloud["notes"] and capture.depth is not None:
             measured = from_depth(job, capture, settings, cloud["cam_from_world"])
             cloud = filled(cloud, measured, settings.max_points, settings.spacing)

@@ -27,6 +27,7 @@ from chebsplat.stages.teacher_models.text_encoder import found
 
 LIFTED = "train.features is lifted"
 PHOTOGRAPHS = ("photos", "colmap", "transforms", "seven_scenes", "video")  # kinds that hold photos of any place
+POSELESS = ("photos", "video")  # kinds that bring no poses
 UNASKED = "no teacher is named"
 HOW = (
     "the embedded one has seen generated rooms only. `chebsplat get-teacher segformer-b0-ade` fetches one for photos "
@@ -69,6 +70,8 @@ def left_out_stages(config: Any, kind: str, why: str, probe: dict[str, bool]) ->
         printed = config.train.method == "printed"
         reason = "the printed method ends with its training" if printed else "refine is asked for nothing"
         left_out |= {"lift": reason, "refine": reason}
+    if config.source.kind not in POSELESS:
+        left_out["pose"] = "the source brings poses"
     if probe["poses"] and config.sfm.poses != "adjusted":
         tested = config.sfm.poses == "auto" and config.source.kind != "generated"
         has_depth = probe["depth"] and config.ingest.depth == "auto"

@@ -288,7 +288,7 @@ class Planner:
         device = stage.device(self.device, sections)
         computing = stage.device_packages if device == "cuda" else ()
         code = self.code.stage(stage.name, (*used, *computing, *media_packages(files)))
-        content = content_hash(raw, root) if raw or stage.name == "ingest" else None
+        content = content_hash(raw, root) if raw or stage.name in ("pose", "ingest") else None
         key = step_key(stage, sections, keys, code, content, device)
         return Step(stage.name, key, store.artifact_path(stage.name, key), inputs, sections, code, raw)
 

@@ -27,7 +27,7 @@ def raw_files(stage: str, sections: dict[str, Any]) -> tuple[Path | None, list[P
 
     Raises: InputError if there are none where there must be.
     """
-    if stage == "ingest" and sections["source"]["kind"] != "generated":
+    if stage in ("pose", "ingest") and sections["source"]["kind"] != "generated":
         folder, kind = Path(sections["source"]["path"]), sections["source"]["kind"]
         if kind == "video" and not folder.is_dir():
             return folder.parent, [folder]

@@ -42,9 +42,10 @@ class Need:
 # Ample: ten times the seconds that were measured at most, three times the memory, since a job that asks for too little
 # is lost, and one that asks for too much begins a little later.
 NEEDS = {  # measured in 18 scenes on two EPYC cores: seconds (median, most); most memory, in office0
+    "pose": Need(100, 4000),
     "ingest": Need(10, 2000),  # 21, 49; 306 MB
     "channels": Need(10, 2000),  # 18, 48
-    "sfm": Need(100, 4000),  # 5 with depth, 574 from photos alone; 295 MB with depth
+    "sfm": Need(100, 4000),  # 5 with depth; 295 MB
     "teacher": Need(15, 4000),  # 9, 66; 1088 MB
     "agree": Need(5, 2000),  # 1, 3; 121 MB
     "teach": Need(600, 8000),  # 3142

@@ -19,22 +19,19 @@ from chebsplat.cameras import centers
 from chebsplat.formats.capture import Capture
 from chebsplat.photos.guided import along_lines, fundamental
 from chebsplat.stages.runtime.command import Job, n_threads
-from chebsplat.stages.settings import SfmSection
+from chebsplat.stages.settings import PoseSection, SfmSection
+from chebsplat.stages.sources.common import file_of
 
 log = logging.getLogger("chebsplat")
+Searched = SfmSection | PoseSection  # settings of features and pairs
 PHOTOS, PAIRS = 8, 64  # a thread's share between two lines of progress; each such block of pairs indexes its views anew
 LEAST = 15  # matches of a pair that has any: pycolmap's own, of a free search
 LARGEST = 128  # features of a view, by size, that say how alike two views are
-FEW = 40  # views that are all matched with each other: 780 pairs, two to three minutes of a core
+FEW = 100  # views that are all matched with each other
 TURN = 30.0  # degrees between two viewing directions that weigh like the capture's median distance of two cameras
 APART = 90.0  # degrees; views that face farther from each other share no feature that SIFT could match
 IN_A_ROW = 5  # views on either side in the order of names
 RATIO = 0.8  # Lowe's, of the distances of the nearest and the second nearest descriptor
-
-
-def file_of(view: int) -> str:
-    """The image of a view in the scratch folder: pycolmap's lists of pairs allow no name with a space."""
-    return f"{view:06d}.png"
 
 
 def match(job: Job, capture: Capture, settings: SfmSection, pairs: np.ndarray) -> Path:
@@ -49,12 +46,7 @@ def match(job: Job, capture: Capture, settings: SfmSection, pairs: np.ndarray) -
 
 def with_features(job: Job, capture: Capture, settings: SfmSection, views: Sequence[int]) -> Path:
     """A database of views with SIFT from the capture's own pixels."""
-    job.scratch.mkdir(parents=True, exist_ok=True)
-    pycolmap.logging.minloglevel = pycolmap.logging.ERROR.value if hasattr(pycolmap.logging, "ERROR") else 2
-    folder, database = _write_images(job, capture, views), job.scratch / "database.db"
-    database.unlink(missing_ok=True)
-    pycolmap.Database.open(database).close()  # creates it
-    files = [file_of(view) for view in views]
+    folder, database = _write_images(job, capture, views), empty_database(job.scratch / "database.db")
     reader = pycolmap.ImageReaderOptions()
     reader.camera_model = "PINHOLE"
     if capture.loss_mask is not None:
@@ -63,17 +55,39 @@ def with_features(job: Job, capture: Capture, settings: SfmSection, views: Seque
     if not _cameras_differ(capture):
         K = capture.Ks[0]
         reader.camera_params = ",".join(str(float(v)) for v in (K[0, 0], K[1, 1], K[0, 2], K[1, 2]))
-    pycolmap.import_images(database, folder, mode, image_names=files, options=reader)
+    extract(job, database, folder, [file_of(view) for view in views], reader, mode, settings)
+    return database
+
+
+def empty_database(path: Path) -> Path:
+    """A new database in place of what may lie there."""
+    pycolmap.logging.minloglevel = pycolmap.logging.ERROR.value if hasattr(pycolmap.logging, "ERROR") else 2
+    path.parent.mkdir(parents=True, exist_ok=True)
+    path.unlink(missing_ok=True)
+    pycolmap.Database.open(path).close()  # creates it
+    return path
+
+
+def extract(
+    job: Job,
+    database: Path,
+    folder: Path,
+    files: Sequence[str],
+    reader: pycolmap.ImageReaderOptions,
+    mode: pycolmap.CameraMode,
+    settings: Searched,
+) -> None:
+    """Add images of a folder to a database, with their cameras as `reader` and `mode` say, and with their SIFT."""
     extraction = pycolmap.FeatureExtractionOptions()
     extraction.sift.peak_threshold = settings.peak_threshold
     extraction.sift.max_num_features = settings.max_features
     extraction.use_gpu, extraction.num_threads = False, n_threads()
-    for some in _in_blocks(job, files, PHOTOS * n_threads(), "features"):
+    pycolmap.import_images(database, folder, mode, image_names=list(files), options=reader)
+    for some in _in_blocks(job, list(files), PHOTOS * n_threads(), "features"):
         pycolmap.extract_features(database, folder, some, mode, reader, extraction)
-    return database
 
 
-def match_freely(job: Job, database: Path, pairs: np.ndarray, settings: SfmSection) -> None:
+def match_freely(job: Job, database: Path, pairs: np.ndarray, settings: Searched) -> None:
     """Match pairs of views [P, 2] as if nothing were known of their poses; what RANSAC verifies is kept."""
     matching, verification = pycolmap.FeatureMatchingOptions(), pycolmap.TwoViewGeometryOptions()
     matching.use_gpu, matching.num_threads = False, n_threads()
@@ -114,9 +128,8 @@ def match_along_lines(job: Job, database: Path, pairs: np.ndarray, capture: Capt
     job.facts["n_matches_along_lines"] = n_matches
 
 
-def chosen_pairs(job: Job, database: Path, capture: Capture, settings: SfmSection) -> np.ndarray:
-    """Pairs of views to match, int [P, 2], as `sfm.matching` says."""
-    n, poses = len(capture.names), capture.cam_from_world
+def chosen_pairs(job: Job, database: Path, n: int, settings: Searched, poses: np.ndarray | None = None) -> np.ndarray:
+    """Pairs of `n` views to match, int [P, 2], as `matching` of the settings says."""
     mode = matching_mode(settings.matching, n, poses is not None)
     if mode == "posed":
         assert poses is not None
@@ -126,7 +139,7 @@ def chosen_pairs(job: Job, database: Path, capture: Capture, settings: SfmSectio
         why = f"{IN_A_ROW} before and after each, {settings.n_matched} most alike"
     else:
         pairs, why = all_pairs(n), "all"
-    log.info("%s: %d of %d pairs (%s; sfm.matching is %s)", mode, len(pairs), n * (n - 1) // 2, why, settings.matching)
+    log.info("%s: %d of %d pairs (%s)", mode, len(pairs), n * (n - 1) // 2, why)
     job.facts["n_pairs"] = len(pairs)
     return pairs
 

@@ -11,9 +11,10 @@ import pycolmap
 
 from chebsplat.formats.capture import Capture
 from chebsplat.photos.guided import fundamental, sampson_distance
-from chebsplat.stages.reconstruction.matching import file_of, match, match_freely, nearest_by_pose
+from chebsplat.stages.reconstruction.matching import match, match_freely, nearest_by_pose
 from chebsplat.stages.runtime.command import Job
 from chebsplat.stages.settings import SfmSection
+from chebsplat.stages.sources.common import file_of
 
 log = logging.getLogger("chebsplat")
 

@@ -33,6 +33,7 @@ class Config(Section):
     scene: parts.SceneSection = parts.SceneSection()
     source: parts.SourceSection = parts.SourceSection()
     ingest: parts.IngestSection = parts.IngestSection()
+    pose: parts.PoseSection = parts.PoseSection()
     sfm: parts.SfmSection = parts.SfmSection()
     channels: parts.ChannelsSection = parts.ChannelsSection()
     teacher: parts.TeacherSection = parts.TeacherSection()

@@ -15,7 +15,7 @@ from scipy.ndimage import map_coordinates
 from chebsplat.errors import DataFailure, InputError
 from chebsplat.formats.images import header
 from chebsplat.stages.settings import IngestSection
-from chebsplat.stages.sources.cameras import DISTORTED, Camera, scaled, undistorted
+from chebsplat.stages.sources.cameras import DISTORTED, EQUIRECTANGULAR, FACES, Camera, scaled, undistorted
 from chebsplat.stages.sources.common import Frame, Listing, natural, sureness
 from chebsplat.stages.sources.pictures import (
     DEEP,
@@ -123,7 +123,28 @@ def chosen(listing: Listing, settings: IngestSection) -> tuple[list[Frame], list
         changed = [new for new, old in zip(frames, given_frames, strict=True) if new.camera != old.camera]
         if changed:
             notes.append(f"Cameras of {len(changed)} views are scaled to their photos, which have another size.")
+    if n := sum(frame.camera.model == EQUIRECTANGULAR for frame in frames):
+        frames = [face for frame in frames for face in faces(frame)]
+        notes.append(
+            f"{n} photos of all directions give {len(FACES)} views each, without what is near above and below."
+        )
     return frames, notes
+
+
+def faces(frame: Frame) -> list[Frame]:
+    """The views of a photo: itself, or of one of all directions its faces.
+
+    Choices: a photo's left and right end, where it is cut, lie between two faces.
+    """
+    if frame.camera.model != EQUIRECTANGULAR:
+        return [frame]
+    views = []
+    for name, turn in FACES.items():
+        camera, pose = replace(frame.camera, turn=turn), frame.pose
+        if pose is not None:
+            pose = np.vstack([camera.turned.T @ pose[:3], pose[3:]])
+        views.append(replace(frame, name=f"{frame.name}.{name}", camera=camera, pose=pose))
+    return views
 
 
 @dataclass(frozen=True, eq=False)
@@ -157,7 +178,7 @@ def positions(camera: Camera, view: Geometry) -> np.ndarray:
         return np.stack(np.meshgrid(x, y))
     grid = np.meshgrid(np.arange(view.width) + 0.5, np.arange(view.height) + 0.5)
     pixels = np.stack([*grid, np.ones((view.height, view.width))], -1).reshape(-1, 3)
-    found = camera.colmap.img_from_cam(pixels @ np.linalg.inv(view.K).T)
+    found = camera.colmap.img_from_cam(pixels @ (camera.turned @ np.linalg.inv(view.K)).T)
     at = np.asarray(found, float).T.reshape(2, view.height, view.width)
     (x_down, x_right), (y_down, y_right) = (np.gradient(side) for side in at)
     plain = (x_right > 0) & (y_down > 0) & (x_right * y_down > x_down * y_right)  # not where at is nan

@@ -19,7 +19,10 @@ MODELS = {"SIMPLE_PINHOLE": 3, "PINHOLE": 4, "SIMPLE_RADIAL": 4, "RADIAL": 5, "O
           "RAD_TAN_THIN_PRISM_FISHEYE": 16, "SIMPLE_DIVISION": 4, "DIVISION": 5, "SIMPLE_FISHEYE": 3, "FISHEYE": 4,
           "EUCM": 6, "EQUIRECTANGULAR": 2}  # fmt: skip
 PINHOLES = ("SIMPLE_PINHOLE", "PINHOLE")
-DISTORTED = tuple(name for name in MODELS if name not in (*PINHOLES, "EQUIRECTANGULAR"))
+EQUIRECTANGULAR = "EQUIRECTANGULAR"  # of a photo of all directions
+DISTORTED = tuple(name for name in MODELS if name not in PINHOLES)
+FACES = {"right-front": 45.0, "right-back": 135.0, "left-back": 225.0, "left-front": 315.0}  # degrees to the right
+TALL = 1.5  # heights of a face in its width: it sees 45° to either side, and 56° up and down
 ROTATION_TOLERANCE = 1e-2  # of RᵀR − I: rows written with three decimals pass, a scale of 1 % does not
 FOCAL = (0.01, 100.0)  # of the longer side: fields of view of 178 and of 0.6 degrees
 OFF_CENTRE = 1.5  # sides by which a principal point may lie off the middle: crops have it outside
@@ -30,16 +33,28 @@ FARTHEST = 1e6  # scene units from the origin: in float32, points that far out a
 
 @dataclass(frozen=True)
 class Camera:
-    """A COLMAP camera: model, its parameters in pixels with pixel centres at half integers, and the image's size."""
+    """A COLMAP camera: model, its parameters in pixels with pixel centres at half integers, and the image's size.
+    turn: degrees to the right that a face of a photo of all directions looks.
+    """
 
     model: str
     params: tuple[float, ...]
     width: int
     height: int
+    turn: float = 0.0
+
+    @property
+    def turned(self) -> np.ndarray:
+        """Rotation [3, 3] from the view to its photo."""
+        sine, cosine = np.sin(np.radians(self.turn)), np.cos(np.radians(self.turn))
+        return np.array([[cosine, 0, sine], [0, 1, 0], [-sine, 0, cosine]])
 
     @property
     def pinhole(self) -> tuple[float, float, float, float]:
         """fx, fy, cx, cy."""
+        if self.model == EQUIRECTANGULAR:
+            pixels = self.width / (2 * np.pi)  # a radian
+            return pixels, pixels, self.width / 2, self.height / 2
         p, one = self.params, self.model.startswith(("SIMPLE_", "RADIAL"))
         return (p[0], p[0], p[1], p[2]) if one else (p[0], p[1], p[2], p[3])
 
@@ -112,6 +127,10 @@ def undistorted(camera: Camera) -> Camera:
     """The pinhole camera of the largest view without blank pixels; pinhole cameras as they are."""
     if camera.model not in DISTORTED:
         return Camera("PINHOLE", camera.pinhole, camera.width, camera.height)
+    if camera.model == EQUIRECTANGULAR:
+        focal = camera.pinhole[0]
+        width, height = round(2 * focal), round(2 * focal * TALL)
+        return Camera("PINHOLE", (focal, focal, width / 2, height / 2), width, height)
     import pycolmap
 
     options = pycolmap.UndistortCameraOptions()

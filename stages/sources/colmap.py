@@ -10,7 +10,7 @@ import numpy as np
 
 from chebsplat.errors import InputError
 from chebsplat.stages.sources import assembly, cameras, common, texts
-from chebsplat.stages.sources.colmap_model import Model, read_model, size_of
+from chebsplat.stages.sources.colmap_model import Cloud, Model, read_model, size_of
 from chebsplat.stages.sources.common import Frame, Listing
 from chebsplat.stages.sources.pictures import names_by_id
 
@@ -33,7 +33,7 @@ def read(folder: Path, settings: Any, class_names: tuple[str, ...] | None = None
     listing, model = _listing(folder)
     fields = assembly.assemble(listing, settings, class_names)
     if "depth" not in fields:
-        fields |= _points(model, fields["names"], fields["source"]["notes"])
+        fields |= points_of(model.cloud, [common.stem(image.name) for image in model.images], fields)
     split = _split(folder, [frame.name for frame in listing.frames])
     if split is not None:
         assembly.give_split(fields, split, "scene.json")
@@ -117,12 +117,13 @@ def _label_names(folder: Path) -> dict[int, str] | None:
     return names_by_id(path, table.items())
 
 
-def _points(model: Model, names: list[str], notes: list[str]) -> dict[str, Any]:
-    """points, point_colors and tracks (point, view) of a capture with views of these names; nothing of few points.
+def points_of(cloud: Cloud, images: list[str], fields: dict[str, Any]) -> dict[str, Any]:
+    """points, point_colors and tracks (point, view) of a capture of these fields; nothing of few points.
 
+    Args:    images: names of the views that the cloud's tracks count.
     Choices: a point whose error is not known is taken.
     """
-    cloud = model.cloud
+    names, notes = fields["names"], fields["source"]["notes"]
     good = np.abs(cloud.means).max(1, initial=0) < cameras.FARTHEST
     if len(cloud.tracks):
         length = np.bincount(cloud.tracks[:, 0], minlength=len(good))
@@ -137,7 +138,7 @@ def _points(model: Model, names: list[str], notes: list[str]) -> dict[str, Any]:
             notes.append(f"{good.sum()} points are left, fewer than {LEAST}: none is used, and photos are matched.")
         return {}
     view = {name: row for row, name in enumerate(names)}
-    of_image = np.array([view.get(common.stem(image.name), -1) for image in model.images])
+    of_image = np.array([view.get(name, -1) for name in images])
     of_point = np.where(good, np.cumsum(good) - 1, -1)
     tracks = np.stack([of_point[cloud.tracks[:, 0]], of_image[cloud.tracks[:, 1]]], 1)
     return {

@@ -8,6 +8,7 @@ from collections import Counter
 from collections.abc import Collection, Iterable, Iterator, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 
@@ -47,6 +48,25 @@ class Frame:
     confidence: Path | None = None  # .npz whose `confidence` [h, w] says how sure it was
 
 
+class Shot(NamedTuple):
+    """A photo that comes alone. size: (width, height), upright; focal: 35 mm equivalent, where EXIF says one;
+    panorama: whether it shows all directions; frame: its number in a video.
+    """
+
+    name: str
+    path: Path
+    size: tuple[int, int]
+    focal: float | None = None
+    mask: Path | None = None
+    panorama: bool = False
+    frame: int = 0
+
+    def reduced(self, max_side: int) -> tuple[int, int]:
+        """The (width, height) that no side of exceeds so many pixels."""
+        factor = min(1.0, max_side / max(self.size))
+        return max(round(self.size[0] * factor), 1), max(round(self.size[1] * factor), 1)
+
+
 @dataclass
 class Listing:
     """All frames of a source.
@@ -79,6 +99,11 @@ def sureness(depth: Path) -> Path | None:
     """The image beside a LiDAR's depth that is 0 where that is not to be believed: confidence/ beside its folder."""
     path = depth.parent.with_name("confidence") / depth.name
     return path if depth.parent.name.startswith("depth") and present(path) else None
+
+
+def file_of(view: int) -> str:
+    """The image of a view in the scratch folder: pycolmap's lists of pairs allow no name with a space."""
+    return f"{view:06d}.png"
 
 
 def stem(name: str) -> str:

@@ -1,8 +1,9 @@
-"""The video source: one file, or a folder that holds one and no photos. Frames are chosen, poses are unknown."""
+"""The video source: one file, or a folder that holds one and no photos. Poses come from the stage `pose`."""
 
 from __future__ import annotations
 
 import os
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -11,53 +12,73 @@ from PIL import Image
 
 from chebsplat.errors import DataFailure, InputError
 from chebsplat.formats import videos
-from chebsplat.photos.frames import BLOCK, choose, laplacian_variance, progress, shifts
+from chebsplat.formats.photo_model import PhotoModel
+from chebsplat.photos.frames import BLOCK, STEP, choose, laplacian_variance, progress, shifts
 from chebsplat.stages.runtime.progress import Progress
+from chebsplat.stages.settings import IngestSection, PoseSection
 from chebsplat.stages.sources import assembly, cameras
-from chebsplat.stages.sources.photos import GUESS
+from chebsplat.stages.sources.colmap import points_of
+from chebsplat.stages.sources.colmap_model import Cloud
+from chebsplat.stages.sources.common import Shot, file_of
 
-MOST = 150  # frames, where ingest.max_views says nothing
+MOST, LEAST = 150, 3  # frames: where pose.max_views says nothing, and that a scene needs
 SIDE, THUMBNAIL = 640, 192  # pixels of the longer side, on which sharpness and movement are measured
 
 
-def read(path: Path, settings: Any, shown: Progress | None = None) -> dict[str, Any]:
-    """The fields of a capture, without poses; views are named by their time in seconds.
+def shots(path: Path, settings: PoseSection, shown: Progress | None, finer: int) -> tuple[list[Shot], list[str]]:
+    """The frames to pose, named by their time in seconds, and notes about them.
 
+    Args:    finer: so many frames in place of one.
     Raises:  InputError where the video cannot be read; DataFailure where its picture hardly moves.
-    Choices: the file is decoded twice, once to measure and once to take, since frames do not fit into memory.
+    Choices: the file is decoded anew whenever frames are taken, since they do not fit into memory.
     """
     (file,) = files(path)
     video = videos.describe(file)
     times, sharpness, moves = _measured(file, video, shown)
-    at_most = settings.max_views or MOST
-    taken = choose(progress(moves), sharpness, at_most)
-    if len(taken) < settings.min_views:
+    at_most = settings.max_views or finer * MOST
+    taken = choose(progress(moves, STEP / finer), sharpness, at_most)
+    if len(taken) < LEAST:
         raise DataFailure(
             f"{file}: its picture moves by {progress(moves)[-1]:.1f} steps of 7.5 % of its width, which gives "
-            f"{len(taken)} views; ingest.min_views is {settings.min_views}: walk around what is filmed"
+            f"{len(taken)} views; {LEAST} are needed: walk around what is filmed"
         )
-    focal = GUESS * max(video.width, video.height)
-    camera = cameras.camera_of(
-        file, "SIMPLE_PINHOLE", (focal, video.width / 2, video.height / 2), video.width, video.height
-    )
-    view = assembly.geometry(camera, settings.max_side)
-    images = _taken(file, set(taken.tolist()), camera, view)
     notes = [
-        f"{len(taken)} of {len(times)} frames are used, one for each time that the picture moves by 7.5 % of its "
-        f"width, at most {at_most} (ingest.max_views).",
-        f"The video has no focal length; {GUESS} times the longer side is the first guess.",
+        f"{len(taken)} of {len(times)} frames are used, one for each time that the picture moves by "
+        f"{STEP / finer:.1%} of its width, at most {at_most} (pose.max_views)."
     ]
-    if view.factor < 1:
-        notes.append(f"Images are reduced by {view.factor:.3f} (ingest.max_side).")
     if video.hdr:
         notes.append("The video is HDR, and its colours are read as they are coded: film in SDR, or convert it.")
-    return {
-        "names": [f"{times[k]:08.3f}" for k in taken],
-        "images": images,
-        "Ks": np.tile(view.K, (len(taken), 1, 1)),
-        "cam_from_world": None,
+    size = video.width, video.height
+    return [Shot(f"{times[k]:08.3f}", file, size, frame=int(k)) for k in taken], notes
+
+
+def save(found: Sequence[Shot], _: Path, pictures: Path, max_side: int) -> None:
+    """Write frames, reduced until no side exceeds `max_side`."""
+    row = {shot.frame: k for k, shot in enumerate(found)}
+    for number, image in _taken(found[0].path, set(row)):
+        size = found[0].reduced(max_side)
+        small = image if image.size == size else image.resize(size, Image.Resampling.BOX)
+        small.save(pictures / file_of(row[number]), compress_level=1)
+
+
+def read(path: Path, settings: IngestSection, model: PhotoModel) -> dict[str, Any]:
+    """The fields of a capture: the frames of a model, without what the lens bends, and its points."""
+    (file,) = files(path)
+    camera = cameras.camera_of(file, *model.cameras[0])
+    view = assembly.geometry(camera, settings.max_side)
+    at = assembly.positions(camera, view)
+    images = [assembly.resampled(image, camera, view, at) for _, image in _taken(file, set(model.frames))]
+    notes = list(model.notes)
+    if view.factor < 1:
+        notes.append(f"Images are reduced by {view.factor:.3f} (ingest.max_side).")
+    fields = {
+        "names": model.names,
+        "images": np.stack(images),
+        "Ks": np.tile(view.K, (len(images), 1, 1)),
+        "cam_from_world": model.cam_from_world,
         "source": {"kind": "video", "notes": notes},
     }
+    return fields | points_of(Cloud(model.points, model.colors, model.errors, model.tracks), model.names, fields)
 
 
 def probe(path: Path) -> dict[str, bool]:
@@ -103,12 +124,12 @@ def _thumbnail(grey: np.ndarray) -> np.ndarray:
     return np.pad(grey, [(0, lack[0]), (0, lack[1])], mode="edge")
 
 
-def _taken(file: Path, wanted: set[int], camera: cameras.Camera, view: assembly.Geometry) -> np.ndarray:
-    """The frames of these numbers, u8 [V, H, W, 3]."""
-    at, images = assembly.positions(camera, view), []
+def _taken(file: Path, wanted: set[int]) -> Iterator[tuple[int, Any]]:
+    """The frames of these numbers, each with its number, as RGB images."""
+    left = len(wanted)
     for k, frame in enumerate(videos.frames(file)):
         if k in wanted:
-            images.append(assembly.resampled(Image.fromarray(frame.pixels()), camera, view, at))
-        if len(images) == len(wanted):
+            yield k, Image.fromarray(frame.pixels())
+            left -= 1
+        if not left:
             break
-    return np.stack(images)

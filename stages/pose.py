@@ -1,0 +1,45 @@
+"""pose: cameras of photos or frames of a video that come alone, found by structure from motion."""
+
+from __future__ import annotations
+
+import logging
+from pathlib import Path
+from types import ModuleType
+
+from chebsplat.formats.photo_model import PhotoModel
+from chebsplat.stages.reconstruction import judge, posing
+from chebsplat.stages.runtime.command import Job
+from chebsplat.stages.sources import photos, video
+
+log = logging.getLogger("chebsplat")
+SOURCES: dict[str, ModuleType] = {"photos": photos, "video": video}  # those that bring no poses
+
+
+def run(job: Job) -> None:
+    """Cameras, lenses and poses of photos, and points that they share. Reads a source. Writes `model`.
+
+    Raises:  DataFailure where few photos register, or nothing tells how far away anything is.
+    Choices: all photos take part, those that are tested later, too. A video gives more frames where few of them join.
+    """
+    source, settings = job.config.source, job.config.pose
+    folder, of = Path(str(source.path)).expanduser(), SOURCES[source.kind]
+    best: posing.Found | None = None
+    for finer in (1, 2) if source.kind == "video" else (1,):
+        shots, notes = of.shots(folder, settings, job.progress, finer)
+        pictures = job.scratch / f"images-{finer}"
+        pictures.mkdir(parents=True, exist_ok=True)
+        of.save(shots, folder, pictures, settings.max_side)
+        found = posing.found(job, shots, pictures, settings)
+        if best is None or len(found.model.names) > len(best.model.names):
+            best = found
+            best.model.notes[:0] = notes
+        if found.whole:
+            break
+    assert best is not None
+    judge.check(best.model, len(shots), settings.min_registered)
+    job.facts |= best.model.judged
+    for note in best.model.notes:
+        log.info("%s", note)
+    for warning in best.model.judged["doubts"]:
+        log.warning("%s", warning)
+    PhotoModel.write(best.model, job.out)

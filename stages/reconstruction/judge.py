@@ -1,0 +1,120 @@
+"""Whether a model that structure from motion made of photos is to be believed, and what to photograph otherwise."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pycolmap
+
+from chebsplat.errors import DataFailure
+from chebsplat.formats.photo_model import PhotoModel
+
+LEAST = 30  # verified matches of a pair that counts
+CONFIRMED = 0.3  # of a pair's matches: where so many are points of the model, the pair agrees with it
+AGREE = 0.8  # of the pairs: of six real captures all that are right have .88 and more, a repetitive board .5
+FLAT = 2.0  # degrees between the rays of the median point: below, depth is a guess
+SCARCE = 60  # points of the median photo
+LOOSE = 1.5e-3  # of the longer side: a reprojection error of 2.4 pixels in 1,600
+REMEDY = "photograph from more places, a step to the side between photos, with two thirds of the picture in common"
+
+
+def judged(model: pycolmap.Reconstruction, database: Path, n_photos: int, others: list[int]) -> dict[str, Any]:
+    """What tells whether a model is right, and `doubts` in words.
+
+    Args: others: photos in each further model, which share nothing with this one.
+    Choices: matches of two photos that RANSAC verified are not all points of the model; where hardly any is, the
+      model has put these photos elsewhere than their matches say.
+    """
+    points = {
+        image.image_id: np.array([p.point3D_id if p.has_point3D() else -1 for p in image.points2D], np.int64)
+        for image in model.images.values()
+        if image.has_pose
+    }
+    shares = []
+    with pycolmap.Database.open(database) as opened:
+        for pair, geometry in zip(*opened.read_two_view_geometries(), strict=True):
+            first, second = pycolmap.pair_id_to_image_pair(pair)
+            matches = geometry.inlier_matches
+            if len(matches) >= LEAST and first in points and second in points:
+                a, b = points[first][matches[:, 0]], points[second][matches[:, 1]]
+                shares.append(float(((a == b) & (a >= 0)).mean()))
+    eyes = {key: model.images[key].projection_center() for key in points}
+    side = max(max(camera.width, camera.height) for camera in model.cameras.values())
+    found: dict[str, Any] = {
+        "how": "structure from motion",
+        "n_registered": len(points),
+        "n_given": n_photos,
+        "n_models": 1 + len(others),
+        "n_in_others": others,
+        "n_points": model.num_points3D(),
+        "points_a_view": float(np.median([(held >= 0).sum() for held in points.values()])),
+        "track_length": round(float(model.compute_mean_track_length()), 2),
+        "reprojection_error_px": round(float(model.compute_mean_reprojection_error()), 3),
+        "reprojection_error": float(model.compute_mean_reprojection_error() / side),
+        "pairs_agree": float(np.mean(np.array(shares) >= CONFIRMED)) if shares else 0.0,
+        "angle_degrees": angle(model, eyes),
+    }
+    return found | {"doubts": doubts(found)}
+
+
+def angle(model: pycolmap.Reconstruction, eyes: dict[int, np.ndarray]) -> float:
+    """The widest angle between two rays of a point, degrees, in the median point."""
+    widest = [0.0]
+    for point in model.points3D.values():
+        rays = point.xyz - np.array([eyes[e.image_id] for e in point.track.elements])
+        rays /= np.linalg.norm(rays, axis=1, keepdims=True)
+        widest.append(float(np.degrees(np.arccos(np.clip((rays @ rays.T).min(), -1, 1)))))
+    return float(np.median(widest))
+
+
+def doubts(found: dict[str, Any]) -> list[str]:
+    """What speaks against a model, and what to do about it; nothing of a good one."""
+    absent, others = found["n_given"] - found["n_registered"], found["n_in_others"]
+    said = []
+    if others:
+        said.append(
+            f"The photos fall into {len(others) + 1} groups that share nothing; the largest is used, {sum(others)} "
+            "photos of others are not: photograph what lies between, or make a scene of each."
+        )
+    elif absent > 0.1 * found["n_given"]:
+        said.append(f"{absent} of {found['n_given']} photos could not be placed and are left out; {REMEDY}.")
+    if found["pairs_agree"] < AGREE:
+        said.append(
+            f"Only {found['pairs_agree']:.0%} of the pairs of photos agree with where the model puts them: something "
+            f"repeats, mirrors or moves in the scene, or the lens changed; check the poses, and {REMEDY}."
+        )
+    if found["reprojection_error"] > LOOSE:
+        said.append(
+            f"Points miss their photos by {found['reprojection_error_px']:.2f} pixels: the lens or what is shown moved "
+            "while it was photographed; lock focus and zoom."
+        )
+    if found["points_a_view"] < SCARCE:
+        said.append(f"A photo has only {found['points_a_view']:.0f} points (median); {REMEDY}, of more texture.")
+    return said
+
+
+def sentence(found: dict[str, Any]) -> str:
+    """The figures of a model in words."""
+    return (
+        f"{found['n_registered']} of {found['n_given']} photos registered, {found['n_points']} points in "
+        f"{found['track_length']:.1f} photos each, {found['reprojection_error_px']:.2f} px, {found['pairs_agree']:.0%} "
+        f"of the pairs agree, {found['angle_degrees']:.1f}° between rays."
+    )
+
+
+def check(model: PhotoModel, n_photos: int, least: float) -> None:
+    """Raise DataFailure on a model that is not to be believed."""
+    found = model.judged
+    if len(model.names) < max(least * n_photos, 3):
+        more = f" {' '.join(found['doubts'])}" if found["doubts"] else ""
+        raise DataFailure(
+            f"{len(model.names)} of {n_photos} photos registered; at least {least:.0%} are needed "
+            f"(pose.min_registered); {REMEDY}.{more}"
+        )
+    if found["angle_degrees"] < FLAT:
+        raise DataFailure(
+            f"the photos were taken from one place: rays of a point meet at {found['angle_degrees']:.1f}° (median), "
+            f"which tells no depth; {REMEDY}"
+        )
