@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import pycolmap
@@ -12,6 +12,8 @@ from chebsplat.errors import DataFailure
 from chebsplat.formats.photo_model import PhotoModel
 
 LEAST = 30  # verified matches of a pair that counts
+DENIED = 0.05  # of a pair's matches: where fewer are, the pair contradicts it
+MOSTLY = 0.5  # of a photo's pairs: where more contradict its place, it is left out
 CONFIRMED = 0.3  # of a pair's matches: where so many are points of the model, the pair agrees with it
 AGREE = 0.8  # of the pairs: of six real captures all that are right have .88 and more, a repetitive board .5
 FLAT = 2.0  # degrees between the rays of the median point: below, depth is a guess
@@ -20,43 +22,81 @@ LOOSE = 1.5e-3  # of the longer side: a reprojection error of 2.4 pixels in 1,60
 REMEDY = "photograph from more places, a step to the side between photos, with two thirds of the picture in common"
 
 
-def judged(model: pycolmap.Reconstruction, database: Path, n_photos: int, others: list[int]) -> dict[str, Any]:
-    """What tells whether a model is right, and `doubts` in words.
+class Pairs(NamedTuple):
+    """The pairs of a model's photos that have LEAST verified matches.
 
-    Args: others: photos in each further model, which share nothing with this one.
-    Choices: matches of two photos that RANSAC verified are not all points of the model; where hardly any is, the
-      model has put these photos elsewhere than their matches say.
+    images: ids [N] of the photos; rows: [P, 2] into them; confirmed: [P] the share of a pair's matches that are points
+    of the model.
     """
+
+    images: list[int]
+    rows: np.ndarray
+    confirmed: np.ndarray
+
+
+def pairs(model: pycolmap.Reconstruction, database: Path) -> Pairs:
+    """Pairs of photos, and how far the model has put them where their matches say."""
     points = {
         image.image_id: np.array([p.point3D_id if p.has_point3D() else -1 for p in image.points2D], np.int64)
         for image in model.images.values()
         if image.has_pose
     }
-    shares = []
+    images, rows, confirmed = sorted(points), [], []
     with pycolmap.Database.open(database) as opened:
         for pair, geometry in zip(*opened.read_two_view_geometries(), strict=True):
             first, second = pycolmap.pair_id_to_image_pair(pair)
             matches = geometry.inlier_matches
             if len(matches) >= LEAST and first in points and second in points:
                 a, b = points[first][matches[:, 0]], points[second][matches[:, 1]]
-                shares.append(float(((a == b) & (a >= 0)).mean()))
-    eyes = {key: model.images[key].projection_center() for key in points}
+                rows.append([images.index(first), images.index(second)])
+                confirmed.append(float(((a == b) & (a >= 0)).mean()))
+    return Pairs(images, np.array(rows, int).reshape(-1, 2), np.array(confirmed))
+
+
+def misplaced(found: Pairs) -> list[int]:
+    """Ids of photos that most of their pairs contradict, for they were put beside something that only looks alike.
+
+    Choices: the one that most of its pairs contradict goes first, and with it what it says of others.
+    """
+    n = len(found.images)
+    agree, deny = np.zeros((n, n)), np.zeros((n, n))
+    for matrix, chosen in ((agree, found.confirmed >= CONFIRMED), (deny, found.confirmed < DENIED)):
+        i, j = found.rows[chosen].T
+        matrix[i, j] = matrix[j, i] = 1
+    kept = np.ones(n, bool)
+    while True:
+        against = deny @ kept
+        share = np.where(kept, against / np.maximum(against + agree @ kept, 1), 0)
+        worst = np.lexsort((against, share))[-1]
+        if share[worst] <= MOSTLY:
+            return [found.images[k] for k in np.flatnonzero(~kept)]
+        kept[worst] = False
+
+
+def judged(
+    model: pycolmap.Reconstruction, found: Pairs, n_photos: int, others: list[int], n_misplaced: int
+) -> dict[str, Any]:
+    """What tells whether a model is right, and `doubts` in words.
+
+    Args: others: photos in each further model, which share nothing with this one; n_misplaced: left out of it.
+    """
+    images = [model.images[key] for key in found.images if model.images[key].has_pose]
     side = max(max(camera.width, camera.height) for camera in model.cameras.values())
-    found: dict[str, Any] = {
+    facts: dict[str, Any] = {
         "how": "structure from motion",
-        "n_registered": len(points),
+        "n_registered": len(images),
         "n_given": n_photos,
-        "n_models": 1 + len(others),
         "n_in_others": others,
+        "n_misplaced": n_misplaced,
         "n_points": model.num_points3D(),
-        "points_a_view": float(np.median([(held >= 0).sum() for held in points.values()])),
+        "points_a_view": float(np.median([image.num_points3D for image in images])),
         "track_length": round(float(model.compute_mean_track_length()), 2),
         "reprojection_error_px": round(float(model.compute_mean_reprojection_error()), 3),
         "reprojection_error": float(model.compute_mean_reprojection_error() / side),
-        "pairs_agree": float(np.mean(np.array(shares) >= CONFIRMED)) if shares else 0.0,
-        "angle_degrees": angle(model, eyes),
+        "pairs_agree": float(np.mean(found.confirmed >= CONFIRMED)) if len(found.confirmed) else 0.0,
+        "angle_degrees": angle(model, {image.image_id: image.projection_center() for image in images}),
     }
-    return found | {"doubts": doubts(found)}
+    return facts | {"doubts": doubts(facts)}
 
 
 def angle(model: pycolmap.Reconstruction, eyes: dict[int, np.ndarray]) -> float:
@@ -80,6 +120,8 @@ def doubts(found: dict[str, Any]) -> list[str]:
         )
     elif absent > 0.1 * found["n_given"]:
         said.append(f"{absent} of {found['n_given']} photos could not be placed and are left out; {REMEDY}.")
+    if n := found["n_misplaced"]:
+        said.append(f"{n} photos are left out that most of their matches contradict: something in the scene repeats.")
     if found["pairs_agree"] < AGREE:
         said.append(
             f"Only {found['pairs_agree']:.0%} of the pairs of photos agree with where the model puts them: something "

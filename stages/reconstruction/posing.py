@@ -124,8 +124,12 @@ def _mapped(job: Job, shots: Sequence[Shot], pictures: Path, database: Path, see
         return None
     sizes = sorted((model.num_reg_images() for model in models.values()), reverse=True)
     model = max(models.values(), key=lambda held: held.num_reg_images())
+    pairs = judge.pairs(model, database)
+    misplaced = judge.misplaced(pairs)
+    for identity in misplaced:
+        model.deregister_frame(model.images[identity].frame_id)
     _refine(model)
-    judged = judge.judged(model, database, len(shots), sizes[1:])
+    judged = judge.judged(model, pairs, len(shots), sizes[1:], len(misplaced))
     whole = judged["n_registered"] >= ENOUGH * len(shots) and judged["pairs_agree"] >= judge.AGREE
     return Found(_collected(model, shots, judged), whole)
 

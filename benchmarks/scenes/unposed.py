@@ -1,0 +1,93 @@
+"""Photos that come alone: what the stage `pose` makes of them, beside pycolmap's defaults on the same files.
+
+Errors are in units of the photo's longer side. A folder with a `truth.json`, which maps a photo's stem to its
+camera-to-world matrix in metres, is held against it, too: medians of the angle and of the distance after a similarity.
+"""
+
+from __future__ import annotations
+
+import json
+import time
+from collections.abc import Sequence
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import Any
+
+import numpy as np
+import pycolmap
+
+from benchmarks import shared
+from chebsplat.cameras import centers
+from chebsplat.errors import ChebsplatError
+from chebsplat.formats.photo_model import PhotoModel
+from chebsplat.pipelines.api import run_stage
+from chebsplat.stages.reconstruction.adjustment import alignment, differences
+
+
+def main(arguments: Sequence[str]) -> int:
+    parser = shared.parser("unposed", __doc__)
+    parser.add_argument("captures", type=Path, nargs="+", help="folders of photos, each with its photos in images/")
+    parser.add_argument("--threads", type=int, default=2)
+    options = parser.parse_args(arguments)
+    print(shared.machine())
+    print("| capture | photos | registered | theirs | points | theirs | error | theirs | seconds | theirs | truth |")
+    print("|---|---|---|---|---|---|---|---|---|---|---|")
+    for folder in options.captures:
+        photos, place = folder / "images", TemporaryDirectory()
+        with place as scratch:
+            theirs, their_seconds = defaults(photos, Path(scratch), options.threads)
+            began = time.perf_counter()
+            try:
+                model = PhotoModel.read(run_stage(
+                    "pose", Path(scratch) / "model", source={"kind": "photos", "path": str(photos)}
+                ))  # fmt: skip
+            except ChebsplatError as error:
+                print(f"| {folder.name} | {error} |", flush=True)
+                continue
+            seconds, held = time.perf_counter() - began, model.judged
+            print(f"| {folder.name} | {held['n_given']} | {held['n_registered']} | {theirs.get('n')} | "
+                  f"{held['n_points']} | {theirs.get('points')} | {held['reprojection_error']:.2e} | "
+                  f"{theirs.get('error', np.nan):.2e} | {seconds:.0f} | {their_seconds:.0f} | "
+                  f"{against(model, folder / 'truth.json')} |", flush=True)  # fmt: skip
+            for doubt in held["doubts"]:
+                print(f"  {doubt}", flush=True)
+    return 0
+
+
+def defaults(photos: Path, place: Path, threads: int) -> tuple[dict[str, Any], float]:
+    """Photos, points and error of the largest model that pycolmap's defaults find with one SIMPLE_RADIAL camera."""
+    pycolmap.logging.minloglevel = 2
+    began, database = time.perf_counter(), place / "theirs.db"
+    extraction, matching = pycolmap.FeatureExtractionOptions(), pycolmap.FeatureMatchingOptions()
+    extraction.num_threads = matching.num_threads = threads
+    pycolmap.extract_features(database, photos, camera_mode=pycolmap.CameraMode.SINGLE, extraction_options=extraction)
+    pycolmap.match_exhaustive(database, matching)
+    options = pycolmap.IncrementalPipelineOptions()
+    options.num_threads, options.random_seed = 1, 0
+    (place / "theirs").mkdir()
+    models = pycolmap.incremental_mapping(database, photos, place / "theirs", options)
+    seconds = time.perf_counter() - began
+    if not models:
+        return {"n": 0, "points": 0}, seconds
+    best = max(models.values(), key=lambda model: model.num_reg_images())
+    side = max(max(camera.width, camera.height) for camera in best.cameras.values())
+    return {
+        "n": best.num_reg_images(),
+        "points": best.num_points3D(),
+        "error": best.compute_mean_reprojection_error() / side,
+    }, seconds
+
+
+def against(model: PhotoModel, path: Path) -> str:
+    """Medians of what a model's poses miss the true ones by."""
+    if not path.exists():
+        return "-"
+    truth = {name: np.linalg.inv(pose) for name, pose in json.loads(path.read_text()).items()}
+    given, found = np.stack([truth[name] for name in model.names]), model.cam_from_world
+    scale, rotation, shift = alignment(found, given)
+    aligned = found.copy()
+    aligned[:, :3, :3] = found[:, :3, :3] @ rotation.T
+    places = scale * centers(found) @ rotation.T + shift
+    aligned[:, :3, 3] = -np.einsum("vij,vj->vi", aligned[:, :3, :3], places)
+    moved, turned = differences(aligned, given)
+    return f"{np.degrees(np.median(turned)):.2f}°, {100 * np.median(moved):.1f} cm (worst {100 * moved.max():.0f})"
