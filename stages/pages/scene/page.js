@@ -271,7 +271,7 @@ function hover(event) { // once a frame at most
     const { label, share, relevant } = meaning(...at); tip.hidden = label === undefined; if (tip.hidden) return;
     const swatch = document.createElement("i"); swatch.style.background = about.labels[label].color;
     tip.replaceChildren(swatch, `${about.labels[label].name} ${Math.round(100 * share)} %${relevant === null ? "" : `, ${about.words[asked.word]} ${calibrated(asked.word) ? `${Math.round(100 * relevant)} %` : relevant.toFixed(2)}`}`);
-    tip.style.left = `${Math.min(clientX, innerWidth - tip.offsetWidth - 20)}px`; tip.style.top = `${Math.min(clientY, innerHeight - 50)}px`;
+    tip.style.left = `${Math.min(clientX, innerWidth - tip.offsetWidth - 20)}px`; tip.style.top = `${Math.min(clientY, innerHeight - tip.offsetHeight - 20)}px`;
   });
 }
 // -- a path of cameras, a link to one, files

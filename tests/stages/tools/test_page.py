@@ -4,9 +4,11 @@ import base64
 import gzip
 import json
 import re
+import shlex
 import shutil
 import subprocess
 import webbrowser
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -14,6 +16,7 @@ from box_room import CALIBRATION, LABELS, MORE, RIVALS, SIZE, N, foreign_ply, ma
 from browser import BROWSER
 from click.testing import CliRunner
 from driven import driven
+from hostile import NAMES, Shape
 from shared import ROOT
 
 from chebsplat.errors import ConfigError
@@ -184,6 +187,28 @@ def test_a_page_of_a_foreign_ply_has_no_semantic_controls(tmp_path):
     assert "labels" not in about
     assert arrays["sh1"].shape == (9, 300)
     assert not re.search(r'id="(ask|legend|words)"', out.read_text())
+
+
+def test_names_are_text_of_a_page_and_never_markup(scene, tmp_path):
+    held = replace(scene[1], labels=np.arange(N, dtype=np.int32) % 15, label_names=NAMES)
+    held.label_embeddings = np.tile(words()[:5], (3, 1))
+    shapes = []
+    for name, labels in (("plain", [f"name{k}" for k in range(15)]), (NAMES[0], NAMES)):
+        write_page(replace(held, label_names=labels), name, None, tmp_path / "page.html")
+        assert [label["name"] for label in held_in(tmp_path / "page.html")[0]["labels"]] == labels
+        shapes.append(Shape((tmp_path / "page.html").read_text()))
+    assert shapes[0].tags == shapes[1].tags
+    assert f"--path {shlex.quote(f'{NAMES[0]}.cameras.json')} " in shapes[1].text
+    if BROWSER is not None:
+        with driven(tmp_path) as browser:
+            browser.open(tmp_path / "page.html", 390, 844)
+            browser.run("scene.ready")
+            browser.run("get('panel').open = true; scene.show('labels'); scene.ask(about.labels[0].name)")
+            shown = browser.run("Array.from(get('legend').querySelectorAll('span'), part => part.textContent)")
+            assert sorted(shown) == sorted(NAMES)
+            assert browser.run("document.querySelectorAll('#panel svg, #panel img, #panel b').length") == 0
+            assert browser.run("document.documentElement.scrollWidth") <= 390
+            assert browser.complaints == []
 
 
 def test_an_existing_file_stays(scene, tmp_path):
