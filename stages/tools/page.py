@@ -99,6 +99,7 @@ def write_page(
         TEMPLATE,
         name=name,
         path=shlex.quote(f"{name}.cameras.json"),
+        points=shlex.quote(f"{name}.points.csv"),
         n=len(means),
         labels=about.get("labels"),
         words=f"{len(words.words):,}" if words else None,
