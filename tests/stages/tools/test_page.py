@@ -504,7 +504,7 @@ def test_in_a_browser_asking_flies_to_what_lies_behind_the_camera(calibrated, tm
     with driven(tmp_path) as browser:
         browser.open(page, *size)
         browser.run("scene.ready")
-        browser.run("get('panel').style.display = 'none'; scene.look(1)")
+        browser.run("get('panel').style.display = 'none'; scene.look(1); new Promise(done => setTimeout(done, 500))")
         assert max(black_edges(browser, tmp_path / "before.png")) < 0.2  # nor above and below on a phone
         for word in ("sofa", "chair"):
             browser.run("scene.look(1); turned(Math.PI, 0, camera.eye); moved()")
