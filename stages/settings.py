@@ -18,7 +18,7 @@ MAX_CHANNELS = 64  # that can be rendered
 def printable(text: str) -> str:
     """The text itself. Raises ValueError if it holds characters that cannot be printed."""
     if unprintable(text):
-        raise ValueError(f"{text[:60]!r} holds characters that cannot be printed")
+        raise ValueError(f"{text[:60]!r} holds characters that cannot be printed; leave them out")
     return text
 
 

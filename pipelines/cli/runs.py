@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 from importlib import import_module
 from pathlib import Path
+from shlex import quote
 from typing import Any
 
 import click
@@ -101,7 +102,8 @@ def study(
         return 0
     used = min(threads, cores)
     folder = out or Path("build/studies") / Path(name).stem
-    command = f"make study={name} cores={cores} threads={used}" + (f" on={on}" if where != cluster.LOCAL else "")
+    command = f"make study={quote(name)} cores={cores} threads={used}"
+    command += f" on={quote(on)}" if where != cluster.LOCAL else ""
 
     def write(failed: dict[str, tuple[int, str, Path]]) -> Path:
         rows = [results.row_of(run, failed) for run in runs]

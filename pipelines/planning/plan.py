@@ -30,7 +30,7 @@ from chebsplat.pipelines.planning.needs import (
 )
 from chebsplat.pipelines.planning.raw import Hashes, content_hash, hashes, raw_files
 from chebsplat.pipelines.work import folders, heads, store
-from chebsplat.pipelines.work.scenes import absent, expanded, folder_of, is_source, read_toml, scene_values
+from chebsplat.pipelines.work.scenes import absent, expanded, folder_of, is_source, read_toml, scene_values, shown
 from chebsplat.stages.registry import OF_KNOWLEDGE, STAGES, Stage, lesson_paths
 from chebsplat.stages.runtime import config as configs
 from chebsplat.stages.settings import SourceSection
@@ -205,7 +205,7 @@ class Planner:
         if settings:
             values = merged(values, overrides(settings))
             title += f"{'+' if ablation else '@'}{name_part}" if (name_part := suffix(settings)) else ""
-        config = placed(configs.build(values, f"scene {scene}"))
+        config = placed(configs.build(values, f"scene {shown(scene)}"))
         asked = config.source
         source = located(resolve_source(name, asked))
         probe = self._probe(source, scene)

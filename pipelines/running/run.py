@@ -124,7 +124,7 @@ def snakemake(
         arguments = ["--workflow-profile", "none", "--profile", str(cluster.profile(on))]
         arguments += ["--cores", str(cores)] if on == cluster.LOCAL else cluster.arguments(plan, on, cores, threads)
         arguments += ["--snakefile", str(HERE / "Snakefile"), "--directory", str(store.work())]
-        arguments += ["--config", f"plan={plan}"]
+        arguments += ["--config", f"plan={plan.relative_to(store.work())}"]
         environment = {"CHEBSPLAT_THREADS": str(threads or cores), "CHEBSPLAT_WORK": str(store.work())}
         code: int | None = None
         try:

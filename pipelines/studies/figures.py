@@ -16,6 +16,11 @@ MARKERS = "osD^vP*X<>"
 Traces = list[tuple[Row, list[dict[str, float]]]]
 
 
+def drawn(name: str) -> str:
+    """A name as matplotlib draws it: without mathematics, and with a place in the legend."""
+    return (" " if name.startswith("_") else "") + name.replace("$", r"\$")
+
+
 def draw(path: Path, rows: list[Row], traces: Traces, settings: dict[str, float] | None, label: str) -> None:
     """Write the picture as PNG.
 
@@ -26,7 +31,7 @@ def draw(path: Path, rows: list[Row], traces: Traces, settings: dict[str, float]
     done = [row for row in rows if row["state"] == "done"]
     variants = list(dict.fromkeys(row["variant"] for row in rows))
     style = {
-        name: {"color": f"C{k % 10}", "marker": MARKERS[k % len(MARKERS)], "label": name}
+        name: {"color": f"C{k % 10}", "marker": MARKERS[k % len(MARKERS)], "label": drawn(name)}
         for k, name in enumerate(variants)
     }
     conditions = [""] if settings is not None else list(dict.fromkeys(row["condition"] for row in rows))
@@ -43,10 +48,10 @@ def draw(path: Path, rows: list[Row], traces: Traces, settings: dict[str, float]
         elif color_only:
             for axis, scene in zip(line, scenes, strict=True):
                 _of_scene(axis, scene, chosen, followed, style)
-            line[0].set_ylabel(f"PSNR, dB {condition}".strip())
+            line[0].set_ylabel(f"PSNR, dB {drawn(condition)}".strip())
         else:
             _over_time(line, chosen, followed, style)
-            line[0].set_ylabel(condition)
+            line[0].set_ylabel(drawn(condition))
         for axis in line:
             axis.grid(alpha=0.3)
     handles = {
@@ -89,7 +94,7 @@ def _of_scene(axis: Any, scene: str, rows: list[Row], traces: Traces, style: dic
     _longest(axis, [(row, trace) for row, trace in traces if row["scene"] == scene], style)
     axis.set_xscale("log")
     axis.xaxis.set_major_formatter("{x:g}")
-    axis.set_title(scene, fontsize=10)
+    axis.set_title(drawn(scene), fontsize=10)
     axis.set_xlabel("training seconds (thin: views trained on)", fontsize=9)
 
 

@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import base64
 import csv
+import html
 import platform
+import re
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -32,6 +34,7 @@ from chebsplat.stages.report import LARGEST
 PAGE = Path(__file__).with_name("page.html")  # a jinja2 template; it fetches nothing from anywhere
 NAME = "study.html"
 PICTURE = "error-against-time.png"
+MARKUP = re.compile(r"([\\`*_{}\[\]|~$^#])|^(\d*)([-+=.)])(?=[\s=-]|$)")  # what Markdown takes for its own
 NARROW = 1100  # pixels of a screen; the comparison's tables take more
 
 
@@ -134,15 +137,24 @@ def processor() -> str:
     return names[0] if names else platform.machine()
 
 
+def inert(text: str) -> str:
+    """Text that Markdown, and the HTML in it, shows as it is, in one line."""
+    return MARKUP.sub(r"\2\\\1\3", html.escape(" ".join(text.split()), quote=False))
+
+
 def markdown(parts: dict[str, Any]) -> str:
-    """The study's section of docs/results/."""
+    """The study's section of docs/results/. Whatever others have named is `inert`."""
     study = parts["study"]
-    text = [f"## {study.title}", "", study.about, "", *(f"- {what}: {value}" for what, value in parts["facts"])]
-    text += ["", f"![error against run time]({PICTURE})", "", parts["note"], ""]
-    rows = [[f"{a}<br>{f'**{b}**' if bold else b}" if b else a for a, b, bold in row] for _, row in parts["table"]]
+    text = [f"## {inert(study.title)}", "", inert(study.about), ""]
+    text += [f"- {what}: {inert(value)}" for what, value in parts["facts"]]
+    text += ["", f"![error against run time]({PICTURE})", "", inert(parts["note"]), ""]
+    shown = [[(inert(a), b, bold) for a, b, bold in row] for _, row in parts["table"]]
+    rows = [[f"{a}<br>{f'**{b}**' if bold else b}" if b else a for a, b, bold in row] for row in shown]
     tables = [("", "", [parts["header"], *rows])]
-    tables += [(f"### {s.heading}", s.note, s.table) for s in parts["more"]]
-    for heading, note, table in (*tables, ("### Each scene", "", parts["scenes"])):
+    more = [(f"### {inert(s.heading)}", s.note, s.table) for s in parts["more"]]
+    for heading, note, table in (*more, ("### Each scene", "", parts["scenes"])):
+        tables.append((heading, inert(note), [list(map(inert, row)) for row in table]))
+    for heading, note, table in tables:
         text += [heading, ""] if heading else []
         text += [note, ""] if note else []
         text += ["| " + " | ".join(row) + " |" for row in table[:1]]
@@ -150,7 +162,12 @@ def markdown(parts: dict[str, Any]) -> str:
         text += ["| " + " | ".join(row) + " |" for row in table[1:]] + [""]
     if parts["left_out"]:
         text += ["### Left out, and why", ""]
-        text += [*(f"- {what}: {why} ({by})" for what, why, by in parts["left_out"]), ""]
+        text += ["- {}: {} ({})".format(*map(inert, line)) for line in parts["left_out"]] + [""]
     if parts["missing"]:
-        text += ["### Runs without figures", "", *(f"- {run}: {why}" for run, why in parts["missing"]), ""]
+        text += [
+            "### Runs without figures",
+            "",
+            *(f"- {inert(run)}: {inert(why)}" for run, why in parts["missing"]),
+            "",
+        ]
     return "\n".join(text)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 from contextlib import suppress
 from pathlib import Path
+from shlex import quote
 
 from chebsplat.errors import ConfigError, InputError
 from chebsplat.formats.names import suggest
@@ -72,16 +73,16 @@ def holder(artifact: Path) -> Path | None:
 
 def unknown(scene: str) -> ConfigError | InputError:
     """The error for a scene that is not there, with the nearest names."""
-    where = f"no finished scene in {store.work()}"
+    where, run = f"no finished scene in {store.work()}", f"run it first: make scene={quote(shown(scene))}"
     if is_source(os.path.expanduser(scene)):
-        return InputError(f"{shown(scene)} is {where}, nor the folder of one; run it first: make scene={shown(scene)}")
+        return InputError(f"{shown(scene)} is {where}, nor the folder of one; {run}")
     if "/" in scene:
         return InputError(f"{shown(scene)} is missing: neither a scene, its folder nor an artifact; correct the path")
     known = titles()
     near = suggest(scene, known) or known[:8]
     if near and scene not in names("scenes"):
         return ConfigError(f"{shown(scene)} is {where}, and no folder of one; there is {', '.join(near)}")
-    return ConfigError(f"{shown(scene)} is {where}, and no folder of one; run it first: make scene={shown(scene)}")
+    return ConfigError(f"{shown(scene)} is {where}, and no folder of one; {run}")
 
 
 def artifact_of(scene: str, stage: str) -> Path:
@@ -93,7 +94,7 @@ def artifact_of(scene: str, stage: str) -> Path:
         return path
     folder = scene_folder(scene)
     if not is_artifact(folder / stage):
-        run = f"run it to its end: make scene={shown(folder.name.partition('@')[0])}"
+        run = f"run it to its end: make scene={quote(shown(folder.name.partition('@')[0]))}"
         raise ConfigError(f"{folder} has no {stage}: it is not finished, or leaves that out; {run}")
     return folder / stage
 

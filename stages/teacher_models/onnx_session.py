@@ -1,7 +1,7 @@
-"""Models in ONNX that somebody brings: the one door to running them. What declares too much is refused, and every run
-ends.
+"""Models in ONNX that somebody brings: the one door to running them. What declares too much is refused, every run
+ends, and takes no more memory than fits what it is fed.
 
-onnxruntime itself refuses weights outside the model's folder and folds no constant above 1 GiB.
+onnxruntime itself refuses weights outside the model's folder.
 """
 
 from __future__ import annotations
@@ -24,6 +24,10 @@ if TYPE_CHECKING:
 SECONDS = 600.0  # of one run, of a window or of a text
 LOOPING = 10.0  # of one run of a model that holds a Loop or a Scan: only such a one may never end
 LARGEST = 1 << 30  # bytes of one output, where the graph says them
+LEAST, MOST = 1 << 29, 1 << 32  # bytes that a run may take beside the weights
+BYTES = 4096  # of these, for each value that it is fed: the embedded teacher takes 330, MOSAIC 50
+FOLDED = 1 << 26  # bytes of a constant that is computed when a model is opened
+OVER = "Available memory of"  # what onnxruntime says where a run would take more
 CUDA = "CUDAExecutionProvider"
 GPU_REMEDY = "`.venv/bin/pip install onnxruntime-gpu` in the place of onnxruntime adds it"
 LOOPS = (b'"\x04Loop', b'"\x04Scan')  # as protobuf writes a node's operator
@@ -41,10 +45,13 @@ class Model:
 
         self.path, self.remedy = Path(path), remedy
         size = regular(self.path, remedy).st_size
-        options = options or onnxruntime.SessionOptions()
-        options.log_severity_level = 4  # what fails is raised, and reported once
+        self._options, self._providers = options or onnxruntime.SessionOptions(), providers(device)
+        self._options.log_severity_level = 4  # what fails is raised, and reported once
+        self._options.add_session_config_entry("session.use_env_allocators", "1")
+        folding = "optimization.constant_folding_max_output_size_in_bytes"
+        self._options.add_session_config_entry(folding, str(FOLDED))
         try:
-            self._session: Any = onnxruntime.InferenceSession(str(path), options, providers=providers(device))
+            self._open(LEAST)
         except Exception as error:  # onnxruntime's own exception types are not public
             raise InputError(f"{path} is not a usable ONNX model ({_line(error)}); {remedy}") from None
         self.inputs: list[Any] = self._session.get_inputs()
@@ -58,10 +65,29 @@ class Model:
                 raise InputError(f"{path} gives {entry.shape}, {declared:,} bytes; at most {LARGEST:,} are possible")
         self.seconds = LOOPING if size and _loops(self.path) else SECONDS
 
-    def run(self, feeds: Mapping[str, np.ndarray]) -> list[np.ndarray]:
-        """All outputs. Raises InputError if the model fails or is not done in its time."""
+    def _open(self, memory: int) -> None:
+        """A session whose runs may take so many bytes. The limit is of an arena that it is opened with, and the
+        sessions before keep theirs.
+        """
         import onnxruntime
 
+        self._session: Any = None  # its memory goes first
+        kinds = onnxruntime.OrtAllocatorType.ORT_ARENA_ALLOCATOR, onnxruntime.OrtMemType.DEFAULT
+        limit = onnxruntime.OrtArenaCfg({"max_mem": memory, "arena_extend_strategy": 1})  # as asked, not doubled
+        onnxruntime.create_and_register_allocator(onnxruntime.OrtMemoryInfo("Cpu", kinds[0], 0, kinds[1]), limit)
+        self._session = onnxruntime.InferenceSession(str(self.path), self._options, providers=self._providers)
+        self.memory = memory
+
+    def run(self, feeds: Mapping[str, np.ndarray]) -> list[np.ndarray]:
+        """All outputs. Raises InputError if the model fails, is not done in its time or takes too much memory.
+
+        Choices: memory grows with what is fed, from LEAST to MOST; the model is opened anew for more.
+        """
+        import onnxruntime
+
+        memory = min(LEAST + BYTES * sum(value.size for value in feeds.values()), MOST)
+        if memory > self.memory:
+            self._open(memory)
         options = onnxruntime.RunOptions()
         late = Timer(self.seconds, lambda: setattr(options, "terminate", True))
         late.daemon = True
@@ -70,6 +96,7 @@ class Model:
             outputs = self._session.run(None, dict(feeds), options)
         except Exception as error:  # onnxruntime's own exception types are not public
             why = f"not done after {self.seconds:g} s" if options.terminate else _line(error)
+            why = f"more than {self.memory:,} bytes of memory are needed" if OVER in str(error) else why
             sizes = ", ".join(str(list(value.shape)) for value in feeds.values())
             raise InputError(f"{self.path} fails on {sizes} ({why}); {self.remedy}") from None
         finally:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from pathlib import Path
 
 import numpy as np
@@ -40,13 +39,10 @@ def extract(
     if query is not None:
         filters["query"] = asked_for(scene.exported, query)
     n = len(scene)
-    left_out = {name: int(n - keep.sum()) for name, keep in filters.items()}
-    kept = np.logical_and.reduce([np.ones(n, bool), *filters.values()])
-    if not kept.any():
-        why = ", ".join(f"{name} {number}" for name, number in left_out.items())
-        raise DataFailure(f"no Gaussian of {n} is left ({why}); choose wider filters")
-    scene.select(kept).to_ply(out)
-    return {"kept": int(kept.sum()), "of": n} | {f"left out by {name}": number for name, number in left_out.items()}
+    part = scene.part(filters)
+    part.to_ply(out)
+    left_out = {f"left out by {name}": int(n - keep.sum()) for name, keep in filters.items()}
+    return {"kept": len(part), "of": n} | left_out
 
 
 def asked_for(scene: Scene, query: Query) -> np.ndarray:
@@ -58,13 +54,8 @@ def asked_for(scene: Scene, query: Query) -> np.ndarray:
 
 
 def corners(text: str | None) -> tuple[float, ...] | None:
-    """Six numbers from "x0,y0,z0,x1,y1,z1". Raises ConfigError if they are no box."""
-    if text is None:
-        return None
+    """Numbers with commas between them. Raises ConfigError if they are none."""
     try:
-        box = tuple(float(part) for part in text.split(","))
+        return None if text is None else tuple(float(part) for part in text.split(","))
     except ValueError:
-        box = ()
-    if len(box) != 6 or not all(math.isfinite(v) for v in box) or any(box[k] >= box[k + 3] for k in range(3)):
-        raise ConfigError(f"--box {text}: six numbers x0,y0,z0,x1,y1,z1 with x0 < x1 and so on are needed")
-    return box
+        raise ConfigError(f"--box {text}: six numbers x0,y0,z0,x1,y1,z1 are needed") from None

@@ -6,11 +6,13 @@ from __future__ import annotations
 
 import hashlib
 import json
+import os
 import re
 import shutil
 import time
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
+from urllib.parse import urlsplit
 
 import numpy as np
 
@@ -93,7 +95,8 @@ def fetched(repository: str, file: str, revision: str) -> Path:
 
     where = f"{repository}: {file}"
     try:
-        return verified(Path(hf_hub_download(repository, file, revision=revision)))
+        token = token_for(constants.ENDPOINT)
+        return verified(Path(hf_hub_download(repository, file, revision=revision, token=token)))
     except errors.LocalEntryNotFoundError as fault:
         why = f"{constants.ENDPOINT} is not reached"
         if isinstance(fault.__cause__, errors.OfflineModeIsEnabled):
@@ -109,6 +112,17 @@ def fetched(repository: str, file: str, revision: str) -> Path:
             raise
         said = str(fault).partition("\n")[0]
         raise InputError(f"{where} broke off ({said}); {AGAIN}") from None
+
+
+def token_for(endpoint: str) -> Literal[False] | None:
+    """What the client sends as a token: its own (None), or nothing (False).
+
+    Choices: the token of a login is the hub's and goes to no other origin; one that HF_TOKEN names
+      goes where HF_ENDPOINT says. The client itself takes none along to where it is redirected.
+    """
+    where = urlsplit(endpoint)
+    hub = (where.scheme, where.hostname, where.port or 443) == ("https", "huggingface.co", 443)
+    return None if hub or os.environ.get("HF_TOKEN") else False
 
 
 def refusal(fault: Any, repository: str, file: str, revision: str) -> str:

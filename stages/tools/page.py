@@ -5,6 +5,7 @@ from __future__ import annotations
 import base64
 import gzip
 import logging
+import shlex
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -97,6 +98,8 @@ def write_page(
     text = rendered(
         TEMPLATE,
         name=name,
+        path=shlex.quote(f"{name}.cameras.json"),
+        points=shlex.quote(f"{name}.points.csv"),
         n=len(means),
         labels=about.get("labels"),
         words=f"{len(words.words):,}" if words else None,

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
@@ -11,7 +11,7 @@ import numpy as np
 import torch
 from scipy.special import expit
 
-from chebsplat.errors import ConfigError
+from chebsplat.errors import ConfigError, DataFailure
 from chebsplat.formats.files import atomic_path
 from chebsplat.formats.names import suggest
 from chebsplat.formats.ply import write_ply
@@ -152,15 +152,25 @@ class OpenedScene:
         """The Gaussians that pass every filter, as a scene; it shares no memory with this one.
 
         Args: mask: bool [N]; label: names to keep; min_opacity: in [0, 1]; box: x0, y0, z0, x1, y1, z1 of centres.
-        Raises: ConfigError on a label that is not there, a mask of another shape, or where nothing is left.
+        Raises: ConfigError on a label that is not there or a filter that is none; DataFailure if nothing is left.
         """
         names = () if label is None else (label,) if isinstance(label, str) else tuple(label)
-        kept = np.ones(len(self), bool) if mask is None else np.asarray(mask)
-        if kept.shape != (len(self),) or kept.dtype != bool:
-            raise ConfigError(f"a mask bool [{len(self)}] is needed, not {kept.dtype} {list(kept.shape)}")
-        kept = np.logical_and.reduce([kept, *passing(self.exported, self.source, names, min_opacity, box).values()])
+        filters = passing(self.exported, self.source, names, min_opacity, box)
+        if mask is not None:
+            filters["mask"] = mask = np.asarray(mask)
+            if mask.shape != (len(self),) or mask.dtype != bool:
+                raise ConfigError(f"a mask bool [{len(self)}] is needed, not {mask.dtype} {list(mask.shape)}")
+        return self.part(filters)
+
+    def part(self, filters: Mapping[str, np.ndarray]) -> OpenedScene:
+        """The Gaussians that pass all of some filters, bool [N] by name. Raises DataFailure where none does."""
+        kept = np.logical_and.reduce([np.ones(len(self), bool), *filters.values()])
         if not kept.any():
-            raise ConfigError(f"no Gaussian of {len(self)} is left; choose wider filters")
+            means = self.parameters["means"]
+            low, high = (",".join(f"{value:.4g}" for value in side) for side in (means.min(0), means.max(0)))
+            why = ", ".join(f"{name} leaves out {int((~keep).sum())}" for name, keep in filters.items())
+            where = f"centres lie from {low} to {high}"
+            raise DataFailure(f"no Gaussian of {len(self)} is left ({why}); {where}: choose wider filters")
         parameters = {name: values[kept] for name, values in self.parameters.items()}
         part = replace(
             self.exported,
@@ -189,6 +199,10 @@ def passing(
 ) -> dict[str, np.ndarray]:
     """Which Gaussians pass each filter that is asked for, bool [N] by its name. Args and errors: see `extract`."""
     filters: dict[str, np.ndarray] = {}
+    if not 0 <= min_opacity <= 1:
+        raise ConfigError(f"an opacity of at least {min_opacity:g}: a number from 0 to 1 is needed")
+    if box is not None and not (len(box) == 6 and np.isfinite(box).all() and np.less(box[:3], box[3:]).all()):
+        raise ConfigError(f"a box of {list(box)}: six numbers x0,y0,z0,x1,y1,z1 with x0 < x1 and so on are needed")
     if labels:
         filters["label"] = has_label(scene, path, labels)
     if min_opacity > 0:

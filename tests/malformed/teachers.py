@@ -90,6 +90,29 @@ def huge() -> Edit:
     return model(zeros, node("Add", "image", "zeros"), constants={"shape": np.array([1, 3, 100_000, 100_000])})
 
 
+def grown(factor: int) -> Edit:
+    """An output whose sides are `factor` times the image's, by a shape that is computed when it runs."""
+    nodes = [
+        helper.make_node("Shape", ["image"], ["shape"]),
+        helper.make_node("Mul", ["shape", "factor"], ["larger"]),
+        helper.make_node("ConstantOfShape", ["larger"], ["zeros"]),
+        helper.make_node("ReduceMax", ["image"], ["most"]),
+    ]
+    return model(*nodes, node("Add", "zeros", "most"), constants={"factor": np.array([1, 1, factor, factor])})
+
+
+def folded() -> Edit:
+    """Twelve constants of 300 MB, each of which would be computed when the model is opened."""
+    count, nodes = 12, [helper.make_node("ReduceMax", ["image"], ["most"])]
+    for k in range(count):
+        value = helper.make_tensor("value", TensorProto.FLOAT, [1], [k])
+        nodes.append(helper.make_node("ConstantOfShape", ["shape"], [f"zeros{k}"], value=value))
+        nodes.append(helper.make_node("Add", [f"zeros{k}", "most"], [f"sum{k}"]))
+        nodes.append(helper.make_node("ReduceMean", [f"sum{k}"], [f"mean{k}"]))
+    last = node("Sum", *(f"mean{k}" for k in range(count)))
+    return model(*nodes, last, constants={"shape": np.array([1, 3, 5000, 5000])})
+
+
 def halves() -> Edit:
     """Two halves that must be alike: a side that is no multiple of 2 fails inside the model."""
     split = helper.make_node("Split", ["image"], ["a", "b"], axis=3, num_outputs=2)
@@ -193,6 +216,10 @@ def rows() -> Iterator[Row]:
     yield Row("teacher", f"{MODEL}: 65 channels", many_channels, (MODEL, "at most 64 can be rendered"), 2)
     yield met(MODEL, "nan", model(node("Log")), "non-finite values", 4)
     yield met(MODEL, "an output of 120 GB", huge(), MODEL, 3, True)
+    for factor in (100, 200, 400, 100_000):  # 0.37, 1.5, 5.9 GB, more than any machine has
+        words = "bytes of memory are needed"
+        yield met(MODEL, f"an output of {factor} times the image's sides", grown(factor), words, 3, True)
+    yield met(MODEL, "constants of 3.6 GB", folded(), "bytes of memory are needed", 3, True)
     yield met(MODEL, "a loop of 2^62 steps", endless(), MODEL, 3, True)
     yield met(MODEL, "a pipe", no_file(MODEL, "pipe"), "is missing", 3, True)
     yield met(TABLE, "a zip bomb", bomb, "are read", 3, True)

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 import chebsplat
-from chebsplat.errors import ChebsplatError, ConfigError
+from chebsplat.errors import ChebsplatError, ConfigError, DataFailure
 from chebsplat.formats.capture import Capture
 from chebsplat.formats.ply import read_ply
 from chebsplat.formats.scene import Scene
@@ -81,8 +81,20 @@ def test_what_cannot_be_is_said(scene):
         scene.select(label="zzz")
     with pytest.raises(ConfigError, match="a mask bool"):
         scene.select(np.ones(3, bool))
-    with pytest.raises(ConfigError, match="is left"):
-        scene.select(np.zeros(len(scene), bool))
+    for opacity in (1.5, -0.1, float("nan")):
+        with pytest.raises(ConfigError, match="from 0 to 1 is needed"):
+            scene.select(min_opacity=opacity)
+    for box in ((0, 0, 0, 1, 1), (0, 0, 0, 1, 0, 1), (0, 0, 0, 1, float("nan"), 1), (0, 0, 0, 1, 1, float("inf"))):
+        with pytest.raises(ConfigError, match="six numbers"):
+            scene.select(box=box)
+    n = len(scene)
+    for filters, left_out in [
+        ({"mask": np.zeros(n, bool)}, f"mask leaves out {n}"),
+        ({"box": (500, 500, 500, 501, 501, 501)}, f"box leaves out {n}"),
+        ({"min_opacity": 1.0, "label": "wall"}, f"opacity leaves out {n}"),
+    ]:
+        with pytest.raises(DataFailure, match=f"no Gaussian of {n} is left .*{left_out}.*centres lie from"):
+            scene.select(**filters)
     with pytest.raises(ConfigError, match="open the scene"):
         scene.query("wall")
     with pytest.raises(AttributeError):

@@ -1,6 +1,8 @@
 """One way to say which scene is meant, whatever the command."""
 
+import re
 from pathlib import Path
+from shlex import quote
 
 import pytest
 from click.testing import CliRunner
@@ -58,12 +60,14 @@ def test_a_scene_of_several_settings_must_be_named_in_full(tmp_path):
         ("office0", ConfigError, "make scene=office0"),
         ("work/nowhere", InputError, "is missing"),
         ("photos", InputError, "run it first: make scene=photos"),
+        ("Anna's $5", InputError, re.escape("make scene=" + quote("Anna's $5"))),
         ("~nobody-of-this-name", ConfigError, "there is toy"),
     ],
 )
 def test_what_is_no_scene_is_an_error_that_says_what_there_is(tmp_path, meant, error, message):
     run("toy")
     photo_folder(tmp_path / "photos")
+    photo_folder(tmp_path / "Anna's $5")
     with pytest.raises(error, match=message):
         scene_folder(meant)
 

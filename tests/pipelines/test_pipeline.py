@@ -444,6 +444,16 @@ def test_a_run_makes_the_report_and_a_second_run_does_nothing(work):
 
 
 @pytest.mark.xdist_group("cli")
+def test_folders_may_be_called_what_a_shell_yaml_or_snakemake_take_for_their_own(tmp_path):
+    name = "Anna's {room} #1: $5 `touch x`; touch x"
+    scene, work = photo_folder(tmp_path / name), tmp_path / "work" / name
+    done = chebsplat("run", "--scene", scene, "--stage", "ingest", "--cores", "1", CHEBSPLAT_WORK=str(work))
+    assert done.returncode == 0, done.stderr
+    assert list(work.glob("*/ingest/artifact.json"))
+    assert not (ROOT / "x").exists() and not (work / "x").exists()
+
+
+@pytest.mark.xdist_group("cli")
 def test_a_failing_stage_gives_its_exit_code_and_nothing_half_made(work):
     failed = chebsplat("run", "--scene", "toy", "--set", "ingest.test_every=10000,ingest.test_offset=9999," + FAST)
     assert failed.returncode == 4

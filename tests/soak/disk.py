@@ -67,7 +67,7 @@ def one(disk: Path, number: int, stage: str, free: int, wanted: int, whole: dict
     done = [path.parent.name for path in work.glob("store/*/[!.]*")]
     if code != 4:
         fault = f"exit code {code}"
-    elif "Traceback" in run.stderr or str(disk) not in run.stderr or "bytes are needed" not in run.stderr:
+    elif "Traceback" in run.stderr or str(disk) not in run.stderr or "make room" not in run.stderr:
         fault = "no clear message"
     elif half := [path for path in hidden(work) if path.name.startswith(".tmp-")]:
         fault = f"left {half[0].name}"

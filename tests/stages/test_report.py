@@ -10,10 +10,11 @@ from html.parser import HTMLParser
 import numpy as np
 import pytest
 from browser import BROWSER, browsed
+from hostile import NAMES, Shape
 from malformed.artifacts import artifacts, copied
 from malformed.edits import changed
 from PIL import Image
-from shared import INPUTS, KEY, run_stage
+from shared import INPUTS, KEY, published, run_stage
 
 from chebsplat.errors import InputError
 from chebsplat.formats.artifact import publish, read_manifest
@@ -156,6 +157,35 @@ def test_in_a_browser_the_page_fits_its_width_without_an_error_or_a_request(toy,
     assert all(seen["shown"])
     # one picture a side, and what lies over it; nothing is left over from the mode before
     assert seen["layers"] == {"photo | render": 2, "true labels | scene": 4, "2D teacher | scene": 4, "errors": 3}
+
+
+def reported(folder, names):
+    """The report's page of a scene whose every name is one of these."""
+    held = Evaluation.read(artifacts() / "evaluate")
+    figures = json.loads(json.dumps(held.figures))
+    iou = {"iou": dict.fromkeys(names, 0.5)}
+    figures["segmentation"] |= {"classes": names, "scene": figures["segmentation"]["scene"] | iou}
+    figures["source"] |= {"name": names[0], "kind": names[1], "notes": names}
+    figures |= {"names": names[:1], "left_out": dict(zip(names, reversed(names), strict=True))}
+    figures["protocol"] |= {"name": names[2], "split": names[3]}
+    stacks = {key: stack[:] for key, stack in held.pictures.items()}
+    stacks["labels"] = np.arange(stacks["labels"].size, dtype=np.int16).reshape(stacks["labels"].shape) % len(names)
+    inputs = {"evaluation": published(folder / "evaluation", Evaluation(figures, stacks))}
+    assert run_stage("report", folder / "report", inputs | {"gaussians": artifacts() / "train"}, {}) == 0
+    return (folder / "report/report.html").read_text()
+
+
+@pytest.mark.filterwarnings("ignore:No artists with labels")  # the small trace has one row
+def test_names_are_text_of_the_report_and_never_markup(tmp_path):
+    plain = Shape(reported(tmp_path / "plain", [f"name{k}" for k in range(len(NAMES))]))
+    text = reported(tmp_path / "hostile", NAMES)
+    hostile = Shape(text)
+    assert hostile.tags == plain.tags
+    for name in NAMES:
+        assert hostile.text.count(name) >= 4  # legend, classes, notes, what is left out
+    if BROWSER is not None:
+        seen, console, requests = browsed(tmp_path, text, 390)
+        assert seen["problems"] == console == requests == seen["cut"] == []
 
 
 @pytest.mark.slow

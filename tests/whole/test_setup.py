@@ -153,3 +153,56 @@ def test_device_cuda_is_refused_where_there_is_no_driver(clone):
     assert done.returncode == 2 and installed == []
     assert "this machine has no NVIDIA driver" in done.stderr
     assert "none of auto, cpu, cuda" in installing(clone, "device=tpu")[0].stderr
+
+
+STUB = '#!/bin/bash\nprintf \'%s\\0\' "$@" > "$CALLS"\n'  # of whatever make calls: keeps what it is given
+HOSTILE = ["Anna's room", 'a "b" room', "$5 $(shell touch x) $$ `touch x`", "'; touch x; '", '"; touch x; "',
+           "a\nb", " # two  spaces \\", "-x;touch x", "*", "$(error no) ${HOME}", "été %s"]  # fmt: skip
+CALLED = [  # goals, variables that get the name, what the command gets of it
+    ([], ["scene", "set", "stage"], ["run", "--scene={}", "--set={}", "--stage={}"]),
+    ([], ["sequence", "ablation", "knowledge"], ["run", "--sequence={}", "--ablation={}", "--knowledge={}"]),
+    (["plan"], ["scene"], ["plan", "--scene={}", "--device=cpu"]),
+    (["plan"], ["study"], ["study", "--plan", "--device=cpu", "--", "{}"]),
+    ([], ["study"], ["study", "--device=cpu", "--", "{}"]),
+    (["view"], ["scene"], ["view", "--", "{}"]),
+    (["verify"], ["scene", "dir"], ["verify", "--", "{}", "{}"]),
+    (["knowledge"], ["teacher", "out"], ["knowledge", "teach", "--teacher={}", "--out={}"]),
+    (["calibration"], ["teacher"], ["calibrate", "--force", "--", "{}"]),
+    ([], ["bench"], ["-m", "benchmarks", "{}"]),
+]
+
+
+@pytest.fixture
+def stubbed(clone):
+    """A clone that is set up, where Python and chebsplat keep what they are called with."""
+    make(clone, "setup")
+    for name in ("python", "chebsplat"):
+        (clone / ".venv/bin" / name).write_text(STUB)
+        (clone / ".venv/bin" / name).chmod(0o755)
+    return clone
+
+
+def called(clone, *arguments, **variables):
+    """What the stub was given, under make with these arguments."""
+    calls = clone.parent / "calls"
+    done = run(clone, "make", *arguments, CALLS=str(calls), **variables)
+    assert done.returncode == 0, done.stderr
+    assert not list(clone.parent.rglob("x"))
+    return calls.read_bytes().decode().split("\0")[:-1]
+
+
+def test_names_reach_the_command_as_they_are_whatever_they_hold(stubbed):
+    for goals, variables, wanted in CALLED:
+        for name in HOSTILE:
+            given = dict.fromkeys(variables, name)
+            device = ["device=cpu"] if "--device=cpu" in wanted else []
+            text = [word.replace("{}", name.lstrip()) for word in wanted]  # make takes a leading space for its own
+            assert called(stubbed, *goals, *device, *(f"{k}={v}" for k, v in given.items())) == text
+    text = [word.replace("{}", HOSTILE[2]) for word in CALLED[0][2]]
+    assert called(stubbed, **dict.fromkeys(CALLED[0][1], HOSTILE[2])) == text  # by the environment
+    assert called(stubbed, "bench-'; touch x; '") == ["-m", "benchmarks", "'; touch x; '"]
+
+
+def test_arguments_are_words_of_the_shell_and_none_of_make(stubbed):
+    words = called(stubbed, "view", "scene=a", "args=--words 'my words.txt' --against \"$NAME\"", NAME="two words")
+    assert words == ["view", "--words", "my words.txt", "--against", "two words", "--", "a"]

@@ -4,11 +4,12 @@ const TEMPERATURE = 0.1, DIMMED = 0.06, FRAME = 1000 / 24, SMALLEST = 0.25; // o
 let splats, drawing, sorter, order = new Uint32Array(0), strength, features, views, lists; // lists: Gaussians by label
 let camera, moving = 0, scale = 1, dirty = true, frames = 0, asked = null, mode = "color", picked = -1;
 let path = []; // cameras that are kept for a file
+let flight = null, points = [], placing = false; // { from, to, began, eye }; labelled points { at, word }; whether clicks add some
 const hidden = new Set(), held = new Set(), pointers = new Map();
 
 // -- cameras of the page, of the capture's lenses
-function lens(view, width, height) { // the capture's picture as large as it fits, in the middle
-  const [fx, fy, cx, cy] = views.subarray(16 * view + 12, 16 * view + 16), by = Math.min(width / about.width, height / about.height);
+function lens(view, width, height) { // the capture's picture in the middle, as high as the page: no black above it
+  const [fx, fy, cx, cy] = views.subarray(16 * view + 12, 16 * view + 16), by = height / about.height;
   return [fx * by, fy * by, width / 2 + (cx - about.width / 2) * by, height / 2 + (cy - about.height / 2) * by];
 }
 function seen({ turn, eye, view }, width = canvas.width, height = canvas.height) {
@@ -17,7 +18,7 @@ function seen({ turn, eye, view }, width = canvas.width, height = canvas.height)
 function sortable({ turn, shift, lens: [fx, fy, cx, cy], size: [width, height] }) {
   return { turn, shift, slopes: [Math.max(cx, width - cx) / fx, Math.max(cy, height - cy) / fy] };
 }
-const shown = () => seen(camera, canvas.clientWidth, canvas.clientHeight); // pointers count in the page's own pixels
+const shown = (of = camera) => seen(of, canvas.clientWidth, canvas.clientHeight); // pointers count in the page's own pixels
 function at_view(view) {
   const pose = views.subarray(16 * view, 16 * view + 12), turn = [0, 1, 2, 4, 5, 6, 8, 9, 10].map(i => pose[i]);
   return { turn, eye: back(turn, [3, 7, 11].map(i => -pose[i])), view, pivot: about.extent / 3 };
@@ -39,7 +40,9 @@ function retint() {
     strength[k] = tints[4 * k + 3] = force[label] ?? (picked >= 0 ? DIMMED : 1);
   }
   drawing.tint(tints); dirty = true;
+  if (semantic) get("nothing").hidden = strength.some(value => value > 0);
 }
+function unhide() { hidden.clear(); picked = -1; legend(); retint(); }
 function show(next) {
   if (next == "relevancy" && !asked) { get("word").focus(); get("answer").textContent = "Type a word first."; return; }
   mode = next;
@@ -114,15 +117,78 @@ function ask(text) {
   const folded = text.toLowerCase().replace(/[_-]/g, " ").trim().split(/\s+/).join(" "), word = about.words.findIndex(known => known.toLowerCase() == folded);
   if (word < 0) {
     const near = about.words.filter(known => folded.length > 1 && (known.includes(folded) || folded.includes(known))).slice(0, 5);
-    get("answer").textContent = `This page has no "${text}"${near.length ? `; near: ${near.join(", ")}` : ""}.`; return null;
+    get("answer").textContent = `This page has no "${text}"${near.length ? `; near: ${near.join(", ")}` : ""}.`;
+    asked = null; if (mode == "relevancy") show("color"); return null; // no heat of the word before
   }
   const began = performance.now(), scores = scored(features.rows, features.lengths, word, features), most = scores.reduce((a, b) => Math.max(a, b), 0);
+  const chosen = [...scores.keys()].filter(k => scores[k] > 0.5);
   asked = { text, word, scores }; tip.hidden = true; show("relevancy");
-  const there = calibrated(word) ? presence(scores) : null, above = scores.reduce((count, score) => count + (score > 0.5), 0), ms = performance.now() - began;
+  if (chosen.filter(k => strength[k] < 1).length > chosen.length / 2) unhide();
+  const there = calibrated(word) ? presence(scores) : null, above = chosen.length, ms = performance.now() - began;
   const many = `${above.toLocaleString("en")} Gaussian${above == 1 ? "" : "s"}`, name = about.words[word];
   get("answer").textContent = there === null ? `${name}: ${many} above 0.5, the highest ${most.toFixed(2)}; not calibrated (${Math.round(ms)} ms)`
     : there > 0.5 ? `${name}: ${many} likelier than not (${Math.round(ms)} ms)` : `${name}: probably not here (${Math.round(100 * there)} %); ${many} likelier than not`;
+  if (above && (there === null || there > 0.5)) show_where(chosen);
   return { above, ms, presence: there };
+}
+
+// -- where an answer is: the camera flies there, unless it sees it already
+const SAMPLES = 200, TRIED = 12, FLIGHT = 700; // Gaussians that stand for an answer; views that are tried; ms
+/** share: of points, those in the middle of what a camera sees; free: of some of these, those that nothing hides. */
+function sees(of, points) {
+  const what = shown(of), { turn, shift, lens: [fx, fy, cx, cy], size: [width, height] } = what;
+  const inside = points.map(p => plus(times(turn, p), shift)).map(([x, y, z]) => [fx * x / z + cx, fy * y / z + cy, z])
+    .filter(([x, y, z]) => z > NEAR && Math.abs(x / width - 0.5) < 0.35 && Math.abs(y / height - 0.5) < 0.35);
+  const order = sorted(splats.means, splats.reach, sortable(what)), some = inside.filter((_, k) => k % Math.ceil(inside.length / 9) == 0);
+  const free = some.filter(([x, y, z]) => {
+    const { covered, depth } = under(splats, order, what, x, y, strength);
+    return covered < 0.5 || depth > 0.8 * z;
+  });
+  return { share: inside.length / points.length, free: free.length / Math.max(some.length, 1) };
+}
+/** Fly to where a view of the capture saw these Gaussians, nearer to them: the densest crowd of them in the middle. */
+function show_where(chosen) {
+  const every = Math.ceil(chosen.length / SAMPLES);
+  const some = chosen.filter((_, k) => k % every == 0).map(k => [...splats.means.subarray(3 * k, 3 * k + 3)]);
+  const now = sees(camera, some);
+  if (now.share > 0.1 && now.free > 0.3) return;
+  const { middle, radius } = crowd(some, about.extent / 5), near = Math.max(3 * radius, about.extent / 20);
+  const rank = ({ turn, eye }) => times(turn, plus(middle, eye, -1))[2] / apart(middle, eye) - apart(middle, eye) / about.extent;
+  const at = about.views.map((_, view) => at_view(view)).sort((a, b) => rank(b) - rank(a)).slice(0, TRIED);
+  const from = at.find(view => sees(facing(view, view.eye, middle, about.up), [middle]).free > 0) ?? at[0];
+  const eye = plus(middle, plus(from.eye, middle, -1), Math.min(near / apart(from.eye, middle), 1));
+  flight = { from: { ...camera }, to: facing(from, eye, middle, about.up), began: performance.now(), eye: camera.eye };
+  get("view").value = from.view; dirty = true;
+}
+/** The camera's place in its flight, which ends when someone else moves it. */
+function fly_on(now) {
+  if (!flight || camera.eye !== flight.eye) { flight = null; return; }
+  const t = matchMedia("(prefers-reduced-motion: reduce)").matches ? 1 : Math.min(Math.max(now - flight.began, 0) / FLIGHT, 1);
+  const { from, to } = flight;
+  camera = t < 1 ? between(from, to, t * t * (3 - 2 * t), about.up) : { ...to };
+  flight = t < 1 ? { ...flight, eye: camera.eye } : null; moved();
+}
+
+// -- labelled points
+function place(x, y) { // a point on the surface that a pixel shows
+  const word = get("name").value.trim(), hit = under(splats, order, shown(), x, y, strength);
+  if (!word) get("name").focus();
+  if (!word || hit.covered < 0.5) { get("placed").textContent = word ? "There is no surface." : "Type a word first."; return; }
+  label_points([...points, { at: ahead(x, y, surface(splats, hit, shown(), x, y)), word }]);
+}
+function label_points(next) {
+  points = next; dirty = true;
+  get("placed").textContent = `${points.length} point${points.length == 1 ? "" : "s"}`;
+  for (const id of ["undo", "csv"]) get(id).disabled = !points.length;
+  get("points").replaceChildren(...points.map(({ word }) => Object.assign(document.createElement("li"), { textContent: word })));
+  get("marks").replaceChildren(...points.map(() => document.createElement("i")));
+}
+function move_marks() {
+  const { turn, shift, lens: [fx, fy, cx, cy] } = shown();
+  [...get("marks").children].forEach((mark, k) => {
+    const [x, y, z] = plus(times(turn, points[k].at), shift);
+    mark.hidden = !(z > NEAR); mark.style.translate = `${fx * x / z + cx}px ${fy * y / z + cy}px`;
+  });
 }
 /** Label, its share and, where a word was asked, relevancy, of the features that a pixel shows; null where nothing is. */
 function meaning(x, y) {
@@ -141,7 +207,7 @@ let last = 0, slow = FRAME, drawn = false, wanted = "", second = [0, 0, ""]; // 
 function frame(now) {
   requestAnimationFrame(frame);
   const passed = now - last; last = now;
-  fly(Math.min(passed, 100) / 1000);
+  fly(Math.min(passed, 100) / 1000); fly_on(now);
   const busy = now - moving < 250;
   if (busy && drawn) { // of a frame that drew, not of the first after rest
     slow += 0.3 * (Math.min(passed, 10 * FRAME) - slow);
@@ -156,6 +222,7 @@ function frame(now) {
     const what = seen(camera), text = JSON.stringify([what.turn, what.shift, canvas.clientWidth, canvas.clientHeight]);
     if (text != wanted) { wanted = text; sorter.ask(sortable(what)); }
     drawing.draw(what, mode == "color" && !!splats.sh1);
+    if (semantic) move_marks();
     dirty = false; frames++;
   }
   if (now - second[0] > 1000) second = [now, frames, `${Math.round(1000 * (frames - second[1]) / (now - second[0]))} frames/s`];
@@ -226,6 +293,7 @@ function listen() {
     if (!pointers.delete(event.pointerId)) return;
     if (pointers.size) { grip = grasp(); grip.pivot = aim(...grip.middle); return; }
     if (travelled > 4 || event.type == "pointercancel") return;
+    if (placing) { place(...pixel(event)); return; }
     hover(event); if (semantic && event.pointerType == "mouse" && event.button == 0) { const { label } = meaning(...pixel(event)); if (label !== undefined) pick(label); }
   };
   canvas.onpointerleave = () => { tip.hidden = true; };
@@ -262,7 +330,10 @@ function listen() {
   for (const button of document.querySelectorAll("[data-mode]")) button.onclick = () => show(button.dataset.mode);
   get("ask").onsubmit = event => { event.preventDefault(); if (get("word").value.trim()) ask(get("word").value); };
   get("word").oninput = event => { if (event.inputType == "insertReplacementText" || !event.inputType) ask(event.target.value); };
-  get("all").onclick = () => { hidden.clear(); picked = -1; legend(); retint(); };
+  for (const button of [get("all"), get("nothing").querySelector("button")]) button.onclick = unhide;
+  get("place").onclick = () => { placing = !placing; get("place").setAttribute("aria-pressed", placing); };
+  get("undo").onclick = () => label_points(points.slice(0, -1));
+  get("csv").onclick = () => offer(new Blob([csv_of(points, about)], { type: "text/csv" }), `${about.name}.points.csv`);
 }
 let hovering = 0;
 function hover(event) { // once a frame at most
@@ -271,7 +342,7 @@ function hover(event) { // once a frame at most
     const { label, share, relevant } = meaning(...at); tip.hidden = label === undefined; if (tip.hidden) return;
     const swatch = document.createElement("i"); swatch.style.background = about.labels[label].color;
     tip.replaceChildren(swatch, `${about.labels[label].name} ${Math.round(100 * share)} %${relevant === null ? "" : `, ${about.words[asked.word]} ${calibrated(asked.word) ? `${Math.round(100 * relevant)} %` : relevant.toFixed(2)}`}`);
-    tip.style.left = `${Math.min(clientX, innerWidth - tip.offsetWidth - 20)}px`; tip.style.top = `${Math.min(clientY, innerHeight - 50)}px`;
+    tip.style.left = `${Math.min(clientX, innerWidth - tip.offsetWidth - 20)}px`; tip.style.top = `${Math.min(clientY, innerHeight - tip.offsetHeight - 20)}px`;
   });
 }
 // -- a path of cameras, a link to one, files

@@ -2,7 +2,7 @@
 // by the equations of chebsplat/rasterize (EWA with 0.3 pixels² of low-pass; fainter than 1/255 is skipped; 0.99 at most).
 // Frame: the scene's, moved by `center`; cameras are OpenCV's (x right, y down, z ahead), pixels from the upper left.
 "use strict";
-const NEAR = 0.01, LOW_PASS = 0.3, FAINTEST = 1 / 255, MOST = 0.99, EXTENT = 3.33;
+const NEAR = 0.01, LOW_PASS = 0.3, FAINTEST = 1 / 255, MOST = 0.99, EXTENT = 3.33, LATE = [0.7, 0.9];
 
 /** The arrays of a page: base64 of gzip, their places as `to_bytes` gives them. */
 async function unpacked(base64, places) {
@@ -211,4 +211,22 @@ function under(splats, order, { turn: R, shift, lens: [fx, fy, cx, cy], size: [w
     found.push([k, alpha * through]); depth += alpha * through * pz; through *= 1 - alpha;
   }
   return { found, covered: 1 - through, depth: depth / Math.max(1 - through, 1e-9) };
+}
+
+/** Depth of the surface that a pixel shows, by what `under` finds there: a Gaussian's where the ray passes it best, and of
+ * these the part late in what the pixel is made of (chebsplat/rasterize/depths.py says why); nan where there is none. */
+function surface({ means, covariances }, { found, covered }, { turn, eye, lens: [fx, fy, cx, cy] }, x, y) {
+  const ray = back(turn, [(x - cx) / fx, (y - cy) / fy, 1]);
+  let passed = 0, part = 0, inverse = 0;
+  for (const [k, weight] of found) {
+    const within = Math.min(passed + weight, LATE[1] * covered) - Math.max(passed, LATE[0] * covered);
+    passed += weight;
+    if (within <= 0) continue;
+    const [a, b, c, d, e, f] = covariances.subarray(6 * k, 6 * k + 6), xy = c * e - b * f, xz = b * e - c * d, yz = b * c - a * e;
+    const across = times([d * f - e * e, xy, xz, xy, a * f - c * c, yz, xz, yz, a * d - b * b], ray);
+    const along = v => across[0] * v[0] + across[1] * v[1] + across[2] * v[2];
+    const depth = along([0, 1, 2].map(i => means[3 * k + i] - eye[i])) / along(ray);
+    if (depth > NEAR) { part += within; inverse += within / depth; }
+  }
+  return part / inverse;
 }

@@ -2,12 +2,14 @@
 
 import csv
 import os
+import re
 import subprocess
 import sys
 
 import numpy as np
 import pytest
 from browser import BROWSER, browsed
+from hostile import NAMES, Shape, shown_in
 from malformed.edits import put
 from matplotlib.figure import Figure
 from shared import ROOT
@@ -254,6 +256,35 @@ def test_in_a_browser_nothing_of_a_crowded_study_is_cut_off(tmp_path, wide):
     seen, console, requests = browsed(tmp_path, page, wide)
     assert seen["problems"] == console == requests == seen["cut"] == []
     assert seen["wide"] <= wide
+
+
+def named_study(folder, names):
+    """A study whose title, conditions, variants and labels have these names: its page and its Markdown."""
+    variants = {name: {"train": {"seed": k}} for k, name in enumerate(names[::4])}
+    asked = study(title=names[0], about=names[1], seeds=[0], baseline=names[0], variants=variants,
+                  conditions={names[2]: {"teacher": {"kind": "labels"}}})  # fmt: skip
+    runs = expand(asked)
+    for run in runs[:-1]:
+        finish(run, segmentation={"scene": {"iou": dict.fromkeys(names, 0.5)}}, labels=(names, ONE_LABEL))
+    rows = [row_of(run, {}) | {"miou": 0.5} for run in runs[:-1]] + [row_of(runs[-1], {})]
+    section = Section(names[3], names[4], [["what", "figure"], *([name, "1"] for name in names)])
+    page = write(folder, asked, runs, rows, f"make study={names[5]}", [section]).read_text()
+    return page, (folder / "results.md").read_text()
+
+
+def test_names_are_text_of_a_study_and_never_markup(tmp_path, work):
+    plain, _ = named_study(tmp_path / "plain", [f"name{k}" for k in range(len(NAMES))])
+    page, markdown = named_study(tmp_path / "hostile", NAMES)
+    assert Shape(page).tags == Shape(plain).tags
+    assert "<" not in markdown.replace("<br>", "")
+    ours = markdown.replace("![error against run time]", "")
+    assert not re.search(r"(?<!\\)(?:\\\\)*[`_{}\[$]", ours)
+    for name in NAMES:
+        assert name in Shape(page).text
+        assert name in shown_in(markdown)
+    if BROWSER is not None:
+        seen, console, requests = browsed(tmp_path, page, 390)
+        assert seen["problems"] == console == requests == seen["cut"] == []
 
 
 def test_a_run_that_failed_is_named_and_counts_in_no_mean(tmp_path):

@@ -106,8 +106,11 @@ def test_without_filters_everything_is_kept(mixed, tmp_path):
         (["--box", "0,0,0,1,1"], 2, "six numbers"),
         (["--box", "0,0,0,1,0,1"], 2, "x0 < x1"),
         (["--box", "0,0,0,1,nan,1"], 2, "six numbers"),
-        (["--box", "500,500,500,501,501,501"], 4, "no Gaussian"),
+        (["--box", "500,500,500,501,501,501"], 4, "centres lie from"),
         (["--min-opacity", "2"], 2, "range"),
+        (["--min-opacity", "nan"], 2, "from 0 to 1"),
+        (["--min-opacity", "1"], 4, "opacity leaves out"),
+        (["--box", "a,0,0,1,1,1"], 2, "six numbers"),
     ],
 )
 def test_a_filter_that_makes_no_sense_is_an_error(mixed, tmp_path, arguments, code, message):

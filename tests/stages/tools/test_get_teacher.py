@@ -17,7 +17,7 @@ from tiny_teachers import write_model
 
 from chebsplat.errors import ConfigError, InputError
 from chebsplat.formats.teacher_model import read_teacher
-from chebsplat.stages.tools.get_teacher import check, get_teacher, parsed
+from chebsplat.stages.tools.get_teacher import check, get_teacher, parsed, token_for
 
 REPOSITORY, COMMIT, CLASSES = "some/Segmenter-B0", "c" * 40, ["wall", "floor", "sofa: a seat", "wall"]
 NAME, SHORT = f"hf:{REPOSITORY}", "segmenter-b0"
@@ -36,7 +36,10 @@ def segmenter(path):
 
 
 class Hub(ThreadingHTTPServer):
-    """Of one repository, whose checksums may be false (`sums`) and whose answers are `cut`; `asked`: its requests."""
+    """Of one repository, whose checksums may be false (`sums`) and whose answers are `cut`; `asked`: its requests.
+
+    store: the origin that it sends on to for large files; tokens: those that came with requests.
+    """
 
     daemon_threads = True
 
@@ -44,6 +47,7 @@ class Hub(ThreadingHTTPServer):
         super().__init__(("127.0.0.1", 0), Answer)
         self.address = f"http://127.0.0.1:{self.server_port}"
         self.sums, self.cut, self.asked, self.revisions = {}, None, [], ("main", COMMIT)
+        self.store, self.tokens = None, []
         self.files = {
             "config.json": json.dumps({"id2label": dict(enumerate(CLASSES))}).encode(),
             "preprocessor_config.json": json.dumps(PREPARATION).encode(),
@@ -63,6 +67,7 @@ class Answer(BaseHTTPRequestHandler):
     def do_HEAD(self):
         hub = self.server
         hub.asked.append((self.command, self.path))
+        hub.tokens.append(self.headers.get("Authorization"))
         found = re.fullmatch(rf"/{REPOSITORY}/resolve/(\w+)/(.+)", self.path)
         code, headers, data = 200, {"X-Repo-Commit": COMMIT}, b""
         if not found:
@@ -74,6 +79,10 @@ class Answer(BaseHTTPRequestHandler):
         else:
             data = hub.files[found[2]]
             headers |= {"ETag": f'"{hub.checksum(found[2])}"'}
+            if hub.store is not None and found[2].endswith(".onnx"):
+                linked = {"X-Linked-ETag": headers["ETag"], "X-Linked-Size": str(len(data))}
+                code, data = 302, b""
+                headers |= linked | {"Location": hub.store + self.path}
         self.send_response(code)
         for header in {"Content-Length": str(len(data)), **headers}.items():
             self.send_header(*header)
@@ -199,6 +208,39 @@ def test_a_repository_that_is_not_there_and_a_folder_of_something_else(hub, tmp_
     (tmp_path / SHORT).mkdir()
     with pytest.raises(ConfigError, match="exists and is not"):
         get_teacher(NAME)
+
+
+@pytest.mark.parametrize(
+    ("endpoint", "named", "sent"),
+    [
+        ("https://huggingface.co", "", True),
+        ("https://huggingface.co:443", "", True),
+        ("http://huggingface.co", "", False),
+        ("https://huggingface.co:444", "", False),
+        ("https://huggingface.co.example.org", "", False),
+        ("https://huggingface.co@example.org", "", False),
+        ("https://huggingface.com", "", False),
+        ("https://hub.example.org", "", False),
+        ("https://hub.example.org", "hf_mine", True),
+    ],
+)
+def test_the_token_of_a_login_goes_to_the_hub_s_own_origin_alone(monkeypatch, endpoint, named, sent):
+    monkeypatch.setenv("HF_TOKEN", named)
+    assert token_for(endpoint) is (None if sent else False)
+
+
+@pytest.mark.parametrize("named", ["", "hf_mine"])
+def test_no_token_follows_to_another_origin(hub, tmp_path, monkeypatch, named):
+    (tmp_path / "token").write_text("hf_of_a_login")
+    monkeypatch.setattr("huggingface_hub.constants.HF_TOKEN_PATH", str(tmp_path / "token"))
+    monkeypatch.setenv("HF_TOKEN", named)
+    with Hub(tmp_path) as store:
+        threading.Thread(target=store.serve_forever, daemon=True).start()
+        hub.store = store.address
+        assert get_teacher(NAME)[0].is_file()
+        store.shutdown()
+    assert store.asked and set(store.tokens) == {None}
+    assert set(hub.tokens) == ({f"Bearer {named}"} if named else {None})
 
 
 def test_names():

@@ -4,9 +4,11 @@ import base64
 import gzip
 import json
 import re
+import shlex
 import shutil
 import subprocess
 import webbrowser
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -14,6 +16,8 @@ from box_room import CALIBRATION, LABELS, MORE, RIVALS, SIZE, N, foreign_ply, ma
 from browser import BROWSER
 from click.testing import CliRunner
 from driven import driven
+from hostile import NAMES, Shape
+from PIL import Image
 from shared import ROOT
 
 from chebsplat.errors import ConfigError
@@ -24,6 +28,7 @@ from chebsplat.pipelines.api import load
 from chebsplat.pipelines.cli import main
 from chebsplat.render import SceneRenderer
 from chebsplat.stages.evaluate import camera
+from chebsplat.stages.learn import read_labels
 from chebsplat.stages.tools.camera_files import read_cameras
 from chebsplat.stages.tools.page import write_page
 
@@ -186,6 +191,28 @@ def test_a_page_of_a_foreign_ply_has_no_semantic_controls(tmp_path):
     assert not re.search(r'id="(ask|legend|words)"', out.read_text())
 
 
+def test_names_are_text_of_a_page_and_never_markup(scene, tmp_path):
+    held = replace(scene[1], labels=np.arange(N, dtype=np.int32) % 15, label_names=NAMES)
+    held.label_embeddings = np.tile(words()[:5], (3, 1))
+    shapes = []
+    for name, labels in (("plain", [f"name{k}" for k in range(15)]), (NAMES[0], NAMES)):
+        write_page(replace(held, label_names=labels), name, None, tmp_path / "page.html")
+        assert [label["name"] for label in held_in(tmp_path / "page.html")[0]["labels"]] == labels
+        shapes.append(Shape((tmp_path / "page.html").read_text()))
+    assert shapes[0].tags == shapes[1].tags
+    assert f"--path {shlex.quote(f'{NAMES[0]}.cameras.json')} " in shapes[1].text
+    if BROWSER is not None:
+        with driven(tmp_path) as browser:
+            browser.open(tmp_path / "page.html", 390, 844)
+            browser.run("scene.ready")
+            browser.run("get('panel').open = true; scene.show('labels'); scene.ask(about.labels[0].name)")
+            shown = browser.run("Array.from(get('legend').querySelectorAll('span'), part => part.textContent)")
+            assert sorted(shown) == sorted(NAMES)
+            assert browser.run("document.querySelectorAll('#panel svg, #panel img, #panel b').length") == 0
+            assert browser.run("document.documentElement.scrollWidth") <= 390
+            assert browser.complaints == []
+
+
 def test_an_existing_file_stays(scene, tmp_path):
     out = tmp_path / "mine.html"
     out.write_text("mine")
@@ -213,9 +240,10 @@ def test_viewing_writes_the_page_anew_beside_the_scene_and_opens_it(scene, tmp_p
 
 
 def in_node(script, given):
-    """What an expression gives for `given`, with the functions of the page's cameras."""
-    source = (ROOT / "stages/pages/scene/cameras.js").read_text()
-    program = f"{source}\nconst given = {json.dumps(given)};\nconsole.log(JSON.stringify({script}))"
+    """What an expression gives for `given`, awaited, with the functions of the page's Gaussians and cameras."""
+    source = "".join((ROOT / f"stages/pages/scene/{name}.js").read_text() for name in ("splats", "cameras"))
+    program = f"{source}\nconst given = {json.dumps(given)};\n"
+    program += f"(async () => console.log(JSON.stringify(await ({script}))))()"
     done = subprocess.run(["node", "-"], input=program, capture_output=True, text=True)
     assert done.returncode == 0, done.stderr
     return json.loads(done.stdout)
@@ -256,6 +284,75 @@ def test_a_link_holds_the_camera_and_one_that_does_not_gives_none():
     good = in_node("link_of(given[0], given[1])", [at, about])
     bad = [good.replace("=1,", "=2,"), good + ",1", good.replace("0.25", "-1"), "#camera=", good + "x"]
     assert in_node("given[0].map(hash => camera_of(hash, given[1]))", [bad, about]) == [None] * 5
+
+
+PLACED = """(async () => {
+  const { about, data, view, pixels } = given, arrays = await unpacked(data, about.places);
+  const of = arrays.views.subarray(16 * view);
+  const splats = decoded(arrays, about.ranges, about.center), turn = [0, 1, 2, 4, 5, 6, 8, 9, 10].map(i => of[i]);
+  const eye = back(turn, [3, 7, 11].map(i => -of[i])), lens = [...of.subarray(12, 16)], [fx, fy, cx, cy] = lens;
+  const what = { turn, eye, shift: times(turn, eye).map(x => -x), lens, size: [about.width, about.height] };
+  const order = sorted(splats.means, splats.reach, { turn, shift: what.shift, slopes: [1, 1] });
+  const strength = new Float32Array(splats.n).fill(1);
+  return csv_of(pixels.map(([x, y], k) => {
+    const depth = surface(splats, under(splats, order, what, x, y, strength), what, x, y);
+    const at = plus(back(turn, [(x - cx) / fx * depth, (y - cy) / fy * depth, depth]), eye);
+    return { at, word: ['chair', 'a "red" sofa, old'][k % 2] };
+  }), about);
+})()"""
+
+
+def surface_of(view, depth, pixels):
+    """Points [M, 3] of the scene that a camera sees in these pixels, whose centres are x + 0.5, y + 0.5."""
+    rays = np.array([[x + 0.5, y + 0.5, 1] for x, y in pixels]) @ np.linalg.inv(view.K).T
+    seen = rays * np.array([depth[y, x] for x, y in pixels])[:, None]
+    return (seen - view.cam_from_world[:3, 3]) @ view.cam_from_world[:3, :3]
+
+
+@pytest.mark.skipif(shutil.which("node") is None, reason="node is not installed")
+def test_labelled_points_lie_on_the_rendered_surface_and_teaching_reads_them(scene, page, tmp_path):
+    rng, (about, _) = np.random.default_rng(0), held_in(page)
+    depth, covered = SceneRenderer(scene[1].parameters).render_depth(camera(scene[1], 1))
+    pixels = [(x, y) for x, y in rng.integers(0, SIZE, (200, 2)).tolist() if covered[y, x] > 0.7]
+    data = re.search(r'id="data">(.*?)</script>', page.read_text(), re.DOTALL)[1]
+    given = {"about": about, "data": data, "view": 1, "pixels": [(x + 0.5, y + 0.5) for x, y in pixels]}
+    (tmp_path / "points.csv").write_text(in_node(PLACED, given))
+    where, said = read_labels(tmp_path / "points.csv")
+    away = np.linalg.norm(where - surface_of(load(scene[0]).cameras[1], depth, pixels), axis=1)
+    assert np.median(away) < 0.002 and away.max() < 0.05  # of a room of 5 m; the mean depth: 0.019, 0.6
+    assert said == [("chair", 'a "red" sofa, old')[k % 2] for k in range(len(pixels))]
+
+
+@pytest.mark.skipif(shutil.which("node") is None, reason="node is not installed")
+@pytest.mark.parametrize("target", [(0, 5, 1), (0, -5, 1), (4, -0.1, -3), (0.2, -0.3, 9)])
+def test_a_flight_ends_upright_with_its_target_in_the_middle_and_stays_a_camera(target):
+    """Ahead, behind, beside, and nearly above a camera that looks along y; up is z."""
+    start = {"turn": [1, 0, 0, 0, 0, -1, 0, 1, 0], "eye": [0.2, -0.3, 1], "view": 0, "pivot": 1}
+    given = {"start": start, "target": target, "eye": [0.5, 0.25, 0.75], "up": [0, 0, 1]}
+    end = in_node("facing(given.start, given.eye, given.target, given.up)", given)
+    R, eye = np.reshape(end["turn"], (3, 3)), np.array(given["eye"])
+    away = np.linalg.norm(np.subtract(target, eye))
+    np.testing.assert_allclose(R @ (np.array(target) - eye), [0, 0, away], atol=1e-9)
+    assert end["pivot"] == pytest.approx(away)
+    assert R[0, 2] == pytest.approx(0, abs=1e-9) and R[1, 2] <= 0
+    flown = "[0, .25, .5, .75, 1].map(t => between(given.start, given.end, t, given.up))"
+    on_the_way = in_node(flown, given | {"end": end})
+    for share, one in zip((0, 0.25, 0.5, 0.75, 1), on_the_way, strict=True):
+        turn = np.reshape(one["turn"], (3, 3))
+        np.testing.assert_allclose(turn @ turn.T, np.eye(3), atol=1e-9)
+        np.testing.assert_allclose(one["eye"], (1 - share) * np.array(start["eye"]) + share * eye)
+    np.testing.assert_allclose(on_the_way[0]["turn"], start["turn"], atol=1e-9)
+    np.testing.assert_allclose(on_the_way[-1]["turn"], end["turn"], atol=1e-9)
+
+
+@pytest.mark.skipif(shutil.which("node") is None, reason="node is not installed")
+def test_of_an_answer_in_several_places_the_densest_is_shown():
+    rng = np.random.default_rng(0)
+    places = [[[0, 0, 0], 0.1, 30], [[3, 1, 0], 0.1, 50], [[-3, 0, 1], 2.0, 40]]
+    points = np.concatenate([rng.normal(at, spread, (count, 3)) for at, spread, count in places])
+    found = in_node("crowd(given, 0.5)", points.tolist())
+    np.testing.assert_allclose(found["middle"], [3, 1, 0], atol=0.05)
+    assert 0.1 < found["radius"] < 0.6
 
 
 in_a_browser = pytest.mark.skipif(BROWSER is None, reason="neither chromium nor google-chrome is installed")
@@ -386,6 +483,103 @@ def test_in_a_browser_a_page_answers_each_word_as_asking_does(calibrated, tmp_pa
         browser.screenshot(tmp_path / "absent.png")
         assert browser.complaints == []
         assert [url for url in browser.requested if not url.startswith("blob:")] == [page.as_uri()]
+
+
+LANDED = "new Promise(done => { const wait = () => flight ? setTimeout(wait, 50) : done(true); wait(); })"
+
+
+def black_edges(browser, path):
+    """The share of black pixels at each edge of what the browser shows: top, bottom, left, right."""
+    browser.screenshot(path)
+    with Image.open(path) as image:
+        black = np.asarray(image.convert("L")) < 8
+    return [float(part.mean()) for part in (black[:40], black[-40:], black[:, :20], black[:, -20:])]
+
+
+@pytest.mark.slow
+@in_a_browser
+@pytest.mark.parametrize("size", [(960, 720), (390, 844)])
+def test_in_a_browser_asking_flies_to_what_lies_behind_the_camera(calibrated, tmp_path, size):
+    held, _, page = calibrated
+    with driven(tmp_path) as browser:
+        browser.open(page, *size)
+        browser.run("scene.ready")
+        browser.run("get('panel').style.display = 'none'; scene.look(1); new Promise(done => setTimeout(done, 500))")
+        assert max(black_edges(browser, tmp_path / "before.png")) < 0.2  # nor above and below on a phone
+        for word in ("sofa", "chair"):
+            browser.run("scene.look(1); turned(Math.PI, 0, camera.eye); moved()")
+            browser.run(f"scene.ask('{word}'); {LANDED}")
+            means = held.parameters["means"][held.labels == LABELS.index(word)] - held_in(page)[0]["center"]
+            turn, eye = (np.array(browser.run(f"camera.{part}")) for part in ("turn", "eye"))
+            seen = (means - eye) @ turn.reshape(3, 3).T
+            fx, fy, cx, cy = browser.run("shown().lens")
+            x, y = seen[:, 0] / seen[:, 2] * fx + cx, seen[:, 1] / seen[:, 2] * fy + cy
+            inside = (seen[:, 2] > 0) & (x > 0) & (x < size[0]) & (y > 0) & (y < size[1])
+            assert inside.mean() > 0.4
+            browser.run("new Promise(done => setTimeout(done, 600))")
+            browser.screenshot(tmp_path / f"{word}.png")
+            with Image.open(tmp_path / f"{word}.png") as image:
+                third = size[0] // 3, size[1] // 3, 2 * size[0] // 3, 2 * size[1] // 3
+                middle = np.asarray(image.convert("RGB").crop(third))
+            assert np.ptp(middle.astype(int), axis=-1).mean() > 30  # heat is coloured, all else is grey
+            eye = browser.run("camera.eye")
+            assert browser.run(f"scene.ask('{word}'); {LANDED}.then(() => camera.eye)") == eye  # it is seen already
+        assert browser.run("scene.ask('zebra')") is None
+        assert browser.run("[mode, asked, get('scale').hidden]") == ["color", None, True]
+        assert "has no" in browser.run("get('answer').textContent")
+        assert browser.complaints == []
+
+
+@pytest.mark.slow
+@in_a_browser
+def test_in_a_browser_where_all_labels_are_hidden_it_says_so_and_shows_them_again(scene, page, tmp_path):
+    with driven(tmp_path) as browser:
+        browser.open(page, 960, 720)
+        browser.run("scene.ready")
+        boxes = "document.querySelectorAll('#legend input').forEach(box => box.click())"
+        browser.run(boxes)
+        assert browser.run("[get('nothing').hidden, Math.max(...strength)]") == [False, 0]
+        browser.screenshot(tmp_path / "nothing.png")
+        browser.run("get('nothing').querySelector('button').click()")
+        assert browser.run("[get('nothing').hidden, Math.min(...strength)]") == [True, 1]
+        browser.run(boxes)
+        browser.run(f"scene.ask('sofa'); {LANDED}")
+        assert browser.run("[get('nothing').hidden, hidden.size]") == [True, 0]
+        assert browser.complaints == []
+
+
+@pytest.mark.slow
+@in_a_browser
+def test_in_a_browser_clicks_label_points_that_teaching_reads(scene, page, tmp_path):
+    view = load(scene[0]).cameras[1]
+    depth, covered = SceneRenderer(scene[1].parameters).render_depth(camera(scene[1], 1))
+    rng, pixels = np.random.default_rng(3), []
+    while len(pixels) < 3:
+        x, y = rng.integers(20, 180), rng.integers(20, 220)
+        pixels += [(int(x), int(y))] if covered[y, x] > 0.9 else []
+    with driven(tmp_path) as browser:
+        browser.open(page, 960, 720)
+        browser.run("scene.ready")
+        browser.run("scene.look(1); new Promise(done => setTimeout(done, 500))")
+        browser.run("document.querySelectorAll('details').forEach(part => { part.open = true; }); get('place').click()")
+        click = [(3 * x + 1.5, 3 * y + 1.5) for x, y in pixels]
+        browser.click(*click[0])
+        assert browser.run("[get('placed').textContent, points.length]") == ["Type a word first.", 0]
+        browser.run("get('name').value = 'sofa, red'")
+        for x, y in [*click, click[0]]:
+            browser.click(x, y)
+        browser.run("get('undo').click()")
+        browser.run("new Promise(done => setTimeout(done, 300))")
+        boxes = "Array.from(get('marks').children, mark => mark.getBoundingClientRect())"
+        marks = browser.run(f"{boxes}.map(box => [box.x + 5, box.y + 5])")
+        np.testing.assert_allclose(marks, click, atol=3)
+        browser.screenshot(tmp_path / "points.png")
+        written = "new Promise(done => { offer = blob => done(blob.text()); get('csv').click(); })"
+        (tmp_path / "points.csv").write_text(browser.run(written))
+        assert browser.complaints == []
+    where, said = read_labels(tmp_path / "points.csv")
+    assert said == ["sofa, red"] * 3
+    assert np.linalg.norm(where - surface_of(view, depth, pixels), axis=1).max() < 0.05
 
 
 @pytest.mark.slow
