@@ -100,7 +100,7 @@ def nearest_file(folder: Path, name: str) -> Path | None:
 
 def detect(folder: Path) -> str:
     """The kind of source that a folder, or a file of video, is. Raises InputError naming what was looked for."""
-    if present(folder / "transforms.json"):
+    if any(present(folder / f"transforms{part}.json") for part in ("", "_train")):
         return "transforms"
     if any(present(folder / part) for part in ("traj.txt", "Sequence_1", "results")):
         return "replica"
