@@ -33,7 +33,8 @@ def read(folder: Path, settings: Any, class_names: tuple[str, ...] | None = None
     listing, model = _listing(folder)
     fields = assembly.assemble(listing, settings, class_names)
     if "depth" not in fields:
-        fields |= _points(model, fields["names"], fields["source"]["notes"])
+        lost = assembly.in_empty_space(model.cloud.means, fields, listing) if listing.empty else None
+        fields |= _points(model, fields["names"], fields["source"]["notes"], lost)
     split = _split(folder, [frame.name for frame in listing.frames])
     if split is not None:
         assembly.give_split(fields, split, "scene.json")
@@ -117,10 +118,10 @@ def _label_names(folder: Path) -> dict[int, str] | None:
     return names_by_id(path, table.items())
 
 
-def _points(model: Model, names: list[str], notes: list[str]) -> dict[str, Any]:
+def _points(model: Model, names: list[str], notes: list[str], lost: np.ndarray | None = None) -> dict[str, Any]:
     """points, point_colors and tracks (point, view) of a capture with views of these names; nothing of few points.
 
-    Choices: a point whose error is not known is taken.
+    Args: lost: points that are left out. Choices: a point whose error is not known is taken.
     """
     cloud = model.cloud
     good = np.abs(cloud.means).max(1, initial=0) < cameras.FARTHEST
@@ -132,6 +133,7 @@ def _points(model: Model, names: list[str], notes: list[str]) -> dict[str, Any]:
             f"{len(good) - good.sum()} of the model's {len(good)} points are left out: fewer than {MIN_TRACK} images "
             f"see them, or they lie more than {MAX_ERROR:g} pixels off."
         )
+    good &= True if lost is None else ~lost
     if good.sum() < LEAST:
         if len(good):
             notes.append(f"{good.sum()} points are left, fewer than {LEAST}: none is used, and photos are matched.")

@@ -68,6 +68,7 @@ class Listing:
     no_depth: tuple[int, ...] = (0,)
     depth_camera: Camera | None = None
     notes: list[str] = field(default_factory=list)
+    empty: dict[str, np.ndarray] = field(default_factory=dict)  # by view, where its photo is transparent, once read
     upright: bool = False  # turn every image by its EXIF orientation; otherwise only where its camera asks for it
 
     def has(self, what: str) -> bool:
@@ -118,6 +119,10 @@ def detect(folder: Path) -> str:
         return "video"
     if folder.is_dir() and set(with_photos(folder)) - BESIDE:
         return "photos"
+    if (folder / "point_cloud").is_dir():
+        raise InputError(
+            f"{folder} is a splat of 3DGS and no source: `chebsplat view` shows it, `chebsplat lift` takes it"
+        )
     if others := unread(folder):
         raise InputError(f"{folder} holds no .jpg, .png or .heic photo: {others}")
     raise InputError(

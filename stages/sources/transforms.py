@@ -57,7 +57,8 @@ def read(folder: Path, settings: Any, class_names: tuple[str, ...] | None = None
         if len(points) < LEAST:
             fields["source"]["notes"].append(f"{cloud.name} holds {len(points)} points, too few: it is not used.")
         else:
-            fields |= {"points": points, "point_colors": colors}
+            kept = ~assembly.in_empty_space(points, fields, listing)
+            fields |= {"points": points[kept], "point_colors": None if colors is None else colors[kept]}
     if tests is not None:
         assembly.give_split(fields, tests, origin)
     return fields
@@ -193,6 +194,10 @@ def _listing(folder: Path, entries: list[Entry]) -> Listing:
     if absent:
         total = len(absent) + len(present)
         notes.append(f"{len(absent)} of {total} listed frames are absent on disk ({common.few(absent)}).")
+        used = {image for _, image in present}
+        there = [name for name in common.names_below(folder) if name.partition("/")[0] not in common.BESIDE]
+        if others := [name for name in there if os.path.join(folder, name) not in used]:
+            notes.append(f"Images that no frame lists: {common.few(others)}.")
     if elsewhere := sum(frame.name != _name(os.path.relpath(frame.image, folder)) for frame in frames):
         notes.append(f"{elsewhere} photos have another path on disk than is listed, and are told by their names.")
     return Listing("transforms", frames, notes=notes + _unused(folder, entries, frames))
