@@ -62,6 +62,8 @@ def assemble(listing: Listing, settings: IngestSection, class_names: tuple[str, 
 
     with ThreadPoolExecutor(WORKERS) as pool:
         list(pool.map(fill, range(len(frames))))
+    if not stacks["loss_mask"].any():
+        raise DataFailure(f"{frames[0].mask or frames[0].image}: no pixel of any view counts; correct the masks")
     fields: dict[str, Any] = {"names": [frame.name for frame in frames], "images": stacks["images"]}
     fields["Ks"] = np.stack([shape.K for shape in shapes])
     fields["cam_from_world"] = np.stack([frame.pose for frame in frames]) if listing.has("pose") else None  # type: ignore[misc]
@@ -77,8 +79,6 @@ def assemble(listing: Listing, settings: IngestSection, class_names: tuple[str, 
         fields["pseudo_labels"], fields["class_names"], remarks = found
         fields["confidence"] = stacks["confidence"]
         notes += remarks
-    if not stacks["loss_mask"].any():
-        raise DataFailure(f"{frames[0].mask or frames[0].image}: no pixel of any view counts; correct the masks")
     if listing.empty:
         notes.append(f"{len(listing.empty)} of {len(frames)} photos have transparent pixels, which are empty space.")
     if not stacks["loss_mask"].all():
@@ -99,14 +99,14 @@ def in_empty_space(points: np.ndarray, fields: dict[str, Any], listing: Listing)
     """
     empty, seen = np.zeros(len(points)), np.zeros(len(points))
     for name, K, pose in zip(fields["names"], fields["Ks"], fields["cam_from_world"], strict=True):
-        map_ = listing.empty.get(name, np.zeros(fields["images"].shape[1:3], bool))
+        clear = listing.empty.get(name, np.zeros(fields["images"].shape[1:3], bool))
         local = points @ pose[:3, :3].T + pose[:3, 3]
         with np.errstate(divide="ignore", invalid="ignore"):
             place = (local @ K.T)[:, :2] / local[:, 2:]
-        here = np.flatnonzero((local[:, 2] > 0) & ((place >= 0) & (place < map_.shape[::-1])).all(1))
+        here = np.flatnonzero((local[:, 2] > 0) & ((place >= 0) & (place < clear.shape[::-1])).all(1))
         column, row = place[here].astype(int).T
         seen[here] += 1
-        empty[here] += map_[row, column]
+        empty[here] += clear[row, column]
     lost: np.ndarray = empty > MOST_EMPTY * seen
     if lost.any():
         fields["source"]["notes"].append(f"{lost.sum()} of {len(points)} points lie in empty space and are left out.")
