@@ -98,6 +98,8 @@ def in_empty_space(points: np.ndarray, fields: dict[str, Any], listing: Listing)
       pixel off. Without this they would stay, and turn black.
     """
     empty, seen = np.zeros(len(points)), np.zeros(len(points))
+    if not listing.empty:
+        return empty > seen
     for name, K, pose in zip(fields["names"], fields["Ks"], fields["cam_from_world"], strict=True):
         clear = listing.empty.get(name, np.zeros(fields["images"].shape[1:3], bool))
         local = points @ pose[:3, :3].T + pose[:3, 3]

@@ -104,8 +104,9 @@ def test_lidar_depth_of_fewer_pixels_is_looked_up_and_believed_where_it_is_sure(
     depth = (1000 + np.arange(16 * 12)).reshape(12, 16).astype(np.uint16)
     sure = (np.arange(16 * 12).reshape(12, 16) % 3).astype(np.uint8)
     for name in "abc":
-        save(folder / f"depth/{name}.png", depth)
-        save(folder / f"confidence/{name}.png", sure)
+        (folder / f"depth/{name}.png").unlink()
+        save(folder / f"depth/{name}.PNG", depth)
+        save(folder / f"confidence/{name}.PNG", sure)
     found = colmap.read(folder, SETTINGS)["depth"][1]
     wanted = np.where(sure > 0, depth / 1000, np.nan).repeat(4, 0).repeat(4, 1)
     np.testing.assert_allclose(found, wanted, rtol=1e-6)
