@@ -94,7 +94,8 @@ def _listing(folder: Path) -> Listing:
         notes.append(
             f"{guessed} of {len(frames)} photos have no focal length; {GUESS} times the longer side is the first guess."
         )
-    if place == folder and (beside := set(common.with_photos(folder)) - {name.partition("/")[0] for name in names}):
+    used = {place.name, *(name.partition("/")[0] for name in names)}
+    if beside := set(common.with_photos(folder)) - used:
         notes.append(f"Photos in these folders are not read: {', '.join(sorted(beside, key=common.natural))}.")
     return Listing("photos", frames, notes=notes, upright=True)
 
