@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import struct
 import zlib
 from pathlib import Path
@@ -24,12 +25,12 @@ TURNED = np.array([-1, -1, 1, -1, 1, 1, -1, 1, -1, 1, -1, -1, 1, -1, 1], np.floa
 
 def is_splat(name: str) -> bool:
     """Whether a path is called like a splat, or is a folder as 3DGS writes it."""
-    return Path(name).suffix.lower() in READ + OTHERS or (Path(name) / "point_cloud").is_dir()
+    return Path(name).suffix.lower() in READ + OTHERS or os.path.isdir(os.path.join(name, "point_cloud"))
 
 
 def splat_file(path: Path) -> Path:
     """The file of a splat: itself, or of 3DGS' output folder the PLY of the last iteration. Raises InputError."""
-    if path.is_dir():
+    if os.path.isdir(path):
         found = [ply for ply in path.glob("point_cloud/iteration_*/point_cloud.ply") if _iteration(ply) >= 0]
         if not found:
             raise InputError(f"{path} holds no point_cloud/iteration_*/point_cloud.ply; name the file of a splat")

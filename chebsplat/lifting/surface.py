@@ -23,6 +23,7 @@ EDGE = 0.06  # metres, of the cubes that one point stands for
 N_PIXELS = 600_000  # that are looked at
 LEAST = 0.4  # of the pixels in the cube of a middling pixel, and three: what floats before a view holds fewer
 EDGE_SWEPT, LEAST_SWEPT = 0.08, 0.2  # the same where photos were swept: coarser, and counted only where views agree
+N_TRIED, N_PLANES, PARALLEL = 400, 20_000, 0.98  # directions, Gaussians that try them; cosine of 11 degrees
 LOOKOUT_SIZE, LOOKOUT_ANGLE = (192, 144), 1.4  # pixels; rad, across
 
 
@@ -97,6 +98,26 @@ def lookouts(means: np.ndarray, opacities: np.ndarray, up: np.ndarray) -> tuple[
             pose[:3, :3], pose[:3, 3] = rotation @ turn, -rotation @ eye
             poses.append(pose)
     return np.stack(poses), np.tile(K, (len(poses), 1, 1))
+
+
+def floor_up(means: np.ndarray, normals: np.ndarray, weights: np.ndarray) -> np.ndarray:
+    """Up, unit [3], of Gaussians without cameras: across the planes that hold most of them, away from the fuller end.
+
+    Args: means [N, 3]; normals [N, 3] unit, of any sign; weights [N], how much of a flat surface each stands for.
+    Choices: a floor and what is parallel to it (ceiling, tables) are more than the walls of one direction; things stand
+      on a floor, so that the middle of all lies nearer to it. Directions are tried at the normals of N_TRIED Gaussians.
+    """
+    rng = np.random.default_rng(0)
+    share = weights / weights.sum()
+    rows = rng.choice(len(means), N_TRIED, p=share)
+    within = np.abs(normals[rows] @ normals[rng.choice(len(means), min(len(means), N_PLANES), p=share)].T) > PARALLEL
+    up: np.ndarray = normals[rows[within.sum(1).argmax()]].astype(np.float64)
+    for _ in range(3):  # the mean of what is parallel to it, of either sign
+        here = np.abs(normals @ up) > PARALLEL
+        up = np.linalg.eigh((normals[here] * weights[here, None]).T @ normals[here])[1][:, -1]
+    heights = means @ up
+    low, high = np.quantile(heights, (0.02, 0.98))
+    return up if (heights.clip(low, high) * share).sum() <= (low + high) / 2 else -up
 
 
 def fused(points: np.ndarray, eyes: np.ndarray, edge: float, least: float = LEAST) -> Surface:

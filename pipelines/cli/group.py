@@ -14,6 +14,7 @@ from pathlib import Path
 from typing import Any, NoReturn
 
 import click
+import numpy as np
 
 from chebsplat.errors import ConfigError
 from chebsplat.pipelines.work import store
@@ -79,6 +80,26 @@ class NewPath(click.ParamType):
         return path
 
 
+class Upward(click.ParamType):
+    """x, y or z with a sign, or three numbers, as a unit vector [3]; `auto` as it is."""
+
+    name = "up"
+
+    def convert(self, value: Any, param: Any, context: click.Context | None) -> Any:
+        if not isinstance(value, str) or value == "auto":
+            return value
+        sign, axis = ("", value) if value[:1] not in ("+", "-") else (value[0], value[1:])
+        try:
+            found = np.array([float(part) for part in value.split(",")])
+        except ValueError:
+            found = np.eye(3)["xyz".index(axis)] if axis in ("x", "y", "z") else np.zeros(0)
+            found = -found if sign == "-" else found
+        length = np.linalg.norm(found)
+        if found.shape != (3,) or not 0 < length < np.inf:
+            raise ConfigError(f"--up {value}: x, y or z with a sign, three numbers such as 0,0,1, or auto is needed")
+        return found / length
+
+
 class Phrases(click.ParamType):
     """Words with commas between them, as a list."""
 
@@ -88,6 +109,11 @@ class Phrases(click.ParamType):
         return [word.strip() for word in value.split(",") if word.strip()]
 
 
+UP = click.option(
+    "--up",
+    type=Upward(),
+    help="against gravity: x, -y, three numbers with commas, or auto (by the cameras, else by the floor)",
+)
 AGAINST = click.option(
     "--against",
     type=Phrases(),

@@ -13,7 +13,7 @@ import click
 
 from chebsplat.errors import InputError
 from chebsplat.formats.splats import is_splat
-from chebsplat.pipelines.cli.group import AGAINST, NewPath
+from chebsplat.pipelines.cli.group import AGAINST, UP, NewPath
 
 PATH = click.option(
     "--path", default="capture", show_default=True, help="orbit, capture, or a cameras.json or transforms.json"
@@ -42,6 +42,7 @@ WORDS = click.option(
 @click.argument("scene")
 @PATH
 @FRAMES
+@UP
 @click.option("--what", default="color", show_default=True, help="of color,labels,depth,relevancy; with commas")
 @click.option("--query", help="words that relevancy is of")
 @AGAINST
@@ -49,7 +50,7 @@ WORDS = click.option(
 @click.option("--fps", type=click.IntRange(1, 240), default=24, show_default=True, help="of a video")
 @click.option("--out", type=click.Path(path_type=Path), required=True, help="a folder of frames, or a .mp4")
 def render(
-    scene: str, path: str, frames: int | None, what: str, size: str | None, fps: int, out: Path, **asked: Any
+    scene: str, path: str, frames: int | None, up: Any, what: str, size: str | None, fps: int, out: Path, **asked: Any
 ) -> None:
     """Render a finished SCENE along a path of cameras, as frames or a video; frames that are there are kept."""
     from chebsplat.formats.artifact import read_manifest
@@ -63,7 +64,7 @@ def render(
     kinds = kinds_of(what, opened, query is not None)
     query_vectors = None if query is None else opened.understood(query, asked["against"])
     shot = Shot(kinds, read_manifest(artifact_of(scene, "export")).key, query_vectors)
-    cameras = [fitted(camera, pixels) for camera in path_of(opened, path, frames)]
+    cameras = [fitted(camera, pixels) for camera in path_of(opened, path, frames, up)]
     if out.suffix == ".mp4":
         render_video(opened, cameras, shot, out, fps, Progress())
     else:
@@ -75,16 +76,17 @@ def render(
 @click.argument("scene")
 @PATH
 @FRAMES
+@UP
 @SIZE
 @click.option("--out", type=click.Path(path_type=Path), required=True, help="the folder to write into")
-def cameras(scene: str, path: str, frames: int | None, size: str | None, out: Path) -> None:
+def cameras(scene: str, path: str, frames: int | None, up: Any, size: str | None, out: Path) -> None:
     """Write the cameras of a SCENE as COLMAP's text model, transforms.json and 3DGS' cameras.json."""
     from chebsplat.pipelines.api import load
     from chebsplat.stages.tools.camera_files import write_cameras
     from chebsplat.stages.tools.camera_paths import fitted, path_of, size_of
 
     pixels = size_of(size)
-    for file in write_cameras(out, [fitted(camera, pixels) for camera in path_of(load(scene), path, frames)]):
+    for file in write_cameras(out, [fitted(camera, pixels) for camera in path_of(load(scene), path, frames, up)]):
         print(file.absolute())
 
 
@@ -94,9 +96,10 @@ def cameras(scene: str, path: str, frames: int | None, size: str | None, out: Pa
 @SH
 @WORDS
 @AGAINST
-def page(scene: str, out: Path, sh: int, words: Path | None, against: list[str]) -> None:
-    """Write a finished SCENE (or a .ply) as one HTML page to fly through and ask in words: no server, no network."""
-    _write_page(scene, out, sh, words, against)
+@UP
+def page(scene: str, out: Path, sh: int, words: Path | None, against: list[str], up: Any) -> None:
+    """Write a finished SCENE (or a splat) as one HTML page to fly through and ask in words: no server, no network."""
+    _write_page(scene, out, sh, words, against, up)
 
 
 @click.command()
@@ -104,8 +107,9 @@ def page(scene: str, out: Path, sh: int, words: Path | None, against: list[str])
 @SH
 @WORDS
 @AGAINST
-def view(scene: str, sh: int, words: Path | None, against: list[str]) -> None:
-    """Look at a finished SCENE (or a .ply): write it as `page` does, and open that in a browser.
+@UP
+def view(scene: str, sh: int, words: Path | None, against: list[str], up: Any) -> None:
+    """Look at a finished SCENE (or a splat): write it as `page` does, and open that in a browser.
 
     The page lies in the scene's folder, that of a .ply where you stand; each call writes it anew.
     """
@@ -117,7 +121,7 @@ def view(scene: str, sh: int, words: Path | None, against: list[str]) -> None:
         with suppress(InputError):  # an artifact of no scene
             out = scene_folder(scene) / PAGE
     out = out.absolute()
-    _write_page(scene, out, sh, words, against)
+    _write_page(scene, out, sh, words, against, up)
     graphical = any(map(os.environ.get, ("BROWSER", "DISPLAY", "WAYLAND_DISPLAY")))
     if not (graphical and webbrowser.open(out.as_uri())):  # without a screen it may be one of text
         print("no browser can be opened from here; open this file in one", file=sys.stderr)
@@ -128,7 +132,7 @@ def _name(scene: str) -> str:
     return path.stem if path.suffix and is_splat(scene) else path.name
 
 
-def _write_page(scene: str, out: Path, sh: int, words: Path | None, against: list[str]) -> None:
+def _write_page(scene: str, out: Path, sh: int, words: Path | None, against: list[str], up: Any) -> None:
     """Write the page and say where it is."""
     from chebsplat.formats.scene import Scene
     from chebsplat.formats.teacher_model import read_label_set
@@ -136,11 +140,11 @@ def _write_page(scene: str, out: Path, sh: int, words: Path | None, against: lis
     from chebsplat.stages.tools.page import foreign, write_page
 
     if is_splat(scene):
-        opened, teacher = foreign(Path(scene).expanduser()), None
+        opened, teacher, up = foreign(Path(scene).expanduser(), up), None, None
     else:
         opened, teacher = Scene.read(artifact_of(scene, "export")), teacher_of(scene)
     more = list(read_label_set(words)) if words else []
-    counts = write_page(opened, _name(scene), teacher, out, sh, against, more)
+    counts = write_page(opened, _name(scene), teacher, out, sh, against, more, up)
     print(", ".join(f"{name} {number:,}" for name, number in counts.items()), file=sys.stderr)
     print(out, flush=True)
 

@@ -10,10 +10,9 @@ from pathlib import Path
 from typing import Any
 
 import click
-import numpy as np
 
 from chebsplat.errors import ConfigError
-from chebsplat.pipelines.cli.group import AGAINST, NewPath, Phrases
+from chebsplat.pipelines.cli.group import AGAINST, UP, NewPath, Phrases, Upward
 
 
 def told(figures: Mapping[str, Any], out: Path) -> None:
@@ -98,10 +97,11 @@ def extract(
 @click.argument("ply", type=click.Path(path_type=Path))
 @click.option("--capture", help="a finished scene of the same photos, or an ingest artifact: gives features and labels")
 @click.option("--teacher", type=click.Path(path_type=Path), help=".onnx, with --capture; default: the scene's own")
+@UP
 @click.option("--out", type=NewPath(), required=True, help="the folder to make")
-def lift(ply: Path, capture: str | None, teacher: Path | None, out: Path) -> None:
-    """Make a scene of any 3DGS .PLY: to render, page and extract from; with --capture, in whose frame it lies, to
-    query, too.
+def lift(ply: Path, capture: str | None, teacher: Path | None, up: Any, out: Path) -> None:
+    """Make a scene of any splat (.PLY, .spz, .splat, a folder of 3DGS): to render, page and extract from; with
+    --capture, in whose frame it lies, to query, too.
 
     Without a .PLY, the stage of this name: --help says more.
     """
@@ -111,8 +111,10 @@ def lift(ply: Path, capture: str | None, teacher: Path | None, out: Path) -> Non
     if capture is None:
         if teacher is not None:
             raise ConfigError("--teacher looks at photos; add --capture, or label by shape alone: chebsplat label")
-        told(import_ply(ply, out), out)
+        told(import_ply(ply, out, up), out)
         return
+    if up is not None:
+        raise ConfigError("--up is of a splat alone; with --capture its cameras tell")
     source = artifact_of(capture, "ingest")
     beside = {} if is_artifact(Path(capture)) else links(scene_folder(capture))
     features = None if teacher else beside.get("teacher")
@@ -143,25 +145,18 @@ def calibrate(model: Path | None, rooms: int, force: bool) -> None:
 @click.command()
 @click.argument("ply", type=click.Path(path_type=Path))
 @click.option("--words", type=Phrases(), help="to choose among, with commas; default: the classes of generated rooms")
-@click.option("--up", default="0,0,1", show_default=True, help="x,y,z against gravity, in the PLY's frame")
+@click.option("--up", type=Upward(), default="z", show_default=True, help="against gravity: -y, 0,0,1, auto, ...")
 @click.option("--unit", type=click.FloatRange(0, min_open=True), help="PLY units in a metre; default: by its extent")
 @click.option("--knowledge", type=click.Path(path_type=Path), help="an artifact; default: the one that is shipped")
 @click.option("--out", type=click.Path(path_type=Path), required=True, help="the .ply to write; an .npz beside it")
-def label(ply: Path, words: list[str] | None, up: str, unit: float | None, knowledge: Path | None, out: Path) -> None:
+def label(ply: Path, words: list[str] | None, up: Any, unit: float | None, knowledge: Path | None, out: Path) -> None:
     """Name the Gaussians of any .PLY of a room by shape alone, with a confidence: no photo, no 2D teacher."""
     from chebsplat.formats.knowledge import SHIPPED
     from chebsplat.stages.tools.lift_ply import label_ply
     from chebsplat.synthetic import CLASS_NAMES
 
-    try:
-        direction = np.array([float(part) for part in up.split(",")])
-    except ValueError:
-        direction = np.zeros(0)
-    length = np.linalg.norm(direction)
-    if direction.shape != (3,) or not 0 < length < np.inf:
-        raise ConfigError(f"--up {up}: three numbers are needed, such as 0,0,1")
     names = words or list(CLASS_NAMES)
-    figures = label_ply(ply, knowledge or SHIPPED, names, direction / length, unit, out)
+    figures = label_ply(ply, knowledge or SHIPPED, names, up, unit, out)
     for name, share in sorted(figures["shares"].items(), key=lambda entry: -entry[1]):
         if share > 0:
             print(f"{name:12s}{share:6.1%}", file=sys.stderr)
@@ -174,15 +169,22 @@ def label(ply: Path, words: list[str] | None, up: str, unit: float | None, knowl
 @click.option("--voxel", type=click.FloatRange(0, min_open=True), help="edge, scene units; default: 1/250 of the room")
 @click.option("--triangles", type=click.IntRange(4), default=200_000, show_default=True, help="at most")
 @click.option("--raw", is_flag=True, help="as it was fused: nothing removed, closed or decimated")
-def mesh(scene: str, out: Path, voxel: float | None, triangles: int, raw: bool) -> None:
-    """Write the surface of a finished SCENE as triangles with colours and labels, in the scene's frame."""
+@UP
+def mesh(scene: str, out: Path, voxel: float | None, triangles: int, raw: bool, up: Any) -> None:
+    """Write the surface of a finished SCENE as triangles with colours and labels, in the scene's frame; with --up
+    turned, so that up is z, and y of a .glb.
+    """
     from chebsplat.formats.meshes import write_mesh
     from chebsplat.pipelines.api import load
     from chebsplat.stages.runtime.progress import Progress
-    from chebsplat.stages.tools.mesh import mesh_of
+    from chebsplat.stages.tools.mesh import mesh_of, turned
+    from chebsplat.stages.tools.up import up_of
 
     opened = load(scene)
     made, facts = mesh_of(opened, voxel, triangles, raw, Progress())
+    if up is not None:
+        poses = opened.exported.cameras.cam_from_world
+        made = turned(made, up_of(up, opened.parameters, poses), out.suffix)
     write_mesh(out, made, opened.label_names)
     told(facts, out)
 

@@ -29,6 +29,7 @@ from chebsplat.stages.sources.pictures import (
 )
 
 WORKERS = 4
+MOST_EMPTY = 1 / 3  # of the views that see a point
 
 
 def assemble(listing: Listing, settings: IngestSection, class_names: tuple[str, ...] | None = None) -> dict[str, Any]:
@@ -52,16 +53,17 @@ def assemble(listing: Listing, settings: IngestSection, class_names: tuple[str, 
             notes.append(f"Only {n} of {len(listing.frames)} frames have {name.replace('_', ' ')}, which are left out.")
     lookup = functools.lru_cache(8)(positions)  # frames of one camera share it
 
-    clear = []
-
     def fill(k: int) -> None:
         view = read_view(frames[k], listing, shapes[k], lookup(frames[k].camera, shapes[k]), set(stacks))
-        clear.extend([k] if view["opaque"] < 1 else [])
+        if not view["opaque"].all():
+            listing.empty[frames[k].name] = ~view["opaque"]
         for name in stacks:
             stacks[name][k, : shapes[k].height, : shapes[k].width] = view[name]
 
     with ThreadPoolExecutor(WORKERS) as pool:
         list(pool.map(fill, range(len(frames))))
+    if not stacks["loss_mask"].any():
+        raise DataFailure(f"{frames[0].mask or frames[0].image}: no pixel of any view counts; correct the masks")
     fields: dict[str, Any] = {"names": [frame.name for frame in frames], "images": stacks["images"]}
     fields["Ks"] = np.stack([shape.K for shape in shapes])
     fields["cam_from_world"] = np.stack([frame.pose for frame in frames]) if listing.has("pose") else None  # type: ignore[misc]
@@ -77,10 +79,8 @@ def assemble(listing: Listing, settings: IngestSection, class_names: tuple[str, 
         fields["pseudo_labels"], fields["class_names"], remarks = found
         fields["confidence"] = stacks["confidence"]
         notes += remarks
-    if not stacks["loss_mask"].any():
-        raise DataFailure(f"{frames[0].mask or frames[0].image}: no pixel of any view counts; correct the masks")
-    if clear:
-        notes.append(f"{len(clear)} of {len(frames)} photos have transparent pixels, which are empty space.")
+    if listing.empty:
+        notes.append(f"{len(listing.empty)} of {len(frames)} photos have transparent pixels, which are empty space.")
     if not stacks["loss_mask"].all():
         fields["loss_mask"] = stacks["loss_mask"]
         notes.append(f"{1 - stacks['loss_mask'].mean():.1%} of the pixels are masked.")
@@ -89,6 +89,30 @@ def assemble(listing: Listing, settings: IngestSection, class_names: tuple[str, 
     if models := sorted({frame.camera.model for frame in frames} & set(DISTORTED)):
         notes.append(f"Images are undistorted ({', '.join(models)}).")
     return fields | {"source": {"kind": listing.kind, "notes": notes}}
+
+
+def in_empty_space(points: np.ndarray, fields: dict[str, Any], listing: Listing) -> np.ndarray:
+    """Which of a source's points [N, 3] lie where photos are transparent, bool [N]; a note says how many.
+
+    Choices: those that more than MOST_EMPTY of the views which have them in sight see as empty; a silhouette may be a
+      pixel off. Without this they would stay, and turn black.
+    """
+    empty, seen = np.zeros(len(points)), np.zeros(len(points))
+    if not listing.empty:
+        return empty > seen
+    for name, K, pose in zip(fields["names"], fields["Ks"], fields["cam_from_world"], strict=True):
+        clear = listing.empty.get(name, np.zeros(fields["images"].shape[1:3], bool))
+        local = points @ pose[:3, :3].T + pose[:3, 3]
+        with np.errstate(divide="ignore", invalid="ignore"):
+            place = (local @ K.T)[:, :2] / local[:, 2:]
+        here = np.flatnonzero((local[:, 2] > 0) & ((place >= 0) & (place < clear.shape[::-1])).all(1))
+        column, row = place[here].astype(int).T
+        seen[here] += 1
+        empty[here] += clear[row, column]
+    lost: np.ndarray = empty > MOST_EMPTY * seen
+    if lost.any():
+        fields["source"]["notes"].append(f"{lost.sum()} of {len(points)} points lie in empty space and are left out.")
+    return lost
 
 
 def give_split(fields: dict[str, Any], tests: set[str], origin: str) -> None:
@@ -188,14 +212,15 @@ def positions(camera: Camera, view: Geometry) -> np.ndarray:
 def read_view(
     frame: Frame, listing: Listing, view: Geometry, at: np.ndarray, wanted: set[str]
 ) -> dict[str, np.ndarray]:
-    """images u8 [H, W, 3], loss_mask bool [H, W], opaque: a share; where `wanted`, depth, labels, pseudo_labels,
-    confidence [H, W].
+    """images u8 [H, W, 3], loss_mask, opaque bool [H, W]; where `wanted`, depth, labels, pseudo_labels, confidence
+    [H, W].
     """
     camera, size = frame.camera, (frame.camera.width, frame.camera.height)
     inside = within(at, size)
     pixels, opaque = photo(frame, listing, view, at)
-    counts = inside & (opaque > 0)
-    fields = {"images": pixels, "loss_mask": counts, "opaque": np.array(opaque)}
+    counts = inside & opaque.any()
+    fields = {"images": pixels, "loss_mask": counts, "opaque": opaque}
+    inside &= opaque  # of empty space there is no depth, nor a label
     if frame.mask is not None:
         counts &= companion(frame.mask, size, at) > 0
     if "depth" in wanted and frame.depth is not None:
@@ -217,11 +242,12 @@ def read_view(
     return fields
 
 
-def photo(frame: Frame, listing: Listing, view: Geometry, at: np.ndarray) -> tuple[np.ndarray, float]:
-    """The view's pixels u8 [H, W, 3] and the photo's opaque share; the whole photo is gone on return."""
+def photo(frame: Frame, listing: Listing, view: Geometry, at: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """The view's pixels u8 [H, W, 3] and where they are opaque, bool [H, W]; the whole photo is gone on return."""
     size = (frame.camera.width, frame.camera.height)
     with open_photo(frame.image, size, listing.upright) as (image, opaque):
-        return resampled(image, frame.camera, view, at), opaque
+        seen = np.ones(at.shape[1:], bool) if opaque is None else nearest(opaque, at, size)
+        return resampled(image, frame.camera, view, at), seen
 
 
 def within(at: np.ndarray, size: tuple[int, int]) -> np.ndarray:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -33,7 +34,8 @@ def read(folder: Path, settings: Any, class_names: tuple[str, ...] | None = None
     listing, model = _listing(folder)
     fields = assembly.assemble(listing, settings, class_names)
     if "depth" not in fields:
-        fields |= points_of(model.cloud, [common.stem(image.name) for image in model.images], fields)
+        lost = assembly.in_empty_space(model.cloud.means, fields, listing)
+        fields |= points_of(model.cloud, [common.stem(image.name) for image in model.images], fields, lost)
     split = _split(folder, [frame.name for frame in listing.frames])
     if split is not None:
         assembly.give_split(fields, split, "scene.json")
@@ -42,10 +44,7 @@ def read(folder: Path, settings: Any, class_names: tuple[str, ...] | None = None
 
 def probe(folder: Path) -> dict[str, bool]:
     """Light: reads names only. A folder with PNGs is a promise: `read` fails if a view of the model has none."""
-    return {"poses": True} | {
-        of: any(name.endswith(".png") for name in common.names_below(folder / place))
-        for place, of in COMPANIONS.items()
-    }
+    return {"poses": True} | {of: any(_pngs(folder / place)) for place, of in COMPANIONS.items()}
 
 
 def files(folder: Path) -> list[Path]:
@@ -55,6 +54,11 @@ def files(folder: Path) -> list[Path]:
     places = [common.photo_folder(folder), *(folder / name for name in (*COMPANIONS, "masks", "confidence"))]
     data = [place / name for place in places for name in common.names_below(place)]
     return sorted([*model, *documents, *data])
+
+
+def _pngs(folder: Path) -> Iterator[tuple[str, Path]]:
+    """PNGs below a folder, by the name of the view that they belong to."""
+    return ((name[:-4], folder / name) for name in common.names_below(folder) if name.lower().endswith(".png"))
 
 
 def _models(folder: Path) -> list[Path]:
@@ -117,10 +121,12 @@ def _label_names(folder: Path) -> dict[int, str] | None:
     return names_by_id(path, table.items())
 
 
-def points_of(cloud: Cloud, images: list[str], fields: dict[str, Any]) -> dict[str, Any]:
+def points_of(
+    cloud: Cloud, images: list[str], fields: dict[str, Any], lost: np.ndarray | None = None
+) -> dict[str, Any]:
     """points, point_colors and tracks (point, view) of a capture of these fields; nothing of few points.
 
-    Args:    images: names of the views that the cloud's tracks count.
+    Args:    images: names of the views that the cloud's tracks count; lost: points that are left out.
     Choices: a point whose error is not known is taken.
     """
     names, notes = fields["names"], fields["source"]["notes"]
@@ -133,6 +139,7 @@ def points_of(cloud: Cloud, images: list[str], fields: dict[str, Any]) -> dict[s
             f"{len(good) - good.sum()} of the model's {len(good)} points are left out: fewer than {MIN_TRACK} images "
             f"see them, or they lie more than {MAX_ERROR:g} pixels off."
         )
+    good &= True if lost is None else ~lost
     if good.sum() < LEAST:
         if len(good):
             notes.append(f"{good.sum()} points are left, fewer than {LEAST}: none is used, and photos are matched.")
@@ -158,23 +165,17 @@ def _listing(folder: Path) -> tuple[Listing, Model]:
     notes += model.notes
     on_disk, wanted = common.images_in(images), [image.name for image in model.images]
     files = common.matched(wanted, on_disk)
-    has = probe(folder)
+    pngs = {of: dict(_pngs(folder / place)) for place, of in COMPANIONS.items()}
     masks, unmasked = common.masks_in(folder, files.values())
     frames = []
     for image in model.images:
         if file := files.get(image.name):
             name = common.stem(file)
-            frames.append(
-                Frame(
-                    name,
-                    images / file,
-                    cameras.camera_of(model.origin, *model.cameras[image.camera]),
-                    image.pose,
-                    folder / f"depth/{name}.png" if has["depth"] else None,
-                    folder / f"semantic/{name}.png" if has["labels"] else None,
-                    masks.get(file),
-                )
-            )
+            camera = cameras.camera_of(model.origin, *model.cameras[image.camera])
+            beside = {
+                of: pngs[of].get(name, folder / place / f"{name}.png") for place, of in COMPANIONS.items() if pngs[of]
+            }
+            frames.append(Frame(name, images / file, camera, image.pose, mask=masks.get(file), **beside))
     rest = set(on_disk) - set(files.values())
     absent = [name for name in wanted if name not in files]
     if absent:

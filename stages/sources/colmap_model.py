@@ -224,7 +224,7 @@ def _whole(word: str) -> int:
 def _text_cameras(path: Path, notes: list[str]) -> Iterator[tuple[int, tuple[str, tuple[float, ...], int, int]]]:
     for _, line in _lines(path):
         if words := line.split():
-            yield int(words[0]), (words[1], tuple(map(float, words[4:])), _whole(words[2]), _whole(words[3]))
+            yield _whole(words[0]), (words[1], tuple(map(float, words[4:])), _whole(words[2]), _whole(words[3]))
 
 
 def _text_images(path: Path, notes: list[str]) -> Iterator[tuple[int, str, int, list[float], list[float]]]:
@@ -241,7 +241,7 @@ def _text_images(path: Path, notes: list[str]) -> Iterator[tuple[int, str, int, 
         elif words:
             try:
                 values = [float(v) for v in words[1:8]]
-                entry = int(words[0]), words[9], int(words[8]), values[:4], values[4:]
+                entry = _whole(words[0]), words[9], _whole(words[8]), values[:4], values[4:]
             except (ValueError, IndexError):
                 entry = None
             if entry is None or (n is not None and abs(math.hypot(*values[:4]) - 1) > SHORT):

@@ -88,6 +88,7 @@ class Listing:
     no_depth: tuple[int, ...] = (0,)
     depth_camera: Camera | None = None
     notes: list[str] = field(default_factory=list)
+    empty: dict[str, np.ndarray] = field(default_factory=dict)  # by view, where its photo is transparent, once read
     upright: bool = False  # turn every image by its EXIF orientation; otherwise only where its camera asks for it
 
     def has(self, what: str) -> bool:
@@ -125,7 +126,7 @@ def nearest_file(folder: Path, name: str) -> Path | None:
 
 def detect(folder: Path) -> str:
     """The kind of source that a folder, or a file of video, is. Raises InputError naming what was looked for."""
-    if present(folder / "transforms.json"):
+    if any(present(folder / f"transforms{part}.json") for part in ("", "_train")):
         return "transforms"
     if any(present(folder / part) for part in ("traj.txt", "Sequence_1", "results")):
         return "replica"
@@ -143,6 +144,10 @@ def detect(folder: Path) -> str:
         return "video"
     if folder.is_dir() and set(with_photos(folder)) - BESIDE:
         return "photos"
+    if (folder / "point_cloud").is_dir():
+        raise InputError(
+            f"{folder} is a splat of 3DGS and no source: `chebsplat view` shows it, `chebsplat lift` takes it"
+        )
     if others := unread(folder):
         raise InputError(f"{folder} holds no .jpg, .png or .heic photo: {others}")
     raise InputError(

@@ -102,7 +102,8 @@ def _listed(folder: Path) -> tuple[list[Shot], list[str]]:
         panorama = size[0] == 2 * size[1] and wraps(place / name, size)
         focal = None if panorama else focal
         found.append(Shot(common.stem(name), place / name, size, focal, masks.get(name), panorama))
-    if place == folder and (beside := set(common.with_photos(folder)) - {name.partition("/")[0] for name in names}):
+    used = {place.name, *(name.partition("/")[0] for name in names)}
+    if beside := set(common.with_photos(folder)) - used:
         notes.append(f"Photos in these folders are not read: {', '.join(sorted(beside, key=common.natural))}.")
     return sorted(found, key=lambda shot: common.natural(shot.name)), notes
 

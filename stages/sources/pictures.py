@@ -26,11 +26,12 @@ MAX_ID = 65_535  # what 16 bits hold
 
 
 @contextmanager
-def open_photo(path: Path, size: tuple[int, int], upright: bool) -> Iterator[tuple[Any, float]]:
-    """An RGB image of (width, height) `size`, and the opaque share of its pixels, as `opened` gives one.
+def open_photo(path: Path, size: tuple[int, int], upright: bool) -> Iterator[tuple[Any, np.ndarray | None]]:
+    """An RGB image of (width, height) `size`, and where it is opaque (None: everywhere), as `opened` gives one.
 
     Choices: a model's own photos are turned by EXIF only if they fit its camera no other way, since COLMAP counts
-      pixels as they are stored. What is transparent is empty: it lies before black, as what is rendered does.
+      pixels as they are stored. What is transparent is empty: it lies before black, as what is rendered does; alpha
+      under one half is transparent.
     """
 
     def check(image: Any) -> None:
@@ -44,13 +45,14 @@ def open_photo(path: Path, size: tuple[int, int], upright: bool) -> Iterator[tup
         if upright or image.size != size:
             image = turned(image)
         if "A" not in image.mode and "transparency" not in image.info:
-            yield (image if image.mode == "RGB" else image.convert("RGB")), 1.0
+            yield (image if image.mode == "RGB" else image.convert("RGB")), None
             return
         image = image if image.mode == "RGBA" else image.convert("RGBA")
         alpha = image.getchannel("A")
         black = Image.new("RGB", image.size)
         black.paste(image, mask=alpha)
-        yield black, float(np.asarray(alpha).mean() / 255)
+        opaque = np.asarray(alpha) >= 128
+        yield black, None if opaque.all() else opaque
 
 
 def companion(

@@ -160,6 +160,8 @@ def _listing(folder: Path) -> Listing:
     listing = Listing("scannet", frames, class_names=protocol.CLASSES if place or pseudo else None)
     by_id = dict(enumerate(("void", *scannet_closed.CLASSES)))
     listing.pseudo_names = by_id if pseudo else None
+    intrinsics = folder / "intrinsic/intrinsic_color.txt"
+    listing.notes += texts.skew_note(intrinsics, texts.read_matrix(intrinsics))
     listing.notes.append(f"ScanNet as {'Panoptic Lifting' if reduced else 'Semantic Gaussians'} lays it out.")
     if extra := sum(path.stem not in set(names) for path in (folder / "pose").glob("*.txt")):
         listing.notes.append(f"{extra} poses have no image in color/ and are left out.")

@@ -76,10 +76,12 @@ def _listing(folder: Path) -> Listing:
     camera = cameras.camera_of(image, "PINHOLE", (focal, focal, width / 2, height / 2), width, height)
     K = np.diag([DEPTH * width / 640, DEPTH * width / 640, 1.0, 1.0])
     K[:2, 2] = width / 2, height / 2
+    notes = []
     if path is not None:
         K = texts.read_matrix(path)
+        notes = texts.skew_note(path, K)
     depth_camera = cameras.camera_of(path or image, "PINHOLE", (K[0, 0], K[1, 1], K[0, 2], K[1, 2]), width, height)
-    notes = [f"The colour camera's focal length is taken to be {focal:g} pixels, at the depth camera's place."]
+    notes += [f"The colour camera's focal length is taken to be {focal:g} pixels, at the depth camera's place."]
     names = [name for name, _, _ in frames]
     matrices = np.array([texts.read_matrix(folder / f"{name}.pose.txt") for name in names])
     poses = cameras.cam_from_world(folder, matrices, [f"{name}.pose.txt" for name in names])

@@ -13,6 +13,7 @@ import numpy as np
 from chebsplat.errors import InputError
 from chebsplat.formats.files import parse_json, read_text
 
+LEAST_SKEW = 0.01  # pixels
 LONGEST = 80  # characters of a value that a message repeats
 LARGEST = 8 << 20  # bytes of a table: 20,000 poses at full precision; its words take up to 60 times as much memory
 
@@ -66,6 +67,12 @@ def read_matrix(path: Path) -> np.ndarray:
     matrix = np.eye(4)
     matrix[: len(rows), : len(rows[0])] = rows
     return matrix
+
+
+def skew_note(path: Path, K: np.ndarray) -> list[str]:
+    """A note on the skew of a matrix of intrinsics, which no camera here has; none where there is none to speak of."""
+    told = f"{path.name} has a skew of {K[0, 1]:g} pixels, which is not used: pixels are taken as rectangular."
+    return [told] if abs(K[0, 1]) > LEAST_SKEW else []
 
 
 def read_table(path: Path, remedy: str) -> list[dict[str, str]]:

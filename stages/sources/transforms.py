@@ -5,48 +5,95 @@ from __future__ import annotations
 import math
 import os
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from chebsplat.errors import InputError
 from chebsplat.formats.images import header, is_image
+from chebsplat.formats.points import read_cloud
 from chebsplat.stages.sources import assembly, cameras, common
 from chebsplat.stages.sources.cameras import Camera
+from chebsplat.stages.sources.colmap import LEAST
 from chebsplat.stages.sources.common import Frame, Listing
 from chebsplat.stages.sources.texts import number, read_json, shortened
 
+NAMES = ("transforms.json", "transforms_train.json", "transforms_test.json", "transforms_val.json")
 PARTS = ("file_path", "depth_file_path", "mask_path")
-DISTORTION = ("k1", "k2", "p1", "p2")
-HIGHER = ("k3", "k4", "k5", "k6")
-PERSPECTIVE = ("OPENCV", "PINHOLE", "SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RADIAL", "PERSPECTIVE")  # subsets of OPENCV
+SPLITS = ("train_filenames", "test_filenames", "val_filenames")
+DISTORTION = ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6")  # as COLMAP's FULL_OPENCV orders them
+NERFSTUDIO = ("k1", "k2", "k3", "k4", "p1", "p2")  # of distortion_params
+# subsets of FULL_OPENCV, and of OPENCV_FISHEYE
+PERSPECTIVE = ("OPENCV", "PINHOLE", "SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RADIAL", "PERSPECTIVE", "FULL_OPENCV")
+FISHEYE = ("OPENCV_FISHEYE", "FISHEYE", "SIMPLE_FISHEYE", "SIMPLE_RADIAL_FISHEYE", "RADIAL_FISHEYE")
+READ = {*PARTS, *SPLITS, *DISTORTION, "distortion_params", "transform_matrix", "camera_model", "is_fisheye", "fl_x",
+        "fl_y", "cx", "cy", "w", "h", "camera_angle_x", "camera_angle_y", "ply_file_path"}  # fmt: skip
+# of other programs' own use: a box to render in, how sharp a photo is, where poses came from
+OTHERS = {"aabb_scale", "scale", "offset", "sharpness", "colmap_im_id", "applied_transform", "applied_scale",
+          "rotation", "n_extra_learnable_dims"}  # fmt: skip
 OPENGL = np.array([1.0, -1.0, -1.0, 1.0])  # y up, z backward -> y down, z forward
 
 
+class Entry(NamedTuple):
+    """A frame: the document that lists it, and its values, those that all frames share among them."""
+
+    origin: Path
+    values: dict[str, Any]
+
+
 def read(folder: Path, settings: Any, class_names: tuple[str, ...] | None = None) -> dict[str, Any]:
-    """The fields of a capture. `class_names` is of no use here: the format has no labels."""
-    return assembly.assemble(_listing(folder), settings, class_names)
+    """The fields of a capture. `class_names` is of no use here: the format has no labels.
+
+    Choices: the points of `ply_file_path` are taken unless there is depth, which gives more. Test views are those of
+      nerfstudio's lists (test and validation), or of transforms_test.json, of transforms_val.json where there is none.
+    """
+    entries = _entries(folder)
+    listing = _listing(folder, entries)
+    tests, origin = _split(folder, entries, listing)
+    fields = assembly.assemble(listing, settings, class_names)
+    cloud = _cloud(folder, entries[0])
+    if cloud is not None and "depth" not in fields:
+        points, colors = read_cloud(cloud)
+        if len(points) < LEAST:
+            fields["source"]["notes"].append(f"{cloud.name} holds {len(points)} points, too few: it is not used.")
+        else:
+            kept = ~assembly.in_empty_space(points, fields, listing)
+            fields |= {"points": points[kept], "point_colors": None if colors is None else colors[kept]}
+    if tests is not None:
+        assembly.give_split(fields, tests, origin)
+    return fields
 
 
 def probe(folder: Path) -> dict[str, bool]:
     """Light: reads the JSON, and asks which files exist only if it lists depth at all."""
-    depth = any(entry.get("depth_file_path") for entry in _document(folder)[1])
+    entries = _entries(folder)
+    depth = any(entry.values.get("depth_file_path") for entry in entries)
     if depth:
-        present, _ = _present(folder)
-        depth = bool(present) and all(entry.get("depth_file_path") for entry, _ in present)
+        present, _ = _present(folder, entries)
+        depth = bool(present) and all(entry.values.get("depth_file_path") for entry, _ in present)
     return {"poses": True, "depth": depth, "labels": False}
 
 
 def files(folder: Path) -> list[Path]:
-    """The JSON, and every image, depth and mask of a frame that is on disk."""
-    present, _ = _present(folder)
-    beside = [folder / _inside(folder, entry[key]) for entry, _ in present for key in PARTS[1:] if entry.get(key)]
-    return sorted([folder / "transforms.json", *(Path(image) for _, image in present), *beside])
+    """The JSON, the points, and every image, depth and mask of a frame that is on disk."""
+    entries = _entries(folder)
+    present, _ = _present(folder, entries)
+    beside = [path for entry, _ in present for part in PARTS[1:] if (path := _part(folder, entry, part))]
+    beside += [sure for path in beside if (sure := common.sureness(path))]
+    cloud = _cloud(folder, entries[0])
+    return sorted([*_documents(folder), *(Path(image) for _, image in present), *beside, *([cloud] if cloud else [])])
 
 
-def _document(folder: Path) -> tuple[dict[str, Any], list[dict[str, Any]]]:
-    """What all frames share, and the frames as they are listed."""
-    path = folder / "transforms.json"
+def _documents(folder: Path) -> list[Path]:
+    """transforms.json; otherwise those of training views and, of the first that there are, of test views."""
+    one, *parts = [folder / name for name in NAMES]
+    if common.present(one) or not (found := [path for path in parts if common.present(path)]):
+        return [one]
+    return found[:2]
+
+
+def _document(path: Path) -> tuple[dict[str, Any], list[dict[str, Any]]]:
+    """What all frames of a document share, and the frames as they are listed."""
     shared = read_json(path)
     entries = shared.pop("frames", None)
     if not isinstance(entries, list) or not entries:
@@ -59,12 +106,32 @@ def _document(folder: Path) -> tuple[dict[str, Any], list[dict[str, Any]]]:
     return shared, entries
 
 
-def _present(folder: Path) -> tuple[list[tuple[dict[str, Any], str]], int]:
-    """(entry, image) of the frames that are on disk; how many are not."""
-    _, entries = _document(folder)
-    images = [_on_disk(os.path.join(folder, _inside(folder, entry["file_path"]))) for entry in entries]
-    present = [(entry, image) for entry, image in zip(entries, images, strict=True) if image is not None]
-    return present, len(entries) - len(present)
+def _entries(folder: Path) -> list[Entry]:
+    return [
+        Entry(path, shared | entry)
+        for path in _documents(folder)
+        for shared, entries in (_document(path),)
+        for entry in entries
+    ]
+
+
+def _present(folder: Path, entries: list[Entry]) -> tuple[list[tuple[Entry, str]], list[str]]:
+    """(entry, image) of the frames that are on disk; the paths of those that are not.
+
+    Choices: a photo that is not where it is listed is one of the others, of this name alone (`common.matched`).
+    """
+    paths = [_inside(folder, entry, entry.values["file_path"]) for entry in entries]
+    images = {path: image for path in paths if (image := _on_disk(os.path.join(folder, path)))}
+    if absent := [path for path in paths if path not in images]:
+        taken = {*images.values(), *(str(_part(folder, entry, part)) for entry in entries for part in PARTS[1:])}
+        others = [
+            name
+            for name in common.names_below(folder)
+            if name.partition("/")[0] not in common.BESIDE and os.path.join(folder, name) not in taken
+        ]
+        images |= {path: os.path.join(folder, name) for path, name in common.matched(absent, others).items()}
+    present = [(entry, images[path]) for entry, path in zip(entries, paths, strict=True) if path in images]
+    return present, [path for path in paths if path not in images]
 
 
 def _on_disk(path: str) -> str | None:
@@ -73,15 +140,20 @@ def _on_disk(path: str) -> str | None:
     return next((p for p in paths if os.path.isfile(p) or (is_image(os.path.basename(p)) and os.path.lexists(p))), None)
 
 
-def _inside(folder: Path, listed: str) -> str:
+def _inside(folder: Path, entry: Entry, listed: str) -> str:
     """A listed path relative to the folder. Raises InputError if it leads out of it."""
     path = listed.replace("\\", "/")
     if os.path.isabs(path):
         path = os.path.relpath(path, os.path.abspath(folder))
     path = os.path.normpath(path)
     if path.split("/")[0] == "..":
-        raise InputError(f"{folder / 'transforms.json'}: {listed} lies elsewhere; write paths relative to the folder")
-    return next(common.printable(folder / "transforms.json", [path]))
+        raise InputError(f"{entry.origin}: {listed} lies elsewhere; write paths relative to the folder")
+    return next(common.printable(entry.origin, [path]))
+
+
+def _part(folder: Path, entry: Entry, part: str) -> Path | None:
+    """The file that an entry lists as one of PARTS."""
+    return folder / _inside(folder, entry, entry.values[part]) if entry.values.get(part) else None
 
 
 def _name(path: str) -> str:
@@ -89,53 +161,126 @@ def _name(path: str) -> str:
     return common.stem(path.removeprefix("images/"))
 
 
-def _listing(folder: Path) -> Listing:
-    path = folder / "transforms.json"
-    shared, _ = _document(folder)
-    present, absent = _present(folder)
-    names = [_name(_inside(folder, entry["file_path"])) for entry, _ in present]
+def _cloud(folder: Path, first: Entry) -> Path | None:
+    """The points that the document names, if they are there."""
+    listed = first.values.get("ply_file_path")
+    if not isinstance(listed, str) or not common.present(path := folder / _inside(folder, first, listed)):
+        return None
+    return path
+
+
+def _listing(folder: Path, entries: list[Entry]) -> Listing:
+    present, absent = _present(folder, entries)
+    names = [_name(_inside(folder, entry, entry.values["file_path"])) for entry, _ in present]
     matrices = []
     for (entry, _), name in zip(present, names, strict=True):
+        path = entry.origin
         try:
-            matrix = np.array(entry["transform_matrix"])
+            matrix = np.array(entry.values["transform_matrix"])
         except ValueError as error:  # ragged, or nested more deeply than arrays can be
             raise InputError(f"{path}: {name} has no usable transform_matrix ({error}); write it again") from None
         if matrix.dtype.kind not in "iuf":
             raise InputError(f"{path}: transform_matrix of {name} does not hold numbers; write it again")
-        if matrix.shape != (4, 4):
+        if matrix.shape not in ((3, 4), (4, 4)):
             raise InputError(f"{path}: transform_matrix of {name} is {matrix.shape}, not (4, 4); write it again")
-        matrices.append(matrix * OPENGL)
-    poses = cameras.cam_from_world(path, np.reshape(matrices, (-1, 4, 4)), names)
+        matrices.append(np.vstack([matrix, [0, 0, 0, 1]])[:4] * OPENGL)
+    poses = cameras.cam_from_world(entries[0].origin, np.reshape(matrices, (-1, 4, 4)), names)
     frames = []
     for (entry, image), name, pose in zip(present, names, poses, strict=True):
-        depth, mask = (folder / _inside(folder, entry[part]) if entry.get(part) else None for part in PARTS[1:])
-        camera = _camera(shared | entry, Path(image), path)
+        depth, mask = (_part(folder, entry, part) for part in PARTS[1:])
+        camera = _camera(entry.values, Path(image), entry.origin)
         frames.append(Frame(name, Path(image), camera, pose, depth, mask=mask))
-    notes = [f"{absent} of {absent + len(present)} listed frames are absent on disk."] if absent else []
-    return Listing("transforms", frames, notes=notes)
+    notes = []
+    if absent:
+        total = len(absent) + len(present)
+        notes.append(f"{len(absent)} of {total} listed frames are absent on disk ({common.few(absent)}).")
+        used = {image for _, image in present}
+        there = [name for name in common.names_below(folder) if name.partition("/")[0] not in common.BESIDE]
+        if others := [name for name in there if os.path.join(folder, name) not in used]:
+            notes.append(f"Images that no frame lists: {common.few(others)}.")
+    if elsewhere := sum(frame.name != _name(os.path.relpath(frame.image, folder)) for frame in frames):
+        notes.append(f"{elsewhere} photos have another path on disk than is listed, and are told by their names.")
+    return Listing("transforms", frames, notes=notes + _unused(folder, entries, frames))
+
+
+def _unused(folder: Path, entries: list[Entry], frames: list[Frame]) -> list[str]:
+    """Notes on what documents hold, or lies beside them, and is not read."""
+    notes, name = [], entries[0].origin.name
+    if unknown := sorted(set().union(*(entry.values for entry in entries)) - READ - OTHERS):
+        notes.append(f"Not read of {name}: {', '.join(map(shortened, unknown))}.")
+    if "ply_file_path" in entries[0].values and _cloud(folder, entries[0]) is None:
+        notes.append(f"ply_file_path of {name} is absent on disk.")
+    if not any(frame.mask for frame in frames) and any(common.names_below(folder / "masks")):
+        notes.append(f"masks/ is not used: {name} lists none (mask_path).")
+    there = [path for part in NAMES if common.present(path := folder / part)]
+    if others := [path.name for path in there if path not in _documents(folder)]:
+        notes.append(f"Not read: {', '.join(others)}.")
+    return notes
+
+
+def _split(folder: Path, entries: list[Entry], listing: Listing) -> tuple[set[str] | None, str]:
+    """Names of the test views and what says so, None where nothing does; frames of no list leave the listing."""
+    documents = _documents(folder)
+    if len(documents) == 2:
+        held = [_inside(folder, e, e.values["file_path"]) for e in entries if e.origin == documents[1]]
+        return {_name(path) for path in held}, documents[1].name
+    lists: dict[str, set[str]] = {}
+    for key in SPLITS:
+        listed = entries[0].values.get(key)
+        if listed is None:
+            continue
+        if not isinstance(listed, list) or not all(isinstance(path, str) for path in listed):
+            raise InputError(f"{documents[0]}: {key} is no list of paths; write it again")
+        lists[key] = {_name(_inside(folder, entries[0], path)) for path in listed}
+    if not lists:
+        return None, ""
+    train, *tests = (lists.get(key, set()) for key in SPLITS)
+    names = {frame.name for frame in listing.frames}
+    if not any(tests):
+        return names - train, "train_filenames"
+    if train and (outside := names - train.union(*tests)):
+        listing.frames = [frame for frame in listing.frames if frame.name not in outside]
+        listing.notes.append(f"{len(outside)} frames are in no list of {documents[0].name} and are left out.")
+    return set().union(*tests), " and ".join(key for key in SPLITS[1:] if key in lists)
 
 
 def _camera(values: dict[str, Any], image: Path, path: Path) -> Camera:
-    """The camera of one frame. Raises InputError on a fisheye, a higher distortion or no focal length."""
+    """The camera of one frame. Raises InputError on a lens that is not supported, or no focal length."""
     named = values.get("camera_model")
     model = "OPENCV_FISHEYE" if values.get("is_fisheye") else "OPENCV" if named is None else shortened(named).strip("'")
-    if model not in PERSPECTIVE or any(values.get(k) for k in HIGHER):
-        model = model if model not in PERSPECTIVE else "FULL_OPENCV"
-        return cameras.camera_of(path, model, (), 0, 0)  # raises: says what is supported
+    if model not in PERSPECTIVE + FISHEYE:
+        raise InputError(
+            f"{path}: camera_model {model} is not supported ({', '.join(PERSPECTIVE + FISHEYE)} are); undistort the "
+            "photos first, for example with `colmap image_undistorter`"
+        )
     size = (values["w"], values["h"]) if "w" in values and "h" in values else header(image)[0]
     try:
         width, height = (number(v) for v in size)
         fx = _focal(values, "x", width)
         fy = _focal(values, "y", height) or fx
         centre = [number(values.get("cx", width / 2)), number(values.get("cy", height / 2))]
-        distortion = [number(values.get(k) or 0.0) for k in DISTORTION]
-    except ValueError as error:
+        k = {key: number(values.get(key) or 0.0) for key in DISTORTION}
+        if "distortion_params" in values:
+            k |= dict(zip(NERFSTUDIO, map(number, values["distortion_params"]), strict=True))
+    except (TypeError, ValueError) as error:
         raise InputError(f"{path}: intrinsics are no numbers that can be used ({error}); write it again") from None
     if fx is None or fy is None:
         raise InputError(f"{path} has neither fl_x nor camera_angle_x; write it again")
-    if any(distortion):
-        return cameras.camera_of(path, "OPENCV", (fx, fy, *centre, *distortion), width, height)
-    return cameras.camera_of(path, "PINHOLE", (fx, fy, *centre), width, height)
+    given = {key for key, value in k.items() if value}
+    kind = "FULL_OPENCV"
+    used: tuple[str, ...] = DISTORTION
+    if model in FISHEYE:
+        kind, used = "OPENCV_FISHEYE", ("k1", "k2", "k3", "k4")
+    elif model != "FULL_OPENCV":  # whose k4 is OpenCV's; nerfstudio means another, which it does not undo either
+        used = DISTORTION[:5]
+        kind = "FULL_OPENCV" if "k3" in given else "OPENCV" if given else "PINHOLE"
+    if beyond := sorted(given - set(used)):
+        raise InputError(
+            f"{path}: {beyond[0]} of a camera {model} is not supported; write FULL_OPENCV if it is OpenCV's, or "
+            "undistort the photos first"
+        )
+    lens = [k[key] for key in (used if model in FISHEYE else DISTORTION)]
+    return cameras.camera_of(path, kind, (fx, fy, *centre, *lens)[: cameras.MODELS[kind]], width, height)
 
 
 def _focal(values: dict[str, Any], axis: str, pixels: float) -> float | None:

@@ -125,7 +125,7 @@ def _transforms_camera(path: Path, entry: dict[str, Any]) -> tuple[str, np.ndarr
         fx = 0.5 * width / math.tan(0.5 * number(entry["camera_angle_x"])) if angled else number(entry["fl_x"])
         centre = number(entry.get("cx", width / 2)), number(entry.get("cy", height / 2))
         params = fx, number(entry.get("fl_y", fx)), *centre
-        matrix = np.array(entry["transform_matrix"], dtype=float).reshape(4, 4) * OPENGL
+        matrix = np.vstack([np.array(entry["transform_matrix"], dtype=float), [0, 0, 0, 1]])[:4].reshape(4, 4) * OPENGL
         name = stem(str(entry["file_path"]).removeprefix("./").removeprefix("images/"))
     return name, matrix, camera_of(path, "PINHOLE", params, width, height)
 

@@ -14,19 +14,23 @@ from chebsplat.errors import ConfigError
 from chebsplat.formats.images import MAX_PIXELS, MAX_SIDE
 from chebsplat.stages.tools.camera_files import read_cameras
 from chebsplat.stages.tools.scene import Camera, OpenedScene
+from chebsplat.stages.tools.up import LEAST_SURE, Up, up_of
 
 ROUND = 120  # frames of an orbit
-LEAST_SURE = 0.5  # of `cameras.common_up`, below which the orbit's plane is that of the cameras
 
 
-def path_of(scene: OpenedScene, path: str, n_frames: int | None) -> list[Camera]:
+def path_of(scene: OpenedScene, path: str, n_frames: int | None, up: Up | None = None) -> list[Camera]:
     """`capture`: the capture's cameras; `orbit`: an orbit among them; otherwise a .json file's.
 
-    Args:   n_frames: of the orbit (None: 120), or of a path through the cameras (None: no path).
-    Raises: ConfigError if it is none of these; InputError if the file's cameras cannot be used.
+    Args:   n_frames: of the orbit (None: 120), or of a path through the cameras (None: no path); up: of the orbit.
+    Raises: ConfigError if it is none of these, or up is given of another path than an orbit; InputError if the file's
+      cameras cannot be used.
     """
     if path == "orbit":
-        return orbit(scene.cameras, n_frames or ROUND)
+        poses = np.stack([camera.cam_from_world for camera in scene.cameras])
+        return orbit(scene.cameras, n_frames or ROUND, None if up is None else up_of(up, scene.parameters, poses))
+    if up is not None:
+        raise ConfigError(f"--up is of an orbit, and the cameras of {path} have their own; add --path orbit")
     if path == "capture":
         cameras = scene.cameras
     elif path.endswith(".json"):
@@ -36,18 +40,20 @@ def path_of(scene: OpenedScene, path: str, n_frames: int | None) -> list[Camera]
     return cameras if n_frames is None else between(cameras, n_frames)
 
 
-def orbit(cameras: list[Camera], n_frames: int) -> list[Camera]:
+def orbit(cameras: list[Camera], n_frames: int, up: np.ndarray | None = None) -> list[Camera]:
     """A round about what the cameras look at, on the ellipse that they themselves lie about, upright.
 
+    Args: up: unit [3]; None: as the cameras were held.
     Choices: the ellipse has the centre and the spread of the cameras in the plane across their common up; all frames
       look at the point that is nearest to the cameras' axes, in least squares; where axes are parallel, at the mean of
       what lies before the cameras at the distance of their spread. The lens is the first camera's.
     """
     poses = np.stack([camera.cam_from_world for camera in cameras])
     eyes, ahead = centers(poses), poses[:, 2, :3]
-    up, sure = common_up(poses)
-    if sure < LEAST_SURE:  # rolled cameras, or all of one direction: the mean of their tops
-        up = -poses[:, 1, :3].mean(0)
+    if up is None:
+        up, sure = common_up(poses)
+        if sure < LEAST_SURE:  # rolled cameras, or all of one direction: the mean of their tops
+            up = -poses[:, 1, :3].mean(0)
     turn = upright(up)
     target, middle = focus(eyes, ahead), eyes.mean(0)
     flat = (eyes - middle) @ turn[:2].T

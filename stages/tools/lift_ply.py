@@ -39,6 +39,7 @@ from chebsplat.stages.shape_models.answers import answered, units
 from chebsplat.stages.shape_models.surfaces import shown
 from chebsplat.stages.teacher_models.text_encoder import found
 from chebsplat.stages.tools.page import foreign
+from chebsplat.stages.tools.up import Up, up_of
 
 log = logging.getLogger("chebsplat")
 
@@ -74,12 +75,13 @@ def lift_ply(
             "labels": len(Features.read(features).label_names)}  # fmt: skip
 
 
-def import_ply(ply: Path, out: Path) -> dict[str, Any]:
+def import_ply(ply: Path, out: Path, up: Up | None = None) -> dict[str, Any]:
     """A PLY as a scene without semantics, of `gaussians` and `export` below `out`; one camera sees its middle half.
 
+    Args: up: of that camera, and so of pages and orbits; None: -y.
     Returns: counts. Raises: InputError on what cannot be read.
     """
-    scene = foreign(ply)
+    scene = foreign(ply, up)
     taken_over(ply, scene.parameters, scene.cameras, out)
     publish("export", export.run, out / "export", {"gaussians": out / "gaussians"})
     return {"gaussians": artifact.read_manifest(out / "export").facts["n_gaussians"]}
@@ -120,13 +122,13 @@ def taught(capture: Path, model: Path | None, out: Path) -> Path:
 
 
 def label_ply(
-    ply: Path, knowledge: Path, words: list[str], up: np.ndarray, unit: float | None, out: Path
+    ply: Path, knowledge: Path, words: list[str], asked_up: Up, unit: float | None, out: Path
 ) -> dict[str, Any]:
     """Write the PLY again with a label a Gaussian, and beside it an .npz: names, labels [N], confidence f32 [N].
 
     Args:
       ply:       a 3DGS PLY of a room; knowledge: a `knowledge` artifact; words: to choose among.
-      up:        [3] against gravity, in the PLY's frame; unit: its units in a metre; None: by the room's extent.
+      asked_up:  against gravity, in the PLY's frame; unit: its units in a metre; None: by the room's extent.
     Returns: counts, and the share of each name.
     Raises:  ConfigError if `out` exists or a word is not known; InputError on what cannot be read; DataFailure where
              the splat shows no surface.
@@ -147,6 +149,7 @@ def label_ply(
     parameters, degree, _ = read_splats(ply)
     if not len(parameters["means"]):
         raise InputError(f"{ply} holds no Gaussians; choose another")
+    up = up_of(asked_up, parameters)
     unit = room_unit(parameters["means"]) if unit is None else unit
     poses, Ks = lookouts(parameters["means"].astype(np.float64), expit(parameters["logit_opacities"]), up)
     cloud = shown(parameters, poses, Ks, LOOKOUT_SIZE, unit)

@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 
+from chebsplat.cameras import upright
 from chebsplat.errors import ConfigError, DataFailure
 from chebsplat.evaluation.metrics import features_at
 from chebsplat.formats.meshes import Frame, Mesh, cleaned, fused, meshlab
@@ -49,6 +50,14 @@ def mesh_of(
     if scene.features is not None and scene.label_embeddings is not None:
         made = made._replace(labels=labels_at(scene, made.vertices))
     return made, facts | {"written": len(made.triangles), "vertices": len(made.vertices)}
+
+
+def turned(mesh: Mesh, up: np.ndarray, suffix: str) -> Mesh:
+    """The mesh with `up`, unit [3], along z, or of a .glb along y, as glTF has it."""
+    turn = upright(up)
+    if suffix.lower() == ".glb":
+        turn = np.array([[1.0, 0, 0], [0, 0, 1], [0, -1, 0]]) @ turn
+    return mesh._replace(vertices=(mesh.vertices @ turn.T).astype(np.float32))
 
 
 def frames(scene: OpenedScene, progress: Progress) -> Iterator[Frame]:

@@ -25,6 +25,7 @@ from chebsplat.labels.calibration import Calibration
 from chebsplat.stages.pages.parts import rendered
 from chebsplat.stages.teacher_models.text_encoder import folded
 from chebsplat.stages.tools.query import are_words, embedded, is_closed, taught, teacher_of, understood
+from chebsplat.stages.tools.up import Up, up_of
 
 log = logging.getLogger("chebsplat")
 
@@ -52,7 +53,7 @@ class Words:
 
 def write_page(
     scene: Scene, name: str, teacher: Path | None, out: Path, sh_degree: int = 0, phrases: Sequence[str] = (),
-    more: Sequence[str] = (),
+    more: Sequence[str] = (), up: Up | None = None,
 ) -> dict[str, int]:  # fmt: skip
     """Write the page, in the place of what is there.
 
@@ -60,6 +61,7 @@ def write_page(
       scene:     from `Scene.read`, or `foreign`; name: the page's title.
       teacher:   the scene's `features` artifact, whose teacher's words are embedded; None: the labels alone.
       sh_degree: 0 or 1; phrases: what words are weighed against, as of `query`; more: words beside the teacher's own.
+      up:        against gravity; None: as the cameras were held.
     Returns: counts: Gaussians, views, labels, words, bytes.
     Raises:  InputError where the teacher is not the scene's or does not know a word.
     """
@@ -67,7 +69,8 @@ def write_page(
 
     means = scene.parameters["means"].astype(np.float64)
     center = np.median(means, axis=0)
-    up, extent = up_and_extent(scene)
+    own, extent = up_and_extent(scene)
+    up = own if up is None else up_of(up, scene.parameters, scene.cameras.cam_from_world)
     packed = pack(scene.parameters, sh_degree)
     arrays: dict[str, np.ndarray] = packed.arrays | {"views": camera_rows(scene, center)}
     about: dict[str, Any] = {
@@ -114,10 +117,10 @@ def write_page(
     return counts | {"bytes": len(text.encode())}
 
 
-def foreign(ply: Path) -> Scene:
-    """A scene of a splat from elsewhere: no semantics, and one camera that sees its middle half.
+def foreign(ply: Path, up: Up | None = None) -> Scene:
+    """A scene of a splat from elsewhere: no semantics, and one camera that sees its middle half, upright.
 
-    Raises: InputError naming the file. Choices: up is -y, as in COLMAP's and 3DGS' own frames.
+    Raises: InputError naming the file. Choices: without `up` it is -y, as in COLMAP's and 3DGS' own frames.
     """
     parameters, degree, _ = read_splats(ply)
     if not len(parameters["means"]):
@@ -128,7 +131,13 @@ def foreign(ply: Path) -> Scene:
     means = parameters["means"]
     low, high = np.quantile(means.astype(np.float64), (0.25, 0.75), axis=0)
     pose = np.eye(4)
-    pose[:3, 3] = [0, 0, 2 * max(float((high - low).max()), 1e-3)] - (low + high) / 2
+    if up is not None:
+        down = -up_of(up, parameters)
+        ahead = np.eye(3)[1 if abs(down[2]) > 0.9 else 2]  # along y where z is up, along z as in COLMAP otherwise
+        ahead = ahead - (ahead @ down) * down
+        ahead /= np.linalg.norm(ahead)
+        pose[:3, :3] = [np.cross(down, ahead), down, ahead]
+    pose[:3, 3] = [0, 0, 2 * max(float((high - low).max()), 1e-3)] - pose[:3, :3] @ (low + high) / 2
     K = np.array([[554.0, 0, 320], [0, 554, 240], [0, 0, 1]])  # 60 degrees across
     return Scene(parameters, Cameras(["start"], K[None], pose[None], 640, 480), order)
 

@@ -307,7 +307,7 @@ def transforms() -> Iterator[Row]:
     cases += [(FILE, f"frames = {value}", keys(FILE, frames=value), "a frame") for value in ([3], [{}])]
     for what, matrix, word in (
         ("null", None, "does not hold numbers"),
-        ("3 rows", np.eye(4)[:3].tolist(), "is (3, 4)"),
+        ("3 columns", np.eye(3).tolist(), "is (3, 3)"),
         ("ragged", [[1], [1, 2]], "no usable transform_matrix"),
         ("words", [["1", "0", "0", "0"]] * 4, "does not hold numbers"),
         ("twice the size", (2 * np.eye(4)).tolist(), RIGID),
@@ -319,7 +319,7 @@ def transforms() -> Iterator[Row]:
     numbers: dict[str, dict[str, tuple[Any, ...]]] = {
         NO_NUMBERS: {"fl_x": (NAN, "10", True, 10**400), "w": (None,), "k1": ("0.1",)},
         NO_CAMERA: {"fl_x": (0, 1e300), "cx": (1e30,), "w": (0,), "h": (2**63,), "k1": (1e30,)},
-        "is not supported": {"k3": (0.1,), "camera_model": ("OPENCV_FISHEYE", {})},
+        "is not supported": {"k4": (0.1,), "camera_model": ("EQUIRECTANGULAR", {})},
     }
     cases += [(FILE, f"{key} = {json.dumps(value)[:20]}", keys(FILE, **{key: value}), word)
               for word, given in numbers.items() for key, values in given.items() for value in values]  # fmt: skip
@@ -339,7 +339,7 @@ def transforms() -> Iterator[Row]:
     yield from met(write_transforms, cases)
     few: list[Case] = [
         ("ingest.min_views", "poses of inf", frames(lambda f: {"transform_matrix": [[INF] * 4] * 4}), "not finite"),
-        ("ingest.min_views", "no photo", frames(lambda f: {"file_path": "x" + f["file_path"]}), "3 listed frames"),
+        ("ingest.min_views", "no photo", frames(lambda f: {"file_path": f["file_path"] + "x"}), "3 listed frames"),
     ]
     yield from met(write_transforms, few, 4)
     heavy: list[Case] = [(FILE, f"a {kind}", no_file(FILE, kind), "a device") for kind in ("pipe", "device")]

@@ -104,8 +104,9 @@ def test_lidar_depth_of_fewer_pixels_is_looked_up_and_believed_where_it_is_sure(
     depth = (1000 + np.arange(16 * 12)).reshape(12, 16).astype(np.uint16)
     sure = (np.arange(16 * 12).reshape(12, 16) % 3).astype(np.uint8)
     for name in "abc":
-        save(folder / f"depth/{name}.png", depth)
-        save(folder / f"confidence/{name}.png", sure)
+        (folder / f"depth/{name}.png").unlink()
+        save(folder / f"depth/{name}.PNG", depth)
+        save(folder / f"confidence/{name}.PNG", sure)
     found = colmap.read(folder, SETTINGS)["depth"][1]
     wanted = np.where(sure > 0, depth / 1000, np.nan).repeat(4, 0).repeat(4, 1)
     np.testing.assert_allclose(found, wanted, rtol=1e-6)
@@ -124,6 +125,27 @@ def test_points_whose_error_is_not_known_are_taken(tmp_path):
     cloud.errors[:] = 9
     assert colmap._points(colmap_model.Model(tmp_path, {}, images, cloud), list("abc"), notes) == {}
     assert notes[-1].startswith("0 points are left, fewer than 100: none is used")
+
+
+def test_points_and_depth_in_empty_space_are_left_out(tmp_path):
+    """The left half of all photos is transparent; every other point lies there."""
+    folder = write_colmap(tmp_path, "PINHOLE 80 60 50 50 40 30")
+    pixels = np.full((60, 80, 4), 200, np.uint8)
+    pixels[:, :40, 3] = 0
+    for name in "abc":
+        save(folder / f"images/{name}.png", pixels)
+    fields = colmap.read(folder, SETTINGS)
+    assert np.isnan(fields["depth"][:, :, :40]).all() and (fields["labels"][:, :, :40] == -1).all()
+    assert np.allclose(fields["depth"][:, :, 40:], 1.5) and (fields["labels"][:, :, 40:] == 0).all()
+    shutil.rmtree(folder / "depth")
+    rng = np.random.default_rng(0)
+    rows = [f"{k} {rng.uniform(4, 8) * (-1) ** k} {rng.uniform(-2, 2)} 30 9 9 9 .5" for k in range(300)]
+    (folder / "sparse/0/points3D.txt").write_text("\n".join(rows))
+    poses = "".join(f"{k + 1} 1 0 0 0 {0.1 * k} 0 0 1 {name}.png\n\n" for k, name in enumerate("abc"))
+    (folder / "sparse/0/images.txt").write_text(poses)
+    fields = colmap.read(folder, SETTINGS)
+    assert len(fields["points"]) == 150 and (fields["points"][:, 0] > 0).all()
+    assert "150 of 300 points lie in empty space and are left out." in fields["source"]["notes"]
 
 
 @pytest.mark.parametrize(("paths", "names"), [

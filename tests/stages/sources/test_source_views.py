@@ -79,7 +79,7 @@ def test_no_view_of_a_text_model_is_lost_whatever_follows_it(tmp_path, between):
     lines = ["#IMAGE_ID, ...", " # thinned"]
     lines += [part for pair in zip(IMAGES, between, strict=True) for part in pair if part is not None]
     write_colmap(tmp_path)
-    (tmp_path / "sparse/0/cameras.txt").write_text("1 PINHOLE 320.0 240.0 200 200 160 120\n")
+    (tmp_path / "sparse/0/cameras.txt").write_text("1.0 PINHOLE 320.0 240.0 200 200 160 120\n")
     (tmp_path / "sparse/0/images.txt").write_text("\n".join(lines))
     model = colmap_model.read_model(tmp_path / "sparse/0")
     assert [image.name for image in model.images] == ["a.png", "b c.png", "0003"]
@@ -115,6 +115,8 @@ LENSES = {
 @pytest.mark.parametrize("lens", LENSES)
 def test_every_lens_that_colmap_writes_is_undone(tmp_path, lens, suffix):
     """Photos whose value is their own coordinate: pycolmap says where each of our pixels lies in them."""
+    if not hasattr(pycolmap.CameraModelId, lens):
+        pytest.skip(f"this pycolmap has no {lens}")
     camera = pycolmap.Camera(camera_id=1, model=lens, width=240, height=180, params=LENSES[lens])
     model = pycolmap.Reconstruction()
     model.add_camera_with_trivial_rig(camera)
@@ -286,13 +288,13 @@ def test_exif_turns_a_photo_and_gives_its_focal_length(tmp_path):
 
 def test_transparent_pixels_are_empty_and_count(tmp_path):
     """They are black, as a render of nothing is; half alpha is half of the colour; a photo of nothing says nothing."""
-    for k, alpha in enumerate((255, 128, 0)):
+    for k, alpha in enumerate((255, 100, 0)):
         pixels = np.full((6, 8, 4), 255, np.uint8)
         pixels[:, :4, 3] = alpha
         pixels[:, 4:, 3] = 255 if k < 2 else 0
         save(tmp_path / f"{k}.png", pixels)
     fields = photos.read(tmp_path, SETTINGS)
-    assert fields["images"][:, 0, [0, 7], 0].tolist() == [[255, 255], [128, 255], [0, 0]]
+    assert fields["images"][:, 0, [0, 7], 0].tolist() == [[255, 255], [100, 255], [0, 0]]
     assert fields["loss_mask"].mean((1, 2)).tolist() == [1, 1, 0]
     assert "2 of 3 photos have transparent pixels, which are empty space." in fields["source"]["notes"]
 

@@ -129,6 +129,9 @@ def test_a_folder_without_photos_is_no_source(tmp_path):
     with pytest.raises(InputError, match=r"transforms\.json"):
         common.detect(tmp_path)
     image(tmp_path / "masks/a.png")
+    (tmp_path / "splat/point_cloud").mkdir(parents=True)
+    with pytest.raises(InputError, match="`chebsplat view` shows it"):
+        common.detect(tmp_path / "splat")
     with pytest.raises(InputError, match=r"transforms\.json"):
         common.detect(tmp_path)
 
