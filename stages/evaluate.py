@@ -75,6 +75,8 @@ def run(job: Job) -> None:
         job.left_out("LPIPS", "evaluate.lpips_weights names no file: not measured")
     else:
         figures["lpips_net"] = {"net": NET, "normalize": NORMALIZE}
+    if lenses := capture.source.get("undistorted"):
+        job.left_out("PSNR on the photos as taken", f"they are undistorted ({', '.join(lenses)}), and measured so")
     if segmentation is not None:
         figures["segmentation"] = segmentation
     figures["left_out"] = scene.summary.get("left_out", {}) | job.facts.get("left_out", {})

@@ -18,6 +18,7 @@ DISTORTED = {"SIMPLE_RADIAL": 4, "RADIAL": 5, "OPENCV": 8}
 ROTATION_TOLERANCE = 1e-2  # of RᵀR − I: rows written with three decimals pass, a scale of 1 % does not
 FOCAL = (0.01, 100.0)  # of the longer side: fields of view of 178 and of 0.6 degrees
 OFF_CENTRE = 1.5  # sides by which a principal point may lie off the middle: crops have it outside
+LEAST_BENT = 0.05  # pixels: a lens that moves none by more is not undone, which would cost detail and gain nothing
 LEAST_KEPT = 0.25  # of each side: a distortion that leaves less of a photo is none that a lens has
 FARTHEST = 1e6  # scene units from the origin: in float32, points that far out are 0.06 apart
 
@@ -60,7 +61,21 @@ def camera_of(origin: Path, model: str, params: Any, width: Any, height: Any) ->
             f"{origin}: camera {model} {camera.width}x{camera.height} {camera.params} is not usable: {wrong}; "
             "restore the file"
         )
-    return camera
+    return Camera("PINHOLE", camera.pinhole, camera.width, camera.height) if bend(camera) < LEAST_BENT else camera
+
+
+@functools.lru_cache(64)
+def bend(camera: Camera) -> float:
+    """Pixels by which a camera's distortion moves a point of the photo at most, looked for on a grid; inf where it
+    cannot be told, 0 of pinhole cameras.
+    """
+    if camera.model not in DISTORTED:
+        return 0.0
+    fx, fy, cx, cy = camera.pinhole
+    x, y = np.meshgrid(np.linspace(0, camera.width, 33), np.linspace(0, camera.height, 33))
+    pixels = np.stack([x, y], -1).reshape(-1, 2)
+    rays = np.column_stack([(pixels - [cx, cy]) / [fx, fy], np.ones(len(pixels))])
+    return float(np.nan_to_num(np.abs(np.asarray(camera.colmap.img_from_cam(rays), float) - pixels), nan=np.inf).max())
 
 
 def fault(camera: Camera) -> str:
@@ -88,7 +103,11 @@ def fault(camera: Camera) -> str:
 
 @functools.lru_cache(64)
 def undistorted(camera: Camera) -> Camera:
-    """The pinhole camera of the largest view without blank pixels; pinhole cameras as they are."""
+    """The pinhole camera of the largest view without blank pixels; pinhole cameras as they are.
+
+    Choices: focal lengths stay, and the principal point stays where it is in its pixel, so that where the lens bends
+      little the view's pixels are the photo's.
+    """
     if camera.model not in DISTORTED:
         return Camera("PINHOLE", camera.pinhole, camera.width, camera.height)
     import pycolmap
@@ -96,7 +115,9 @@ def undistorted(camera: Camera) -> Camera:
     options = pycolmap.UndistortCameraOptions()
     options.blank_pixels = 0.0
     plain = pycolmap.undistort_camera(options, camera.colmap)
-    return Camera("PINHOLE", tuple(float(v) for v in plain.params), plain.width, plain.height)
+    fx, fy, *centre = plain.params
+    centre = [own + round(cut - own) for own, cut in zip(camera.pinhole[2:], centre, strict=True)]
+    return Camera("PINHOLE", (fx, fy, *centre), plain.width, plain.height)
 
 
 def cam_from_world(origin: Path, world_from_cam: np.ndarray, names: list[str]) -> np.ndarray:
