@@ -11,6 +11,7 @@ import numpy as np
 
 from chebsplat.errors import InputError
 from chebsplat.formats.images import MAX_PIXELS, MAX_SIDE
+from chebsplat.formats.world import World
 from chebsplat.stages.sources.texts import number
 
 PINHOLES = {"SIMPLE_PINHOLE": 3, "PINHOLE": 4}  # model: number of parameters
@@ -20,7 +21,8 @@ FOCAL = (0.01, 100.0)  # of the longer side: fields of view of 178 and of 0.6 de
 OFF_CENTRE = 1.5  # sides by which a principal point may lie off the middle: crops have it outside
 LEAST_BENT = 0.05  # pixels: a lens that moves none by more is not undone, which would cost detail and gain nothing
 LEAST_KEPT = 0.25  # of each side: a distortion that leaves less of a photo is none that a lens has
-FARTHEST = 1e6  # scene units from the origin: in float32, points that far out are 0.06 apart
+FARTHEST = 1e9  # scene units from the origin: in float64, points that far out are 1e-7 apart
+WIDEST = 1e6  # units of `formats.world`, between a camera and most others: in float32, points are 0.06 apart there
 
 
 @dataclass(frozen=True)
@@ -148,10 +150,12 @@ def cam_from_world(origin: Path, world_from_cam: np.ndarray, names: list[str]) -
 
 
 def near(origin: Path, places: np.ndarray, names: list[str]) -> None:
-    """Raise InputError if one of some cameras' places [V, 3] is beyond FARTHEST; nan is left to `chosen`."""
-    reach = np.abs(places).max(1, initial=0)
-    for k in np.flatnonzero(np.isfinite(reach) & (reach > FARTHEST)):
+    """Raise InputError if one of some cameras' places [V, 3] is beyond FARTHEST, or so far from most of them that no
+    scene can hold both; nan is left to `chosen`.
+    """
+    reach, inside = (np.abs(where).max(1, initial=0) for where in (places, World.of(places).inward(places)))
+    for k in np.flatnonzero(np.isfinite(reach) & ((reach > FARTHEST) | (inside > WIDEST))):
         raise InputError(
-            f"{origin}: {names[k]} lies {reach[k]:.3g} units from the origin, farther than the {FARTHEST:.0e} that "
-            "single precision allows; move the scene's origin into the scene"
+            f"{origin}: {names[k]} lies {reach[k]:.3g} units from the origin, too far to be told from the others "
+            "or to be seen beside them; correct its pose, or move the scene's origin into the scene"
         )

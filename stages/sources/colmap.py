@@ -7,7 +7,9 @@ from typing import Any
 
 import numpy as np
 
+from chebsplat.cameras import centers
 from chebsplat.errors import InputError
+from chebsplat.formats.world import World
 from chebsplat.stages.sources import assembly, cameras, common, texts
 from chebsplat.stages.sources.colmap_model import Model, read_model
 from chebsplat.stages.sources.common import Frame, Listing
@@ -104,7 +106,8 @@ def _label_names(folder: Path) -> dict[int, str] | None:
 def _points(model: Model, names: list[str], notes: list[str]) -> dict[str, Any]:
     """points, point_colors and tracks (point, view) of a capture with views of these names; nothing of few points."""
     cloud = model.cloud
-    good = np.abs(cloud.means).max(1, initial=0) < cameras.FARTHEST
+    within = World.of(centers(np.stack([image.pose for image in model.images]))).inward(cloud.means)
+    good = np.abs(within).max(1, initial=0) < cameras.WIDEST
     if len(cloud.tracks):
         length = np.bincount(cloud.tracks[:, 0], minlength=len(good))
         good &= (length >= MIN_TRACK) & (cloud.errors <= MAX_ERROR)
@@ -120,7 +123,7 @@ def _points(model: Model, names: list[str], notes: list[str]) -> dict[str, Any]:
     of_point = np.where(good, np.cumsum(good) - 1, -1)
     tracks = np.stack([of_point[cloud.tracks[:, 0]], of_image[cloud.tracks[:, 1]]], 1)
     return {
-        "points": cloud.means[good].astype(np.float32),
+        "points": cloud.means[good],
         "point_colors": cloud.colors[good],
         "tracks": tracks[(tracks >= 0).all(1)].astype(np.int32),
     }

@@ -18,6 +18,7 @@ from chebsplat.formats.features import Features
 from chebsplat.formats.gaussians import Gaussians
 from chebsplat.formats.ply import read_ply
 from chebsplat.formats.points import Points, thinned
+from chebsplat.formats.world import HERE, World
 from chebsplat.settings import DescribeSection, TrainSection
 from chebsplat.splats.gaussians import initial_gaussians
 from chebsplat.stages.runtime.command import Job, n_threads
@@ -71,7 +72,8 @@ def assemble(job: Job, inputs: Inputs, backend: str = "auto") -> Trainer:
     job.facts["decided"] = decided(job.config.train, train, features is not None)
     _note_left_out(job, train, features is not None, evidence.no_depth)
     torch.set_num_threads(n_threads())  # sums of torch depend on it; the same bytes are promised for the same number
-    model = model_of(points, features, train, job.config.describe, job.device, backend)
+    world = World.read(capture.source)
+    model = model_of(points, features, train, job.config.describe, job.device, backend, world)
     undone = exposures if train.exposure == "measured" else None
     if undone is not None:
         log.info("exposures of photos differ by %.2f stops from those about them: undone", stops)
@@ -158,13 +160,14 @@ def model_of(
     describe: DescribeSection,
     device: str = "cpu",
     backend: str = "auto",
+    world: World = HERE,
 ) -> SceneModel:
     """The scene before training: a Gaussian at each point, or those of `train.start`; modules drawn by the training's
-    seed. train: resolved; backend: of `rasterize`.
+    seed. train: resolved; backend: of `rasterize`; world: of the capture, whose source `train.start` is of.
     """
     torch.manual_seed(train.seed)
     if train.start:
-        initial = started(Path(train.start), train)
+        initial = started(Path(train.start), train, world)
     else:
         assert train.opacity is not None
         initial = initial_gaussians(points.means, points.colors, points.covariances, train.opacity)
@@ -194,12 +197,12 @@ def start_features(model: SceneModel, capture: Capture, points: Points, features
     return int(lifted.features.any(1).sum())
 
 
-def started(ply: Path, train: TrainSection) -> dict[str, Tensor]:
-    """Raw parameters of the Gaussians of a 3DGS PLY, in the frame of the scene's cameras, with its SH bands.
+def started(ply: Path, train: TrainSection, world: World) -> dict[str, Tensor]:
+    """Raw parameters of the Gaussians of a 3DGS PLY, in the frame of its source's cameras, with its SH bands.
 
     Raises: InputError naming the file; ConfigError where they are more than `train.max_gaussians`.
     """
-    parameters, degree, _ = read_ply(ply)
+    parameters, degree, _ = read_ply(ply, world)
     n = len(parameters["means"])
     if n == 0:
         raise InputError(f"{ply} holds no Gaussians; choose another train.start")
