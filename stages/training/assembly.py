@@ -8,6 +8,7 @@ from pathlib import Path
 
 import numpy as np
 import torch
+from scipy.spatial import cKDTree
 from torch import Tensor
 
 from chebsplat.cameras import extent
@@ -20,7 +21,7 @@ from chebsplat.formats.ply import read_ply
 from chebsplat.formats.points import Points, thinned
 from chebsplat.formats.world import HERE, World
 from chebsplat.settings import DescribeSection, TrainSection
-from chebsplat.splats.gaussians import initial_gaussians
+from chebsplat.splats.gaussians import initial_gaussians, sh0_of, surface_of
 from chebsplat.stages.runtime.command import Job, n_threads
 from chebsplat.stages.runtime.progress import Progress
 from chebsplat.stages.settings import LiftSection
@@ -167,7 +168,7 @@ def model_of(
     """
     torch.manual_seed(train.seed)
     if train.start:
-        initial = started(Path(train.start), train, world)
+        initial = started(Path(train.start), points, train, world)
     else:
         assert train.opacity is not None
         initial = initial_gaussians(points.means, points.colors, points.covariances, train.opacity)
@@ -197,10 +198,12 @@ def start_features(model: SceneModel, capture: Capture, points: Points, features
     return int(lifted.features.any(1).sum())
 
 
-def started(ply: Path, train: TrainSection, world: World) -> dict[str, Tensor]:
+def started(ply: Path, points: Points, train: TrainSection, world: World) -> dict[str, Tensor]:
     """Raw parameters of the Gaussians of a 3DGS PLY, in the frame of its source's cameras, with its SH bands.
 
     Raises: InputError naming the file; ConfigError where they are more than `train.max_gaussians`.
+    Choices: Gaussians of one colour, which tells nothing, take that of the nearest of the scene's points: a training
+      moves colours too slowly to find them.
     """
     parameters, degree, _ = read_ply(ply, world)
     n = len(parameters["means"])
@@ -211,6 +214,10 @@ def started(ply: Path, train: TrainSection, world: World) -> dict[str, Tensor]:
     raw = {name: parameters[name] for name in ("means", "log_scales", "quats", "logit_opacities", "sh0")}
     for band in range(1, min(degree, train.sh_degree) + 1):
         raw[f"sh{band}"] = parameters["shN"][:, band**2 - 1 : (band + 1) ** 2 - 1]
+    colors = surface_of(parameters)[1]
+    if np.abs(colors - np.median(colors, 0)).mean() < 1 / 255:
+        log.warning("%s has Gaussians of one colour; they take those of the points beside them", ply)
+        raw["sh0"] = sh0_of(points.colors[cKDTree(points.means).query(parameters["means"])[1]])
     return {name: torch.tensor(values, dtype=torch.float32) for name, values in raw.items()}
 
 

@@ -10,7 +10,8 @@ from shared import INPUTS, run_stage
 
 from chebsplat.cameras import unproject
 from chebsplat.formats.evaluation import Evaluation
-from chebsplat.formats.ply import read_ply
+from chebsplat.formats.ply import read_ply, write_ply
+from chebsplat.formats.points import Points
 from chebsplat.formats.scene import Scene
 from chebsplat.settings import TrainSection
 from chebsplat.stages.sources import generated
@@ -42,7 +43,7 @@ def written(folder, scale, offset):
 
 @pytest.fixture(scope="module")
 def scenes(tmp_path_factory):
-    """PSNR, opened scene, and the poses that were written, of each change."""
+    """PSNR, opened scene, the poses that were written, and points, of each change."""
     found = {}
     for name, change in CHANGES.items():
         place = tmp_path_factory.mktemp("units")
@@ -61,7 +62,7 @@ def scenes(tmp_path_factory):
             assert run_stage(stage, made[stage], roles, config) == 0
         opened = OpenedScene(Scene.read(made["export"]), made["export"])
         psnr = Evaluation.read(made["evaluate"]).figures["image"]["psnr"]
-        found[name] = psnr, opened, poses
+        found[name] = psnr, opened, poses, Points.read(made["sfm"])
     return found
 
 
@@ -73,8 +74,8 @@ def places(ply):
 
 @pytest.mark.parametrize("name", list(CHANGES)[1:])
 def test_units_and_origin_change_neither_the_picture_nor_what_is_exported(scenes, name, tmp_path):
-    (psnr, plain, _), (scale, offset) = scenes["as it is"], CHANGES[name]
-    other, opened, poses = scenes[name]
+    (psnr, plain, _, _), (scale, offset) = scenes["as it is"], CHANGES[name]
+    other, opened, poses, points = scenes[name]
     assert abs(other - psnr) < 0.01
     origin, rounding = np.array([offset, offset, 0]), 1e-9 * abs(offset)
     files = [scene.source / "scene.ply" for scene in (plain, opened)]
@@ -82,7 +83,7 @@ def test_units_and_origin_change_neither_the_picture_nor_what_is_exported(scenes
     assert np.abs(moved - origin - scale * ends).max() < 0.02 * scale * (ends[1] - ends[0]).max()
     sizes = [np.median(read_ply(ply)[0]["log_scales"]) for ply in files]
     assert sizes[1] - sizes[0] == pytest.approx(np.log(scale), abs=0.05)
-    begun = started(files[1], TrainSection(), opened.world)["means"].numpy()
+    begun = started(files[1], points, TrainSection(), opened.world)["means"].numpy()
     assert np.allclose(begun, opened.parameters["means"], atol=1e-5)
     for camera, pose in zip(opened.cameras, poses, strict=True):
         assert np.allclose(camera.cam_from_world[:3, :3], pose[:3, :3])
@@ -94,3 +95,17 @@ def test_units_and_origin_change_neither_the_picture_nor_what_is_exported(scenes
     parts = plain.select(box=box.ravel()), opened.select(box=(origin + scale * box).ravel())
     assert len(parts[1]) == pytest.approx(len(parts[0]), rel=0.1)
     assert np.allclose(places(parts[1].to_ply(tmp_path / "part.ply")), parts[1].points()[0], rtol=1e-6, atol=0)
+
+
+@pytest.mark.parametrize("color", [0.0, 0.4, 1.0])
+def test_a_given_splat_of_one_colour_begins_with_the_points_colours_and_another_with_its_own(scenes, color, tmp_path):
+    _, opened, _, points = scenes["tiny"]
+    given = opened.parameters
+    own = started(opened.source / "scene.ply", points, TrainSection(), opened.world)
+    assert np.allclose(own["sh0"], given["sh0"])
+    sh0 = np.full_like(given["sh0"], (color - 0.5) / 0.28209479177387814)
+    write_ply(tmp_path / "one.ply", given | {"sh0": sh0}, 0, world=opened.world)
+    found = started(tmp_path / "one.ply", points, TrainSection(), opened.world)
+    nearest = np.linalg.norm(given["means"][:, None] - points.means, axis=-1).argmin(1)
+    shown = 255 * (found["sh0"][:, 0].numpy() * 0.28209479177387814 + 0.5)
+    assert np.abs(shown - points.colors[nearest]).max() < 0.01
