@@ -63,16 +63,16 @@ def camera_of(origin: Path, model: str, params: Any, width: Any, height: Any) ->
             f"{origin}: camera {model} {camera.width}x{camera.height} {camera.params} is not usable: {wrong}; "
             "restore the file"
         )
-    return Camera("PINHOLE", camera.pinhole, camera.width, camera.height) if bend(camera) < LEAST_BENT else camera
+    if camera.model in DISTORTED and bend(camera) < LEAST_BENT:
+        return Camera("PINHOLE", camera.pinhole, camera.width, camera.height)
+    return camera
 
 
 @functools.lru_cache(64)
 def bend(camera: Camera) -> float:
-    """Pixels by which a camera's distortion moves a point of the photo at most, looked for on a grid; inf where it
-    cannot be told, 0 of pinhole cameras.
+    """Pixels by which a distorted camera moves a point of the photo at most, looked for on a grid; inf where that
+    cannot be told.
     """
-    if camera.model not in DISTORTED:
-        return 0.0
     fx, fy, cx, cy = camera.pinhole
     x, y = np.meshgrid(np.linspace(0, camera.width, 33), np.linspace(0, camera.height, 33))
     pixels = np.stack([x, y], -1).reshape(-1, 2)
