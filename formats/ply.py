@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import logging
 import re
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -15,6 +16,7 @@ from plyfile import PlyData, PlyElement, PlyListProperty, PlyParseError
 
 from chebsplat.errors import InputError
 from chebsplat.formats.files import regular
+from chebsplat.formats.world import HERE, World
 
 log = logging.getLogger("chebsplat")
 
@@ -33,6 +35,7 @@ def write_ply(
     degree: int,
     labels: np.ndarray | None = None,
     label_names: list[str] | None = None,
+    world: World = HERE,
 ) -> None:
     """Write raw parameters (`formats.gaussians.Gaussians.parameters`) as a binary little-endian 3DGS PLY.
 
@@ -42,13 +45,17 @@ def write_ply(
       labels:     [N] class ids, -1 none; `label` is then the last property.
       label_names: by id, written as comments `label ID NAME` of those that occur, in ASCII: what else a name holds is
                    escaped as Python does (`caf\\xe9`); `labels.json` beside a scene's PLY has the names themselves.
+      world:      of the parameters; the file has its source's.
     Choices: normals are written as zeros, since some loaders hard-code their presence. Tags are floats like all else:
       Open3D skips a `ushort`, and gsply 0.4 and spz-js 1.2 take any other type, or a second element, for the data.
+      Only x, y, z are doubles, and only of a scene far from its source's origin, which floats would round to steps.
     """
+    parameters = parameters | {"log_scales": parameters["log_scales"] + np.float32(np.log(world.scale))}
     n, n_rest = len(parameters["means"]), REST[degree]
     names = [*_FIXED, *(f"f_rest_{i}" for i in range(3 * n_rest)), *_TAIL]
+    means = world.outward(parameters["means"])
     blocks = [
-        parameters["means"],
+        means.astype(np.float32),
         np.zeros((n, 3), np.float32),
         parameters["sh0"][:, 0],
         parameters["shN"][:, :n_rest].transpose(0, 2, 1).reshape(n, -1),
@@ -63,7 +70,12 @@ def write_ply(
             names.append(name)
             blocks.append(values[:, None])
     rows = np.concatenate(blocks, 1, dtype="<f4", casting="same_kind")
-    vertex = PlyElement.describe(rows.view([(name, "<f4") for name in names])[:, 0], "vertex")
+    table = rows.view([(name, "<f4") for name in names])[:, 0]
+    if any(world.origin):
+        table = table.astype([(name, "<f8" if name in _FIXED[:3] else "<f4") for name in names])
+        for axis, name in enumerate(_FIXED[:3]):
+            table[name] = means[:, axis]
+    vertex = PlyElement.describe(table, "vertex")
     comments = []
     if labels is not None and label_names is not None:
         plain = [name.encode("unicode_escape").decode("ascii") for name in label_names]
@@ -71,9 +83,10 @@ def write_ply(
     PlyData([vertex], byte_order="<", comments=comments).write(str(path))
 
 
-def read_ply(path: Path) -> tuple[dict[str, np.ndarray], int, np.ndarray | None]:
+def read_ply(path: Path, world: World = HERE) -> tuple[dict[str, np.ndarray], int, np.ndarray | None]:
     """Raw parameters, file degree, and labels where the file has them. Normals and tags are optional.
 
+    Args:   world: to bring the Gaussians into, from that of its source.
     Raises: InputError naming the file: not a PLY, truncated, not a 3DGS layout, or most values not finite.
     Choices: discs of two scales (2DGS) are THIN across them. The filter that mip-splatting, GOF and RaDe-GS keep beside
       the scales is fused into scales and opacities, as these export it. `usable` says what is left out.
@@ -90,9 +103,9 @@ def read_ply(path: Path) -> tuple[dict[str, np.ndarray], int, np.ndarray | None]
     if degree is None:
         raise InputError(f"{path} has {n_rest} f_rest properties; 0, 9, 24 or 45 are possible")
 
-    def block(wanted: list[str]) -> np.ndarray:
+    def block(wanted: list[str], inward: Callable[[np.ndarray], np.ndarray] = np.asarray) -> np.ndarray:
         with np.errstate(over="ignore"):  # of doubles; what is infinite then is refused below
-            return np.stack([np.asarray(vertex[name], np.float32) for name in wanted], 1)
+            return inward(np.stack([vertex[name] for name in wanted], 1)).astype(np.float32)
 
     def whole(name: str, low: int, high: int) -> np.ndarray:
         values: np.ndarray = np.asarray(vertex[name])[kept]
@@ -105,7 +118,7 @@ def read_ply(path: Path) -> tuple[dict[str, np.ndarray], int, np.ndarray | None]
     shN = np.zeros((n, 15, 3), np.float32)
     shN[:, : n_rest // 3] = rest.reshape(n, 3, n_rest // 3).transpose(0, 2, 1)
     parameters = {
-        "means": block(["x", "y", "z"]),
+        "means": block(_FIXED[:3], world.inward),
         "log_scales": block(_TAIL[1 : 3 if flat else 4]),
         "quats": block(_TAIL[4:]),
         "logit_opacities": block(["opacity"])[:, 0],
@@ -120,6 +133,7 @@ def read_ply(path: Path) -> tuple[dict[str, np.ndarray], int, np.ndarray | None]
         log.info("%s: its filter_3D is fused into scales and opacities", path)
         parameters |= fused(parameters["log_scales"], parameters["logit_opacities"], np.asarray(vertex["filter_3D"]))
     parameters, kept = usable(path, parameters)
+    parameters["log_scales"] -= np.float32(np.log(world.scale))
     if "sh_degree" in names:
         parameters["degrees"] = whole("sh_degree", 0, degree).astype(np.uint8)
     labels = whole("label", -1, 2**24).astype(np.int32) if "label" in names else None

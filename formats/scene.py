@@ -14,6 +14,7 @@ from chebsplat.formats.cameras import Cameras
 from chebsplat.formats.manifest import Manifest
 from chebsplat.formats.ply import REST, write_ply
 from chebsplat.formats.record import Array, Record
+from chebsplat.formats.world import World
 
 LABELS = "labels.json"
 RAGGED = ("means", "log_scales", "quats", "sh0", "logit_opacities", "sh1", "sh2", "sh3")
@@ -28,7 +29,7 @@ class Scene:
     cameras:    of the views it can be evaluated on.
     order:      i64 [N], row of each Gaussian in the checkpoint.
     labels:     i32 [N] class index, -1 none; None without semantics. label_names, label_embeddings f32 [L, C].
-    summary:    counts, bytes, and what was left out and why.
+    summary:    counts, bytes, what was left out and why, and where the scene's `formats.world.World` is another.
     """
 
     SCHEMA: ClassVar[str] = "chebsplat.scene/3"
@@ -44,22 +45,22 @@ class Scene:
         """Fill the directory that `artifact.publish` yields; returns bytes by part.
 
         Choices: `scene.ply` is trimmed to the highest degree in use; `scene_d<k>.ply` hold each degree apart, each
-        valid on its own. Features are 16-bit fixed point: as small as halves, 20 times as exact. Degrees are
-        stored in the checkpoint's order, which they then tell.
+        valid on its own; all are in the source's world. Features are 16-bit fixed point: as small as halves, 20 times
+        as exact. Degrees are stored in the checkpoint's order, which they then tell.
         """
-        p, degrees = self.parameters, self.parameters["degrees"]
+        p, degrees, world = self.parameters, self.parameters["degrees"], World.read(self.summary)
         unsorted = np.empty_like(degrees)
         unsorted[self.order] = degrees
         if not np.array_equal(np.argsort(unsorted, kind="stable"), self.order):
             raise ValueError("Gaussians are not sorted by degree, stably")
         top = int(degrees.max(initial=0))
-        write_ply(out / "scene.ply", p, top, self.labels, self.label_names)
+        write_ply(out / "scene.ply", p, top, self.labels, self.label_names, world)
         if len(np.unique(degrees)) > 1:
             for degree in np.unique(degrees):
                 of_degree = degrees == degree
                 part = {name: values[of_degree] for name, values in p.items()}
                 labels = None if self.labels is None else self.labels[of_degree]
-                write_ply(out / f"scene_d{degree}.ply", part, int(degree), labels, self.label_names)
+                write_ply(out / f"scene_d{degree}.ply", part, int(degree), labels, self.label_names, world)
         bands = {}
         for band in range(1, top + 1):
             rows = p["shN"][degrees >= band, REST[band - 1] : REST[band]]

@@ -13,6 +13,7 @@ from chebsplat.errors import InputError
 from chebsplat.formats.files import regular
 from chebsplat.formats.packed import C0
 from chebsplat.formats.ply import REST, read_ply, usable
+from chebsplat.formats.world import HERE, World
 
 READ = (".ply", ".spz", ".splat")
 OTHERS = (".ksplat", ".sog", ".sogs", ".lcc", ".rad")
@@ -46,18 +47,21 @@ def _iteration(ply: Path) -> int:
     return int(number) if number.isdecimal() else -1
 
 
-def read_splats(path: Path) -> tuple[dict[str, np.ndarray], int, np.ndarray | None]:
+def read_splats(path: Path, world: World = HERE) -> tuple[dict[str, np.ndarray], int, np.ndarray | None]:
     """Raw parameters, degree and labels, as `ply.read_ply`, of any file or folder that `splat_file` takes.
 
+    Args:   world: to bring the Gaussians into, from that of its source.
     Raises: InputError naming the file.
     """
     path = splat_file(Path(path))
     if path.suffix.lower() not in (".spz", ".splat"):
-        return read_ply(path)
+        return read_ply(path, world)
     if path.stat().st_size > LARGEST:
         raise InputError(f"{path} has more than the {LARGEST >> 20} MiB that are read; thin it out")
     parameters, degree = (_spz if path.suffix.lower() == ".spz" else _splat)(path)
-    return usable(path, parameters)[0], degree, None
+    parameters = usable(path, parameters)[0]
+    moved = {"means": world.inward(parameters["means"]), "log_scales": parameters["log_scales"] - np.log(world.scale)}
+    return parameters | {name: values.astype(np.float32) for name, values in moved.items()}, degree, None
 
 
 def _splat(path: Path) -> tuple[dict[str, np.ndarray], int]:

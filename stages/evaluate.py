@@ -43,8 +43,13 @@ def run(job: Job) -> None:
     row = {name: view for view, name in enumerate(capture.names)}
     chosen = capture.is_test if not protocol.ON_TRAINING else ~capture.is_test
     places = [k for k, name in enumerate(scene.cameras.names) if name in row and chosen[row[name]]]
+    if capture.loss_mask is not None:
+        counted = [k for k in places if capture.loss_mask[row[scene.cameras.names[k]]].any()]
+        if hidden := len(places) - len(counted):
+            job.left_out(f"{hidden} of {len(places)} views", "masks and transparency leave no pixel of them")
+        places = counted
     if not places:
-        raise DataFailure("no view to evaluate has a camera; lower ingest.test_every")
+        raise DataFailure("no view to evaluate has a camera and a pixel that counts; lower ingest.test_every")
     names = [scene.cameras.names[k] for k in places]
     renderer = SceneRenderer(scene.parameters, job.device)
     cameras = [camera(scene, k) for k in places]
@@ -75,6 +80,8 @@ def run(job: Job) -> None:
         job.left_out("LPIPS", "evaluate.lpips_weights names no file: not measured")
     else:
         figures["lpips_net"] = {"net": NET, "normalize": NORMALIZE}
+    if lenses := capture.source.get("undistorted"):
+        job.left_out("PSNR on the photos as taken", f"they are undistorted ({', '.join(lenses)}), and measured so")
     if segmentation is not None:
         figures["segmentation"] = segmentation
     figures["left_out"] = scene.summary.get("left_out", {}) | job.facts.get("left_out", {})

@@ -11,6 +11,7 @@ from chebsplat.formats.features import Features
 from chebsplat.formats.gaussians import Gaussians
 from chebsplat.formats.lifted import Lifted, Refined
 from chebsplat.formats.scene import Scene
+from chebsplat.formats.world import World
 from chebsplat.labels.decode import decode_labels
 from chebsplat.stages.runtime.command import Job
 
@@ -55,6 +56,7 @@ def run(job: Job) -> None:
         job.left_out(f"SH band {degree}", "no Gaussian keeps it")
     left_out = gaussians.notes.get("left_out", {}) | job.facts.get("left_out", {})
     summary = {"left_out": left_out, "by_degree": counts, "n_initial": gaussians.notes.get("n_initial")}
+    summary |= World.read(gaussians.notes).notes
     scene = Scene(parameters, gaussians.cameras, order, **labelled, summary=summary)
     sizes = scene.write(job.out)
     job.facts |= {"n_gaussians": len(order), "by_degree": counts, "bytes": sizes}

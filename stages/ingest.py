@@ -15,6 +15,7 @@ from chebsplat.evaluation import protocols
 from chebsplat.formats.capture import MAPS, Capture
 from chebsplat.formats.names import natural
 from chebsplat.formats.photo_model import PhotoModel
+from chebsplat.formats.world import HERE, World
 from chebsplat.photos.exposures import relit
 from chebsplat.photos.frames import blurred, detail
 from chebsplat.stages.runtime.command import Job
@@ -175,6 +176,7 @@ def run(job: Job) -> None:
         if fields.get("cam_from_world") is None and any(strengths[1:]):
             raise ConfigError("ingest.disturb_degrees and disturb_shift change poses, and this source has none")
         fields |= disturbed(fields, *strengths)
+    fields |= normalised(fields)
     if settings.classes is not None:
         fields |= renamed(fields, settings.classes)
     without = {what: f"the {source.kind} source has none" for what in ("depth", "labels") if fields.get(what) is None}
@@ -189,6 +191,26 @@ def run(job: Job) -> None:
         job.left_out("views", f"{n_views - len(capture.names)} that ingest.max_train_views spares the training")
     job.facts |= {"source": capture.source, "n_views": len(capture.names), "n_test": int(np.sum(capture.is_test))}
     capture.write(job.out)
+
+
+def normalised(fields: dict[str, Any]) -> dict[str, Any]:
+    """Those fields of a capture that change as its scene is brought to a size and place for single precision
+    (`formats.world.World.of`), and where it was.
+    """
+    poses, points, depth = (fields.get(name) for name in ("cam_from_world", "points", "depth"))
+    world = HERE if poses is None else World.of(centers(poses))
+    changed: dict[str, Any] = {}
+    if points is not None:
+        changed["points"] = world.inward(points).astype(np.float32)
+    if world.notes and poses is not None:
+        place = ", ".join(f"{value:.6g}" for value in world.origin)
+        note = f"Inside, the scene is moved by -({place}) and divided by {world.scale:g}; what is exported is not."
+        log.info("%s", note)
+        changed["cam_from_world"] = world.poses_inward(poses)
+        changed["source"] = fields["source"] | world.notes | {"notes": [*fields["source"].get("notes", []), note]}
+        if depth is not None:
+            changed["depth"] = (np.asarray(depth[:]) / world.scale).astype(np.float32)
+    return changed
 
 
 def recolored(images: np.ndarray, is_test: np.ndarray, stops: float) -> np.ndarray:

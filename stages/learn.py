@@ -19,6 +19,7 @@ from chebsplat.formats.knowledge import Knowledge, read_knowledge
 from chebsplat.formats.lesson import Lesson, write_lesson
 from chebsplat.formats.names import suggest
 from chebsplat.formats.points import Points
+from chebsplat.formats.world import World
 from chebsplat.labels.decode import decode_labels
 from chebsplat.lifting.averages import SEEN_WITHIN, SWEPT_WITHIN, averaged
 from chebsplat.lifting.blend import familiar
@@ -67,7 +68,8 @@ def run(job: Job) -> None:
         if not len(z):
             raise DataFailure(encoding.notes["none"])
         if settings.points is not None:
-            said, n_views, embeddings = labelled(Path(settings.points), start, descriptors)
+            world = World.read(capture.source)
+            said, n_views, embeddings = labelled(Path(settings.points), start, descriptors, world)
             notes |= {"given": True, "teacher": "labelled points"}
         else:
             said, n_views = meant(job, start, capture, points, features, descriptors)
@@ -143,7 +145,9 @@ def named_embeddings(job: Job, start: Knowledge, features: Features) -> np.ndarr
     return np.asarray(features.label_embeddings @ to_knowledge(start, features))
 
 
-def labelled(path: Path, start: Knowledge, descriptors: Descriptors) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def labelled(
+    path: Path, start: Knowledge, descriptors: Descriptors, world: World
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """What a user says of points: the words f32 [N, d] of the described points, zero of the others; n_views,
     LEAST_VIEWS of those; and the unit embeddings f32 [L, d] of the words.
 
@@ -157,7 +161,7 @@ def labelled(path: Path, start: Knowledge, descriptors: Descriptors) -> tuple[np
         near = ", ".join(suggest(word, start.words))
         raise InputError(f"{path}: knowledge has no word {word}" + (f"; near: {near}" if near else ""))
     means, _ = in_scene(descriptors)
-    away, nearest = cKDTree(means).query(where)
+    away, nearest = cKDTree(means).query(world.inward(where))
     beside = away <= REACH * descriptors.unit
     if not beside.any():
         raise InputError(f"{path}: no point lies within {REACH} m of the scene's surface; give x, y, z in its frame")

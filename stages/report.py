@@ -150,9 +150,10 @@ def summary_rows(figures: dict[str, Any], by_degree: list[int] | None, trained: 
         return "not measured" if value is None else form.format(value)
 
     image = figures["image"]
+    of = ", of undistorted photos" if "undistorted" in figures["source"] else ""
     rows = [
         ["figure", "scene", "2D teacher"],
-        ["PSNR, dB (8-bit, mean over views)", f"{image['psnr']:.2f}", ""],
+        [f"PSNR, dB (8-bit, mean over views{of})", f"{image['psnr']:.2f}", ""],
         ["PSNR after a colour fit by view, dB", shown(image.get("psnr_fit"), "{:.2f}"), ""],
         ["SSIM (window 11, σ 1.5)", f"{image['ssim']:.4f}", ""],
         ["LPIPS (vgg, images in [0, 1])", shown(figures["lpips"], "{:.3f}"), ""],

@@ -11,6 +11,7 @@ from chebsplat.cameras import centers, unproject
 from chebsplat.errors import DataFailure
 from chebsplat.formats.capture import Capture
 from chebsplat.formats.points import Points
+from chebsplat.photos.colors import tell_of
 from chebsplat.splats.gaussians import local_shape
 from chebsplat.stages.reconstruction.dense import MOST, swept, wants_more
 from chebsplat.stages.reconstruction.pose_check import wants_adjustment
@@ -155,13 +156,13 @@ def from_source(capture: Capture, settings: SfmSection) -> Cloud:
     """The source's own points that a training view has in its image, thinned to one a voxel.
 
     Choices: a point is taken as seen from the nearest such view, which turns its normal; walls in between are not
-    looked for. A point without a colour takes the pixel's.
+    looked for. Points without colours, or with some that tell nothing, take the pixels there (`tell_of`).
     """
     assert capture.cam_from_world is not None and capture.points is not None
     kept = thin(capture.points, settings.max_points)
     points, (width, height) = capture.points[kept].astype(np.float64), capture.size
     distance, seen = np.full(len(points), np.inf), np.full(len(points), -1)
-    colors = np.zeros((len(points), 3), np.uint8)
+    pixels, colors = np.zeros((len(points), 3), np.uint8), capture.point_colors
     tracks = tracks_of(capture, kept)
     for view in np.flatnonzero(~capture.is_test):
         pose = capture.cam_from_world[view]
@@ -172,11 +173,12 @@ def from_source(capture: Capture, settings: SfmSection) -> Cloud:
             away = np.where(np.isin(np.arange(len(points)), tracks[tracks[:, 1] == view, 0]), away, np.inf)
         nearer = (camera[:, 2] > 0.01) & (u >= 0) & (u < width) & (v >= 0) & (v < height) & (away < distance)
         distance[nearer], seen[nearer] = away[nearer], view
-        if capture.point_colors is None:
-            colors[nearer] = capture.images[view][v[nearer].astype(int), u[nearer].astype(int)]
-    if capture.point_colors is not None:
-        colors = capture.point_colors[kept]
+        pixels[nearer] = capture.images[view][v[nearer].astype(int), u[nearer].astype(int)]
     inside = seen >= 0
+    if colors is not None and not tell_of(colors[kept][inside], pixels[inside]):
+        log.warning("the source's colours of points tell nothing of the photos; the photos' own are taken")
+        colors = None
+    colors = pixels if colors is None else colors[kept]
     tracks = tracks_of(capture, kept[inside])
     log.info("%d of the source's %d points are used; nothing is matched", inside.sum(), len(capture.points))
     return {

@@ -8,6 +8,7 @@ from typing import Any
 from chebsplat.errors import DataFailure
 from chebsplat.formats.cameras import Cameras
 from chebsplat.formats.gaussians import Gaussians
+from chebsplat.formats.world import World
 from chebsplat.stages.runtime.command import Job
 from chebsplat.stages.training.assembly import KNOWLEDGE, assemble, read_inputs
 from chebsplat.stages.training.facts import facts_of, printed_facts
@@ -45,6 +46,7 @@ def run(job: Job) -> None:
     modules |= {KNOWLEDGE + name: basis.numpy() for name, basis in bases.items()}
     cameras = Cameras(points.names, points.Ks, points.cam_from_world, *inputs.capture.size)
     notes: dict[str, Any] = {"left_out": job.facts.get("left_out", {}), "n_added": population.n_added}
+    notes |= World.read(inputs.capture.source).notes
     notes |= {"n_removed": population.n_removed, "n_broken": population.n_broken, "n_initial": n_initial}
     if features is not None:
         notes |= {"label_names": features.label_names, "convention": features.convention}

@@ -15,6 +15,7 @@ from benchmarks.stability import (  # noqa: F401  # importing a module registers
     losses,
     pruning,
     regions,
+    splats,
     training,
 )
 from benchmarks.stability.case import CASES, Row, run

@@ -88,6 +88,16 @@ def _black(views: Views) -> torch.Tensor:
     return images
 
 
+def _away(views: Views) -> torch.Tensor:
+    poses = views.viewmats.clone()
+    poses[1] = torch.diag(torch.tensor([-1.0, 1, -1, 1])) @ poses[1]
+    return poses
+
+
+def _hidden(views: Views) -> torch.Tensor:
+    return torch.arange(4)[:, None, None].ne(1).expand(views.images.shape[:3])  # type: ignore[arg-type]
+
+
 def _lost(views: Views) -> torch.Tensor:
     poses = views.viewmats.clone()
     poses[1, 0, 3] = torch.nan
@@ -129,6 +139,11 @@ SCENES: dict[str, Callable[[], Trainer]] = {
     "a camera inside a Gaussian": lambda: _raw(means=_at_the_camera, log_scales=lambda v: v[0].fill_(1.0)),
     "a Gaussian of scale 1e30": lambda: _raw(log_scales=lambda v: v[0].fill_(69.0)),
     "needles of 1e-20": lambda: _raw(log_scales=lambda v: v[:, 0].fill_(-46.0)),
+    "needles of 1e+03": lambda: _raw(log_scales=lambda v: v[:, 0].fill_(7.0)),
+    "near-flat Gaussians": lambda: _raw(log_scales=lambda v: v[:, 2].fill_(-30.0)),
+    "quaternions of 1e-30": lambda: _raw(quats=lambda v: v.mul_(1e-30)),
+    "SH of 1e+04": lambda: _raw(sh0=lambda v: v.mul_(1e4), sh1=lambda v: v.fill_(1e4), sh3=lambda v: v.fill_(-1e4)),
+    "all on one pixel": lambda: _raw(means=lambda v: v.copy_(v[:1].expand_as(v)), log_scales=lambda v: v.fill_(-7.0)),
     "quaternions of 0": lambda: _raw(quats=lambda v: v[::5].zero_()),
     "opacity logits of ±1e4": lambda: _raw(logit_opacities=lambda v: (v[::2].fill_(1e4), v[1::2].fill_(-1e4))),
     "a NaN colour": lambda: _raw(sh0=lambda v: v[3].fill_(torch.nan)),
@@ -138,6 +153,8 @@ SCENES: dict[str, Callable[[], Trainer]] = {
     "one view's features NaN": lambda: _with_views(features=_corrupt(float("nan"))),
     "one view's features 1e30": lambda: _with_views(features=_corrupt(1e30)),
     "one view black": lambda: _with_views(images=_black),
+    "one view looks away": lambda: _with_views(viewmats=_away),
+    "nothing of one view counts": lambda: _with_views(masks=_hidden),
     "one view's pose NaN": lambda: _with_views(viewmats=_lost),
     "rates 10 times too high": lambda: _rates(10),
     "rates 1000 times too high": lambda: _rates(1000),

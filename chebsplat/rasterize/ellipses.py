@@ -16,7 +16,7 @@ from chebsplat.kernels.jit import body, inline, kernel, prange
 HALF_LOG2E = 0.5 * math.log2(math.e)
 LN2 = math.log(2.0)
 PARTS = 64  # of the Gaussians: each has scratch of its own
-LARGEST, EXTENT = 1e30, 3.33  # as `projection`'s, which numba's cache could not follow
+LARGEST, EXTENT, LEAST_KEPT = 1e30, 3.33, 0.005  # as `projection`'s, which numba's cache could not follow
 
 
 @inline
@@ -141,7 +141,7 @@ def _project(
         covariances[i, 0], covariances[i, 1], covariances[i, 2] = a, b, c
         over = 1.0 / determinant
         conics[i, 0], conics[i, 1], conics[i, 2] = c * over, -b * over, a * over
-        compensations[i] = area * math.sqrt(over)
+        compensations[i] = max(area * math.sqrt(over), LEAST_KEPT)
         p, under = math.sqrt(HALF_LOG2E * c * over), 1.0 / c
         whitening[i, 0], whitening[i, 1], whitening[i, 2] = p, -p * b * under, math.sqrt(HALF_LOG2E * under)
 
@@ -152,8 +152,8 @@ def project(means, quats, scales, viewmat, K, width, height, near_plane, far_pla
 
     Args: means, scales [N, 3], quats [N, 4] float32; viewmat [4, 4], K [3, 3] float64.
     Returns: float32 means2d [N, 2], covariances [N, 3] (xx, xy, yy; ε included), whitening [N, 3] (p, q, r),
-      conics [N, 3], depths [N]; radii [N] i32; compensations [N] f32, √(det Σ / det(Σ + ε I)). Rows of culled
-      Gaussians are zero; a visible one's radius is not.
+      conics [N, 3], depths [N]; radii [N] i32; compensations [N] f32, √(det Σ / det(Σ + ε I)), at least
+      LEAST_KEPT. Rows of culled Gaussians are zero; a visible one's radius is not.
     """
     n = len(means)
     means2d, covariances = np.zeros((n, 2), np.float32), np.zeros((n, 3), np.float32)
@@ -191,7 +191,7 @@ def _project_adjoint(
 
     The gradient to the factor F of Σ is 2 / (½ log₂e) Wᵀ M (W F): W F is bounded, while gradients to Σ itself would
     have to cancel over the needle's length. The compensation is |f × g| / √det of F's rows f and g; its gradient is
-    taken at the unit normal f × g / |f × g|, which stays bounded as the ellipse flattens.
+    taken at the unit normal f × g / |f × g|, which stays bounded as the ellipse flattens, and is 0 below its floor.
     """
     unit, camera, normal, across = np.empty(4), np.empty(3), np.empty(3), np.empty((2, 3))
     rotation, jacobian, screen = np.empty((3, 3)), np.empty((2, 3)), np.empty((2, 3))
@@ -219,7 +219,7 @@ def _project_adjoint(
             top, low = s * (uu * axis_u + uv * axis_v), s * (uv * axis_u + vv * axis_v)
             by_scales[k] = top * axis_u + low * axis_v
             by_axes[0, k], by_axes[1, k] = s * p * top, s * (q * top + r * low)
-        if grad_compensations[i] != 0 and area > 0:
+        if grad_compensations[i] != 0 and area > LEAST_KEPT * math.sqrt(determinant):
             weight = grad_compensations[i] / (determinant * math.sqrt(determinant))
             for k in range(3):
                 normal[k] /= area

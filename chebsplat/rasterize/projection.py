@@ -11,6 +11,7 @@ from chebsplat.splats.rotations import rotation_matrices
 
 EXTENT = 3.33  # in σ: there even a Gaussian of opacity 1 has fallen to 1/255, √(2 ln 255)
 CELL = 4  # pixels, the side of a cell of `cell_colors`
+LEAST_KEPT = 0.005  # of an opacity that is compensated: 3DGS's and gsplat's floor
 LARGEST = 1e30  # of a projected variance, pixels²: more is culled, so that float32 can hold what is made of it
 
 
@@ -21,7 +22,7 @@ class Projected(NamedTuple):
     covariances: Tensor  # [N, 3] xx, xy, yy of the 2D covariance, ε included, pixels²
     conics: Tensor  # [N, 3] upper triangle of its inverse, pixels⁻²
     whitening: Tensor  # [N, 3] p, q, r of W = [[p, q], [0, r]], WᵀW half the conic: at an offset d, α ∝ exp(−|W d|²)
-    compensations: Tensor  # [N] √(det Σ / det(Σ + ε I)), what ε adds to the ellipse's area
+    compensations: Tensor  # [N] √(det Σ / det(Σ + ε I)), what ε adds to the ellipse's area; at least LEAST_KEPT
     depths: Tensor  # [N] camera z
     radii: Tensor  # [N] int, extent of the opacity-independent ellipse of 3.33 σ in pixels
     visible: Tensor  # [N] bool
@@ -87,7 +88,7 @@ def project(
     # from the covariance, not from the conic, whose own determinant would cancel
     p, r = (0.5 * (c + eps2d) / determinant).sqrt(), (0.5 / (c + eps2d)).sqrt()
     whitening = torch.stack([p, -p * b / (c + eps2d), r], -1)
-    compensations = torch.linalg.vector_norm(cross, dim=-1) / determinant.sqrt()
+    compensations = (torch.linalg.vector_norm(cross, dim=-1) / determinant.sqrt()).clamp_min(LEAST_KEPT)
     means2d = torch.stack([fx * x / z + cx, fy * y / z + cy], -1)
 
     reach = (EXTENT * largest.sqrt()).ceil().clamp_max(2**30)

@@ -58,7 +58,7 @@ def rasterize(
       backgrounds: [C, D]; black if None.
       max_alpha:   ceiling of one Gaussian's alpha; its gradient above is zero.
       rasterize_mode: `antialiased` multiplies opacities by √(det Σ / det(Σ + eps2d I)), Σ the projected covariance, so
-        that a Gaussian smaller than a pixel fades as it shrinks; `classic` does not.
+        that a Gaussian smaller than a pixel fades as it shrinks, to 0.005 at least; `classic` does not.
       absgrad:     whether meta's `means2d` carries `absgrad` [C, N, 2], after backward the sum over pixels of the
         absolute gradient.
       cell_colors: [N, E] or [C, N, E], channels of which only means over cells of 4×4 pixels are wanted, on black; on

@@ -65,9 +65,14 @@ def initial_gaussians(
         "log_scales": log_scales,
         "quats": quats,
         "logit_opacities": np.full(n, np.log(opacity / (1 - opacity))),
-        "sh0": (colors[:, None].astype(np.float64) / 255 - 0.5) / _C0,
+        "sh0": sh0_of(colors),
     }
     return {name: torch.as_tensor(np.ascontiguousarray(value), dtype=torch.float32) for name, value in raw.items()}
+
+
+def sh0_of(colors: np.ndarray) -> np.ndarray:
+    """Coefficients f64 [N, 1, 3] of SH band 0 that show colours u8 [N, 3]."""
+    return (colors[:, None].astype(np.float64) / 255 - 0.5) / _C0
 
 
 def activated(raw: Mapping[str, Tensor]) -> tuple[Tensor, Tensor, Tensor, Tensor]:

@@ -5,6 +5,7 @@ has and that its masks keep.
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -72,6 +73,25 @@ def light(coefficients: Tensor, directions: Tensor, degree: int, backend: str = 
     return torch.einsum("nk,nkc->nc", values, coefficients[:, : n_coefficients(degree)])
 
 
+class _Floored(torch.autograd.Function):
+    """Values with what is negative cut off; a gradient that would lift it back above 0 passes."""
+
+    @staticmethod
+    def forward(ctx: Any, values: Tensor) -> Tensor:
+        ctx.save_for_backward(values)
+        return values.clamp_min(0)
+
+    @staticmethod
+    def backward(ctx: Any, grad: Tensor) -> Tensor:
+        (values,) = ctx.saved_tensors
+        return torch.where((values > 0) | (grad < 0), grad, 0)
+
+
+def _floored(values: Tensor) -> Tensor:
+    cut: Tensor = _Floored.apply(values)
+    return cut
+
+
 def eval_sh(sh0: Tensor, shN: Tensor, directions: Tensor, degree: int) -> Tensor:
     """Colour seen along a direction; the half-grey offset is added and negative light cut off.
 
@@ -83,7 +103,7 @@ def eval_sh(sh0: Tensor, shN: Tensor, directions: Tensor, degree: int) -> Tensor
     Returns: [N, 3], at least 0.
     """
     coefficients = torch.cat([sh0, shN[:, : n_coefficients(degree) - 1]], 1)
-    return (light(coefficients, directions, degree) + 0.5).clamp_min(0)
+    return _floored(light(coefficients, directions, degree) + 0.5)
 
 
 def colors_in_view(
@@ -102,7 +122,8 @@ def colors_in_view(
       band to use; backend: of `rasterize`.
     Raises: ValueError if the degree is not within 0 and 3.
     Choices: no gradient reaches the means through the view's direction; a band that is not used gets no gradient at
-      all, so that the optimizer leaves it out.
+      all, so that the optimizer leaves it out. A colour that is cut off at 0 keeps the gradient that would lift it: a
+      Gaussian that begins black, or has become so, can be seen again.
     """
     if not 0 <= degree <= 3:
         raise ValueError(f"degree {degree} is not within 0 and 3")
@@ -110,7 +131,7 @@ def colors_in_view(
         return sh_kernels.colors_in_view(bands, masks, index, means, eye, degree)
     coefficients = _coefficients(bands[: degree + 1], masks, index)
     directions = means.detach().index_select(0, index) - eye
-    return (light(coefficients, directions, min(degree, len(bands) - 1), backend) + 0.5).relu()
+    return _floored(light(coefficients, directions, min(degree, len(bands) - 1), backend) + 0.5)
 
 
 def _coefficients(bands: Sequence[Tensor], masks: Tensor | None, index: Tensor) -> Tensor:

@@ -109,7 +109,7 @@ def _backward(sh1, sh2, sh3, bands, index, means, eye, degree, out, grad, for_ba
         top = _kept(bands, n_held, i, v, degree)
         _basis(means, eye, i, degree if for_bands else top, values)
         for c in range(3):
-            g = grad[v, c] if out[v, c] > 0 else np.float32(0)
+            g = grad[v, c] if out[v, c] > 0 or grad[v, c] < 0 else np.float32(0)
             to_sh0[i, 0, c] = values[0] * g
             if top >= 1:
                 _to_band(values, 1, g, to_sh1, i, c)

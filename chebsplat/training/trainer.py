@@ -235,14 +235,15 @@ class Trainer:
             weights = settings.weight_mask, settings.weight_sh
             return losses | auxiliary_losses(parts, weights)
         if auxiliary.soft_mask is not None:
-            losses["mask"] = settings.weight_mask * auxiliary.soft_mask.mean()
+            soft = auxiliary.soft_mask
+            losses["mask"] = settings.weight_mask * soft.sum() / max(len(soft), 1)
         if auxiliary.band_masks is not None:
             losses["sh"] = settings.weight_sh * sh_prune.sh_loss(auxiliary.band_masks, self._guided(rendered.index))
         return losses
 
     @torch.no_grad()
     def held_in_psnr(self, indices: list[int]) -> float:
-        """Mean PSNR over training views at full resolution, dB."""
+        """Mean PSNR over training views at full resolution, dB, of which a pixel counts; 0 if none does."""
         scores = []
         for index in indices:
             camera, degree = self.views.camera(index, 1), self.schedule.degree(self.share)
@@ -250,8 +251,9 @@ class Trainer:
             image = (rendered.rgb.clamp(0, 1) * 255).round().byte().cpu().numpy()
             mask = None if self.views.masks is None else self.views.masks[index].cpu().numpy()
             truth = self.views.images[index].cpu().numpy()
-            scores.append(psnr(image, truth) if mask is None else psnr(image[mask], truth[mask]))
-        return float(np.mean(scores))
+            if mask is None or mask.any():
+                scores.append(psnr(image, truth) if mask is None else psnr(image[mask], truth[mask]))
+        return float(np.mean(scores or [0.0]))
 
     @torch.no_grad()
     def finish(self) -> dict[str, np.ndarray]:

@@ -156,7 +156,7 @@ def _collected(model: pycolmap.Reconstruction, shots: Sequence[Shot], judged: di
     rows = [int(image.name[:-4]) for image in images]
     used = sorted({image.camera_id for image in images})
     place = {image.image_id: view for view, image in enumerate(images)}
-    cameras = []
+    cameras: list[list[Any]] = []
     for identity in used:
         held, width, height = model.cameras[identity], *shots[rows[[i.camera_id for i in images].index(identity)]].size
         held.rescale(width, height)

@@ -12,6 +12,7 @@ from chebsplat.errors import DataFailure
 from chebsplat.formats.capture import Capture
 from chebsplat.formats.descriptors import Descriptors
 from chebsplat.formats.points import Points
+from chebsplat.formats.world import World
 from chebsplat.lifting.smoothing import room_unit
 from chebsplat.lifting.surface import surface, swept_surface
 from chebsplat.splats.gaussians import local_shape
@@ -98,9 +99,9 @@ def up_of(poses: np.ndarray) -> tuple[np.ndarray, float]:
 
 
 def scene_unit(capture: Capture | None, means: np.ndarray) -> tuple[float, str]:
-    """Scene units of a metre, and what says so: 1 where the source is metric or has depth, otherwise by the extent."""
+    """Scene units of a metre, and what says so: the source's where it is metric or has depth, otherwise the extent."""
     if capture is not None and (capture.depth is not None or capture.source.get("kind") in METRIC):
-        return 1.0, "source"
+        return 1 / World.read(capture.source).scale, "source"
     return room_unit(means), "extent"
 
 

@@ -10,6 +10,7 @@ from typing import Any
 
 import numpy as np
 from PIL import Image
+from scipy.fft import dctn, idctn
 from scipy.ndimage import map_coordinates
 
 from chebsplat.errors import DataFailure, InputError
@@ -35,10 +36,10 @@ MOST_EMPTY = 1 / 3  # of the views that see a point
 def assemble(listing: Listing, settings: IngestSection, class_names: tuple[str, ...] | None = None) -> dict[str, Any]:
     """Read all frames into the fields of a capture.
 
-    Choices: `max_views` picks evenly from the naturally sorted frames. Images are reduced to `max_side` by averaging
-      and then undistorted; depth, labels and masks take the nearest pixel of the file. Smaller views are padded at
-      the right and the bottom, where the loss mask is false, as it is in a photo that is all transparent. Depth and
-      labels are taken only if every frame of the source has them.
+    Choices: `max_views` picks evenly from the naturally sorted frames. Images are reduced to `max_side` by averaging,
+      and undistorted in the same step where a lens bends them (`resampled`); depth, labels and masks take the nearest
+      pixel of the file. Smaller views are padded at the right and the bottom, where the loss mask is false, as it is
+      in a photo that is all transparent. Depth and labels are taken only if every frame of the source has them.
     Raises:  InputError naming a bad file, DataFailure under `min_views` or where no label has a name.
     """
     frames, notes = chosen(listing, settings)
@@ -87,8 +88,9 @@ def assemble(listing: Listing, settings: IngestSection, class_names: tuple[str, 
     if (least := min(shape.factor for shape in shapes)) < 1:
         notes.append(f"Images are reduced by {least:.3f} (ingest.max_side).")
     if models := sorted({frame.camera.model for frame in frames} & set(DISTORTED)):
-        notes.append(f"Images are undistorted ({', '.join(models)}).")
-    return fields | {"source": {"kind": listing.kind, "notes": notes}}
+        notes.append(f"Images are undistorted ({', '.join(models)}), and figures are of these, not of photos as taken.")
+    source = {"kind": listing.kind, "notes": notes} | ({"undistorted": models} if models else {})
+    return fields | {"source": source}
 
 
 def in_empty_space(points: np.ndarray, fields: dict[str, Any], listing: Listing) -> np.ndarray:
@@ -263,14 +265,27 @@ def moved(at: np.ndarray, camera: Camera, other: Camera) -> tuple[np.ndarray, tu
 
 
 def resampled(image: Any, camera: Camera, view: Geometry, at: np.ndarray) -> np.ndarray:
-    """The RGB photo as u8 [H, W, 3] of the view: area averages, then bilinear where the photo is distorted."""
-    distorted = camera.model in DISTORTED
-    size = (view.width, view.height)
-    if distorted:
-        size = (max(round(camera.width * view.factor), 1), max(round(camera.height * view.factor), 1))
-    small = np.asarray(image if size == image.size else image.resize(size, Image.Resampling.BOX))
-    if not distorted:
-        return small
+    """The RGB photo as u8 [H, W, 3] of the view: area averages, where the photo is distorted of its undistorted self.
 
-    x, y = at[0] * size[0] / camera.width - 0.5, at[1] * size[1] / camera.height - 0.5
-    return np.stack([map_coordinates(small[..., c], [y, x], order=1, mode="nearest") for c in range(3)], -1)
+    Choices: a distorted photo is interpolated, by cubic splines, where it is at least twice as fine as the view:
+      reduced no further, or doubled by its cosine series, which adds and loses nothing. A pixel is the mean of four
+      places in it, each with its share of the area; where pixels are as large as the photo's, the value at its middle.
+    """
+    if camera.model not in DISTORTED:
+        size = (view.width, view.height)
+        return np.asarray(image if size == image.size else image.resize(size, Image.Resampling.BOX))
+
+    scale = min(2 * view.factor, 1.0)
+    size = (max(round(camera.width * scale), 1), max(round(camera.height * scale), 1))
+    finer = np.asarray(image if size == image.size else image.resize(size, Image.Resampling.BOX), np.float32)
+    if scale == 1:
+        twice = [2 * side for side in finer.shape[:2]]
+        finer = 2 * idctn(dctn(finer, axes=(0, 1), norm="ortho"), s=twice, axes=(0, 1), norm="ortho")
+    spans = np.array([camera.height, camera.width])[:, None, None]
+    places = (at[::-1] * (np.array(finer.shape[:2])[:, None, None] / spans) - 0.5)[:, None]
+    if view.factor < 1:
+        away = (1 - view.factor / scale) / 2  # pixels of the view
+        down, right = (away * np.gradient(places[:, 0], axis=axis) for axis in (1, 2))
+        places = np.stack([places[:, 0] + i * down + j * right for i in (-1, 1) for j in (-1, 1)], 1)
+    means = [map_coordinates(finer[..., c], places, np.float32, mode="nearest").mean(0) for c in range(3)]
+    return np.stack(means, -1).round().clip(0, 255).astype(np.uint8)

@@ -11,6 +11,7 @@ import numpy as np
 
 from chebsplat.errors import InputError
 from chebsplat.formats.images import MAX_PIXELS, MAX_SIDE
+from chebsplat.formats.world import World
 from chebsplat.stages.sources.texts import number
 
 # COLMAP's models in the order of their ids: number of parameters
@@ -26,9 +27,11 @@ TALL = 1.5  # heights of a face in its width: it sees 45° to either side, and 5
 ROTATION_TOLERANCE = 1e-2  # of RᵀR − I: rows written with three decimals pass, a scale of 1 % does not
 FOCAL = (0.01, 100.0)  # of the longer side: fields of view of 178 and of 0.6 degrees
 OFF_CENTRE = 1.5  # sides by which a principal point may lie off the middle: crops have it outside
+LEAST_BENT = 0.05  # pixels: a lens that moves none by more is not undone, which would cost detail and gain nothing
 LEAST_KEPT = 0.25  # of each side: a distortion that leaves less of a photo is none that a lens has
 SAME_SHAPE = 0.02  # difference in aspect ratio that still counts as another resolution of the same picture
-FARTHEST = 1e6  # scene units from the origin: in float32, points that far out are 0.06 apart
+FARTHEST = 1e9  # scene units from the origin: in float64, points that far out are 1e-7 apart
+WIDEST = 1e6  # units of `formats.world`, between a camera and most others: in float32, points are 0.06 apart there
 
 
 @dataclass(frozen=True)
@@ -81,7 +84,21 @@ def camera_of(origin: Path, model: str, params: Any, width: Any, height: Any) ->
             f"{origin}: camera {model} {camera.width}x{camera.height} {camera.params} is not usable: {wrong}; "
             "restore the file"
         )
+    if camera.model in DISTORTED and bend(camera) < LEAST_BENT:
+        return Camera("PINHOLE", camera.pinhole, camera.width, camera.height)
     return camera
+
+
+@functools.lru_cache(64)
+def bend(camera: Camera) -> float:
+    """Pixels by which a distorted camera moves a point of the photo at most, looked for on a grid; inf where that
+    cannot be told.
+    """
+    fx, fy, cx, cy = camera.pinhole
+    x, y = np.meshgrid(np.linspace(0, camera.width, 33), np.linspace(0, camera.height, 33))
+    pixels = np.stack([x, y], -1).reshape(-1, 2)
+    rays = np.column_stack([(pixels - [cx, cy]) / [fx, fy], np.ones(len(pixels))])
+    return float(np.nan_to_num(np.abs(np.asarray(camera.colmap.img_from_cam(rays), float) - pixels), nan=np.inf).max())
 
 
 def fault(camera: Camera) -> str:
@@ -124,7 +141,11 @@ def scaled(camera: Camera, size: tuple[int, int]) -> Camera:
 
 @functools.lru_cache(64)
 def undistorted(camera: Camera) -> Camera:
-    """The pinhole camera of the largest view without blank pixels; pinhole cameras as they are."""
+    """The pinhole camera of the largest view without blank pixels; pinhole cameras as they are.
+
+    Choices: focal lengths stay, and the principal point stays where it is in its pixel, so that where the lens bends
+      little the view's pixels are the photo's.
+    """
     if camera.model not in DISTORTED:
         return Camera("PINHOLE", camera.pinhole, camera.width, camera.height)
     if camera.model == EQUIRECTANGULAR:
@@ -136,7 +157,9 @@ def undistorted(camera: Camera) -> Camera:
     options = pycolmap.UndistortCameraOptions()
     options.blank_pixels = 0.0
     plain = pycolmap.undistort_camera(options, camera.colmap)
-    return Camera("PINHOLE", tuple(float(v) for v in plain.params), plain.width, plain.height)
+    fx, fy, *centre = plain.params
+    centre = [own + round(cut - own) for own, cut in zip(camera.pinhole[2:], centre, strict=True)]
+    return Camera("PINHOLE", (fx, fy, *centre), plain.width, plain.height)
 
 
 def cam_from_world(origin: Path, world_from_cam: np.ndarray, names: list[str]) -> np.ndarray:
@@ -167,10 +190,12 @@ def cam_from_world(origin: Path, world_from_cam: np.ndarray, names: list[str]) -
 
 
 def near(origin: Path, places: np.ndarray, names: list[str]) -> None:
-    """Raise InputError if one of some cameras' places [V, 3] is beyond FARTHEST; nan is left to `chosen`."""
-    reach = np.abs(places).max(1, initial=0)
-    for k in np.flatnonzero(np.isfinite(reach) & (reach > FARTHEST)):
+    """Raise InputError if one of some cameras' places [V, 3] is beyond FARTHEST, or so far from most of them that no
+    scene can hold both; nan is left to `chosen`.
+    """
+    reach, inside = (np.abs(where).max(1, initial=0) for where in (places, World.of(places).inward(places)))
+    for k in np.flatnonzero(np.isfinite(reach) & ((reach > FARTHEST) | (inside > WIDEST))):
         raise InputError(
-            f"{origin}: {names[k]} lies {reach[k]:.3g} units from the origin, farther than the {FARTHEST:.0e} that "
-            "single precision allows; move the scene's origin into the scene"
+            f"{origin}: {names[k]} lies {reach[k]:.3g} units from the origin, too far to be told from the others "
+            "or to be seen beside them; correct its pose, or move the scene's origin into the scene"
         )

@@ -9,7 +9,9 @@ from typing import Any
 
 import numpy as np
 
+from chebsplat.cameras import centers
 from chebsplat.errors import InputError
+from chebsplat.formats.world import World
 from chebsplat.stages.sources import assembly, cameras, common, texts
 from chebsplat.stages.sources.colmap_model import Cloud, Model, read_model, size_of
 from chebsplat.stages.sources.common import Frame, Listing
@@ -130,7 +132,8 @@ def points_of(
     Choices: a point whose error is not known is taken.
     """
     names, notes = fields["names"], fields["source"]["notes"]
-    good = np.abs(cloud.means).max(1, initial=0) < cameras.FARTHEST
+    within = World.of(centers(fields["cam_from_world"])).inward(cloud.means)
+    good = np.abs(within).max(1, initial=0) < cameras.WIDEST
     if len(cloud.tracks):
         length = np.bincount(cloud.tracks[:, 0], minlength=len(good))
         good &= (length >= MIN_TRACK) & ~(cloud.errors > MAX_ERROR)
@@ -149,7 +152,7 @@ def points_of(
     of_point = np.where(good, np.cumsum(good) - 1, -1)
     tracks = np.stack([of_point[cloud.tracks[:, 0]], of_image[cloud.tracks[:, 1]]], 1)
     return {
-        "points": cloud.means[good].astype(np.float32),
+        "points": cloud.means[good],
         "point_colors": cloud.colors[good],
         "tracks": tracks[(tracks >= 0).all(1)].astype(np.int32),
     }

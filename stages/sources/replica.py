@@ -16,7 +16,7 @@ from chebsplat.stages.sources.pictures import names_by_id
 
 VOID = 0  # Semantic-NeRF's id of pixels without a class
 SEQUENCE = "Sequence_1"
-SCALES = (0.1, 1e6)  # stored units in one scene unit: depth stays below cameras.FARTHEST, and is never rounded to 0
+SCALES = (0.1, 1e6)  # stored units in one scene unit: depth stays below 1e6, and is never rounded to 0
 
 
 def read(folder: Path, settings: Any, class_names: tuple[str, ...] | None = None) -> dict[str, Any]:

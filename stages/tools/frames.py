@@ -145,13 +145,13 @@ def pictures(scene: OpenedScene, camera: Camera, shot: Shot, kinds: Sequence[str
     """The arrays of these kinds: color and relevancy u8 [H, W, 3], labels i32 [H, W], depth f32 [H, W]."""
     from chebsplat.stages.pages.pictures import heat
 
-    view, renderer = camera.view(), scene.renderer
+    view, renderer = scene.inside(camera).view(), scene.renderer
     found: dict[str, np.ndarray] = {}
     features = None
     if set(kinds) != {"depth"}:
         found["color"], features = renderer.render(view, with_features=bool(set(kinds) & set(SEMANTIC)))
     if "depth" in kinds or "labels" in kinds:
-        found["depth"], alpha = renderer.render_depth(view)
+        found["depth"], alpha = scene.depth(view)
         if "labels" in kinds and features is not None and scene.label_embeddings is not None:
             found["labels"] = np.where(alpha < COVERED, -1, decode_labels(features, scene.label_embeddings))
     if "relevancy" in kinds and features is not None and shot.query is not None:

@@ -26,6 +26,7 @@ from chebsplat.formats.ply import write_ply
 from chebsplat.formats.points import Points
 from chebsplat.formats.splats import read_splats, splat_file
 from chebsplat.formats.teacher_model import EMBEDDED, read_teacher
+from chebsplat.formats.world import HERE, World
 from chebsplat.labels.decode import decode
 from chebsplat.lifting.observations import carry
 from chebsplat.lifting.smoothing import room_unit
@@ -50,7 +51,7 @@ def lift_ply(
     """Lift features to the Gaussians of a PLY, and export them.
 
     Args:
-      ply:      a 3DGS PLY in the frame of the cameras.
+      ply:      a 3DGS PLY in the frame of the source's cameras.
       capture:  a `capture` artifact; points: a `points` artifact with its cameras, where the capture has no poses.
       features: a `features` artifact of this capture; None: the teacher is run.
       model:    .onnx of the teacher to run; None: the embedded one.
@@ -58,7 +59,8 @@ def lift_ply(
     Returns: counts.
     Raises:  InputError on what cannot be read, DataFailure if no view sees a Gaussian.
     """
-    taken_over(ply, foreign(ply).parameters, cameras_of(capture, points), out)
+    world = World.read(Capture.read(capture).source)
+    taken_over(ply, foreign(ply, world=world).parameters, cameras_of(capture, points), out, world)
     config = out / "settings.json"
     config.write_text(json.dumps({"train": {"features": "lifted"}}))
     if features is None:
@@ -87,13 +89,13 @@ def import_ply(ply: Path, out: Path, up: Up | None = None) -> dict[str, Any]:
     return {"gaussians": artifact.read_manifest(out / "export").facts["n_gaussians"]}
 
 
-def taken_over(ply: Path, parameters: dict[str, np.ndarray], cameras: Cameras, out: Path) -> None:
-    """Make the folder `out`, and in it `gaussians` of what a PLY holds."""
+def taken_over(ply: Path, parameters: dict[str, np.ndarray], cameras: Cameras, out: Path, world: World = HERE) -> None:
+    """Make the folder `out`, and in it `gaussians` of what a PLY holds; world: of the capture."""
     out.mkdir(parents=True)
     given = {"path": ply.name, "sha256": artifact.sha256_file(splat_file(ply))}
     manifest = Manifest(Gaussians.SCHEMA, artifact.digest(given), "train", facts={"source": given})
     with artifact.publish(out / "gaussians", manifest) as tmp:
-        Gaussians(parameters, cameras, notes={"left_out": {"training": "the splat was given"}}).write(tmp)
+        Gaussians(parameters, cameras, notes=world.notes | {"left_out": {"training": "the splat was given"}}).write(tmp)
 
 
 def cameras_of(capture: Path, points: Path | None) -> Cameras:

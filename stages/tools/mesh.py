@@ -26,7 +26,7 @@ LEAST_PART = 12.0  # voxels across a connected part that stays
 def mesh_of(
     scene: OpenedScene, voxel: float | None, n_triangles: int, raw: bool, progress: Progress
 ) -> tuple[Mesh, dict[str, Any]]:
-    """The mesh of a scene in its own frame and units, and facts: voxel, and how many triangles before and after.
+    """The mesh of a scene in its source's frame and units, and facts: voxel, and how many triangles before and after.
 
     Args: voxel: edge, scene units; None: the 250th part of the room; n_triangles: at most; raw: nothing is cleaned.
     Raises: ConfigError on a scene without cameras; DataFailure where its Gaussians show no surface.
@@ -38,17 +38,19 @@ def mesh_of(
     if not raw:
         meshlab()  # a missing extra is said before minutes are spent
     extent = room_extent(scene)
-    edge = extent / N_VOXELS if voxel is None else voxel
+    edge = extent / N_VOXELS if voxel is None else voxel / scene.world.scale
+    shown = f"{edge * scene.world.scale:.3g}"
     made = fused(open3d(), frames(scene, progress), edge, 2 * extent)
     if not len(made.triangles):
-        raise DataFailure(f"{scene.source} shows no surface of voxels of {edge:.3g}; choose larger ones: --voxel")
-    facts = {"voxel": float(f"{edge:.3g}"), "triangles fused": len(made.triangles)}
+        raise DataFailure(f"{scene.source} shows no surface of voxels of {shown}; choose larger ones: --voxel")
+    facts = {"voxel": float(shown), "triangles fused": len(made.triangles)}
     if not raw:
         made = cleaned(made, n_triangles, LEAST_PART * edge, LONGEST_HOLE, edge)
     if not len(made.triangles):
-        raise DataFailure(f"nothing of the surface is larger than {LEAST_PART:g} voxels of {edge:.3g}; take --raw")
+        raise DataFailure(f"nothing of the surface is larger than {LEAST_PART:g} voxels of {shown}; take --raw")
     if scene.features is not None and scene.label_embeddings is not None:
         made = made._replace(labels=labels_at(scene, made.vertices))
+    made = made._replace(vertices=scene.world.outward(made.vertices).astype(np.float32))
     return made, facts | {"written": len(made.triangles), "vertices": len(made.vertices)}
 
 
@@ -62,7 +64,8 @@ def turned(mesh: Mesh, up: np.ndarray, suffix: str) -> Mesh:
 
 def frames(scene: OpenedScene, progress: Progress) -> Iterator[Frame]:
     """Depth of the surface and colour from each camera."""
-    for camera, _ in progress.track(scene.cameras, len(scene.cameras), "views"):
+    inside = [scene.inside(camera) for camera in scene.cameras]
+    for camera, _ in progress.track(inside, len(inside), "views"):
         view = camera.view()
         depth, covered = scene.renderer.render_depth(view)
         depth[covered < OPAQUE] = 0
@@ -81,7 +84,7 @@ def without_edges(depth: np.ndarray) -> np.ndarray:
 
 
 def room_extent(scene: OpenedScene) -> float:
-    """The longest side of the box that holds 98 % of the opaque Gaussians along each axis, scene units."""
+    """The longest side of the box that holds 98 % of the opaque Gaussians along each axis, inside."""
     means, logits = scene.parameters["means"], scene.parameters["logit_opacities"]
     solid = means[logits > 0] if (logits > 0).any() else means
     low, high = np.quantile(solid, (0.01, 0.99), axis=0)

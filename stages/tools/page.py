@@ -21,6 +21,7 @@ from chebsplat.formats.packed import pack, signed, to_bytes
 from chebsplat.formats.scene import Scene
 from chebsplat.formats.splats import read_splats
 from chebsplat.formats.teacher_model import EMBEDDED, read_label_set, read_label_table, read_teacher
+from chebsplat.formats.world import HERE, World
 from chebsplat.labels.calibration import Calibration
 from chebsplat.stages.pages.parts import rendered
 from chebsplat.stages.teacher_models.text_encoder import folded
@@ -71,10 +72,12 @@ def write_page(
     center = np.median(means, axis=0)
     own, extent = up_and_extent(scene)
     up = own if up is None else up_of(up, scene.parameters, scene.cameras.cam_from_world)
+    world = World.read(scene.summary)
     packed = pack(scene.parameters, sh_degree)
     arrays: dict[str, np.ndarray] = packed.arrays | {"views": camera_rows(scene, center)}
     about: dict[str, Any] = {
         "name": name, "ranges": packed.ranges, "center": center.tolist(), "up": up.tolist(), "extent": extent,
+        "origin": list(world.origin), "scale": world.scale,
         "width": scene.cameras.width, "height": scene.cameras.height, "views": scene.cameras.names,
     }  # fmt: skip
     counts = {"Gaussians": len(means), "views": len(scene.cameras.names)}
@@ -117,12 +120,13 @@ def write_page(
     return counts | {"bytes": len(text.encode())}
 
 
-def foreign(ply: Path, up: Up | None = None) -> Scene:
-    """A scene of a splat from elsewhere: no semantics, and one camera that sees its middle half, upright.
+def foreign(ply: Path, up: Up | None = None, world: World = HERE) -> Scene:
+    """A scene of a splat from elsewhere: no semantics, and one camera that sees its middle half, upright. world: to
+    bring it into, from that of its source.
 
     Raises: InputError naming the file. Choices: without `up` it is -y, as in COLMAP's and 3DGS' own frames.
     """
-    parameters, degree, _ = read_splats(ply)
+    parameters, degree, _ = read_splats(ply, world)
     if not len(parameters["means"]):
         raise InputError(f"{ply} holds no Gaussians; choose another")
     degrees = parameters.setdefault("degrees", np.full(len(parameters["means"]), degree, np.uint8))

@@ -16,6 +16,7 @@ from chebsplat.formats.files import atomic_path
 from chebsplat.formats.names import suggest
 from chebsplat.formats.ply import write_ply
 from chebsplat.formats.scene import Scene
+from chebsplat.formats.world import World
 from chebsplat.labels.decode import decode_labels
 from chebsplat.render import SceneRenderer
 from chebsplat.splats.gaussians import surface_of
@@ -73,13 +74,15 @@ class OpenedScene:
 
     parameters: raw, as `formats.scene.Scene` holds them; `features` f32 [N, C], `labels` i32 [N] (-1: none) and
     `label_names` and `label_embeddings` f32 [L, C] are None without semantics; `cameras`: of the capture, in its order.
+    Parameters are in the scene's own world; cameras, points, boxes, depth and files in that of its source (`world`).
     """
 
     def __init__(self, scene: Scene, source: Path, teacher: Path | None = None):
         self.source, self.exported, self._teacher = source, scene, teacher
         self.parameters, self.labels, self.label_names = scene.parameters, scene.labels, scene.label_names
         self.label_embeddings, held = scene.label_embeddings, scene.cameras
-        views = zip(held.names, held.Ks, held.cam_from_world, strict=True)
+        self.world = World.read(scene.summary)
+        views = zip(held.names, held.Ks, self.world.poses_outward(held.cam_from_world), strict=True)
         self.cameras = [Camera(name, K, pose, held.width, held.height) for name, K, pose in views]
 
     def __len__(self) -> int:
@@ -106,10 +109,19 @@ class OpenedScene:
             raise ConfigError(f"{self.source} has no view {name}" + (f"; near: {near}" if near else ""))
         return found[0]
 
+    def inside(self, camera: Camera) -> Camera:
+        """A camera of the source's world in that of the parameters, for the `renderer`."""
+        return replace(camera, cam_from_world=self.world.poses_inward(camera.cam_from_world))
+
+    def depth(self, view: View) -> tuple[np.ndarray, np.ndarray]:
+        """`SceneRenderer.render_depth` of a view inside, in the source's units."""
+        depth, alpha = self.renderer.render_depth(view)
+        return depth * np.float32(self.world.scale), alpha
+
     def render(self, camera: Camera) -> Picture:
         """Colour, depth and, where there are semantics, features and labels from `camera`."""
-        view = camera.view()
-        depth, alpha = self.renderer.render_depth(view)
+        view = self.inside(camera).view()
+        depth, alpha = self.depth(view)
         color, features = self.renderer.render(view, with_features=True)
         if features is None or self.label_embeddings is None:
             return Picture(color, depth, alpha, features)
@@ -181,8 +193,9 @@ class OpenedScene:
         return OpenedScene(part, self.source, self._teacher)
 
     def points(self) -> tuple[np.ndarray, np.ndarray]:
-        """Centres f32 [N, 3], scene units, and colours u8 [N, 3] of SH degree 0."""
-        return self.parameters["means"], np.round(surface_of(self.parameters)[1] * 255).astype(np.uint8)
+        """Centres [N, 3], f32, or f64 where the source's world is another, and colours u8 [N, 3] of SH degree 0."""
+        means = self.world.outward(self.parameters["means"])
+        return means, np.round(surface_of(self.parameters)[1] * 255).astype(np.uint8)
 
     def to_ply(self, path: str | Path) -> Path:
         """Write a 3DGS PLY with labels, trimmed to the highest SH degree in use; raises ConfigError if it exists."""
@@ -190,7 +203,8 @@ class OpenedScene:
         if path.exists():
             raise ConfigError(f"{path} exists; remove it, or choose another path")
         with atomic_path(path) as temporary:
-            write_ply(temporary, self.parameters, int(self.parameters["degrees"].max()), self.labels, self.label_names)
+            top = int(self.parameters["degrees"].max())
+            write_ply(temporary, self.parameters, top, self.labels, self.label_names, self.world)
         return path
 
 
@@ -208,7 +222,7 @@ def passing(
     if min_opacity > 0:
         filters["opacity"] = expit(scene.parameters["logit_opacities"]) >= min_opacity
     if box is not None:
-        means = scene.parameters["means"]
+        means = World.read(scene.summary).outward(scene.parameters["means"])
         filters["box"] = np.all((means >= list(box[:3])) & (means <= list(box[3:])), axis=1)
     return filters
 

@@ -8,6 +8,7 @@ from pathlib import Path
 
 import numpy as np
 import torch
+from scipy.spatial import cKDTree
 from torch import Tensor
 
 from chebsplat.cameras import extent
@@ -18,8 +19,9 @@ from chebsplat.formats.features import Features
 from chebsplat.formats.gaussians import Gaussians
 from chebsplat.formats.points import Points, thinned
 from chebsplat.formats.splats import read_splats
+from chebsplat.formats.world import HERE, World
 from chebsplat.settings import DescribeSection, TrainSection
-from chebsplat.splats.gaussians import initial_gaussians
+from chebsplat.splats.gaussians import initial_gaussians, sh0_of, surface_of
 from chebsplat.stages.runtime.command import Job, n_threads
 from chebsplat.stages.runtime.progress import Progress
 from chebsplat.stages.settings import LiftSection
@@ -71,7 +73,8 @@ def assemble(job: Job, inputs: Inputs, backend: str = "auto") -> Trainer:
     job.facts["decided"] = decided(job.config.train, train, features is not None)
     _note_left_out(job, train, features is not None, evidence.no_depth)
     torch.set_num_threads(n_threads())  # sums of torch depend on it; the same bytes are promised for the same number
-    model = model_of(points, features, train, job.config.describe, job.device, backend)
+    world = World.read(capture.source)
+    model = model_of(points, features, train, job.config.describe, job.device, backend, world)
     undone = exposures if train.exposure == "measured" else None
     if undone is not None:
         log.info("exposures of photos differ by %.2f stops from those about them: undone", stops)
@@ -158,13 +161,14 @@ def model_of(
     describe: DescribeSection,
     device: str = "cpu",
     backend: str = "auto",
+    world: World = HERE,
 ) -> SceneModel:
     """The scene before training: a Gaussian at each point, or those of `train.start`; modules drawn by the training's
-    seed. train: resolved; backend: of `rasterize`.
+    seed. train: resolved; backend: of `rasterize`; world: of the capture, whose source `train.start` is of.
     """
     torch.manual_seed(train.seed)
     if train.start:
-        initial = started(Path(train.start), train)
+        initial = started(Path(train.start), points, train, world)
     else:
         assert train.opacity is not None
         initial = initial_gaussians(points.means, points.colors, points.covariances, train.opacity)
@@ -194,12 +198,14 @@ def start_features(model: SceneModel, capture: Capture, points: Points, features
     return int(lifted.features.any(1).sum())
 
 
-def started(ply: Path, train: TrainSection) -> dict[str, Tensor]:
-    """Raw parameters of the Gaussians of a splat, in the frame of the scene's cameras, with its SH bands.
+def started(ply: Path, points: Points, train: TrainSection, world: World) -> dict[str, Tensor]:
+    """Raw parameters of the Gaussians of a splat, in the frame of its source's cameras, with its SH bands.
 
     Raises: InputError naming the file; ConfigError where they are more than `train.max_gaussians`.
+    Choices: Gaussians of one colour, which tells nothing, take that of the nearest of the scene's points: a training
+      moves colours too slowly to find them.
     """
-    parameters, degree, _ = read_splats(ply)
+    parameters, degree, _ = read_splats(ply, world)
     n = len(parameters["means"])
     if n == 0:
         raise InputError(f"{ply} holds no Gaussians; choose another train.start")
@@ -208,6 +214,10 @@ def started(ply: Path, train: TrainSection) -> dict[str, Tensor]:
     raw = {name: parameters[name] for name in ("means", "log_scales", "quats", "logit_opacities", "sh0")}
     for band in range(1, min(degree, train.sh_degree) + 1):
         raw[f"sh{band}"] = parameters["shN"][:, band**2 - 1 : (band + 1) ** 2 - 1]
+    colors = surface_of(parameters)[1]
+    if np.abs(colors - np.median(colors, 0)).mean() < 1 / 255:
+        log.warning("%s has Gaussians of one colour; they take those of the points beside them", ply)
+        raw["sh0"] = sh0_of(points.colors[cKDTree(points.means).query(parameters["means"])[1]])
     return {name: torch.tensor(values, dtype=torch.float32) for name, values in raw.items()}
 
 

@@ -117,6 +117,20 @@ def test_what_is_masked_counts_in_no_image_figure_and_no_lpips_is_none(weights):
 
 
 @pytest.mark.xdist_group("toy")
+def test_a_test_view_without_a_pixel_that_counts_is_left_out_and_named(toy, tmp_path):
+    capture = Capture.read(toy["ingest"])
+    capture.loss_mask = np.ones(capture.images.shape[:3], bool)
+    capture.loss_mask[np.flatnonzero(capture.is_test)[0]] = False
+    inputs = inputs_of(toy, "evaluate") | {"capture": published(tmp_path / "capture", capture)}
+    assert run_stage("evaluate", tmp_path / "out", inputs) == 0
+    found, whole = (Evaluation.read(path).figures for path in (tmp_path / "out", toy["evaluate"]))
+    assert found["names"] == whole["names"][1:]
+    assert found["image"]["per_view"]["psnr"] == whole["image"]["per_view"]["psnr"][1:]
+    n = len(whole["names"])
+    assert "no pixel" in found["left_out"][f"1 of {n} views"]
+
+
+@pytest.mark.xdist_group("toy")
 def test_lpips_given_weights_and_the_time_by_part_are_in_the_evaluation(toy, weights, tmp_path):
     save_file(weights, tmp_path / "vgg.safetensors")
     config = changed(evaluate={"lpips_weights": str(tmp_path / "vgg.safetensors"), "timing_repeats": 1})

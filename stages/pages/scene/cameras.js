@@ -57,12 +57,12 @@ function camera_of(hash, about) {
   const told = about.views[view] !== undefined && pivot > 0 && rest.length == 12;
   return told && [pivot, ...eye, ...turn].every(Number.isFinite) ? { view, pivot, eye, turn } : null;
 }
-/** Cameras as 3DGS' cameras.json, in the scene's frame and the capture's pixels. views: f32 [V, 16]. */
+/** Cameras as 3DGS' cameras.json, in the frame of the scene's source and the capture's pixels. views: f32 [V, 16]. */
 function file_of(path, about, views) {
   return path.map(({ turn, eye, view }, id) => {
     const [fx, fy, cx, cy] = views.subarray(16 * view + 12, 16 * view + 16);
     const rotation = [0, 1, 2].map(c => [0, 3, 6].map(r => turn[r + c]));
-    const size = { width: about.width, height: about.height }, position = plus(eye, about.center);
+    const size = { width: about.width, height: about.height }, position = plus(about.origin, plus(eye, about.center), about.scale);
     return { id, img_name: `key_${id + 1}`, ...size, position, rotation, fy, fx, cx, cy };
   });
 }

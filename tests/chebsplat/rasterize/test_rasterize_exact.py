@@ -283,6 +283,20 @@ def test_compensation_has_exact_gradients_of_its_own(shape, backend):
 
 
 @pytest.mark.parametrize("backend", ["reference", "cpu"])
+@pytest.mark.parametrize("size", [0.0, 1e-6, 1e-3])
+def test_compensation_ends_at_its_floor_and_has_no_gradient_there(size, backend):
+    viewmats, K, width, height = camera(9, 9)
+    arguments = [torch.tensor([[0.0, 0, 2]]), torch.tensor([[1.0, 0, 0, 0]]), torch.full((1, 3), size)]
+    arguments = [a.requires_grad_(True) for a in (*arguments, torch.tensor([0.9]), torch.ones(1, 1))]
+    options = {"rasterize_mode": "antialiased", "backend": backend}
+    alpha = rasterize(*arguments, viewmats, K, width, height, **options)[1][0, 4, 4, 0]  # the mean's own pixel
+    torch.testing.assert_close(alpha.detach(), torch.tensor(0.9 * 0.005))
+    alpha.backward()
+    torch.testing.assert_close(arguments[3].grad, torch.tensor([0.005]))
+    assert arguments[2].grad.abs().max() < 1e-6  # 2.6 at a scale of 1e-3 without the floor
+
+
+@pytest.mark.parametrize("backend", ["reference", "cpu"])
 @pytest.mark.parametrize("n", [0, 5])
 def test_nothing_in_view_is_the_background_with_zero_gradients(n, backend):
     arguments, dtype = [a[:n] for a in scene(channels=3)], torch.float64 if backend == "reference" else torch.float32

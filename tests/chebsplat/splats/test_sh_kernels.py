@@ -38,6 +38,18 @@ def test_colors_equal_the_oracle(degree, masked, held):
         torch.testing.assert_close(found.double(), expected, rtol=1e-5, atol=2e-6)
 
 
+@pytest.mark.parametrize("backend", ["auto", "reference"])
+@pytest.mark.parametrize("value", [-0.2, 0.0])
+def test_a_colour_cut_off_at_black_is_lifted_and_never_lowered(value, backend):
+    sh0 = torch.full((2, 1, 3), (value - 0.5) / 0.28209479177387814).requires_grad_(True)
+    index, means, eye = torch.arange(2), torch.ones(2, 3), torch.zeros(3)
+    colors = colors_in_view([sh0], None, index, means, eye, 0, backend)
+    assert colors.abs().max() < 1e-7
+    (colors * torch.tensor([[-1.0], [1.0]])).sum().backward()
+    torch.testing.assert_close(sh0.grad[0], torch.full((1, 3), -0.28209479177387814))
+    assert value == 0 or not sh0.grad[1].any()  # rounding decides on which side of 0 the other one is
+
+
 def test_a_mask_that_no_longer_learns_gets_no_gradient_and_changes_none_of_the_others():
     parameters, index, means, eye = scene()
     learning, frozen = [[p.clone().requires_grad_(True) for p in parameters] for _ in range(2)]

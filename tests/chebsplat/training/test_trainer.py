@@ -10,7 +10,7 @@ import pytest
 import torch
 from shared import ROOT
 
-from benchmarks.stability.training import tiny_trainer
+from benchmarks.stability.training import four_views, tiny_trainer
 from chebsplat.errors import DataFailure
 from chebsplat.settings import TrainSection
 from chebsplat.stages.training.defaults import Evidence, resolved
@@ -212,6 +212,29 @@ def test_a_view_that_makes_the_loss_non_finite_is_named():
     made.views.features = lambda index: torch.full((10, 12, 8), torch.nan)
     with pytest.raises(DataFailure, match=r"step 1, view view\d: loss features is not finite; .* look at the view"):
         next(made.steps())
+
+
+def looking_away(views):
+    views.viewmats[1] = torch.diag(torch.tensor([-1.0, 1, -1, 1])) @ views.viewmats[1]
+
+
+def hidden(views):
+    views.masks = torch.ones(views.images.shape[:3], dtype=torch.bool)
+    views.masks[1] = False
+
+
+@pytest.mark.parametrize("method", ["ours", "printed"])
+@pytest.mark.parametrize("changes", [[looking_away], [hidden], [looking_away, hidden]])
+def test_a_view_that_shows_nothing_stops_nothing(changes, method):
+    views = four_views()
+    for change in changes:
+        change(views)
+    made = tiny_trainer(views=views, method=method, prune_from=0.0)
+    assert all(np.isfinite(list(figures.values())).all() for figures in made.steps())
+    assert all(np.isfinite(values).all() for values in made.finish().values())
+    counted = [0, 2, 3] if hidden in changes else [0, 1, 2, 3]
+    assert made.held_in_psnr([0, 1, 2, 3]) == made.held_in_psnr(counted) < 100
+    assert hidden not in changes or made.held_in_psnr([1]) == 0
 
 
 def test_a_breakdown_is_named():

@@ -242,16 +242,30 @@ def test_depth_of_seven_scenes_has_a_narrower_field_of_view_than_colour(scene, t
         seven_scenes.read(tmp_path / "..", SETTINGS)
 
 
-@pytest.mark.parametrize("colored", [True, False])
-def test_a_sources_own_points_become_the_scenes(scene, tmp_path, colored):
-    """All but five lie on what the views show."""
+SAYING_NOTHING = {
+    "none": lambda seen: None,
+    "black": lambda seen: 0 * seen,
+    "white": lambda seen: 0 * seen + 255,
+    "one colour": lambda seen: 0 * seen + np.array([7, 200, 7], np.uint8),
+    "0 and 1 for 0 and 255": lambda seen: (seen > 127).astype(np.uint8),
+    "at random": lambda seen: np.random.default_rng(0).integers(0, 256, seen.shape).astype(np.uint8),
+    "black but for a few": lambda seen: seen * (np.arange(len(seen))[:, None] < 10).astype(np.uint8),
+}
+
+
+@pytest.mark.parametrize("colors", ["theirs", *SAYING_NOTHING])
+def test_a_sources_own_points_become_the_scenes_and_their_colours_where_these_tell_something(scene, tmp_path, colors):
+    """All but five lie on what the views show. Theirs: what is shown, darker by 3."""
     pixels = np.argwhere(np.ones((72, 96), bool))[::23]
     parts = [unproject(scene["depth"][k], scene["Ks"][k], scene["cam_from_world"][k], pixels) for k in range(0, 16, 4)]
     points = np.concatenate([*parts, np.full((5, 3), 50.0)]).astype(np.float32)
+    shown = [scene["images"][k][pixels[:, 0], pixels[:, 1]] for k in range(0, 16, 4)]
+    shown = np.concatenate([*shown, np.zeros((5, 3), np.uint8)])[np.isfinite(points).all(1)]
     points = points[np.isfinite(points).all(1)]
-    colors = np.full((len(points), 3), 7, np.uint8) if colored else None
+    theirs = shown - np.minimum(shown, 3)
+    given = theirs if colors == "theirs" else SAYING_NOTHING[colors](shown)
     fields = {key: scene[key] for key in ("names", "images", "Ks", "cam_from_world")}
-    record = Capture(**fields, is_test=np.arange(16) % 8 == 0, points=points, point_colors=colors)
+    record = Capture(**fields, is_test=np.arange(16) % 8 == 0, points=points, point_colors=given)
     capture = published(tmp_path / "c", record)
     config = {"sfm": {"max_points": 100_000, "dense": "off"}}
     assert run_stage("sfm", tmp_path / "out", {"capture": capture}, config) == 0
@@ -260,7 +274,10 @@ def test_a_sources_own_points_become_the_scenes(scene, tmp_path, colored):
     assert facts["how"] == "source" and facts["n_candidates"] == len(points)
     assert facts["n_unseen"] >= 5 and len(found.means) == len(points) - facts["n_unseen"]
     assert np.isin(found.means[:, 0], points[:, 0]).all()
-    assert (found.colors == 7).all() == colored
+    row = {tuple(point): k for k, point in enumerate(points.tolist())}
+    rows = [row[tuple(point)] for point in found.means.tolist()]
+    apart = np.abs(found.colors - (theirs if colors == "theirs" else shown)[rows].astype(float))
+    assert not apart.any() if colors == "theirs" else np.median(apart) < 4  # where no wall hides a point
     to_eyes = centers(scene["cam_from_world"])[None] - found.means[:, None]
     facing = (np.einsum("ni,nvi->nv", found.normals, to_eyes) > 0).mean()
     assert facing > 0.8  # most points of a convex room are turned towards most cameras

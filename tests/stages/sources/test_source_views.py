@@ -6,13 +6,15 @@ import numpy as np
 import pycolmap
 import pytest
 from PIL import Image
-from shared import run_stage
+from scipy.ndimage import laplace
+from shared import data, run_stage
 from source_folders import SETTINGS, image, save, write_colmap
 
 from chebsplat.formats.artifact import read_manifest
 from chebsplat.formats.capture import Capture
 from chebsplat.stages.settings import IngestSection
-from chebsplat.stages.sources import colmap, colmap_model, common, photos
+from chebsplat.stages.sources import assembly, colmap, colmap_model, common, photos
+from chebsplat.stages.sources.cameras import Camera
 
 SIZE, FOCAL = (240, 180), 200.0
 MODELS = {
@@ -223,6 +225,60 @@ def test_undistortion_follows_the_polynomial_for_images_depth_and_labels(tmp_pat
     ids = np.array([int(name.removeprefix("class_")) for name in fields["class_names"]])[fields["labels"][0]]
     whole = np.abs((at_y + 10) % 20 - 10) > 0.01  # off the edges of stripes
     assert (ids == np.floor(at_y / 20) + 1)[inner][whole[inner]].all()
+
+
+STRAIGHT = ["SIMPLE_RADIAL 80 60 50 40.3 29.6 0", "RADIAL 80 60 50 40 30 0 0", "OPENCV 80 60 50 51 40 30 0 0 0 0",
+            "OPENCV 80 60 50 50 40 30 1e-5 -2e-5 1e-6 0"]  # fmt: skip
+
+
+@pytest.mark.parametrize("line", STRAIGHT)
+def test_a_lens_that_bends_nothing_leaves_every_pixel_as_it_is(tmp_path, line):
+    folder = write_colmap(tmp_path, line)
+    noise = np.random.default_rng(0).integers(0, 256, (60, 80, 3)).astype(np.uint8)
+    save(folder / "images/a.png", noise)
+    fields = colmap.read(folder, SETTINGS)
+    assert np.array_equal(fields["images"][0], noise)
+    params = [float(value) for value in line.split()[3:]]
+    focal = params[:2] if line.startswith("OPENCV") else [params[0]] * 2
+    centre = params[2:4] if line.startswith("OPENCV") else params[1:3]
+    assert fields["Ks"][0].tolist() == [[focal[0], 0, centre[0]], [0, focal[1], centre[1]], [0, 0, 1]]
+    assert "undistorted" not in str(fields["source"])
+
+
+@pytest.mark.parametrize("k", [-0.1, 0.01, 0.1])
+def test_where_a_lens_bends_nothing_pixels_stay_and_the_scale_too(tmp_path, k):
+    """At the principal point: the view's pixel is the photo's there, and its focal length that of the photo."""
+    folder = write_colmap(tmp_path, f"SIMPLE_RADIAL 80 60 90 40.3 29.6 {k}")
+    noise = np.random.default_rng(0).integers(0, 256, (60, 80, 3)).astype(np.uint8)
+    save(folder / "images/a.png", noise)
+    fields = colmap.read(folder, SETTINGS)
+    K = fields["Ks"][0]
+    assert K[0, 0] == K[1, 1] == 90
+    moved = K[:2, 2] - [40.3, 29.6]
+    assert np.allclose(moved, moved.round())
+    x, y = (int(v) for v in np.floor(K[:2, 2]))
+    assert np.abs(fields["images"][0, y, x].astype(int) - noise[29, 40]).max() <= 0.06 * 255  # splines of white noise
+    assert fields["source"]["undistorted"] == ["SIMPLE_RADIAL"]
+
+
+@pytest.mark.data
+@pytest.mark.parametrize("side", [160, 480, 640, 8192])
+@pytest.mark.parametrize(
+    "photo", ["fox/images/0012.jpg", "captures/kitchen/images/13.jpg", "statue_colmap/dense/0/images/DSC_5283.jpg"]
+)
+def test_undoing_a_lens_keeps_the_detail_of_a_photo(photo, side):
+    """Variance of the Laplacian, against that of the photo reduced alike and otherwise as it is."""
+    image = Image.open(data(photo.split("/")[0]) / photo.partition("/")[2]).convert("RGB")
+    width, height = image.size
+    camera = Camera("SIMPLE_RADIAL", (1.2 * max(width, height), width / 2, height / 2, -0.05), width, height)
+    view = assembly.geometry(camera, side)
+    found = assembly.resampled(image, camera, view, assembly.positions(camera, view))
+    size = [round(n * view.factor) for n in image.size]
+    plain = np.asarray(image if size == list(image.size) else image.resize(size, Image.Resampling.BOX))
+    cut = [max((a - b) // 2, 0) + 4 for a, b in zip(plain.shape[:2], found.shape[:2], strict=True)]
+    inner = plain[cut[0] : -cut[0], cut[1] : -cut[1]]
+    kept, before = (laplace(pixels.mean(-1, dtype=float)).var() for pixels in (found[4:-4, 4:-4], inner))
+    assert 0.93 < kept / before < 1.3
 
 
 def test_pixels_where_a_distortion_folds_back_do_not_count(tmp_path):

@@ -1,0 +1,84 @@
+"""Where the scene of artifacts lies in its source's world: moved and scaled where single precision asks for it."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any, Self
+
+import numpy as np
+
+from chebsplat.errors import InputError
+
+EXTENTS = (0.1, 1000.0)  # scene units that cameras may lie apart: near planes and thresholds are made for rooms
+FARTHEST = 1000.0  # extents from the origin: float32 tells 6e-5 of an extent apart there
+
+
+@dataclass(frozen=True)
+class World:
+    """A point of the source's world is origin + scale · that of the artifacts. Depths are scaled alike."""
+
+    origin: tuple[float, ...] = (0.0, 0.0, 0.0)
+    scale: float = 1.0
+
+    @classmethod
+    def of(cls, eyes: np.ndarray) -> Self:
+        """The world for a scene whose cameras stand at `eyes` [V, 3] of its source's; those that are not finite tell
+        nothing.
+
+        Choices: a scene of sane size about a sane origin stays as it is. Others are brought to an extent of 1 to 10
+          units by a power of ten, and to the middle of the cameras. One place alone has no extent: its scale stays. A
+          few cameras gone astray decide nothing: middle and extent are medians.
+        """
+        eyes = eyes[np.isfinite(eyes).all(1)]
+        if not len(eyes):
+            return cls()
+        middle = np.median(eyes, 0)
+        extent = 2 * float(np.median(np.linalg.norm(eyes - middle, axis=1)))
+        told = extent > 1e-12 * np.abs(middle).max()  # by more than rounding
+        sane = not told or EXTENTS[0] <= extent <= EXTENTS[1]
+        scale = 1.0 if sane else float(10.0 ** np.floor(np.log10(extent)))
+        near = np.linalg.norm(middle) <= FARTHEST * (extent if told else 1.0)
+        return cls((0.0, 0.0, 0.0) if near else tuple(middle.tolist()), scale)
+
+    @classmethod
+    def read(cls, notes: Mapping[str, Any]) -> Self:
+        """The world that an artifact's notes tell of; the artifacts' own where they tell of none. Raises InputError."""
+        held = notes.get("world")
+        if held is None:
+            return cls()
+        try:
+            world = cls(tuple(map(float, held["origin"])), float(held["scale"]))
+            if not (np.isfinite(world.origin).all() and len(world.origin) == 3 and 0 < world.scale < np.inf):
+                raise ValueError
+        except (KeyError, TypeError, ValueError):
+            raise InputError(f"world {str(held)[:80]} is no place of a scene; make the artifact again") from None
+        return world
+
+    @property
+    def notes(self) -> dict[str, Any]:
+        """For `read`; nothing where the worlds are one."""
+        return {} if self == HERE else {"world": {"origin": list(self.origin), "scale": self.scale}}
+
+    def outward(self, points: np.ndarray) -> np.ndarray:
+        """Points [..., 3] in the source's world, f64; f32 and untouched where the worlds are one."""
+        return points if not self.notes else np.asarray(self.origin) + self.scale * points.astype(np.float64)
+
+    def inward(self, points: np.ndarray) -> np.ndarray:
+        """Points [..., 3] of the source's world in the artifacts'."""
+        return points if not self.notes else (points - np.asarray(self.origin)) / self.scale
+
+    def poses_outward(self, cam_from_world: np.ndarray) -> np.ndarray:
+        """Poses [..., 4, 4] of cameras in the source's world."""
+        poses = cam_from_world.copy()
+        poses[..., :3, 3] = self.scale * poses[..., :3, 3] - poses[..., :3, :3] @ self.origin
+        return poses
+
+    def poses_inward(self, cam_from_world: np.ndarray) -> np.ndarray:
+        """Poses [..., 4, 4] of cameras of the source's world in the artifacts'."""
+        poses = cam_from_world.copy()
+        poses[..., :3, 3] = (poses[..., :3, 3] + poses[..., :3, :3] @ self.origin) / self.scale
+        return poses
+
+
+HERE = World()  # of scenes that are as their source has them
