@@ -22,6 +22,7 @@ from chebsplat.stages.settings import IngestSection, SourceSection
 from chebsplat.stages.sources import (
     colmap,
     common,
+    depth_units,
     generated,
     photos,
     replica,
@@ -57,6 +58,8 @@ def read(name: str, source: SourceSection, settings: IngestSection, progress: Pr
         "seven_scenes": seven_scenes,
     }
     fields: dict[str, Any] = modules[source.kind].read(folder, settings)
+    if fields.get("depth") is not None and settings.depth == "auto":
+        depth_units.fit(fields, folder)
     if unread := common.unread(folder):
         fields["source"]["notes"].append(f"{unread[0].upper()}{unread[1:]}.")
     return fields

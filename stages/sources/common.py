@@ -62,7 +62,7 @@ class Listing:
     pseudo_names: dict[int, str] | None = None
     any_label_size: bool = False
     depth_scale: float = 1000.0
-    no_depth: tuple[int, ...] = (0,)
+    no_depth: tuple[int, ...] = (0, 65_535)  # none, and what 16 bits hold no more of
     depth_camera: Camera | None = None
     notes: list[str] = field(default_factory=list)
     upright: bool = False  # turn every image by its EXIF orientation; otherwise only where its camera asks for it
