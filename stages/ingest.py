@@ -23,6 +23,7 @@ from chebsplat.stages.settings import IngestSection, SourceSection
 from chebsplat.stages.sources import (
     colmap,
     common,
+    depth_units,
     generated,
     photos,
     replica,
@@ -65,6 +66,8 @@ def read(name: str, source: SourceSection, settings: IngestSection, model: Photo
     fields: dict[str, Any] = (
         modules[source.kind].read(folder, settings) if model is None else photos.read(folder, settings, model)
     )
+    if fields.get("depth") is not None and settings.depth == "auto":
+        depth_units.fit(fields, folder)
     if unread := common.unread(folder):
         fields["source"]["notes"].append(f"{unread[0].upper()}{unread[1:]}.")
     return fields

@@ -12,6 +12,7 @@ from pathlib import Path
 from typing import Any
 
 from chebsplat.errors import InputError
+from chebsplat.formats import dataparser
 from chebsplat.formats.artifact import sha256_file
 from chebsplat.formats.files import regular
 from chebsplat.formats.images import images_below
@@ -39,7 +40,8 @@ def raw_files(stage: str, sections: dict[str, Any]) -> tuple[Path | None, list[P
     if stage == "teacher" and sections["teacher"]["model"]:
         return None, _of_teacher(sections["teacher"])
     if stage == "train" and sections["train"]["start"]:
-        return None, [splat_file(Path(sections["train"]["start"]))]
+        start = splat_file(Path(sections["train"]["start"]))
+        return None, [path for path in (start, dataparser.beside(start)) if path is not None]
     if stage == "learn" and sections["learn"]["points"]:
         return None, [_named(sections["learn"]["points"], "learn.points")]
     if stage == "teach":

@@ -7,13 +7,14 @@ from typing import Any, NamedTuple
 
 import numpy as np
 import pycolmap
+from scipy.sparse.csgraph import connected_components
 
 from chebsplat.errors import DataFailure
 from chebsplat.formats.photo_model import PhotoModel
 
 LEAST = 30  # verified matches of a pair that counts
 DENIED = 0.05  # of a pair's matches: where fewer are, the pair contradicts it
-MOSTLY = 0.5  # of a photo's pairs: where more contradict its place, it is left out
+MOSTLY = 0.3  # of a photo's pairs: where more contradict its place, it is left out
 CONFIRMED = 0.3  # of a pair's matches: where so many are points of the model, the pair agrees with it
 AGREE = 0.8  # of the pairs: of six real captures all that are right have .88 and more, a repetitive board .5
 FLAT = 2.0  # degrees between the rays of the median point: below, depth is a guess
@@ -54,9 +55,10 @@ def pairs(model: pycolmap.Reconstruction, database: Path) -> Pairs:
 
 
 def misplaced(found: Pairs) -> list[int]:
-    """Ids of photos that most of their pairs contradict, for they were put beside something that only looks alike.
+    """Ids of photos that many of their pairs contradict, for they were put beside something that only looks alike.
 
-    Choices: the one that most of its pairs contradict goes first, and with it what it says of others.
+    Choices: the one that most of its pairs contradict goes first, and with it what it says of others. Of groups of
+      photos that no pair holds together then, the largest stays; photos without pairs stay, too.
     """
     n = len(found.images)
     agree, deny = np.zeros((n, n)), np.zeros((n, n))
@@ -69,8 +71,12 @@ def misplaced(found: Pairs) -> list[int]:
         share = np.where(kept, against / np.maximum(against + agree @ kept, 1), 0)
         worst = np.lexsort((against, share))[-1]
         if share[worst] <= MOSTLY:
-            return [found.images[k] for k in np.flatnonzero(~kept)]
+            break
         kept[worst] = False
+    held = np.flatnonzero(kept & agree.any(1))
+    _, group = connected_components(agree[np.ix_(held, held)], directed=False)
+    kept[held[group != np.bincount(group, minlength=1).argmax()]] = False
+    return [found.images[k] for k in np.flatnonzero(~kept)]
 
 
 def judged(

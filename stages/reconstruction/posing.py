@@ -23,6 +23,7 @@ from chebsplat.stages.sources.cameras import EQUIRECTANGULAR
 from chebsplat.stages.sources.common import Shot, file_of
 
 log = logging.getLogger("chebsplat")
+MORE = 1.1  # times the photos of an earlier attempt
 ENOUGH = 0.9  # of the photos: where fewer register, or the matches disagree, more is tried
 FAINT = 0.002  # SIFT's peak threshold where the usual one finds too little; it costs exactness
 WIDE = 0.5  # a fisheye's focal length in longer sides, where EXIF says nothing
@@ -43,8 +44,9 @@ def found(job: Job, shots: Sequence[Shot], pictures: Path, settings: PoseSection
     """The model of photos whose reduced pictures lie in a folder, named by their rows.
 
     Raises:  DataFailure where no two photos register.
-    Choices: attempts end with the first that is whole; otherwise the one that registers most photos counts, the first
-      of several. One thread maps, for with it mapping repeats.
+    Choices: attempts end with the first that is whole; otherwise the one that registers most photos counts, where it is
+      MORE than an earlier one has: what costs more finds more that only looks alike. One thread maps, for with it
+      mapping repeats.
     """
     best: Found | None = None
     for lens, peak in attempts(shots, settings):
@@ -54,7 +56,7 @@ def found(job: Job, shots: Sequence[Shot], pictures: Path, settings: PoseSection
         again = settings.model_copy(update={"peak_threshold": peak})
         database = _matched(job, shots, pictures, lens, again)
         tried = _mapped(job, shots, pictures, database, settings.seed)
-        if tried is not None and (best is None or len(tried.model.names) > len(best.model.names)):
+        if tried is not None and (best is None or len(tried.model.names) > MORE * len(best.model.names)):
             best = tried
         if best is not None and best.whole:
             break

@@ -30,14 +30,18 @@ def read(folder: Path, settings: Any, class_names: tuple[str, ...] | None = None
 
     Choices: scene.json's split counts all of its frames, so `max_views` never moves a view from one side to the
       other; if it leaves one side empty, the split is not given and a note says so. The model's points are taken
-      unless there is depth, which gives more; of those with tracks the ones that fewer than MIN_TRACK images see, or
-      that are known to lie farther than MAX_ERROR pixels off on average, are left out.
+      unless there is depth, which gives more and is held against them (`landmarks`); of those with tracks the ones
+      that fewer than MIN_TRACK images see, or that are known to lie farther than MAX_ERROR pixels off on average, are
+      left out.
     """
     listing, model = _listing(folder)
     fields = assembly.assemble(listing, settings, class_names)
-    if "depth" not in fields:
-        lost = assembly.in_empty_space(model.cloud.means, fields, listing)
-        fields |= points_of(model.cloud, [common.stem(image.name) for image in model.images], fields, lost)
+    lost = assembly.in_empty_space(model.cloud.means, fields, listing)
+    shown = points_of(model.cloud, [common.stem(image.name) for image in model.images], fields, lost)
+    if "depth" in fields and settings.depth == "auto":
+        fields["landmarks"] = shown
+    else:
+        fields |= shown
     split = _split(folder, [frame.name for frame in listing.frames])
     if split is not None:
         assembly.give_split(fields, split, "scene.json")

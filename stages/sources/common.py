@@ -85,7 +85,7 @@ class Listing:
     corrections: dict[int, int] = field(default_factory=dict)
     pseudo_names: dict[int, str] | None = None
     depth_scale: float = 1000.0
-    no_depth: tuple[int, ...] = (0,)
+    no_depth: tuple[int, ...] = (0, 65_535)  # none, and what 16 bits hold no more of
     depth_camera: Camera | None = None
     notes: list[str] = field(default_factory=list)
     empty: dict[str, np.ndarray] = field(default_factory=dict)  # by view, where its photo is transparent, once read

@@ -20,7 +20,6 @@ from chebsplat.stages.sources.common import Frame, Listing
 # Focal lengths in pixels of a 640 wide image. The data set states the depth camera's alone; 525 is a Kinect's colour
 # camera: in the red kitchen, 520 carries colours over to neighbouring views best, and 585 much worse than 525.
 COLOR, DEPTH = 525.0, 585.0
-UNKNOWN = (0, 65_535)  # stored depths that mean "none": of the copies with cleaned depth, and of the authors' own
 
 
 def read(folder: Path, settings: Any, class_names: tuple[str, ...] | None = None) -> dict[str, Any]:
@@ -90,4 +89,4 @@ def _listing(folder: Path) -> Listing:
         Frame(name, folder / image, camera, pose, folder / f"{name}.depth.png" if has_depth else None)
         for (name, image, _), pose in zip(frames, poses, strict=True)
     ]
-    return Listing("seven_scenes", listed, no_depth=UNKNOWN, depth_camera=depth_camera, notes=notes)
+    return Listing("seven_scenes", listed, depth_camera=depth_camera, notes=notes)

@@ -41,6 +41,7 @@ from chebsplat.stages.shape_models.surfaces import shown
 from chebsplat.stages.teacher_models.text_encoder import found
 from chebsplat.stages.tools.page import foreign
 from chebsplat.stages.tools.up import Up, up_of
+from chebsplat.stages.training.placing import in_frame
 
 log = logging.getLogger("chebsplat")
 
@@ -51,16 +52,19 @@ def lift_ply(
     """Lift features to the Gaussians of a PLY, and export them.
 
     Args:
-      ply:      a 3DGS PLY in the frame of the source's cameras.
+      ply:      a 3DGS PLY, which is brought into the frame of the cameras.
       capture:  a `capture` artifact; points: a `points` artifact with its cameras, where the capture has no poses.
       features: a `features` artifact of this capture; None: the teacher is run.
       model:    .onnx of the teacher to run; None: the embedded one.
       out:      becomes a folder of artifacts by name, as a scene's: gaussians, lift, export, and what the teacher made.
     Returns: counts.
-    Raises:  InputError on what cannot be read, DataFailure if no view sees a Gaussian.
+    Raises:  InputError on what cannot be read or fits in no frame, DataFailure if no view sees a Gaussian.
     """
-    world = World.read(Capture.read(capture).source)
-    taken_over(ply, foreign(ply, world=world).parameters, cameras_of(capture, points), out, world)
+    held = Capture.read(capture)
+    cameras, world = cameras_of(capture, points), World.read(held.source)
+    surface = held.points if points is None else Points.read(points).means
+    parameters = in_frame(ply, foreign(ply, world=world).parameters, held, cameras, surface, world)
+    taken_over(ply, parameters, cameras, out, world)
     config = out / "settings.json"
     config.write_text(json.dumps({"train": {"features": "lifted"}}))
     if features is None:

@@ -28,6 +28,7 @@ from chebsplat.stages.settings import LiftSection
 from chebsplat.stages.training.defaults import LIFTED_FROM, OPEN, decided, evidence_of, resolved
 from chebsplat.stages.training.lifting import lifted_from
 from chebsplat.stages.training.photos import own_exposures
+from chebsplat.stages.training.placing import in_frame
 from chebsplat.stages.training.views import training_views
 from chebsplat.training.model import SceneModel
 from chebsplat.training.printed import PrintedScene
@@ -73,8 +74,7 @@ def assemble(job: Job, inputs: Inputs, backend: str = "auto") -> Trainer:
     job.facts["decided"] = decided(job.config.train, train, features is not None)
     _note_left_out(job, train, features is not None, evidence.no_depth)
     torch.set_num_threads(n_threads())  # sums of torch depend on it; the same bytes are promised for the same number
-    world = World.read(capture.source)
-    model = model_of(points, features, train, job.config.describe, job.device, backend, world)
+    model = model_of(points, features, train, job.config.describe, job.device, backend, capture)
     undone = exposures if train.exposure == "measured" else None
     if undone is not None:
         log.info("exposures of photos differ by %.2f stops from those about them: undone", stops)
@@ -161,14 +161,14 @@ def model_of(
     describe: DescribeSection,
     device: str = "cpu",
     backend: str = "auto",
-    world: World = HERE,
+    capture: Capture | None = None,
 ) -> SceneModel:
     """The scene before training: a Gaussian at each point, or those of `train.start`; modules drawn by the training's
-    seed. train: resolved; backend: of `rasterize`; world: of the capture, whose source `train.start` is of.
+    seed. train: resolved; backend: of `rasterize`; capture: that shows in which frame `train.start` lies.
     """
     torch.manual_seed(train.seed)
     if train.start:
-        initial = started(Path(train.start), points, train, world)
+        initial = started(Path(train.start), points, train, capture)
     else:
         assert train.opacity is not None
         initial = initial_gaussians(points.means, points.colors, points.covariances, train.opacity)
@@ -198,19 +198,23 @@ def start_features(model: SceneModel, capture: Capture, points: Points, features
     return int(lifted.features.any(1).sum())
 
 
-def started(ply: Path, points: Points, train: TrainSection, world: World) -> dict[str, Tensor]:
-    """Raw parameters of the Gaussians of a splat, in the frame of its source's cameras, with its SH bands.
+def started(ply: Path, points: Points, train: TrainSection, capture: Capture | None) -> dict[str, Tensor]:
+    """Raw parameters of the Gaussians of a splat, brought into the frame of the scene's cameras, with its SH bands.
 
-    Raises: InputError naming the file; ConfigError where they are more than `train.max_gaussians`.
+    Raises: InputError naming the file, as `in_frame` does; ConfigError where they are more than `train.max_gaussians`.
     Choices: Gaussians of one colour, which tells nothing, take that of the nearest of the scene's points: a training
       moves colours too slowly to find them.
     """
+    world = HERE if capture is None else World.read(capture.source)
     parameters, degree, _ = read_splats(ply, world)
     n = len(parameters["means"])
     if n == 0:
         raise InputError(f"{ply} holds no Gaussians; choose another train.start")
     if n > train.max_gaussians:
         raise ConfigError(f"{ply} holds {n} Gaussians; set train.max_gaussians={n} or more")
+    if capture is not None:
+        cameras = Cameras(points.names, points.Ks, points.cam_from_world, *capture.size)
+        parameters = in_frame(ply, parameters, capture, cameras, points.means, world)
     raw = {name: parameters[name] for name in ("means", "log_scales", "quats", "logit_opacities", "sh0")}
     for band in range(1, min(degree, train.sh_degree) + 1):
         raw[f"sh{band}"] = parameters["shN"][:, band**2 - 1 : (band + 1) ** 2 - 1]

@@ -98,7 +98,7 @@ ROOMS = {
         "training": {"runtime", "settings"},
         "teacher_models": {"runtime", "settings"},
         "shape_models": {"reconstruction", "runtime", "settings", "sources", "teacher_models"},
-        "tools": {"pages", "runtime", "settings", "shape_models", "sources", "teacher_models"},
+        "tools": {"pages", "runtime", "settings", "shape_models", "sources", "teacher_models", "training"},
     },
     "pipelines": {
         "work": set(),

@@ -136,3 +136,14 @@ def test_a_key_holds_what_training_starts_from_and_not_where_that_lies(tmp_path,
         plan = Planner().plan("toy", f"train.start={path}")
         keys.append(next(step.key for step in plan.steps if step.stage == "train"))
     assert keys[0] == keys[1] != keys[2]
+
+
+def test_a_key_holds_the_file_that_says_in_which_frame_a_splat_lies(tmp_path, quick_plans):
+    (tmp_path / "theirs.ply").write_bytes(b"ply\n")
+    keys = []
+    for text in (None, "{}", "{} "):
+        if text:
+            (tmp_path / "dataparser_transforms.json").write_text(text)
+        plan = Planner().plan("toy", f"train.start={tmp_path / 'theirs.ply'}")
+        keys.append(next(step.key for step in plan.steps if step.stage == "train"))
+    assert len(set(keys)) == 3
