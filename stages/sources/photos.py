@@ -11,6 +11,7 @@ import numpy as np
 from PIL import Image
 
 from chebsplat.errors import InputError
+from chebsplat.formats.artifact import sha256_file
 from chebsplat.formats.images import header, is_image
 from chebsplat.formats.photo_model import PhotoModel
 from chebsplat.stages.runtime.progress import Progress
@@ -70,6 +71,12 @@ def _photos(folder: Path) -> tuple[Path, list[str]]:
 def shots(folder: Path, settings: PoseSection, _: Progress | None, __: int) -> tuple[list[Shot], list[str]]:
     """The photos of a folder, at most `max_views` of them, evenly chosen, and notes about them."""
     found, notes = _listed(folder)
+    first: dict[str, Shot] = {}
+    for shot in found:
+        first.setdefault(sha256_file(shot.path), shot)
+    if len(first) < len(found):
+        notes.append(f"{len(found) - len(first)} of {len(found)} photos are copies of others, and left out.")
+        found = list(first.values())
     if settings.max_views is not None and len(found) > settings.max_views:
         rows = np.linspace(0, len(found) - 1, settings.max_views).round().astype(int)
         notes.append(f"{len(rows)} of {len(found)} photos are used (pose.max_views).")

@@ -1,0 +1,233 @@
+"""Photos that come alone: cameras, lenses and poses are found, and models that are not to be believed are refused."""
+
+import json
+import shutil
+from itertools import pairwise
+
+import numpy as np
+import pytest
+from PIL import Image
+from shared import data, run_stage
+
+from chebsplat.cameras import centers
+from chebsplat.errors import DataFailure
+from chebsplat.formats import artifact
+from chebsplat.formats.capture import Capture
+from chebsplat.formats.photo_model import PhotoModel
+from chebsplat.stages.reconstruction import judge
+from chebsplat.stages.reconstruction.adjustment import alignment
+from chebsplat.stages.reconstruction.posing import attempts
+from chebsplat.stages.settings import IngestSection, PoseSection
+from chebsplat.stages.sources import assembly, photos
+from chebsplat.stages.sources.cameras import FACES, Camera
+from chebsplat.stages.sources.common import Frame, Listing, Shot
+
+GOOD = {
+    "n_registered": 20, "n_given": 20, "n_in_others": [], "n_misplaced": 0, "n_points": 4000, "points_a_view": 400.0,
+    "track_length": 4.0, "reprojection_error_px": 0.5, "reprojection_error": 4e-4, "pairs_agree": 0.95,
+    "angle_degrees": 15.0,
+}  # fmt: skip
+
+
+def pairs_of(n, agree, deny=()):
+    rows = [*agree, *deny]
+    return judge.Pairs(list(range(100, 100 + n)), np.array(rows), np.repeat([0.7, 0.0], [len(agree), len(deny)]))
+
+
+def ring(first, n):
+    return [(first + k, first + (k + 1) % n) for k in range(n)]
+
+
+@pytest.mark.parametrize(
+    ("found", "absent"),
+    [
+        (pairs_of(8, ring(0, 8)), []),
+        (pairs_of(8, ring(0, 7), [(7, 2), (7, 3)]), [7]),  # what has no pair that agrees
+        (pairs_of(9, [*ring(0, 8), (8, 0)], [(8, 3), (8, 4)]), [8]),
+        (pairs_of(12, ring(0, 7) + ring(7, 4) + [(11, 0), (11, 7)], [(11, 3), (11, 4), (11, 8)]), [7, 8, 9, 10, 11]),
+        (pairs_of(8, ring(0, 8), [(0, 4)]), []),  # one in three tells nothing
+    ],
+)
+def test_photos_that_their_pairs_contradict_are_left_out_and_groups_that_hang_on_them(found, absent):
+    assert judge.misplaced(found) == [100 + k for k in absent]
+
+
+@pytest.mark.parametrize(
+    ("changed", "said"),
+    [
+        ({"n_in_others": [8]}, "2 groups that share nothing"),
+        ({"n_registered": 15}, "5 of 20 photos could not be placed"),
+        ({"n_misplaced": 3}, "3 photos are left out that most of their matches contradict"),
+        ({"pairs_agree": 0.5}, "Only 50% of the pairs"),
+        ({"reprojection_error": 3e-3}, "lock focus and zoom"),
+        ({"points_a_view": 30.0}, "only 30 points"),
+    ],
+)
+def test_what_speaks_against_a_model_is_said(changed, said):
+    assert judge.doubts(GOOD) == []
+    (doubt,) = judge.doubts(GOOD | changed)
+    assert said in doubt
+
+
+@pytest.mark.parametrize(
+    ("n", "changed", "said"), [(8, {}, r"8 of 20 photos registered"), (20, {"angle_degrees": 0.4}, "from one place")]
+)
+def test_a_model_that_is_not_to_be_believed_is_refused(n, changed, said):
+    none = np.zeros((0, 3))
+    model = PhotoModel(["a"] * n, [], np.zeros(n), np.zeros((n, 4, 4)), none, none, none[:, 0], none[:, :2],
+                       judged=GOOD | changed | {"doubts": []})  # fmt: skip
+    with pytest.raises(DataFailure, match=said):
+        judge.check(model, 20, 0.5)
+
+
+def test_a_fisheye_is_tried_last_and_a_lens_that_is_named_is_kept():
+    shot = Shot("a", None, (800, 600))
+    assert [lens for lens, _ in attempts([shot], PoseSection())] == ["SIMPLE_RADIAL"] * 2 + ["OPENCV_FISHEYE"]
+    assert {lens for lens, _ in attempts([shot], PoseSection(camera="OPENCV"))} == {"OPENCV"}
+    assert {lens for lens, _ in attempts([shot._replace(panorama=True)], PoseSection())} == {"EQUIRECTANGULAR"}
+    peaks = [peak for _, peak in attempts([shot], PoseSection())]
+    assert all(later <= before for before, later in pairwise(peaks))
+
+
+def panorama(width):
+    """All directions, each in its own colour, u8 [H, 2H, 3]."""
+    x, y = np.meshgrid((np.arange(width) + 0.5) / width * 2 - 1, (np.arange(width // 2) + 0.5) / width * 4 - 1)
+    longitude, latitude = x * np.pi, y * np.pi / 2
+    rays = [np.sin(longitude) * np.cos(latitude), np.sin(latitude), np.cos(longitude) * np.cos(latitude)]
+    return (127.5 + 127.5 * np.stack(rays, -1)).round().astype(np.uint8)
+
+
+def test_faces_of_a_photo_of_all_directions_show_each_direction_where_their_poses_say(tmp_path):
+    file = tmp_path / "a.png"
+    Image.fromarray(panorama(800)).save(file)
+    pose = np.eye(4)
+    pose[:3, :3], pose[:3, 3] = np.linalg.qr(np.random.default_rng(0).normal(size=(3, 3)))[0], [1, 2, 3]
+    pose[:3, :3] *= np.linalg.det(pose[:3, :3])
+    camera = Camera("EQUIRECTANGULAR", (800.0, 400.0), 800, 400)
+    fields = assembly.assemble(
+        Listing("photos", [Frame("a", file, camera, pose)], upright=True), IngestSection(min_views=1)
+    )
+    assert fields["names"] == [f"a.{name}" for name in sorted(FACES)]
+    _, height, width, _ = fields["images"].shape
+    assert height / width == pytest.approx(1.5, abs=0.01)
+    pixels = np.stack([*np.meshgrid(np.arange(width) + 0.5, np.arange(height) + 0.5), np.ones((height, width))], -1)
+    for image, K, found in zip(fields["images"], fields["Ks"], fields["cam_from_world"], strict=True):
+        rays = pixels @ np.linalg.inv(K).T @ found[:3, :3] @ pose[:3, :3].T  # in the photo's frame
+        rays /= np.linalg.norm(rays, axis=-1, keepdims=True)
+        inside = (slice(2, -2), slice(2, -2))
+        assert np.abs(127.5 + 127.5 * rays - image)[inside].max() < 3
+        assert np.allclose(centers(found[None]), centers(pose[None]))
+
+
+def test_a_photo_of_all_directions_closes_at_its_sides_and_a_wide_one_does_not(tmp_path):
+    for name, pixels in {"all": panorama(400), "wide": panorama(400)[:, 60:260].repeat(2, 1)}.items():
+        Image.fromarray(pixels).save(tmp_path / f"{name}.png")
+    (closed, wide), _ = photos._listed(tmp_path)
+    assert closed.panorama and not wide.panorama
+
+
+def posed(folder, out, **settings):
+    """The exit code of the stage `pose`, and its model."""
+    config = {"source": {"kind": "photos", "path": str(folder)}, "pose": settings, "ingest": {"max_side": 400}}
+    code = run_stage("pose", out, config=config)
+    return code, PhotoModel.read(out) if code == 0 else None, config
+
+
+@pytest.mark.data
+@pytest.mark.xdist_group("sfm")
+def test_poses_and_the_lens_of_photos_are_found_and_what_it_bends_is_undone(tmp_path):
+    """Photos whose own lens moves their corners by less than 1 % of the -0.15 r² that is added."""
+    focal, cut, folder = 687.5, 20, tmp_path / "photos"
+    folder.mkdir()
+    files = sorted((data("fox") / "images").iterdir())[15:27]
+    for file in files:
+        small = Image.open(file).convert("RGB").resize((540, 960), Image.Resampling.BOX)
+        Image.fromarray(bent(np.asarray(small), focal, -0.15, cut)).save(folder / f"{file.stem}.png")
+    shutil.copy(folder / f"{files[0].stem}.png", folder / "copy.png")
+    code, model, config = posed(folder, tmp_path / "model")
+    assert code == 0 and len(model.names) == 12
+    name, params, width, height = model.cameras[0]
+    assert (name, width, height) == ("SIMPLE_RADIAL", 500, 920)
+    assert params[3] == pytest.approx(-0.15, abs=0.04)
+    assert any("copies" in note for note in model.notes) and model.judged["doubts"] == []
+    assert run_stage("ingest", tmp_path / "capture", {"model": tmp_path / "model"}, config) == 0
+    capture = Capture.read(tmp_path / "capture")
+    assert capture.points is not None and len(capture.tracks) > len(capture.points)
+    given = {frame["file_path"].split("/")[-1].split(".")[0]: np.array(frame["transform_matrix"])
+             for frame in json.loads((data("fox") / "transforms.json").read_text())["frames"]}  # fmt: skip
+    true = np.linalg.inv(np.stack([given[name] @ np.diag([1, -1, -1, 1]) for name in capture.names]))
+    scale, rotation, shift = alignment(capture.cam_from_world, true)
+    there = scale * centers(capture.cam_from_world) @ rotation.T + shift
+    away = np.linalg.norm(there - centers(true), axis=1)
+    assert np.median(away) < 0.03 * np.linalg.norm(centers(true) - centers(true).mean(0), axis=1).mean()
+
+
+def bent(pixels, focal, k, cut):
+    """A pinhole picture u8 [H, W, 3] of a focal length as a lens of this k sees it, borders cut off."""
+    from scipy.ndimage import map_coordinates
+
+    height, width = pixels.shape[:2]
+    y, x = np.mgrid[cut : height - cut, cut : width - cut] + 0.5
+    x, y = (x - width / 2) / focal, (y - height / 2) / focal
+    flat = np.hypot(x, y)
+    straight = flat.copy()
+    for _ in range(20):  # r' = r (1 + k r²), solved for r
+        straight = flat / (1 + k * straight**2)
+    grow = np.where(flat > 0, straight / np.maximum(flat, 1e-12), 1)
+    at = [y * grow * focal + height / 2 - 0.5, x * grow * focal + width / 2 - 0.5]
+    return np.stack([map_coordinates(pixels[..., c], at, order=1, mode="nearest") for c in range(3)], -1)
+
+
+def plain_photos(folder):
+    for k in range(4):
+        Image.fromarray(np.full((60, 80, 3), 40 * k, np.uint8)).save(folder / f"{k}.png")
+
+
+def one_photo_in_copies(folder):
+    for k in range(6):
+        shutil.copy(min((data("fox") / "images").iterdir()), folder / f"{k}.jpg")
+
+
+def turned_on_the_spot(folder):
+    """Views of one panorama."""
+    whole = np.asarray(Image.open(min((data("captures") / "flat360/images").iterdir())).convert("RGB"))
+    for k in range(10):
+        camera = Camera("EQUIRECTANGULAR", (1600.0, 800.0), 1600, 800, turn=45.0 + 9 * k)
+        view = assembly.geometry(camera, 640)
+        pixels = assembly.resampled(Image.fromarray(whole), camera, view, assembly.positions(camera, view))
+        Image.fromarray(pixels).save(folder / f"{k}.png")
+
+
+@pytest.mark.data
+@pytest.mark.xdist_group("sfm")
+@pytest.mark.parametrize("made", [plain_photos, one_photo_in_copies, turned_on_the_spot])
+def test_what_tells_no_depth_is_refused_before_anything_is_trained(made, tmp_path):
+    (tmp_path / "photos").mkdir()
+    made(tmp_path / "photos")
+    assert posed(tmp_path / "photos", tmp_path / "model")[0] == 4
+
+
+@pytest.mark.data
+@pytest.mark.slow
+@pytest.mark.xdist_group("sfm")
+def test_two_rooms_in_one_folder_are_told_apart(tmp_path):
+    (tmp_path / "photos").mkdir()
+    for room in ("lunddoor", "flat360"):
+        for k, file in enumerate(sorted((data("captures") / room / "images").iterdir())[:11]):
+            with Image.open(file) as image:
+                side = min(image.size)
+                image.convert("RGB").crop((0, 0, side, side)).resize((700, 700)).save(
+                    tmp_path / f"photos/{room}{k}.png"
+                )
+    code, model, _ = posed(tmp_path / "photos", tmp_path / "model")
+    assert code == 4 or any("groups" in doubt or "could not be placed" in doubt for doubt in model.judged["doubts"])
+
+
+@pytest.mark.data
+@pytest.mark.slow
+@pytest.mark.xdist_group("sfm")
+@pytest.mark.parametrize(("name", "least"), [("goproboard", 18), ("flat360", 10)])
+def test_fisheyes_and_photos_of_all_directions_are_posed_without_a_word_about_their_lens(name, least, tmp_path):
+    code, model, _ = posed(data("captures") / name / "images", tmp_path / "model")
+    assert code == 0 and len(model.names) >= least
+    assert artifact.read_manifest(tmp_path / "model").facts["n_registered"] == len(model.names)
