@@ -205,7 +205,8 @@ def _listing(folder: Path, entries: list[Entry]) -> Listing:
     for (entry, image), name, pose in zip(present, names, poses, strict=True):
         depth, mask = (_part(folder, entry, part) for part in PARTS[1:])
         camera = _camera(entry.values, Path(image), entry.origin)
-        frames.append(Frame(name, Path(image), camera, pose, depth, mask=mask))
+        sure = None if depth is None else common.sureness(depth)
+        frames.append(Frame(name, Path(image), camera, pose, depth, mask=mask, sureness=sure))
     notes = []
     if absent:
         total = len(absent) + len(present)
