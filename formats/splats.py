@@ -85,14 +85,15 @@ def _splat(path: Path) -> tuple[dict[str, np.ndarray], int]:
 
 def _spz(path: Path) -> tuple[dict[str, np.ndarray], int]:
     """Niantic's SPZ, versions 2 and 3: gzip of planes of bytes. Axes become those of PLY files."""
-    unpacking = zlib.decompressobj(31)
+    data = path.read_bytes()
     try:
-        data = unpacking.decompress(path.read_bytes(), LARGEST)
+        if data[:4] != b"NGSP":  # as version 4 begins
+            data = zlib.decompressobj(31).decompress(data, LARGEST)
     except zlib.error as error:
         raise InputError(f"{path} is cut or no SPZ of version 2 or 3 ({error}); {REMEDY}") from None
     magic, version, n, degree, bits, _ = SPZ.unpack_from(data.ljust(SPZ.size, b"\0"))
     if magic != b"NGSP" or version not in (2, 3) or degree not in REST:
-        raise InputError(f"{path} is no SPZ of version 2 or 3; {REMEDY}")
+        raise InputError(f"{path} is no SPZ of version 2 or 3 ({magic!r}, version {version}); {REMEDY}")
     widths = {"means": 9, "alphas": 1, "colors": 3, "scales": 3, "quats": version + 1, "sh": 3 * REST[degree]}
     if len(data) < SPZ.size + n * sum(widths.values()):
         raise InputError(f"{path} is cut, or has more than the {LARGEST >> 20} MiB that are read; {REMEDY}")

@@ -9,6 +9,7 @@ from shlex import quote
 
 from chebsplat.errors import ConfigError, InputError
 from chebsplat.formats.names import suggest
+from chebsplat.formats.splats import is_splat
 from chebsplat.pipelines.work import folders, store
 from chebsplat.pipelines.work.scenes import is_source, names, shown
 from chebsplat.stages.registry import STAGES
@@ -74,6 +75,10 @@ def holder(artifact: Path) -> Path | None:
 def unknown(scene: str) -> ConfigError | InputError:
     """The error for a scene that is not there, with the nearest names."""
     where, run = f"no finished scene in {store.work()}", f"run it first: make scene={quote(shown(scene))}"
+    if is_splat(path := os.path.expanduser(scene)) and os.path.exists(path):
+        return InputError(
+            f"{shown(scene)} is a splat and {where}; make one of it: chebsplat lift {quote(shown(scene))} --out ..."
+        )
     if is_source(os.path.expanduser(scene)):
         return InputError(f"{shown(scene)} is {where}, nor the folder of one; {run}")
     if "/" in scene:

@@ -17,7 +17,7 @@ from chebsplat.errors import DataFailure, InputError
 from chebsplat.formats.images import header
 from chebsplat.stages.settings import IngestSection
 from chebsplat.stages.sources.cameras import DISTORTED, EQUIRECTANGULAR, FACES, Camera, scaled, undistorted
-from chebsplat.stages.sources.common import Frame, Listing, natural, sureness
+from chebsplat.stages.sources.common import Frame, Listing, natural
 from chebsplat.stages.sources.pictures import (
     DEEP,
     GREY,
@@ -231,8 +231,8 @@ def read_view(
             place, field = moved(at, camera, listing.depth_camera)
         stored = companion(frame.depth, field, place, DEEP, "16-bit depth").astype(np.float32)
         known = within(place, field) & inside & ~np.isin(stored, listing.no_depth)
-        if (trusted := sureness(frame.depth)) is not None:
-            known &= companion(trusted, field, place) > 0
+        if frame.sureness is not None:
+            known &= companion(frame.sureness, field, place) > 0
         fields["depth"] = np.where(known, stored / np.float32(listing.depth_scale), np.float32(np.nan))
     if "labels" in wanted and frame.labels is not None:
         fields["labels"] = np.where(inside, label_ids(frame, listing, size, at), np.int32(-1))

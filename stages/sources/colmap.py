@@ -182,7 +182,8 @@ def _listing(folder: Path) -> tuple[Listing, Model]:
             beside = {
                 of: pngs[of].get(name, folder / place / f"{name}.png") for place, of in COMPANIONS.items() if pngs[of]
             }
-            frames.append(Frame(name, images / file, camera, image.pose, mask=masks.get(file), **beside))
+            sure = common.sureness(beside["depth"]) if "depth" in beside else None
+            frames.append(Frame(name, images / file, camera, image.pose, sureness=sure, mask=masks.get(file), **beside))
     rest = set(on_disk) - set(files.values())
     absent = [name for name in wanted if name not in files]
     if absent:

@@ -40,12 +40,13 @@ class Frame:
     image: Path
     camera: Camera
     pose: np.ndarray | None = None
-    depth: Path | None = None  # where `confidence/` lies beside its folder, that says where it is sure
+    depth: Path | None = None
     labels: Path | None = None
     mask: Path | None = None
     objects: Path | None = None  # ids of objects, as large as the labels
     pseudo_labels: Path | None = None  # what a 2D network took the photo for
     confidence: Path | None = None  # .npz whose `confidence` [h, w] says how sure it was
+    sureness: Path | None = None  # 0 where the depth is not to be believed, as a LiDAR says
 
 
 class Shot(NamedTuple):
@@ -97,7 +98,7 @@ class Listing:
 
 
 def sureness(depth: Path) -> Path | None:
-    """The image beside a LiDAR's depth that is 0 where that is not to be believed: confidence/ beside its folder."""
+    """What says where a LiDAR's depth is sure, if there is any: confidence/ beside its folder."""
     path = depth.parent.with_name("confidence") / depth.name
     return path if depth.parent.name.startswith("depth") and present(path) else None
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import os
-from pathlib import Path
+from pathlib import Path, PureWindowsPath
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -118,10 +118,12 @@ def _entries(folder: Path) -> list[Entry]:
 def _present(folder: Path, entries: list[Entry]) -> tuple[list[tuple[Entry, str]], list[str]]:
     """(entry, image) of the frames that are on disk; the paths of those that are not.
 
-    Choices: a photo that is not where it is listed is one of the others, of this name alone (`common.matched`).
+    Raises: InputError if a path leads out of the folder, and no photo in it is meant.
+    Choices: a photo that is not where it is listed, or was on another machine, is one of the others, of this name alone
+      (`common.matched`).
     """
-    paths = [_inside(folder, entry, entry.values["file_path"]) for entry in entries]
-    images = {path: image for path in paths if (image := _on_disk(os.path.join(folder, path)))}
+    paths = [_below(folder, entry.values["file_path"]) for entry in entries]
+    images = {path: image for path in paths if not _leads_out(path) and (image := _on_disk(os.path.join(folder, path)))}
     if absent := [path for path in paths if path not in images]:
         taken = {*images.values(), *(str(_part(folder, entry, part)) for entry in entries for part in PARTS[1:])}
         others = [
@@ -130,8 +132,15 @@ def _present(folder: Path, entries: list[Entry]) -> tuple[list[tuple[Entry, str]
             if name.partition("/")[0] not in common.BESIDE and os.path.join(folder, name) not in taken
         ]
         images |= {path: os.path.join(folder, name) for path, name in common.matched(absent, others).items()}
-    present = [(entry, images[path]) for entry, path in zip(entries, paths, strict=True) if path in images]
-    return present, [path for path in paths if path not in images]
+    present, absent = [], []
+    for entry, path in zip(entries, paths, strict=True):
+        image = images.get(path)
+        inside = os.path.relpath(image, folder) if image and _leads_out(path) else _inside(folder, entry, path)
+        if image is None:
+            absent.append(inside)
+        else:
+            present.append((entry._replace(values=entry.values | {"file_path": inside}), image))
+    return present, absent
 
 
 def _on_disk(path: str) -> str | None:
@@ -140,13 +149,20 @@ def _on_disk(path: str) -> str | None:
     return next((p for p in paths if os.path.isfile(p) or (is_image(os.path.basename(p)) and os.path.lexists(p))), None)
 
 
+def _below(folder: Path, listed: str) -> str:
+    """A listed path relative to the folder, which may lead out of it."""
+    path = listed.replace("\\", "/")
+    return os.path.normpath(os.path.relpath(path, os.path.abspath(folder)) if os.path.isabs(path) else path)
+
+
+def _leads_out(path: str) -> bool:
+    return path.split("/")[0] == ".." or bool(PureWindowsPath(path).drive)
+
+
 def _inside(folder: Path, entry: Entry, listed: str) -> str:
     """A listed path relative to the folder. Raises InputError if it leads out of it."""
-    path = listed.replace("\\", "/")
-    if os.path.isabs(path):
-        path = os.path.relpath(path, os.path.abspath(folder))
-    path = os.path.normpath(path)
-    if path.split("/")[0] == "..":
+    path = _below(folder, listed)
+    if _leads_out(path):
         raise InputError(f"{entry.origin}: {listed} lies elsewhere; write paths relative to the folder")
     return next(common.printable(entry.origin, [path]))
 
@@ -171,7 +187,7 @@ def _cloud(folder: Path, first: Entry) -> Path | None:
 
 def _listing(folder: Path, entries: list[Entry]) -> Listing:
     present, absent = _present(folder, entries)
-    names = [_name(_inside(folder, entry, entry.values["file_path"])) for entry, _ in present]
+    names = [_name(entry.values["file_path"]) for entry, _ in present]
     matrices = []
     for (entry, _), name in zip(present, names, strict=True):
         path = entry.origin
@@ -189,7 +205,8 @@ def _listing(folder: Path, entries: list[Entry]) -> Listing:
     for (entry, image), name, pose in zip(present, names, poses, strict=True):
         depth, mask = (_part(folder, entry, part) for part in PARTS[1:])
         camera = _camera(entry.values, Path(image), entry.origin)
-        frames.append(Frame(name, Path(image), camera, pose, depth, mask=mask))
+        sure = None if depth is None else common.sureness(depth)
+        frames.append(Frame(name, Path(image), camera, pose, depth, mask=mask, sureness=sure))
     notes = []
     if absent:
         total = len(absent) + len(present)
@@ -222,8 +239,8 @@ def _split(folder: Path, entries: list[Entry], listing: Listing) -> tuple[set[st
     """Names of the test views and what says so, None where nothing does; frames of no list leave the listing."""
     documents = _documents(folder)
     if len(documents) == 2:
-        held = [_inside(folder, e, e.values["file_path"]) for e in entries if e.origin == documents[1]]
-        return {_name(path) for path in held}, documents[1].name
+        held = [entry for entry, _ in _present(folder, entries)[0] if entry.origin == documents[1]]
+        return {_name(entry.values["file_path"]) for entry in held}, documents[1].name
     lists: dict[str, set[str]] = {}
     for key in SPLITS:
         listed = entries[0].values.get(key)

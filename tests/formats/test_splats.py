@@ -110,7 +110,8 @@ def test_a_splat_of_32_bytes_a_gaussian_reads(tmp_path):
     ("a.SOG", b"any", r"\.sog is not read \(\.ply, \.spz, \.splat are\)"),
     ("a.splat", bytes(33), "no multiple of 32"),
     ("a.spz", b"any", "is cut or no SPZ"),
-    ("a.spz", gzip.compress(struct.pack("<4sIIBBBx", b"NGSP", 4, 1, 0, 12, 0)), "no SPZ of version 2 or 3"),
+    ("a.spz", struct.pack("<4sIIBBBx", b"NGSP", 4, 1, 0, 12, 0) + bytes(16), r"\(b'NGSP', version 4\); export"),
+    ("a.spz", gzip.compress(struct.pack("<4sIIBBBx", b"NGSP", 1, 1, 0, 12, 0)), "no SPZ of version 2 or 3"),
     ("a.spz", gzip.compress(struct.pack("<4sIIBBBx", b"NGSP", 3, 2**32 - 1, 3, 12, 0)), "is cut, or has more"),
     ("a.spz", gzip.compress(bytes(9))[:-9], "no SPZ"),
 ])  # fmt: skip

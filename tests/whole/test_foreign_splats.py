@@ -125,6 +125,8 @@ def test_a_splat_file_and_a_folder_of_3dgs_become_a_scene_and_a_page(tmp_path, n
         done = CliRunner().invoke(main, [command, str(path), "--out", str(tmp_path / out)])
         assert done.exit_code == 0, done.output
     assert len(Gaussians.read(tmp_path / "made/gaussians").parameters["means"]) == 9
+    done = CliRunner().invoke(main, ["render", str(path), "--out", str(tmp_path / "frames")])
+    assert done.exit_code == 3 and "is a splat and no finished scene" in done.output and "chebsplat lift" in done.output
 
 
 def test_a_key_holds_what_training_starts_from_and_not_where_that_lies(tmp_path, quick_plans):

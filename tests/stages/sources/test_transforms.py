@@ -118,6 +118,19 @@ def test_photos_that_lie_elsewhere_or_were_reduced_are_found_and_cameras_scaled(
     assert "3 photos have another path" in notes and "Cameras of 3 views are scaled" in notes
 
 
+def test_paths_of_another_machine_mean_the_photos_of_these_names(tmp_path):
+    folder = write_transforms(tmp_path / "scene")
+    for k, path in enumerate(("/home/me/scene/images/frame_9.jpg", "C:\\scene\\images\\frame_10.png", "../frame_11")):
+        change_frame(folder, k, file_path=path)
+    fields = transforms.read(folder, SETTINGS)
+    assert [name.rsplit("/")[-1] for name in fields["names"]] == ["frame_9", "frame_10", "frame_11"]
+    assert fields["images"][:, 0, 0, 0].tolist() == [0, 20, 40]
+    assert len(transforms.files(folder)) == 4
+    image(tmp_path / "frame_12.png")
+    with pytest.raises(InputError, match="lies elsewhere"):
+        transforms.read(change_frame(folder, 2, file_path="../frame_12.png"), SETTINGS)
+
+
 def test_a_skew_of_intrinsics_is_said_not_to_be_used(tmp_path):
     from source_folders import tiny
 
