@@ -27,19 +27,22 @@ class World:
         nothing.
 
         Choices: a scene of sane size about a sane origin stays as it is. Others are brought to an extent of 1 to 10
-          units by a power of ten, and to the middle of the cameras. One place alone has no extent: its scale stays. A
-          few cameras gone astray decide nothing: middle and extent are medians.
+          units by a power of ten, and about the origin by a round number near the middle of the cameras, so that a
+          scene that was moved or scaled by such a number is as before. One place alone has no extent: its scale stays.
+          A few cameras gone astray decide nothing: middle and extent are medians.
         """
         eyes = eyes[np.isfinite(eyes).all(1)]
         if not len(eyes):
             return cls()
         middle = np.median(eyes, 0)
         extent = 2 * float(np.median(np.linalg.norm(eyes - middle, axis=1)))
-        told = extent > 1e-12 * np.abs(middle).max()  # by more than rounding
-        sane = not told or EXTENTS[0] <= extent <= EXTENTS[1]
-        scale = 1.0 if sane else float(10.0 ** np.floor(np.log10(extent)))
-        near = np.linalg.norm(middle) <= FARTHEST * (extent if told else 1.0)
-        return cls((0.0, 0.0, 0.0) if near else tuple(middle.tolist()), scale)
+        if extent <= 1e-12 * np.abs(middle).max():  # no more than rounding
+            extent = 1.0
+        unit = float(10.0 ** np.floor(np.log10(extent)))
+        sane = EXTENTS[0] <= extent <= EXTENTS[1]
+        near = np.linalg.norm(middle) <= FARTHEST * extent
+        origin = 0 * middle if near else (middle / (100 * unit)).round() * (100 * unit)
+        return cls(tuple(origin.tolist()), 1.0 if sane else unit)
 
     @classmethod
     def read(cls, notes: Mapping[str, Any]) -> Self:
