@@ -35,6 +35,7 @@ N_VIEWS, LEAST_VIEWS, WIDTH = 8, 4, 96  # that are compared, without which nothi
 # faint Gaussians have 0.1 to 0.66 at their places.
 AGREES, DOUBTED = 0.4, 0.2
 SAME = 0.01  # by which a frame that points refine must be better than the usual ones, which are exact
+ONE_COLOR = 1 / 72  # of the coefficient of band 0, which is a step of 255 in colour
 BETTER = 0.1  # by which another frame must be better than the splat's own
 FIRST, REFINED = 4, 3  # views that all frames are tried on; frames of these that are refined
 STEPS, N_POINTS, NEAREST = 100, 1000, 0.6  # of refining: steps at most, points, and which of them are believed
@@ -66,9 +67,11 @@ def in_frame(
           world: that the splat was brought into as it was read, as the capture was.
     Raises:  InputError naming the splat, and what was tried, where it resembles the photos in no frame.
     Choices: it is turned only where that is clearly better. One that resembles them little in its own frame, and in no
-      other, is taken with a warning: it may be trained little. With fewer than LEAST_VIEWS nothing is said.
+      other, is taken with a warning: it may be trained little. With fewer than LEAST_VIEWS, and of Gaussians of one
+      colour, nothing is said.
     """
-    if (sights := sights_of(capture, cameras)) is None or not len(parameters["means"]):
+    sights, light = sights_of(capture, cameras), parameters["sh0"][:, 0]
+    if sights is None or np.abs(light - np.median(light, 0)).mean() < ONE_COLOR:
         return parameters
     renderer = plain(parameters)
     own = likeness(renderer, sights, Similarity(1.0, np.eye(3), np.zeros(3)))

@@ -154,7 +154,7 @@ def test_what_nothing_tells_the_way_of_is_refused_with_what_was_tried(room, tmp_
     assert str(tmp_path / "a.ply") in str(no.value)
 
 
-def test_a_splat_trained_little_is_taken_with_a_warning_and_few_views_say_nothing(room, tmp_path, caplog):
+def test_a_splat_trained_little_is_taken_with_a_warning_and_few_views_or_one_colour_say_nothing(room, tmp_path, caplog):
     capture, parameters, _ = room
     rng = np.random.default_rng(0)
     few = parameters | {"means": parameters["means"] + rng.normal(0, 0.4, (len(parameters["means"]), 3)).astype("f4")}
@@ -165,6 +165,8 @@ def test_a_splat_trained_little_is_taken_with_a_warning_and_few_views_say_nothin
                     np.zeros(3, bool))  # fmt: skip
     far = ANY.of_gaussians(parameters)
     assert in_frame(tmp_path / "a.ply", far, three, view_of(three), None) is far
+    plain = far | {"sh0": np.ones_like(far["sh0"])}
+    assert in_frame(tmp_path / "a.ply", plain, capture, view_of(capture), None) is plain
 
 
 @pytest.mark.xdist_group("toy")
