@@ -25,6 +25,8 @@ from chebsplat.stages.sources.common import Shot, file_of
 log = logging.getLogger("chebsplat")
 MORE = 1.1  # times the photos of an earlier attempt
 ENOUGH = 0.9  # of the photos: where fewer register, or the matches disagree, more is tried
+HALF = 0.5  # of the photos: where a plain lens registers so many, a fisheye's is not tried
+FISHEYE = "OPENCV_FISHEYE"
 FAINT = 0.002  # SIFT's peak threshold where the usual one finds too little; it costs exactness
 WIDE = 0.5  # a fisheye's focal length in longer sides, where EXIF says nothing
 FILM = 36.0  # mm, the longer side of the frame that 35 mm equivalents refer to
@@ -50,6 +52,8 @@ def found(job: Job, shots: Sequence[Shot], pictures: Path, settings: PoseSection
     """
     best: Found | None = None
     for lens, peak in attempts(shots, settings):
+        if best is not None and lens == FISHEYE != settings.camera and len(best.model.names) > HALF * len(shots):
+            break  # the lens is found
         if best is not None:
             log.info("%d of %d photos registered; trying %s, features from %g on", len(best.model.names), len(shots),
                      lens, peak)  # fmt: skip
@@ -75,7 +79,7 @@ def attempts(shots: Sequence[Shot], settings: PoseSection) -> Iterator[tuple[str
     if peak > FAINT:
         yield lens, FAINT
     if settings.camera == "auto" and lens != EQUIRECTANGULAR:
-        yield "OPENCV_FISHEYE", min(peak, FAINT)
+        yield FISHEYE, min(peak, FAINT)
 
 
 def _matched(job: Job, shots: Sequence[Shot], pictures: Path, lens: str, settings: PoseSection) -> Path:
@@ -94,7 +98,7 @@ def _matched(job: Job, shots: Sequence[Shot], pictures: Path, lens: str, setting
         reader.camera_model = lens
         if lens == EQUIRECTANGULAR:
             reader.camera_params = f"{width},{height}"
-        elif focal is not None or lens == "OPENCV_FISHEYE":
+        elif focal is not None or lens == FISHEYE:
             pixels = max(width, height) * (WIDE if focal is None else focal / FILM)
             focals = [pixels] * (2 if lens.startswith("OPENCV") else 1)
             reader.camera_params = ",".join(map(str, [*focals, width / 2, height / 2, *[0.0] * LENSES[lens]]))

@@ -94,7 +94,7 @@ ROOMS = {
         "measuring": set(),
         "pages": set(),
         "sources": {"runtime", "settings"},
-        "reconstruction": {"runtime", "settings"},
+        "reconstruction": {"runtime", "settings", "sources"},
         "training": {"runtime", "settings"},
         "teacher_models": {"runtime", "settings"},
         "shape_models": {"reconstruction", "runtime", "settings", "sources", "teacher_models"},
