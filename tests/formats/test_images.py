@@ -9,13 +9,12 @@ import numpy as np
 import pytest
 from malformed.edits import EPS, declared_png
 from PIL import Image, ImageOps
-from source_folders import SETTINGS, image
+from source_folders import alone, image
 
 from chebsplat.errors import InputError
 from chebsplat.formats import images
 from chebsplat.formats.images import header, opened, read_rgb, seen_size, turned
 from chebsplat.stages import channels
-from chebsplat.stages.sources import photos
 from chebsplat.stages.tools import get_teacher
 
 
@@ -31,7 +30,7 @@ def test_an_image_that_is_a_program_is_never_run(tmp_path, monkeypatch, how):
     image(folder / "a.png")
     (folder / "b.png").write_bytes(EPS)
     read = {
-        "ingest": lambda: photos.read(folder, SETTINGS),
+        "ingest": lambda: alone(folder),
         "channels": lambda: list(channels.photos([folder / "b.png"])),
         "check-teacher": lambda: get_teacher.shown(folder / "b.png"),
     }[how]

@@ -3,10 +3,9 @@
 import json
 import os
 import shutil
-from pathlib import Path
 
 import pytest
-from shared import photo_folder
+from source_folders import image, write_colmap
 from tiny_teachers import color_reference, color_teacher
 
 from chebsplat.errors import InputError
@@ -23,7 +22,10 @@ pytestmark = pytest.mark.usefixtures("own_work")
 
 @pytest.fixture
 def photos(tmp_path):
-    return Path(photo_folder(tmp_path / "photos"))
+    write_colmap(tmp_path / "room", names=[f"{k}.png" for k in range(4)])
+    for k in range(4):
+        image(tmp_path / f"room/images/{k}.png", value=60 * k)
+    return tmp_path / "room/images"
 
 
 def planned(stage, *arguments):
@@ -42,24 +44,24 @@ def same_size_and_time(path, data):
 
 
 def edited(photos):
-    same_size_and_time(photos / "2.jpg", (photos / "1.jpg").read_bytes())
-    return "2.jpg"
+    same_size_and_time(photos / "2.png", (photos / "1.png").read_bytes())
+    return "2.png"
 
 
 def added(photos):
-    shutil.copy(photos / "1.jpg", photos / "7.jpg")
-    return "7.jpg"
+    shutil.copy(photos / "1.png", photos / "7.png")
+    return "7.png"
 
 
 def removed(photos):
-    (photos / "2.jpg").unlink()
-    return "2.jpg"
+    (photos / "2.png").unlink()
+    return "2.png"
 
 
 def replaced(photos):
-    shutil.copystat(photos / "2.jpg", photos / "1.jpg")
-    os.replace(photos / "1.jpg", photos / "2.jpg")
-    return ".jpg"
+    shutil.copystat(photos / "2.png", photos / "1.png")
+    os.replace(photos / "1.png", photos / "2.png")
+    return ".png"
 
 
 CHANGES = [edited, added, removed, replaced]
@@ -68,7 +70,7 @@ CHANGES = [edited, added, removed, replaced]
 @pytest.mark.parametrize("change", CHANGES)
 @pytest.mark.parametrize("when", ["before", "while"])
 def test_photos_that_change_after_they_were_planned_are_named(photos, change, when):
-    step, _ = planned("ingest", photos)
+    step, _ = planned("ingest", photos.parent)
     named = change(photos) if when == "before" else ""
     with pytest.raises(InputError, match="run again") as error, unchanged("ingest", step.sections, step.raw):
         assert when == "while"
@@ -77,12 +79,12 @@ def test_photos_that_change_after_they_were_planned_are_named(photos, change, wh
 
 
 def test_of_photos_that_change_nothing_is_published_under_the_key_of_the_old(photos, capfd):
-    step, plan = planned("ingest", photos)
+    step, plan = planned("ingest", photos.parent)
     named = edited(photos)
     assert job.run(plan, step.key) == 3
     assert named in capfd.readouterr().err
     assert not step.path.exists()
-    again, plan = planned("ingest", photos)
+    again, plan = planned("ingest", photos.parent)
     assert again.key != step.key
     assert job.run(plan, again.key) == 0
     assert artifact.verify(again.path).key == again.key
@@ -111,7 +113,7 @@ def test_models_labels_and_weights_are_watched_too(tmp_path, stage, file):
 
 
 def test_files_that_were_not_touched_for_long_are_not_read_again(photos, monkeypatch):
-    _, files = raw_files("ingest", {"source": {"kind": "photos", "path": str(photos)}})
+    _, files = raw_files("ingest", {"source": {"kind": "colmap", "path": str(photos.parent)}})
     monkeypatch.setattr(raw, "SETTLED", -1)
     memo = {}
     found = hashes(files, memo)
@@ -122,19 +124,19 @@ def test_files_that_were_not_touched_for_long_are_not_read_again(photos, monkeyp
 
 def test_a_file_that_has_changed_just_now_is_read_again(photos):
     memo = {}
-    found = hashes([photos / "1.jpg"], memo)
+    found = hashes([photos / "1.png"], memo)
     assert memo == {}
-    assert not found[str(photos / "1.jpg")][2]
+    assert not found[str(photos / "1.png")][2]
 
 
 @pytest.mark.parametrize("damage", ["[]", "{", '{"PATH": 5}', '{"PATH": [1]}', '{"PATH": [[1, 2], 7]}', "[" * 10**5])
 def test_a_damaged_memory_of_hashes_costs_time_only(photos, own_work, damage):
-    step, _ = planned("ingest", photos)
+    step, _ = planned("ingest", photos.parent)
     code = next(path for path in Planner().code.memo)
-    for name, path in (("files", photos / "1.jpg"), ("code", code)):
+    for name, path in (("files", photos / "1.png"), ("code", code)):
         (own_work / ".cache").mkdir(exist_ok=True)
         (own_work / f".cache/{name}.json").write_text(damage.replace("PATH", str(path)))
-    again, _ = planned("ingest", photos)
+    again, _ = planned("ingest", photos.parent)
     assert again.key == step.key
 
 
@@ -145,7 +147,7 @@ def test_names_that_are_not_utf8_are_hashed(tmp_path):
 
 
 def test_a_finished_step_is_made_again_where_a_member_is_gone(photos):
-    step, plan = planned("ingest", photos)
+    step, plan = planned("ingest", photos.parent)
     assert job.run(plan, step.key) == 0 and step.fresh
     member = next(path for path in step.path.rglob("*") if path.name == "zarr.json")
     member.unlink()

@@ -4,6 +4,7 @@ import copy
 import dataclasses
 import importlib
 import inspect
+import json
 import re
 
 import numpy as np
@@ -75,6 +76,13 @@ def one_photo(toy, tmp):
     return {}, {"source": {"kind": "photos", "path": str(tmp / "photos")}}
 
 
+def one_frame(toy, tmp):
+    one_photo(toy, tmp)
+    frames = [{"file_path": "a.jpg", "transform_matrix": np.eye(4).tolist()}]
+    (tmp / "photos/transforms.json").write_text(json.dumps({"fl_x": 30.0, "frames": frames}))
+    return {}, {"source": {"kind": "transforms", "path": str(tmp / "photos")}}
+
+
 def teacher_of_nothing(toy, tmp):
     model = color_teacher(tmp, weights=np.zeros((3, 3)))
     return {}, {"channels": {"model": str(model), "reference": str(color_reference(tmp / "reference"))}}
@@ -95,7 +103,8 @@ def without_gaussians(checkpoint):
 
 only_test_views = but_for("capture", lambda capture: {"is_test": capture.is_test | True})
 FAILURES = {  # the inputs of a stage that are others than the toy scene's, and its config
-    "ingest": one_photo,
+    "pose": one_photo,
+    "ingest": one_frame,
     "sfm": but_for("capture", without_depth),
     "channels": teacher_of_nothing,
     "teacher": but_for("capture", lambda capture: {"labels": None}),

@@ -5,7 +5,9 @@ import json
 import numpy as np
 from PIL import Image
 
+from chebsplat.formats.photo_model import PhotoModel
 from chebsplat.stages.settings import IngestSection
+from chebsplat.stages.sources import photos
 
 SETTINGS = IngestSection(max_side=160, min_views=2)
 SMALL = IngestSection(max_side=160, max_views=6, min_views=2)
@@ -16,6 +18,24 @@ def image(path, size=(8, 6), value=100, mode="RGB"):
     path.parent.mkdir(parents=True, exist_ok=True)
     Image.new(mode, size, value if mode in ("L", "I;16", "P") else (value,) * len(mode)).save(path)
     return path
+
+
+def alone(folder, settings=SETTINGS):
+    """Fields of photos that come alone, as of a model that looks along z from places a metre apart."""
+    found, notes = photos._listed(folder)
+    model = model_of([shot.name for shot in found], [shot.size for shot in found], [shot.focal for shot in found])
+    model.notes = notes
+    return photos.read(folder, settings, model)
+
+
+def model_of(names, sizes, focals):
+    """A model without points; focals: 35 mm equivalents, None: 1.2 longer sides."""
+    poses = np.tile(np.eye(4), (len(names), 1, 1))
+    poses[:, 0, 3] = -np.arange(len(names))
+    longs = [max(size) * (1.2 if focal is None else focal / 36) for size, focal in zip(sizes, focals, strict=True)]
+    cameras = [["SIMPLE_PINHOLE", [long, w / 2, h / 2], w, h] for long, (w, h) in zip(longs, sizes, strict=True)]
+    none = np.zeros((0, 3))
+    return PhotoModel(names, cameras, np.arange(len(names)), poses, none, none, none[:, 0], none[:, :2].astype(int))
 
 
 def save(path, data):

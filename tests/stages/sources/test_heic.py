@@ -7,7 +7,7 @@ import pytest
 from PIL import Image
 from scipy.ndimage import uniform_filter1d, zoom
 from shared import data
-from source_folders import SETTINGS, image
+from source_folders import alone, image
 
 from chebsplat.errors import InputError
 from chebsplat.formats import images
@@ -37,7 +37,7 @@ def test_orientation_and_focal_length_count_as_in_a_jpeg(tmp_path):
     for name in ("a.heic", "b.HEIC", "c.jpg"):  # the last one lies about what it is
         heic(tmp_path / name, turn=6)
     assert common.detect(tmp_path) == "photos"
-    fields = photos.read(tmp_path, SETTINGS)
+    fields = alone(tmp_path)
     assert fields["images"].shape == (3, 96, 64, 3)
     assert fields["images"][0, 10, 50, 0] > 200 > 50 > fields["images"][0, 10, 10, 0]  # it was turned clockwise
     assert fields["Ks"][0, 0, 0] == pytest.approx(96 * 26 / 36)

@@ -4,7 +4,7 @@ import shutil
 
 import numpy as np
 import pytest
-from source_folders import SETTINGS, image, save, write_colmap
+from source_folders import SETTINGS, alone, image, save, write_colmap
 
 from chebsplat.errors import DataFailure
 from chebsplat.stages.settings import IngestSection
@@ -158,7 +158,7 @@ def test_photos_alone_are_found_in_the_folders_that_others_put_them_in(tmp_path,
     for path in paths:
         image(tmp_path / path, value=255)
     assert common.detect(tmp_path) == "photos"
-    assert photos.read(tmp_path, SETTINGS)["names"] == names
+    assert alone(tmp_path)["names"] == names
     assert len(photos.files(tmp_path)) == len(names) + ("masks/1.png" in paths)
 
 
@@ -167,6 +167,6 @@ def test_masks_beside_photos_are_used(tmp_path):
         image(tmp_path / f"{k}.jpg")
     image(tmp_path / "masks/0.png", mode="L", value=0)
     image(tmp_path / "masks/1.jpg.png", mode="L", value=255)
-    fields = photos.read(tmp_path, SETTINGS)
+    fields = alone(tmp_path)
     assert fields["loss_mask"].mean((1, 2)).tolist() == [0, 1, 1]
     assert "1 of 3 views have no mask; all their pixels count." in fields["source"]["notes"]

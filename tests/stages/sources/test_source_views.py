@@ -8,11 +8,11 @@ import pytest
 from PIL import Image
 from scipy.ndimage import laplace
 from shared import data, run_stage
-from source_folders import SETTINGS, image, save, write_colmap
+from source_folders import SETTINGS, alone, image, save, write_colmap
 
 from chebsplat.formats.artifact import read_manifest
 from chebsplat.formats.capture import Capture
-from chebsplat.stages.settings import IngestSection
+from chebsplat.stages.settings import IngestSection, PoseSection
 from chebsplat.stages.sources import assembly, colmap, colmap_model, common, photos
 from chebsplat.stages.sources.cameras import Camera
 
@@ -310,18 +310,15 @@ def test_labels_without_a_name_are_noted_and_class_names_can_be_given(tmp_path):
     assert any("sofa" in note for note in fields["source"]["notes"])
 
 
-def test_photos_have_no_poses_and_mixed_sizes_are_masked(tmp_path):
+def test_photos_of_mixed_sizes_are_masked(tmp_path):
     for k, size in enumerate([(80, 60), (60, 80), (40, 30)]):
         image(tmp_path / f"{k}.{'JPG' if k else 'jpeg'}", size)
     image(tmp_path / "thumbs/0.jpg")
     (tmp_path / "._0.jpg").write_bytes(b"not a photo")
     assert common.detect(tmp_path) == "photos"
-    fields = photos.read(tmp_path, SETTINGS)
-    assert fields["cam_from_world"] is None
+    fields = alone(tmp_path)
     assert fields["images"].shape == (3, 80, 80, 3)
     assert fields["loss_mask"].sum() == 80 * 60 * 2 + 40 * 30
-    assert fields["Ks"][0][0, 0] == pytest.approx(1.2 * 80)
-    assert "3 of 3 photos" in fields["source"]["notes"][0]
     assert fields["source"]["notes"][-2] == "Photos in these folders are not read: thumbs."
     assert photos.probe(tmp_path)["poses"] is False
     assert len(photos.files(tmp_path)) == 3
@@ -335,11 +332,11 @@ def test_exif_turns_a_photo_and_gives_its_focal_length(tmp_path):
         pixels = np.zeros((60, 80, 3), np.uint8)
         pixels[:, :40] = 255
         Image.fromarray(pixels).save(tmp_path / f"{k}.jpg", exif=exif)
-    fields = photos.read(tmp_path, SETTINGS)
+    fields = alone(tmp_path)
     assert fields["images"].shape == (3, 80, 60, 3)
     assert fields["images"][0, :30].min() > 200 and fields["images"][0, 50:].max() < 50
     assert np.allclose(fields["Ks"][:, 0, 0], [28 / 36 * 80, 28 / 36 * 80, 96])
-    assert "1 of 3 photos have no focal length" in fields["source"]["notes"][0]
+    assert "1 of 3 photos have no focal length" in photos.shots(tmp_path, PoseSection(), None, 1)[1][0]
 
 
 def test_transparent_pixels_are_empty_and_count(tmp_path):
@@ -349,7 +346,7 @@ def test_transparent_pixels_are_empty_and_count(tmp_path):
         pixels[:, :4, 3] = alpha
         pixels[:, 4:, 3] = 255 if k < 2 else 0
         save(tmp_path / f"{k}.png", pixels)
-    fields = photos.read(tmp_path, SETTINGS)
+    fields = alone(tmp_path)
     assert fields["images"][:, 0, [0, 7], 0].tolist() == [[255, 255], [100, 255], [0, 0]]
     assert fields["loss_mask"].mean((1, 2)).tolist() == [1, 1, 0]
     assert "2 of 3 photos have transparent pixels, which are empty space." in fields["source"]["notes"]
@@ -358,10 +355,10 @@ def test_transparent_pixels_are_empty_and_count(tmp_path):
 def test_images_are_reduced_but_never_enlarged(tmp_path):
     for k in range(3):
         image(tmp_path / f"{k}.jpg", (320, 160))
-    fields = photos.read(tmp_path, SETTINGS)
+    fields = alone(tmp_path)
     assert fields["images"].shape == (3, 80, 160, 3)
     assert fields["Ks"][0][0, 0] == pytest.approx(1.2 * 160)
-    assert photos.read(tmp_path, IngestSection(max_side=8192))["images"].shape == (3, 160, 320, 3)
+    assert alone(tmp_path, IngestSection(max_side=8192))["images"].shape == (3, 160, 320, 3)
 
 
 def test_depth_that_is_not_wanted_is_left_out_and_nothing_else(tmp_path):

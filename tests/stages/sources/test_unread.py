@@ -1,7 +1,7 @@
 """What lies beside photos and is not read is counted, with what to do about it."""
 
 import pytest
-from source_folders import image
+from source_folders import image, model_of
 
 from chebsplat.errors import InputError
 from chebsplat.pipelines.planning.needs import source_sentence
@@ -16,7 +16,8 @@ def test_raw_photos_and_videos_beside_photos_are_counted_in_notes_and_plan(tmp_p
     for name in ("IMG_1.CR2", "IMG_2.cr2", "walk.MP4", ".hidden.mp4", "notes.txt"):
         (tmp_path / name).write_bytes(b"\0")
     source = SourceSection(kind="photos", path=str(tmp_path))
-    note = ingest.read("scene", source, IngestSection(min_views=2))["source"]["notes"][-1]
+    model = model_of([str(k) for k in range(3)], [(8, 6)] * 3, [None] * 3)
+    note = ingest.read("scene", source, IngestSection(min_views=2), model)["source"]["notes"][-1]
     assert note.startswith("2 .cr2, 1 .mp4 not read; convert to JPEG, for example with `darktable-cli a.cr2 a.jpg`")
     assert "a video is read by itself" in note
     assert f"({note[:-1]})" in source_sentence("scene", source, source)

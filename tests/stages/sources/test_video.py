@@ -4,7 +4,9 @@ import sys
 
 import numpy as np
 import pytest
+from PIL import Image
 from scipy.ndimage import gaussian_filter, uniform_filter1d, zoom
+from source_folders import model_of
 
 from chebsplat.errors import DataFailure, InputError
 from chebsplat.formats import videos
@@ -13,8 +15,9 @@ from chebsplat.pipelines.planning.needs import media_packages
 from chebsplat.pipelines.planning.raw import raw_files
 from chebsplat.pipelines.work import scenes
 from chebsplat.stages.runtime.progress import Progress
-from chebsplat.stages.settings import IngestSection
+from chebsplat.stages.settings import IngestSection, PoseSection
 from chebsplat.stages.sources import common, video
+from chebsplat.stages.sources.common import file_of
 
 RATE, SPEED = 30, 2  # frames/s, pixels a frame
 
@@ -73,31 +76,44 @@ def test_frames_are_apart_sharp_in_order_and_the_same_again(tmp_path, capfd):
     blur = {k for k in range(120) if k % 4 != 1}
     file = film(tmp_path / "walk.mp4", blur=blur)
     assert common.detect(tmp_path) == common.detect(file) == "video"
-    settings = IngestSection(max_side=96)
-    fields, again = video.read(tmp_path, settings, Progress(show=True)), video.read(file, settings)
-    assert "frames 120/120" in capfd.readouterr().err
-    assert (fields["images"] == again["images"]).all() and fields["names"] == again["names"]
-    assert fields["images"].shape[1:] == (64, 96, 3)
-    at = np.array([float(name) for name in fields["names"]]) * RATE
+    shots, notes = video.shots(tmp_path, PoseSection(), Progress(show=True), 1)
+    assert shots == video.shots(file, PoseSection(), None, 1)[0]
+    assert "frames 120/120" in capfd.readouterr().err and "frames are used" in notes[0]
+    at = np.array([float(shot.name) for shot in shots]) * RATE
     assert not {round(k) for k in at} & blur
     assert (np.diff(at) * SPEED / 192 < 2 * STEP).all() and len(at) > 120 * SPEED / 192 / STEP - 3  # pixels are whole
-    assert fields["names"] == sorted(fields["names"]) and fields["cam_from_world"] is None
-    assert len(video.read(file, IngestSection(max_views=5))["names"]) == 5
+    names = [shot.name for shot in shots]
+    assert names == sorted(names)
+    finer = video.shots(file, PoseSection(), None, 2)[0]
+    assert len(finer) > 1.6 * len(shots)
+    assert len(video.shots(file, PoseSection(max_views=5), None, 1)[0]) == 5
+    fields = filmed(file, IngestSection(max_side=96))
+    assert fields["names"] == names and fields["images"].shape == (len(names), 64, 96, 3)
+    video.save(shots, file, tmp_path, 64)
+    assert Image.open(tmp_path / file_of(len(shots) - 1)).size == (64, 43)
     assert media_packages([file]) == ("av",)
+
+
+def filmed(file, settings):
+    """The fields of a video of which all frames are placed."""
+    shots, _ = video.shots(file, PoseSection(), None, 1)
+    model = model_of([shot.name for shot in shots], [shot.size for shot in shots], [None] * len(shots))
+    model.frames = [shot.frame for shot in shots]
+    return video.read(file, settings, model)
 
 
 @pytest.mark.parametrize(("turn", "row", "column"), [(-90, 10, -10), (90, -10, 10), (180, -10, -10)])
 def test_a_video_is_turned_as_its_phone_was_held(tmp_path, turn, row, column):
-    file = film(tmp_path / "a.mov", n=40, turn=turn)
-    images = video.read(file, IngestSection(min_views=2))["images"]
+    file = film(tmp_path / "a.mov", n=60, turn=turn)
+    images = filmed(file, IngestSection())["images"]
     assert images.shape[1:3] == ((128, 192) if turn == 180 else (192, 128))
     red = images[0].astype(int)[row, column]
     assert red[0] > 150 > 80 > red[2]
 
 
 def test_a_video_that_hardly_moves_says_so(tmp_path):
-    with pytest.raises(DataFailure, match=r"ingest\.min_views is 3: walk around"):
-        video.read(film(tmp_path / "a.mp4", n=5), IngestSection())
+    with pytest.raises(DataFailure, match=r"3 are needed: walk around"):
+        video.shots(film(tmp_path / "a.mp4", n=5), PoseSection(), None, 1)
 
 
 @pytest.mark.parametrize("content", [b"", b"text", bytes(64), b"ffconcat version 1.0\nfile b.mp4\n", None])
@@ -105,7 +121,7 @@ def test_what_is_no_video_is_named_and_no_playlist_is_followed(tmp_path, content
     whole = film(tmp_path / "b.mp4", n=5).read_bytes()
     (tmp_path / "a.mp4").write_bytes(whole[: len(whole) // 2] if content is None else content)
     with pytest.raises(InputError, match=r"a\.mp4 is not a readable video"):
-        video.read(tmp_path / "a.mp4", IngestSection())
+        video.shots(tmp_path / "a.mp4", PoseSection(), None, 1)
 
 
 def test_without_the_extra_a_video_is_one_line_that_installs_it(tmp_path, monkeypatch):
@@ -125,7 +141,7 @@ def test_a_file_names_a_scene_and_is_its_raw_input(tmp_path, monkeypatch):
         name, values = scenes.scene_values(given)
         assert (name, values["source"]) == ("my-walk", {"kind": "video", "path": str(file)})
     for path in (file, tmp_path):
-        assert raw_files("ingest", {"source": {"kind": "video", "path": str(path)}}) == (tmp_path, [file])
+        assert raw_files("pose", {"source": {"kind": "video", "path": str(path)}}) == (tmp_path, [file])
     (tmp_path / "b.mp4").write_bytes(b"\0")
     with pytest.raises(InputError, match="2 videos"):
         video.files(tmp_path)
