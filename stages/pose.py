@@ -23,23 +23,23 @@ def run(job: Job) -> None:
     """
     source, settings = job.config.source, job.config.pose
     folder, of = Path(str(source.path)).expanduser(), SOURCES[source.kind]
-    best: posing.Found | None = None
+    best: PhotoModel | None = None
     for finer in (1, 2) if source.kind == "video" else (1,):
         shots, notes = of.shots(folder, settings, job.progress, finer)
         pictures = job.scratch / f"images-{finer}"
         pictures.mkdir(parents=True, exist_ok=True)
         of.save(shots, folder, pictures, settings.max_side)
         found = posing.found(job, shots, pictures, settings)
-        if best is None or len(found.model.names) > len(best.model.names):
+        if best is None or len(found.names) / len(shots) > best.judged["n_registered"] / best.judged["n_given"]:
             best = found
-            best.model.notes[:0] = notes
-        if found.whole:
+            best.notes[:0] = notes
+        if len(best.names) * posing.MORE >= best.judged["n_given"]:
             break
     assert best is not None
-    judge.check(best.model, len(shots), settings.min_registered)
-    job.facts |= best.model.judged
-    for note in best.model.notes:
+    judge.check(best, settings.min_registered)
+    job.facts |= best.judged
+    for note in best.notes:
         log.info("%s", note)
-    for warning in best.model.judged["doubts"]:
+    for warning in best.judged["doubts"]:
         log.warning("%s", warning)
-    PhotoModel.write(best.model, job.out)
+    best.write(job.out)

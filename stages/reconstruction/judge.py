@@ -13,6 +13,7 @@ from chebsplat.errors import DataFailure
 from chebsplat.formats.photo_model import PhotoModel
 
 LEAST = 30  # verified matches of a pair that counts
+SOUND = 0.6  # of the pairs
 DENIED = 0.05  # of a pair's matches: where fewer are, the pair contradicts it
 MOSTLY = 0.3  # of a photo's pairs: where more contradict its place, it is left out
 CONFIRMED = 0.3  # of a pair's matches: where so many are points of the model, the pair agrees with it
@@ -57,9 +58,12 @@ def pairs(model: pycolmap.Reconstruction, database: Path) -> Pairs:
 def misplaced(found: Pairs) -> list[int]:
     """Ids of photos that many of their pairs contradict, for they were put beside something that only looks alike.
 
-    Choices: the one that most of its pairs contradict goes first, and with it what it says of others. Of groups of
-      photos that no pair holds together then, the largest stays; photos without pairs stay, too.
+    Choices: the one that most of its pairs contradict goes first, and with it what it says of others. One pair alone
+      tells nothing. Of groups of photos that no pair holds together then, the largest stays; photos without pairs
+      stay, too. Where less than SOUND of all pairs agree, matches are no witnesses, and all stay.
     """
+    if not len(found.confirmed) or np.mean(found.confirmed >= CONFIRMED) < SOUND:
+        return []
     n = len(found.images)
     agree, deny = np.zeros((n, n)), np.zeros((n, n))
     for matrix, chosen in ((agree, found.confirmed >= CONFIRMED), (deny, found.confirmed < DENIED)):
@@ -68,7 +72,7 @@ def misplaced(found: Pairs) -> list[int]:
     kept = np.ones(n, bool)
     while True:
         against = deny @ kept
-        share = np.where(kept, against / np.maximum(against + agree @ kept, 1), 0)
+        share = np.where(kept & (against > 1), against / np.maximum(against + agree @ kept, 1), 0)
         worst = np.lexsort((against, share))[-1]
         if share[worst] <= MOSTLY:
             break
@@ -152,9 +156,9 @@ def sentence(found: dict[str, Any]) -> str:
     )
 
 
-def check(model: PhotoModel, n_photos: int, least: float) -> None:
+def check(model: PhotoModel, least: float) -> None:
     """Raise DataFailure on a model that is not to be believed."""
-    found = model.judged
+    found, n_photos = model.judged, model.judged["n_given"]
     if len(model.names) < max(least * n_photos, 3):
         more = f" {' '.join(found['doubts'])}" if found["doubts"] else ""
         raise DataFailure(

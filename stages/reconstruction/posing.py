@@ -23,9 +23,8 @@ from chebsplat.stages.sources.cameras import EQUIRECTANGULAR
 from chebsplat.stages.sources.common import Shot, file_of
 
 log = logging.getLogger("chebsplat")
-MORE = 1.1  # times the photos of an earlier attempt
-ENOUGH = 0.9  # of the photos: where fewer register, or the matches disagree, more is tried
-HALF = 0.5  # of the photos: where a plain lens registers so many, a fisheye's is not tried
+MORE = 1.1  # times the photos of an earlier attempt, which one that costs more must register
+HALF = 0.5  # of the photos: where a plain lens registers so many, it is found
 FISHEYE = "OPENCV_FISHEYE"
 FAINT = 0.002  # SIFT's peak threshold where the usual one finds too little; it costs exactness
 WIDE = 0.5  # a fisheye's focal length in longer sides, where EXIF says nothing
@@ -35,51 +34,42 @@ FLATTEST = 1.5  # degrees between the rays of a point: COLMAP's own
 LENSES = {"SIMPLE_PINHOLE": 0, "SIMPLE_RADIAL": 1, "RADIAL": 2, "OPENCV": 4, "OPENCV_FISHEYE": 4}  # and their terms
 
 
-class Found(NamedTuple):
-    """whole: whether ENOUGH of the photos registered and their matches agree with the model."""
-
-    model: PhotoModel
-    whole: bool
-
-
-def found(job: Job, shots: Sequence[Shot], pictures: Path, settings: PoseSection) -> Found:
+def found(job: Job, shots: Sequence[Shot], pictures: Path, settings: PoseSection) -> PhotoModel:
     """The model of photos whose reduced pictures lie in a folder, named by their rows.
 
     Raises:  DataFailure where no two photos register.
-    Choices: attempts end with the first that is whole; otherwise the one that registers most photos counts, where it is
-      MORE than an earlier one has: what costs more finds more that only looks alike. One thread maps, for with it
-      mapping repeats.
+    Choices: attempts end where no further one could register MORE than the best, which is what counts: what costs more
+      also finds more that only looks alike. One thread maps, for with it mapping repeats.
     """
-    best: Found | None = None
-    for lens, peak in attempts(shots, settings):
-        if best is not None and lens == FISHEYE != settings.camera and len(best.model.names) > HALF * len(shots):
-            break  # the lens is found
-        if best is not None:
-            log.info("%d of %d photos registered; trying %s, features from %g on", len(best.model.names), len(shots),
-                     lens, peak)  # fmt: skip
-        again = settings.model_copy(update={"peak_threshold": peak})
-        database = _matched(job, shots, pictures, lens, again)
-        tried = _mapped(job, shots, pictures, database, settings.seed)
-        if tried is not None and (best is None or len(tried.model.names) > MORE * len(best.model.names)):
-            best = tried
-        if best is not None and best.whole:
+
+    def mapped(lens: str, peak: float) -> PhotoModel | None:
+        database = _matched(job, shots, pictures, lens, settings.model_copy(update={"peak_threshold": peak}))
+        return _mapped(job, shots, pictures, database, settings.seed)
+
+    lens: str = settings.camera
+    if lens == "auto":
+        lens = EQUIRECTANGULAR if all(shot.panorama for shot in shots) else "SIMPLE_RADIAL"
+    best = mapped(lens, settings.peak_threshold)
+    for other, peak in further(lens, settings, 0 if best is None else len(best.names) / len(shots)):
+        n_registered = 0 if best is None else len(best.names)
+        if n_registered * MORE >= len(shots):
             break
+        log.info("%d of %d photos registered; trying %s, features from %g on", n_registered, len(shots), other, peak)
+        tried = mapped(other, peak)
+        if tried is not None and len(tried.names) > MORE * n_registered:
+            best = tried
     if best is None:
         raise DataFailure("no two photos could be registered; add photos with more overlap and texture")
     return best
 
 
-def attempts(shots: Sequence[Shot], settings: PoseSection) -> Iterator[tuple[str, float]]:
-    """(camera model, peak threshold of SIFT) in the order in which they are tried."""
-    lens: str = settings.camera
-    peak = settings.peak_threshold
-    if lens == "auto":
-        lens = EQUIRECTANGULAR if all(shot.panorama for shot in shots) else "SIMPLE_RADIAL"
-    yield lens, peak
-    if peak > FAINT:
-        yield lens, FAINT
-    if settings.camera == "auto" and lens != EQUIRECTANGULAR:
-        yield FISHEYE, min(peak, FAINT)
+def further(lens: str, settings: PoseSection, registered: float) -> list[tuple[str, float]]:
+    """(camera model, peak threshold of SIFT) to try after `lens` has registered such a part of the photos: more
+    features, and first a fisheye's lens where it is less than HALF.
+    """
+    faint = min(settings.peak_threshold, FAINT)
+    fisheye = settings.camera == "auto" and lens != EQUIRECTANGULAR and registered < HALF
+    return [(FISHEYE, faint)] * fisheye + [(lens, faint)] * (faint < settings.peak_threshold)
 
 
 def _matched(job: Job, shots: Sequence[Shot], pictures: Path, lens: str, settings: PoseSection) -> Path:
@@ -110,7 +100,7 @@ def _matched(job: Job, shots: Sequence[Shot], pictures: Path, lens: str, setting
     return database
 
 
-def _mapped(job: Job, shots: Sequence[Shot], pictures: Path, database: Path, seed: int) -> Found | None:
+def _mapped(job: Job, shots: Sequence[Shot], pictures: Path, database: Path, seed: int) -> PhotoModel | None:
     """The largest model that mapping finds, in pixels of the photos; None of none."""
     options = pycolmap.IncrementalPipelineOptions()
     options.num_threads, options.random_seed = 1, seed
@@ -136,8 +126,7 @@ def _mapped(job: Job, shots: Sequence[Shot], pictures: Path, database: Path, see
         model.deregister_frame(model.images[identity].frame_id)
     _refine(model)
     judged = judge.judged(model, pairs, len(shots), sizes[1:], len(misplaced))
-    whole = judged["n_registered"] >= ENOUGH * len(shots) and judged["pairs_agree"] >= judge.AGREE
-    return Found(_collected(model, shots, judged), whole)
+    return _collected(model, shots, judged)
 
 
 def _refine(model: pycolmap.Reconstruction) -> None:

@@ -2,7 +2,6 @@
 
 import json
 import shutil
-from itertools import pairwise
 
 import numpy as np
 import pytest
@@ -16,11 +15,11 @@ from chebsplat.formats.capture import Capture
 from chebsplat.formats.photo_model import PhotoModel
 from chebsplat.stages.reconstruction import judge
 from chebsplat.stages.reconstruction.adjustment import alignment
-from chebsplat.stages.reconstruction.posing import attempts
+from chebsplat.stages.reconstruction.posing import further
 from chebsplat.stages.settings import IngestSection, PoseSection
 from chebsplat.stages.sources import assembly, photos
 from chebsplat.stages.sources.cameras import FACES, Camera
-from chebsplat.stages.sources.common import Frame, Listing, Shot
+from chebsplat.stages.sources.common import Frame, Listing
 
 GOOD = {
     "n_registered": 20, "n_given": 20, "n_in_others": [], "n_misplaced": 0, "n_points": 4000, "points_a_view": 400.0,
@@ -77,16 +76,23 @@ def test_a_model_that_is_not_to_be_believed_is_refused(n, changed, said):
     model = PhotoModel(["a"] * n, [], np.zeros(n), np.zeros((n, 4, 4)), none, none, none[:, 0], none[:, :2],
                        judged=GOOD | changed | {"doubts": []})  # fmt: skip
     with pytest.raises(DataFailure, match=said):
-        judge.check(model, 20, 0.5)
+        judge.check(model, 0.5)
 
 
-def test_a_fisheye_is_tried_last_and_a_lens_that_is_named_is_kept():
-    shot = Shot("a", None, (800, 600))
-    assert [lens for lens, _ in attempts([shot], PoseSection())] == ["SIMPLE_RADIAL"] * 2 + ["OPENCV_FISHEYE"]
-    assert {lens for lens, _ in attempts([shot], PoseSection(camera="OPENCV"))} == {"OPENCV"}
-    assert {lens for lens, _ in attempts([shot._replace(panorama=True)], PoseSection())} == {"EQUIRECTANGULAR"}
-    peaks = [peak for _, peak in attempts([shot], PoseSection())]
-    assert all(later <= before for before, later in pairwise(peaks))
+@pytest.mark.parametrize(
+    ("settings", "lens", "registered", "tried"),
+    [
+        ({}, "SIMPLE_RADIAL", 0.7, ["SIMPLE_RADIAL"]),
+        ({}, "SIMPLE_RADIAL", 0.2, ["OPENCV_FISHEYE", "SIMPLE_RADIAL"]),
+        ({}, "EQUIRECTANGULAR", 0.2, ["EQUIRECTANGULAR"]),
+        ({"camera": "OPENCV"}, "OPENCV", 0.2, ["OPENCV"]),
+        ({"peak_threshold": 0.001}, "SIMPLE_RADIAL", 0.2, ["OPENCV_FISHEYE"]),
+    ],
+)
+def test_more_features_are_tried_and_a_fisheyes_lens_where_a_plain_one_is_none(settings, lens, registered, tried):
+    found = further(lens, PoseSection(**settings), registered)
+    assert [name for name, _ in found] == tried
+    assert all(peak <= PoseSection(**settings).peak_threshold for _, peak in found)
 
 
 def panorama(width):

@@ -118,12 +118,12 @@ def test_points_whose_error_is_not_known_are_taken(tmp_path):
     tracks = np.stack([np.repeat(np.arange(150), 3), np.tile(np.arange(3), 150)], 1)
     errors = np.where(np.arange(150) < 120, np.nan, np.where(np.arange(150) < 140, -1.0, 9.0))
     cloud = colmap_model.Cloud(rng.normal(size=(150, 3)), np.zeros((150, 3), np.uint8), errors, tracks)
-    images = [colmap_model.Image(f"{name}.png", 1, np.eye(4)) for name in "abc"]
     notes = []
-    found = colmap._points(colmap_model.Model(tmp_path, {}, images, cloud), list("abc"), notes)
+    fields = {"names": list("abc"), "cam_from_world": np.tile(np.eye(4), (3, 1, 1)), "source": {"notes": notes}}
+    found = colmap.points_of(cloud, list("abc"), fields)
     assert len(found["points"]) == 140 and notes[0].startswith("10 of the model's 150 points")
     cloud.errors[:] = 9
-    assert colmap._points(colmap_model.Model(tmp_path, {}, images, cloud), list("abc"), notes) == {}
+    assert colmap.points_of(cloud, list("abc"), fields) == {}
     assert notes[-1].startswith("0 points are left, fewer than 100: none is used")
 
 

@@ -148,16 +148,16 @@ def cloud_of(rng, n, n_views, length):
 @pytest.mark.parametrize(("length", "n_kept"), [(0, 150), (2, 0), (4, 150)])
 def test_points_that_enough_images_see_are_taken_and_those_without_any_tracks(length, n_kept):
     cloud = cloud_of(np.random.default_rng(0), 150, 6, length)
-    images = [colmap_model.Image(f"{name}.png", 1, np.eye(4)) for name in "fedcba"]
     notes = []
-    fields = colmap._points(colmap_model.Model(None, {}, images, cloud), list("abcd"), notes)
+    given = {"names": list("abcd"), "cam_from_world": np.tile(np.eye(4), (4, 1, 1)), "source": {"notes": notes}}
+    fields = colmap.points_of(cloud, list("fedcba"), given)
     assert len(fields.get("points", ())) == n_kept
     if length == 4:
         point, view = fields["tracks"].T
         expected = {(p, "abcdef"[5 - v]) for p, v in cloud.tracks.tolist() if 5 - v < 4}
         assert {(p, "abcd"[v]) for p, v in zip(point.tolist(), view.tolist(), strict=True)} == expected
         cloud.errors[:20] = 9
-        few = colmap._points(colmap_model.Model(None, {}, images, cloud), list("abcd"), notes)
+        few = colmap.points_of(cloud, list("fedcba"), given)
         assert len(few["points"]) == 130 and notes[0].startswith("20 of the model's 150 points are left out")
         assert few["tracks"][:, 0].max() < 130
 
@@ -336,7 +336,7 @@ def test_exif_turns_a_photo_and_gives_its_focal_length(tmp_path):
     assert fields["images"].shape == (3, 80, 60, 3)
     assert fields["images"][0, :30].min() > 200 and fields["images"][0, 50:].max() < 50
     assert np.allclose(fields["Ks"][:, 0, 0], [28 / 36 * 80, 28 / 36 * 80, 96])
-    assert "1 of 3 photos have no focal length" in photos.shots(tmp_path, PoseSection(), None, 1)[1][0]
+    assert "1 of 2 photos have no focal length" in photos.shots(tmp_path, PoseSection(), None, 1)[1][-1]
 
 
 def test_transparent_pixels_are_empty_and_count(tmp_path):
