@@ -277,15 +277,17 @@ def resampled(image: Any, camera: Camera, view: Geometry, at: np.ndarray) -> np.
 
     scale = min(2 * view.factor, 1.0)
     size = (max(round(camera.width * scale), 1), max(round(camera.height * scale), 1))
-    finer = np.asarray(image if size == image.size else image.resize(size, Image.Resampling.BOX), np.float32)
-    if scale == 1:
-        twice = [2 * side for side in finer.shape[:2]]
-        finer = 2 * idctn(dctn(finer, axes=(0, 1), norm="ortho"), s=twice, axes=(0, 1), norm="ortho")
+    small = np.asarray(image if size == image.size else image.resize(size, Image.Resampling.BOX), np.float32)
+    shape = [2 * side if scale == 1 else side for side in small.shape[:2]]
     spans = np.array([camera.height, camera.width])[:, None, None]
-    places = (at[::-1] * (np.array(finer.shape[:2])[:, None, None] / spans) - 0.5)[:, None]
+    places = (at[::-1] * (np.array(shape)[:, None, None] / spans) - 0.5)[:, None]
     if view.factor < 1:
         away = (1 - view.factor / scale) / 2  # pixels of the view
         down, right = (away * np.gradient(places[:, 0], axis=axis) for axis in (1, 2))
         places = np.stack([places[:, 0] + i * down + j * right for i in (-1, 1) for j in (-1, 1)], 1)
-    means = [map_coordinates(finer[..., c], places, np.float32, mode="nearest").mean(0) for c in range(3)]
+    means = []
+    for finer in np.moveaxis(small, -1, 0):  # one by one: a photo at twice its resolution is large
+        if scale == 1:
+            finer = 2 * idctn(dctn(finer, norm="ortho"), s=shape, norm="ortho")
+        means.append(map_coordinates(finer, places, np.float32, mode="nearest").mean(0))
     return np.stack(means, -1).round().clip(0, 255).astype(np.uint8)

@@ -88,7 +88,7 @@ def import_ply(ply: Path, out: Path, up: Up | None = None) -> dict[str, Any]:
     Returns: counts. Raises: InputError on what cannot be read.
     """
     scene = foreign(ply, up)
-    taken_over(ply, scene.parameters, scene.cameras, out)
+    taken_over(ply, scene.parameters, scene.cameras, out, World.read(scene.summary))
     publish("export", export.run, out / "export", {"gaussians": out / "gaussians"})
     return {"gaussians": artifact.read_manifest(out / "export").facts["n_gaussians"]}
 

@@ -120,13 +120,16 @@ def write_page(
     return counts | {"bytes": len(text.encode())}
 
 
-def foreign(ply: Path, up: Up | None = None, world: World = HERE) -> Scene:
+def foreign(ply: Path, up: Up | None = None, world: World | None = None) -> Scene:
     """A scene of a splat from elsewhere: no semantics, and one camera that sees its middle half, upright. world: to
-    bring it into, from that of its source.
+    bring it into, from that of its source; None: one that suits it.
 
     Raises: InputError naming the file. Choices: without `up` it is -y, as in COLMAP's and 3DGS' own frames.
     """
-    parameters, degree, _ = read_splats(ply, world)
+    chosen = world or HERE
+    parameters, degree, _ = read_splats(ply, chosen)
+    if world is None and (chosen := World.of(parameters["means"].astype(np.float64))) != HERE:
+        parameters, degree, _ = read_splats(ply, chosen)
     if not len(parameters["means"]):
         raise InputError(f"{ply} holds no Gaussians; choose another")
     degrees = parameters.setdefault("degrees", np.full(len(parameters["means"]), degree, np.uint8))
@@ -143,7 +146,7 @@ def foreign(ply: Path, up: Up | None = None, world: World = HERE) -> Scene:
         pose[:3, :3] = [np.cross(down, ahead), down, ahead]
     pose[:3, 3] = [0, 0, 2 * max(float((high - low).max()), 1e-3)] - pose[:3, :3] @ (low + high) / 2
     K = np.array([[554.0, 0, 320], [0, 554, 240], [0, 0, 1]])  # 60 degrees across
-    return Scene(parameters, Cameras(["start"], K[None], pose[None], 640, 480), order)
+    return Scene(parameters, Cameras(["start"], K[None], pose[None], 640, 480), order, summary=chosen.notes)
 
 
 def camera_rows(scene: Scene, center: np.ndarray) -> np.ndarray:

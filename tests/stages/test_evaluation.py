@@ -20,6 +20,7 @@ from chebsplat.pipelines.planning.plan import Planner
 from chebsplat.render import SceneRenderer, frame_parts
 from chebsplat.stages.evaluate import camera
 from chebsplat.stages.measuring.image_quality import image_figures, perceptual
+from chebsplat.stages.report import summary_rows
 from chebsplat.stages.sources import generated
 from tests.stages.test_stages import changed, inputs_of
 
@@ -117,10 +118,11 @@ def test_what_is_masked_counts_in_no_image_figure_and_no_lpips_is_none(weights):
 
 
 @pytest.mark.xdist_group("toy")
-def test_a_test_view_without_a_pixel_that_counts_is_left_out_and_named(toy, tmp_path):
+def test_a_test_view_without_a_pixel_that_counts_is_left_out_and_undistorted_photos_are_named(toy, tmp_path):
     capture = Capture.read(toy["ingest"])
     capture.loss_mask = np.ones(capture.images.shape[:3], bool)
     capture.loss_mask[np.flatnonzero(capture.is_test)[0]] = False
+    capture.source["undistorted"] = ["OPENCV"]
     inputs = inputs_of(toy, "evaluate") | {"capture": published(tmp_path / "capture", capture)}
     assert run_stage("evaluate", tmp_path / "out", inputs) == 0
     found, whole = (Evaluation.read(path).figures for path in (tmp_path / "out", toy["evaluate"]))
@@ -128,6 +130,9 @@ def test_a_test_view_without_a_pixel_that_counts_is_left_out_and_named(toy, tmp_
     assert found["image"]["per_view"]["psnr"] == whole["image"]["per_view"]["psnr"][1:]
     n = len(whole["names"])
     assert "no pixel" in found["left_out"][f"1 of {n} views"]
+    assert "undistorted (OPENCV)" in found["left_out"]["PSNR on the photos as taken"]
+    rows = [summary_rows(figures, None, {"milliseconds": {}})[1][0] for figures in (whole, found)]
+    assert "undistorted" not in rows[0] and "of undistorted photos" in rows[1]
 
 
 @pytest.mark.xdist_group("toy")

@@ -13,8 +13,10 @@ from chebsplat.formats.evaluation import Evaluation
 from chebsplat.formats.ply import read_ply, write_ply
 from chebsplat.formats.points import Points
 from chebsplat.formats.scene import Scene
+from chebsplat.formats.world import HERE, World
 from chebsplat.settings import TrainSection
 from chebsplat.stages.sources import generated
+from chebsplat.stages.tools.page import foreign
 from chebsplat.stages.tools.scene import OpenedScene
 from chebsplat.stages.training.assembly import started
 
@@ -109,3 +111,20 @@ def test_a_given_splat_of_one_colour_begins_with_the_points_colours_and_another_
     nearest = np.linalg.norm(given["means"][:, None] - points.means, axis=-1).argmin(1)
     shown = 255 * (found["sh0"][:, 0].numpy() * 0.28209479177387814 + 0.5)
     assert np.abs(shown - points.colors[nearest]).max() < 0.01
+
+
+@pytest.mark.parametrize("name", list(CHANGES)[1:])
+def test_a_splat_from_elsewhere_is_seen_in_any_unit_and_keeps_its_own(scenes, name, tmp_path):
+    _, opened, _, _ = scenes["as it is"]
+    scale, offset = CHANGES[name]
+    pictures, middles = [], []
+    for k, world in enumerate((HERE, World((offset, offset, 0.0), scale))):
+        ply = tmp_path / f"{k}.ply"
+        write_ply(ply, opened.parameters, 0, world=world)
+        scene = OpenedScene(foreign(ply), ply)
+        assert np.allclose(scene.points()[0], places(ply), rtol=1e-6, atol=0)
+        middles.append(np.median(scene.points()[0], axis=0))
+        pictures.append(scene.render(scene.cameras[0]))
+    assert np.allclose(middles[1], [offset, offset, 0] + scale * middles[0], rtol=1e-6)
+    assert np.abs(pictures[1].color.astype(float) - pictures[0].color).mean() < 1
+    assert np.nanmedian(pictures[1].depth) == pytest.approx(scale * np.nanmedian(pictures[0].depth), rel=1e-3)
