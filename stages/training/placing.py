@@ -15,6 +15,7 @@ import numpy as np
 import torch
 from PIL import Image
 from scipy.spatial import KDTree
+from scipy.spatial.transform import Rotation
 from scipy.special import expit
 
 from chebsplat.cameras import centers, resized
@@ -39,6 +40,7 @@ ONE_COLOR = 1 / 72  # of the coefficient of band 0, which is a step of 255 in co
 BETTER = 0.1  # by which another frame must be better than the splat's own
 FIRST, REFINED = 4, 3  # views that all frames are tried on; frames of these that are refined
 STEPS, N_POINTS, NEAREST = 100, 1000, 0.6  # of refining: steps at most, points, and which of them are believed
+FEW_STEPS, FEW_POINTS = 20, 300  # of a rough one, by which starts are chosen
 LEAST_GAIN = 1e-3  # of their distances, by which a step must bring them nearer
 SWAPPED = np.array([[1.0, 0, 0], [0, 0, 1], [0, -1, 0]])  # nerfstudio's axes of COLMAP's: z up
 TURNS = [np.diag(signs) for signs in ((1.0, 1, 1), (1.0, -1, -1), (-1.0, 1, -1), (-1.0, -1, 1))]
@@ -179,8 +181,11 @@ def guessed(
     if len(solid) < 16:
         return kept
     tree = KDTree(solid)
-    kept += [("its points", way) for way in principal(points, solid)]
-    finer = [(f"{name}, refined", refined(points, tree, way)) for name, way in kept]
+    rough = sorted(
+        (refined(points, tree, way, FEW_STEPS, FEW_POINTS) for way in principal(points, solid)), key=lambda x: x[1]
+    )
+    kept += [("its points", way) for way, _ in rough[:REFINED]]
+    finer = [(f"{name}, refined", refined(points, tree, way)[0]) for name, way in kept]
     usual = max(likeness(renderer, sights, way) for _, way in kept)
     return kept + [each for each in finer if likeness(renderer, sights, each[1]) > usual + SAME]
 
@@ -249,26 +254,31 @@ def principal_axes(points: np.ndarray) -> tuple[np.ndarray, np.ndarray, float]:
 
 
 def principal(points: np.ndarray, others: np.ndarray) -> Iterator[Similarity]:
-    """Ways that lay the middle, the principal axes and the size of points on those of others."""
+    """Ways that lay the middle, the principal axes and the size of points on those of others, in each of their 24
+    orders: axes of like length may be another's.
+    """
     center, axes, size = principal_axes(points)
     other, theirs, larger = principal_axes(others)
-    for signs in TURNS:
-        rotation, scale = theirs.T @ signs @ axes, larger / max(size, 1e-30)
+    for turn in Rotation.create_group("O").as_matrix():
+        rotation, scale = theirs.T @ turn @ axes, larger / max(size, 1e-30)
         yield Similarity(scale, rotation, other - scale * rotation @ center)
 
 
-def refined(points: np.ndarray, tree: KDTree, way: Similarity) -> Similarity:
-    """A way that brings points [P, 3] nearer to what the tree holds, by pairs of the nearest.
+def refined(
+    points: np.ndarray, tree: KDTree, way: Similarity, steps: int = STEPS, n_points: int = N_POINTS
+) -> tuple[Similarity, float]:
+    """A way that brings points [P, 3] nearer to what the tree holds, by pairs of the nearest, and how far they are
+    then, of the way's scale.
 
     Choices: the NEAREST of them in each step: of the others the splat has nothing, or floats instead.
     """
-    chosen = points[np.random.default_rng(0).choice(len(points), min(len(points), N_POINTS), replace=False)]
+    chosen = points[np.random.default_rng(0).choice(len(points), min(len(points), n_points), replace=False)]
     last = np.inf
-    for _ in range(STEPS):
+    for _ in range(steps):
         away, index = tree.query(way.of_points(chosen))
         kept = away <= np.quantile(away, NEAREST)
-        if away[kept].sum() > (1 - LEAST_GAIN) * last:
+        if away[kept].mean() > (1 - LEAST_GAIN) * last:
             break
-        last = away[kept].sum()
+        last = away[kept].mean()
         way = fitted(chosen[kept], tree.data[index[kept]])
-    return way
+    return way, float(last / way.scale)
