@@ -16,7 +16,9 @@ SOURCES: dict[str, ModuleType] = {"photos": photos, "video": video}  # those tha
 
 
 def run(job: Job) -> None:
-    """Cameras, lenses and poses of photos, and points that they share. Reads a source. Writes `model`.
+    """Cameras, lenses and poses of photos, and points that they share.
+
+    Reads photos or a video. Writes `model`.
 
     Raises:  DataFailure where few photos register, or nothing tells how far away anything is.
     Choices: all photos take part, those that are tested later, too. A video gives more frames where few of them join.

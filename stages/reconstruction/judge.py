@@ -19,6 +19,10 @@ MOSTLY = 0.3  # of a photo's pairs: where more contradict its place, it is left 
 CONFIRMED = 0.3  # of a pair's matches: where so many are points of the model, the pair agrees with it
 AGREE = 0.8  # of the pairs: of six real captures all that are right have .88 and more, a repetitive board .5
 FLAT = 2.0  # degrees between the rays of the median point: below, depth is a guess
+LEVEL = 0.9  # of the pairs: of views of one panorama all, of captures that are right at most 40 %
+HOMOGRAPHIES = {
+    getattr(pycolmap.TwoViewGeometryConfiguration, name) for name in ("PLANAR", "PANORAMIC", "PLANAR_OR_PANORAMIC")
+}
 SCARCE = 60  # points of the median photo
 LOOSE = 1.5e-3  # of the longer side: a reprojection error of 2.4 pixels in 1,600
 REMEDY = "photograph from more places, a step to the side between photos, with two thirds of the picture in common"
@@ -28,12 +32,13 @@ class Pairs(NamedTuple):
     """The pairs of a model's photos that have LEAST verified matches.
 
     images: ids [N] of the photos; rows: [P, 2] into them; confirmed: [P] the share of a pair's matches that are points
-    of the model.
+    of the model; level: of the pairs, whose matches one homography explains.
     """
 
     images: list[int]
     rows: np.ndarray
     confirmed: np.ndarray
+    level: float = 0.0
 
 
 def pairs(model: pycolmap.Reconstruction, database: Path) -> Pairs:
@@ -43,7 +48,7 @@ def pairs(model: pycolmap.Reconstruction, database: Path) -> Pairs:
         for image in model.images.values()
         if image.has_pose
     }
-    images, rows, confirmed = sorted(points), [], []
+    images, rows, confirmed, level = sorted(points), [], [], []
     with pycolmap.Database.open(database) as opened:
         for pair, geometry in zip(*opened.read_two_view_geometries(), strict=True):
             first, second = pycolmap.pair_id_to_image_pair(pair)
@@ -52,7 +57,8 @@ def pairs(model: pycolmap.Reconstruction, database: Path) -> Pairs:
                 a, b = points[first][matches[:, 0]], points[second][matches[:, 1]]
                 rows.append([images.index(first), images.index(second)])
                 confirmed.append(float(((a == b) & (a >= 0)).mean()))
-    return Pairs(images, np.array(rows, int).reshape(-1, 2), np.array(confirmed))
+                level.append(geometry.config in HOMOGRAPHIES)
+    return Pairs(images, np.array(rows, int).reshape(-1, 2), np.array(confirmed), float(np.mean(level or [0])))
 
 
 def misplaced(found: Pairs) -> list[int]:
@@ -104,6 +110,7 @@ def judged(
         "reprojection_error_px": round(float(model.compute_mean_reprojection_error()), 3),
         "reprojection_error": float(model.compute_mean_reprojection_error() / side),
         "pairs_agree": float(np.mean(found.confirmed >= CONFIRMED)) if len(found.confirmed) else 0.0,
+        "pairs_level": found.level,
         "angle_degrees": angle(model, {image.image_id: image.projection_center() for image in images}),
     }
     return facts | {"doubts": doubts(facts)}
@@ -165,8 +172,8 @@ def check(model: PhotoModel, least: float) -> None:
             f"{len(model.names)} of {n_photos} photos registered; at least {least:.0%} are needed "
             f"(pose.min_registered); {REMEDY}.{more}"
         )
-    if found["angle_degrees"] < FLAT:
+    if found["angle_degrees"] < FLAT or found["pairs_level"] > LEVEL:
         raise DataFailure(
-            f"the photos were taken from one place: rays of a point meet at {found['angle_degrees']:.1f}° (median), "
-            f"which tells no depth; {REMEDY}"
+            f"the photos were taken from one place, or show one plane: a homography explains {found['pairs_level']:.0%} "
+            f"of the pairs, rays of a point meet at {found['angle_degrees']:.1f}° (median), which tells no depth; {REMEDY}"
         )
