@@ -58,7 +58,7 @@ def pairs(model: pycolmap.Reconstruction, database: Path) -> Pairs:
                 rows.append([images.index(first), images.index(second)])
                 confirmed.append(float(((a == b) & (a >= 0)).mean()))
                 level.append(geometry.config in HOMOGRAPHIES)
-    return Pairs(images, np.array(rows, int).reshape(-1, 2), np.array(confirmed), float(np.mean(level or [0])))
+    return Pairs(images, np.array(rows, int).reshape(-1, 2), np.array(confirmed), float(np.mean(level or [False])))
 
 
 def misplaced(found: Pairs) -> list[int]:
@@ -174,6 +174,6 @@ def check(model: PhotoModel, least: float) -> None:
         )
     if found["angle_degrees"] < FLAT or found["pairs_level"] > LEVEL:
         raise DataFailure(
-            f"the photos were taken from one place, or show one plane: a homography explains {found['pairs_level']:.0%} "
-            f"of the pairs, rays of a point meet at {found['angle_degrees']:.1f}° (median), which tells no depth; {REMEDY}"
+            f"the photos were taken from one place, or show one plane, which tells no depth: a homography explains "
+            f"{found['pairs_level']:.0%} of the pairs, rays of a point meet at {found['angle_degrees']:.1f}°; {REMEDY}"
         )

@@ -159,7 +159,7 @@ def _largest_descriptors(database: Path, n_views: int) -> list[np.ndarray]:
 def _write_images(job: Job, capture: Capture, views: Iterable[int]) -> Path:
     """The images of some of the capture's views, and where it has them their masks, as pycolmap reads them."""
     folder, masks = job.scratch / "images", job.scratch / "masks"
-    folder.mkdir(exist_ok=True)
+    folder.mkdir(parents=True, exist_ok=True)
     masks.mkdir(exist_ok=True)
     for view in views:
         Image.fromarray(capture.images[view]).save(folder / file_of(view), compress_level=0)

@@ -31,10 +31,10 @@ def changed(**sections):
 
 
 def inputs_of(toy, stage):
-    return {role: toy[of] for role, of in INPUTS[stage].items()}
+    return {role: toy[of] for role, of in INPUTS.get(stage, {}).items()}
 
 
-@pytest.mark.parametrize("stage", STAGES)
+@pytest.mark.parametrize("stage", INPUTS)
 def test_a_finished_artifact_is_whole_and_a_second_call_does_nothing(toy, stage, capsys):
     manifest = artifact.verify(toy[stage], STAGES[stage].schema)
     assert manifest.seconds > 0

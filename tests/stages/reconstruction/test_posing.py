@@ -23,7 +23,8 @@ from chebsplat.stages.sources.common import Frame, Listing
 
 GOOD = {
     "n_registered": 20, "n_given": 20, "n_in_others": [], "n_misplaced": 0, "n_points": 4000, "points_a_view": 400.0,
-    "track_length": 4.0, "reprojection_error_px": 0.5, "reprojection_error": 4e-4, "pairs_agree": 0.95, "pairs_level": 0.1,
+    "track_length": 4.0, "reprojection_error_px": 0.5, "reprojection_error": 4e-4, "pairs_agree": 0.95,
+    "pairs_level": 0.1,
     "angle_degrees": 15.0,
 }  # fmt: skip
 
