@@ -63,7 +63,8 @@ def lift_ply(
     held = Capture.read(capture)
     cameras, world = cameras_of(capture, points), World.read(held.source)
     surface = held.points if points is None else Points.read(points).means
-    parameters = in_frame(ply, foreign(ply, world=world).parameters, held, cameras, surface, world)
+    theirs = read_splats(ply)[0] if world.notes else None
+    parameters = in_frame(ply, foreign(ply, world=world).parameters, held, cameras, surface, theirs)
     taken_over(ply, parameters, cameras, out, world)
     config = out / "settings.json"
     config.write_text(json.dumps({"train": {"features": "lifted"}}))

@@ -214,7 +214,8 @@ def started(ply: Path, points: Points, train: TrainSection, capture: Capture | N
         raise ConfigError(f"{ply} holds {n} Gaussians; set train.max_gaussians={n} or more")
     if capture is not None:
         cameras = Cameras(points.names, points.Ks, points.cam_from_world, *capture.size)
-        parameters = in_frame(ply, parameters, capture, cameras, points.means, world)
+        theirs = read_splats(ply)[0] if world.notes else None
+        parameters = in_frame(ply, parameters, capture, cameras, points.means, theirs)
     raw = {name: parameters[name] for name in ("means", "log_scales", "quats", "logit_opacities", "sh0")}
     for band in range(1, min(degree, train.sh_degree) + 1):
         raw[f"sh{band}"] = parameters["shN"][:, band**2 - 1 : (band + 1) ** 2 - 1]

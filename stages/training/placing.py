@@ -23,7 +23,7 @@ from chebsplat.errors import InputError
 from chebsplat.formats.cameras import Cameras
 from chebsplat.formats.capture import Capture
 from chebsplat.formats.dataparser import NAME, beside, read_dataparser
-from chebsplat.formats.world import HERE, World
+from chebsplat.formats.world import World
 from chebsplat.render import SceneRenderer
 from chebsplat.splats.similarity import Similarity, fitted
 from chebsplat.views import View
@@ -60,13 +60,13 @@ def in_frame(
     capture: Capture,
     cameras: Cameras,
     points: np.ndarray | None,
-    world: World = HERE,
+    theirs: dict[str, np.ndarray] | None = None,
 ) -> dict[str, np.ndarray]:
     """Raw parameters of a splat in the frame of the cameras; bit for bit as they are where the splat lies in it.
 
-    Args: ply: where it comes from, for messages and the file beside it; cameras: of the capture, by name;
-          points: [P, 3] of the surface in the cameras' frame, which normalisations are computed of and made exact by;
-          world: that the splat was brought into as it was read, as the capture was.
+    Args: ply: where it comes from, for messages and the file beside it; parameters: brought from the source's world to
+          the capture's, and theirs: as the file has them, None: the same; cameras: of the capture, by name;
+          points: [P, 3] of the surface in the cameras' frame, which normalisations are computed of and made exact by.
     Raises:  InputError naming the splat, and what was tried, where it resembles the photos in no frame.
     Choices: it is turned only where that is clearly better. One that resembles them little in its own frame, and in no
       other, is taken with a warning: it may be trained little. With fewer than LEAST_VIEWS, and of Gaussians of one
@@ -75,21 +75,21 @@ def in_frame(
     sights, light = sights_of(capture, cameras), parameters["sh0"][:, 0]
     if sights is None or np.abs(light - np.median(light, 0)).mean() < ONE_COLOR:
         return parameters
-    renderer = plain(parameters)
-    own = likeness(renderer, sights, Similarity(1.0, np.eye(3), np.zeros(3)))
+    own = likeness(plain(parameters), sights, Similarity(1.0, np.eye(3), np.zeros(3)))
     if own >= AGREES:
         return parameters
-    out = Similarity(world.scale, np.eye(3), np.array(world.origin))
-    tried = [(name, out.inverse().after(way).after(out)) for name, way in told(ply)]
-    tried = [(name, way) for name, way in tried if likeness(renderer, sights, way) >= AGREES]
-    tried = tried or guessed(renderer, sights, parameters, cameras, points, out.inverse())
+    theirs, world = parameters if theirs is None else theirs, World.read(capture.source)
+    renderer, outward = plain(theirs), Similarity(world.scale, np.eye(3), np.array(world.origin))
+    ways = [(name, way.after(outward)) for name, way in told(ply)]
+    tried = [(name, way) for name, way in ways if likeness(renderer, sights, way) >= AGREES]
+    tried = tried or guessed(renderer, sights, theirs, cameras, points)
     found, name, way = max(((likeness(renderer, sights, way), name, way) for name, way in tried), key=lambda x: x[0])
     if found >= max(AGREES, own + BETTER):
         log.warning(
             "%s lies in another frame than the cameras, that of %s: it is scaled by %.4g, turned and shifted "
             "(its renders resemble the photos by %.2f of 1 then, %.2f as it is)", ply, name, 1 / way.scale, found, own,
         )  # fmt: skip
-        return way.inverse().of_gaussians(parameters)
+        return way.inverse().of_gaussians(theirs)
     if own < DOUBTED:
         file = beside(ply)
         raise InputError(
@@ -165,14 +165,9 @@ def guessed(
     parameters: dict[str, np.ndarray],
     cameras: Cameras,
     points: np.ndarray | None,
-    inward: Similarity,
 ) -> list[tuple[str, Similarity]]:
-    """The likeliest of the frames that trainers make, and where there are points these frames refined by them.
-
-    Args: inward: the way that the splat went as it was read.
-    """
+    """The likeliest of the frames that trainers make, and where there are points these frames refined by them."""
     tried = [*nerfstudios(cameras.cam_from_world), *gsplats(cameras.cam_from_world, points)]
-    tried = [(name, inward.after(way)) for name, way in tried]
     first = np.array([likeness(renderer, sights, way, FIRST) for _, way in tried])
     kept = [tried[k] for k in np.argsort(-first)[:REFINED]]
     if points is None or len(points) < 16:

@@ -2,6 +2,7 @@
 
 import json
 import logging
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -193,3 +194,20 @@ def test_lift_and_train_take_a_splat_of_nerfstudios_frame_as_if_it_lay_in_theirs
     alike = (features[0] * features[1]).sum(1) / np.maximum(np.linalg.norm(features[0], axis=1) ** 2, 1e-9)
     assert np.median(alike[features[0].any(1)]) > 0.999
     assert abs(psnr[0] - psnr[1]) < 0.1
+
+
+@pytest.mark.parametrize("told", ["in its source's", "by cameras", "by a file"])
+def test_in_a_scene_that_is_normalised_inside_the_way_is_found_from_the_source_world(room, tmp_path, told):
+    capture, parameters, _ = room
+    outward = Similarity(1000.0, np.eye(3), np.array([5000.0, -2000.0, 100.0]))
+    capture = replace(capture, source={"world": {"origin": outward.shift.tolist(), "scale": 1000.0}})
+    way = {"in its source's": outward, "by cameras": nerfstudios(capture, None), "by a file": ANY}[told]
+    if told == "by a file":
+        from_source = ANY.after(outward.inverse())
+        matrix = np.c_[from_source.rotation, from_source.shift / from_source.scale].tolist()
+        text = json.dumps({"transform": matrix, "scale": from_source.scale})
+        (tmp_path / "dataparser_transforms.json").write_text(text)
+    theirs = way.of_gaussians(parameters)
+    inside = outward.inverse().of_gaussians(theirs)
+    found = in_frame(tmp_path / "a.ply", inside, capture, view_of(capture), None, theirs)
+    np.testing.assert_allclose(found["means"], parameters["means"], atol=1e-5)
