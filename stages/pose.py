@@ -6,6 +6,7 @@ import logging
 from pathlib import Path
 from types import ModuleType
 
+from chebsplat.formats import artifact
 from chebsplat.formats.photo_model import PhotoModel
 from chebsplat.stages.reconstruction import judge, posing
 from chebsplat.stages.runtime.command import Job
@@ -23,6 +24,20 @@ def run(job: Job) -> None:
     Raises:  DataFailure where few photos register, or nothing tells how far away anything is.
     Choices: all photos take part, those that are tested later, too. A video gives more frames where few of them join.
     """
+    try:
+        best = _best(job)
+    finally:
+        artifact.discard(job.scratch)  # also of photos that cannot be posed
+    job.facts |= best.judged
+    for note in best.notes:
+        log.info("%s", note)
+    for warning in best.judged["doubts"]:
+        log.warning("%s", warning)
+    best.write(job.out)
+
+
+def _best(job: Job) -> PhotoModel:
+    """The model of a source's photos, or of the frames of a video that give the better one."""
     source, settings = job.config.source, job.config.pose
     folder, of = Path(str(source.path)).expanduser(), SOURCES[source.kind]
     best: PhotoModel | None = None
@@ -39,9 +54,4 @@ def run(job: Job) -> None:
             break
     assert best is not None
     judge.check(best, settings.min_registered)
-    job.facts |= best.judged
-    for note in best.notes:
-        log.info("%s", note)
-    for warning in best.judged["doubts"]:
-        log.warning("%s", warning)
-    best.write(job.out)
+    return best

@@ -8,10 +8,14 @@ import shlex
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
+from chebsplat.cameras import centers
 from chebsplat.errors import DataFailure
 from chebsplat.formats.artifact import read_manifest
 from chebsplat.formats.evaluation import Evaluation
 from chebsplat.formats.gaussians import Gaussians
+from chebsplat.formats.photo_model import PhotoModel
 from chebsplat.stages.pages import parts
 from chebsplat.stages.pages import pictures as draw
 from chebsplat.stages.pages.parts import REPORT, rendered
@@ -21,6 +25,7 @@ from chebsplat.stages.runtime.command import Job
 N_PICTURES = 4  # test views in the report
 LARGEST = 20_000_000  # bytes of the page
 STAGE_OF = {
+    "model": "pose",
     "capture": "ingest",
     "points": "sfm",
     "channels": "channels",
@@ -51,8 +56,9 @@ FRAMES = {"color": "colour", "color_and_features": "colour and features"}
 def run(job: Job) -> None:
     """One HTML page, and the figures as CSV, of what was measured and where it comes from.
 
-    Reads `evaluation` and `gaussians`, and of `capture`, `points`, `channels`, `features`, `agreement`, `descriptors`,
-    `encoding`, `lesson`, `knowledge`, `encoder`, `lifted`, `refined` and `scene` what there is. Writes `report`.
+    Reads `evaluation` and `gaussians`, and of `model`, `capture`, `points`, `channels`, `features`, `agreement`,
+    `descriptors`, `encoding`, `lesson`, `knowledge`, `encoder`, `lifted`, `refined` and `scene` what there is. Writes
+    `report`.
     """
     evaluation = Evaluation.read(job.inputs["evaluation"])
     gaussians = Gaussians.read(job.inputs["gaussians"])
@@ -99,6 +105,7 @@ def run(job: Job) -> None:
         left_out=sorted(left_out.items()),
         decided=decided_rows(facts["gaussians"]),
         started=started(job.inputs, facts),
+        posed=posed(PhotoModel.read(job.inputs["model"])) if "model" in job.inputs else None,
         versions=sorted(versions.items()),
         code=next((m.code for m in manifests.values() if "commit" in m.code), None),
         settings=json.dumps(settings, indent=1, sort_keys=True),
@@ -107,6 +114,16 @@ def run(job: Job) -> None:
         raise DataFailure(f"the page would have {len(text) / 1e6:.0f} MB; lower ingest.max_side")
     (job.out / "report.html").write_text(text)
     job.facts |= {"page": "report.html", "psnr": figures["image"]["psnr"]}
+
+
+def posed(model: PhotoModel) -> dict[str, Any]:
+    """Where photos that came alone were taken, in a sentence and a picture, and what is doubtful about it."""
+    point, view = model.tracks.T
+    counts = np.bincount(view, minlength=len(model.names))
+    errors = np.bincount(view, model.errors[point], len(model.names)) / np.maximum(counts, 1)
+    poses = model.cam_from_world
+    picture = draw.cameras(centers(poses), -poses[:, 1, :3], model.points, errors)
+    return {"sentence": " ".join(model.notes), "doubts": model.judged["doubts"], "picture": picture}
 
 
 def decided_rows(facts: dict[str, Any]) -> list[tuple[str, str, str]]:

@@ -69,10 +69,8 @@ class PoseSection(Section):
     max_views: int | None = number(
         None, "at most so many photos or frames, evenly chosen; default: all, of a video 150", 2, 100_000
     )
-    camera: Literal[
-        "auto", "SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV", "OPENCV_FISHEYE", "EQUIRECTANGULAR"
-    ] = setting(
-        "auto", "COLMAP's model of the lens; auto: SIMPLE_RADIAL, a fisheye's where that fails; of panoramas theirs"
+    camera: Literal["auto", "SIMPLE_PINHOLE", "SIMPLE_RADIAL", "OPENCV", "OPENCV_FISHEYE", "EQUIRECTANGULAR"] = setting(
+        "auto", "model of the lens; auto: SIMPLE_RADIAL, or what the photos ask for"
     )
     peak_threshold: float = number(0.0067, "of SIFT; where few photos register, .002 is tried", 1e-6, 1)
     max_features: int = number(8192, "of a photo: the largest are kept; matching takes their square", 64, 100_000)

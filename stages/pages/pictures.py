@@ -75,6 +75,42 @@ def png(image: np.ndarray, path: Any) -> None:
     Image.fromarray(image).save(path, "PNG")
 
 
+def svg(figure: Any) -> str:
+    """A figure as inline SVG, which is closed."""
+    buffer = io.StringIO()
+    figure.savefig(buffer, format="svg", metadata={"Date": None}, transparent=True)
+    plt.close(figure)
+    text = buffer.getvalue()
+    return text[text.index("<svg") :]
+
+
+def cameras(eyes: np.ndarray, ups: np.ndarray, points: np.ndarray, errors: np.ndarray) -> str:
+    """Cameras and points from above and from the side, and each photo's error, as inline SVG.
+
+    Args: eyes, ups: [V, 3] places of the cameras and what is up to each, in the order of the photos; points [N, 3];
+          errors: [V] pixels.
+    """
+    matplotlib.use("Agg")
+    axes = np.linalg.svd(np.eye(3) - np.outer(*[ups.mean(0) / np.linalg.norm(ups.mean(0))] * 2))[0][:, :2]
+    axes = np.column_stack([axes, ups.mean(0) / np.linalg.norm(ups.mean(0))])
+    near = np.abs(points - np.median(points, 0)).max(1) if len(points) else np.zeros(0)
+    shown = points[near <= np.quantile(near, 0.95)] @ axes if len(points) else np.zeros((0, 3))
+    shown, placed = shown[:: max(len(shown) // 1500, 1)], eyes @ axes
+    with matplotlib.rc_context({"svg.hashsalt": "cameras", "svg.fonttype": "none", "font.family": "sans-serif"}):
+        figure, panels = plt.subplots(1, 3, figsize=(12.6, 3.4), layout="constrained")
+        for panel, (i, j), title in zip(panels, ((0, 1), (0, 2)), ("from above", "from the side"), strict=False):
+            panel.scatter(*shown[:, [i, j]].T, s=1, color="#999999", linewidths=0)
+            panel.plot(*placed[:, [i, j]].T, color="#cccccc", linewidth=0.5)
+            panel.scatter(*placed[:, [i, j]].T, s=14, c=np.arange(len(placed)), cmap="viridis")
+            panel.set_aspect("equal", "datalim")
+            panel.set_title(f"cameras and points {title}", fontsize=10)
+            panel.tick_params(labelsize=7)
+        panels[2].bar(np.arange(len(errors)), errors, color="#1f6feb")
+        panels[2].set_title("error of each photo's points, pixels", fontsize=10)
+        panels[2].set_xlabel("photos in their order", fontsize=8)
+        return svg(figure)
+
+
 def curves(trace: list[dict[str, float]], test_psnr: float) -> list[str]:
     """Error against run time as inline SVG: PSNR with the test views' at the end, losses, number of Gaussians."""
     matplotlib.use("Agg")
@@ -99,9 +135,5 @@ def curves(trace: list[dict[str, float]], test_psnr: float) -> list[str]:
             axis.set_xlabel("training seconds")
             axis.set_title(title, fontsize=10)
             axis.grid(alpha=0.3)
-            buffer = io.StringIO()
-            figure.savefig(buffer, format="svg", metadata={"Date": None}, transparent=True)
-            plt.close(figure)
-        text = buffer.getvalue()
-        drawn.append(text[text.index("<svg") :])
+            drawn.append(svg(figure))
     return drawn

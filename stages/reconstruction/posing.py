@@ -31,7 +31,7 @@ WIDE = 0.5  # a fisheye's focal length in longer sides, where EXIF says nothing
 FILM = 36.0  # mm, the longer side of the frame that 35 mm equivalents refer to
 STRAY = 3.0  # pixels of the pictures that photos are reduced to
 FLATTEST = 1.5  # degrees between the rays of a point: COLMAP's own
-LENSES = {"SIMPLE_PINHOLE": 0, "SIMPLE_RADIAL": 1, "RADIAL": 2, "OPENCV": 4, "OPENCV_FISHEYE": 4}  # and their terms
+LENSES = {"SIMPLE_PINHOLE": 0, "SIMPLE_RADIAL": 1, "OPENCV": 4, "OPENCV_FISHEYE": 4}  # and their terms
 
 
 def found(job: Job, shots: Sequence[Shot], pictures: Path, settings: PoseSection) -> PhotoModel:

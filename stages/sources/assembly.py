@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import functools
-import itertools
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from typing import Any
@@ -13,11 +12,11 @@ from PIL import Image
 from scipy.fft import dctn, idctn
 from scipy.ndimage import map_coordinates
 
-from chebsplat.errors import DataFailure, InputError
+from chebsplat.errors import DataFailure
 from chebsplat.formats.images import header
 from chebsplat.stages.settings import IngestSection
 from chebsplat.stages.sources.cameras import DISTORTED, EQUIRECTANGULAR, FACES, Camera, scaled, undistorted
-from chebsplat.stages.sources.common import Frame, Listing, natural
+from chebsplat.stages.sources.common import Frame, Listing, distinct, natural
 from chebsplat.stages.sources.pictures import (
     DEEP,
     GREY,
@@ -136,9 +135,7 @@ def chosen(listing: Listing, settings: IngestSection) -> tuple[list[Frame], list
     if len(frames) < settings.min_views:
         raise DataFailure(f"{len(frames)} usable frames; ingest.min_views is {settings.min_views}. {' '.join(notes)}")
     frames = sorted(frames, key=lambda frame: natural(frame.name))
-    for first, second in itertools.pairwise(frames):
-        if first.name == second.name:
-            raise InputError(f"{first.image} and {second.image} are both view {first.name}; rename or remove one")
+    distinct((frame.name, frame.image) for frame in frames)
     if settings.max_views is not None and len(frames) > settings.max_views:
         picked = np.linspace(0, len(frames) - 1, settings.max_views).round().astype(int)
         notes.append(f"{len(picked)} of {len(frames)} views are used (ingest.max_views).")

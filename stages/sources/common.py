@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import os
 import re
 from collections import Counter
@@ -112,6 +113,13 @@ def stem(name: str) -> str:
     """A relative POSIX path without the suffix of an image; other dots are part of the name."""
     base, end = os.path.splitext(name)
     return base if end.lower() in SUFFIXES else name
+
+
+def distinct(named: Iterable[tuple[str, Path]]) -> None:
+    """Raise InputError where two files, in the order of their names, are one view."""
+    for (name, first), (other, second) in itertools.pairwise(named):
+        if name == other:
+            raise InputError(f"{first} and {second} are both view {name}; rename or remove one")
 
 
 def present(path: Path) -> bool:

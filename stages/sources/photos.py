@@ -112,7 +112,9 @@ def _listed(folder: Path) -> tuple[list[Shot], list[str]]:
     used = {place.name, *(name.partition("/")[0] for name in names)}
     if beside := set(common.with_photos(folder)) - used:
         notes.append(f"Photos in these folders are not read: {', '.join(sorted(beside, key=common.natural))}.")
-    return sorted(found, key=lambda shot: common.natural(shot.name)), notes
+    found.sort(key=lambda shot: common.natural(shot.name))
+    common.distinct((shot.name, shot.path) for shot in found)
+    return found, notes
 
 
 def wraps(path: Path, size: tuple[int, int]) -> bool:

@@ -58,6 +58,8 @@ def met(
             if plan:
                 return ["plan", "--scene", f"{source}/"]
             section = {"kind": layout, "path": str(source)}
+            if layout == "photos":  # which come alone: ingest has no model of them yet
+                return stage("pose", folder, {"source": section})
             return stage("ingest", folder, {"source": section, "ingest": {"min_views": 2} | settings})
 
         yield Row(kind, f"{named}: {what}{', in plan' * plan}", build, (named, word), code, alone)
@@ -107,11 +109,8 @@ def photos() -> Iterator[Row]:
         ("c.png", "65 million pixels", picture("c.png", (65_000, 1001), mode="1"), "64 megapixels"),
         ("photo", "a name that is no UTF-8", called_by(b"photo\xff\xfe.jpg"), "cannot be printed"),
     ])  # fmt: skip
-    one = all_of(remove("a.jpg"), remove("b.jpg"))
-    yield from met(write_photos, [("ingest.min_views", "one photo", one, "1 usable frames")], 4)
-    yield from met(write_photos, [("ingest.test_every", "all are test views", one, "all of them")], 4, min_views=1)
-    none = ("ingest.test_offset", "no test view", put("d.txt", ""), "none of them")
-    yield from met(write_photos, [none], 4, test_offset=7)
+    alone: list[Case] = [("photos", "of one colour", put("d.txt", ""), "no two photos could be registered")]
+    yield from met(write_photos, alone, 4)
     bombs = {"10,000 million pixels": (100_000, 100_000), "177 million pixels": (13_300, 13_300),
              "2^31 columns": (2**31 - 1, 1)}  # fmt: skip
     heavy: list[Case] = [("b.jpg", what, declared_png(*size), "too large") for what, size in bombs.items()]
@@ -128,6 +127,11 @@ def photos() -> Iterator[Row]:
 
 
 def companions() -> Iterator[Row]:
+    one = all_of(remove("images/a.png"), remove("images/b.png"))
+    yield from met(write_companions, [("ingest.min_views", "one photo", one, "1 usable frames")], 4)
+    yield from met(write_companions, [("ingest.test_every", "all are test views", one, "all of them")], 4, min_views=1)
+    none = ("ingest.test_offset", "no test view", put("d.txt", ""), "none of them")
+    yield from met(write_companions, [none], 4, test_offset=7)
     cases: list[Case] = []
     for place, mode in MODES.items():
         path = f"{place}/b.png"
@@ -160,7 +164,7 @@ def companions() -> Iterator[Row]:
 
 # COLMAP
 
-PINHOLE, OPENCV, PANORAMA = 1, 4, 17
+PINHOLE, OPENCV = 1, 4
 MODEL = "sparse/0"
 NAMES = (b"a.png", b"b.png", b"c.png")
 
@@ -212,7 +216,6 @@ def colmap() -> Iterator[Row]:
         ]
     for what, values, word in (
         ("no known model", (99,), "no known model"),
-        ("a panorama", (PANORAMA, (8, 6), (8, 6)), "EQUIRECTANGULAR is not supported"),
         ("2^63 rows", (PINHOLE, (8, 2**63)), NO_CAMERA),
         ("f = 1e300", (PINHOLE, (8, 6), (1e300, 10, 4, 3)), "focal length"),
         ("f = nan", (PINHOLE, (8, 6), (NAN, 10, 4, 3)), "no numbers"),

@@ -9,6 +9,7 @@ from plyfile import PlyData
 from shared import INPUTS, run_stage
 
 from chebsplat.cameras import unproject
+from chebsplat.formats.capture import Capture
 from chebsplat.formats.evaluation import Evaluation
 from chebsplat.formats.ply import read_ply, write_ply
 from chebsplat.formats.points import Points
@@ -85,7 +86,7 @@ def test_units_and_origin_change_neither_the_picture_nor_what_is_exported(scenes
     assert np.abs(moved - origin - scale * ends).max() < 0.02 * scale * (ends[1] - ends[0]).max()
     sizes = [np.median(read_ply(ply)[0]["log_scales"]) for ply in files]
     assert sizes[1] - sizes[0] == pytest.approx(np.log(scale), abs=0.05)
-    begun = started(files[1], points, TrainSection(), opened.world)["means"].numpy()
+    begun = started(files[1], points, TrainSection(), Capture.read(opened.source.parent / "ingest"))["means"].numpy()
     assert np.allclose(begun, opened.parameters["means"], atol=1e-5)
     for camera, pose in zip(opened.cameras, poses, strict=True):
         assert np.allclose(camera.cam_from_world[:3, :3], pose[:3, :3])
@@ -103,11 +104,11 @@ def test_units_and_origin_change_neither_the_picture_nor_what_is_exported(scenes
 def test_a_given_splat_of_one_colour_begins_with_the_points_colours_and_another_with_its_own(scenes, color, tmp_path):
     _, opened, _, points = scenes["tiny"]
     given = opened.parameters
-    own = started(opened.source / "scene.ply", points, TrainSection(), opened.world)
+    own = started(opened.source / "scene.ply", points, TrainSection(), Capture.read(opened.source.parent / "ingest"))
     assert np.allclose(own["sh0"], given["sh0"])
     sh0 = np.full_like(given["sh0"], (color - 0.5) / 0.28209479177387814)
     write_ply(tmp_path / "one.ply", given | {"sh0": sh0}, 0, world=opened.world)
-    found = started(tmp_path / "one.ply", points, TrainSection(), opened.world)
+    found = started(tmp_path / "one.ply", points, TrainSection(), Capture.read(opened.source.parent / "ingest"))
     nearest = np.linalg.norm(given["means"][:, None] - points.means, axis=-1).argmin(1)
     shown = 255 * (found["sh0"][:, 0].numpy() * 0.28209479177387814 + 0.5)
     assert np.abs(shown - points.colors[nearest]).max() < 0.01
