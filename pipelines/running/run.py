@@ -87,6 +87,8 @@ def say_result(plan: Plan, stage: str | None) -> None:
     if last.stage == "report":
         for line in aligned(summary.table(plan.targets["evaluate"])):
             say(f"  {line}")
+        for doubt in summary.doubts(plan.targets):
+            say(f"  doubtful: {doubt}")
     link = store.work() / plan.title / last.stage
     print(summary.readable(link / "report.html" if last.stage == "report" else link))
 

@@ -63,6 +63,15 @@ def table(evaluation: Path) -> list[tuple[str, str, str]]:
     return [row for row in rows if row[1]]
 
 
+def doubts(made: dict[str, Path]) -> list[str]:
+    """What is doubtful about the poses of a scene, or about its teacher, in sentences. made: artifacts by stage."""
+    said: list[str] = []
+    for stage in {"pose", "agree"} & made.keys():
+        facts = artifact.read_manifest(made[stage]).facts
+        said += facts.get("doubts") or filter(None, [facts.get("doubt")])
+    return said
+
+
 def scaled(size: float | None) -> float | None:
     """Bytes as MB."""
     return None if size is None else size / 1e6

@@ -3,6 +3,7 @@
 import json
 import shutil
 
+import numpy as np
 import pytest
 from malformed import artifacts, commands, sources, teachers
 from malformed.edits import cut, flipped, remove
@@ -64,7 +65,9 @@ def test_photos_of_64_megapixels_are_read_within_a_gibibyte(tmp_path):
     source.mkdir()
     Image.new("RGBA", (8000, 8000), (9, 9, 9, 255)).save(source / "0.png", compress_level=1)
     (source / "1.png").symlink_to(source / "0.png")
-    config = {"source": {"kind": "photos", "path": str(source)}, "ingest": {"min_views": 2}}
+    frames = [{"file_path": f"{k}.png", "transform_matrix": np.eye(4).tolist()} for k in range(2)]
+    (source / "transforms.json").write_text(json.dumps({"fl_x": 8000.0, "frames": frames}))
+    config = {"source": {"kind": "transforms", "path": str(source)}, "ingest": {"min_views": 2}}
     answer = run_alone(stage("ingest", tmp_path, config), tmp_path, 120)
     assert answer.code == 0, answer.stderr
     assert answer.peak < BYTES
