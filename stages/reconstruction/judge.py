@@ -130,10 +130,10 @@ def doubts(found: dict[str, Any]) -> list[str]:
     """What speaks against a model, and what to do about it; nothing of a good one."""
     absent, others = found["n_given"] - found["n_registered"], found["n_in_others"]
     said = []
-    if others:
+    if others and absent > 0.1 * found["n_given"]:
         said.append(
-            f"The photos fall into {len(others) + 1} groups that share nothing; the largest is used, {sum(others)} "
-            "photos of others are not: photograph what lies between, or make a scene of each."
+            f"The photos fall into {len(others) + 1} groups that share nothing; the largest is used, {absent} photos "
+            "are not: photograph what lies between, or make a scene of each."
         )
     elif absent > 0.1 * found["n_given"]:
         said.append(f"{absent} of {found['n_given']} photos could not be placed and are left out; {REMEDY}.")

@@ -55,7 +55,7 @@ def test_photos_that_their_pairs_contradict_are_left_out_and_groups_that_hang_on
 @pytest.mark.parametrize(
     ("changed", "said"),
     [
-        ({"n_in_others": [8]}, "2 groups that share nothing"),
+        ({"n_in_others": [8], "n_registered": 12}, "2 groups that share nothing"),
         ({"n_registered": 15}, "5 of 20 photos could not be placed"),
         ({"n_misplaced": 3}, "3 photos are left out that most of their matches contradict"),
         ({"pairs_agree": 0.5}, "Only 50% of the pairs"),
