@@ -50,12 +50,12 @@ def read(name: str, source: SourceSection, settings: IngestSection, model: Photo
         return generated.capture(name, source.seed, source.preset)
 
     folder = Path(str(source.path)).expanduser()
+    if source.kind in ALONE and model is None:
+        raise ConfigError(f"{source.kind} bring no poses; give the artifact of stage pose (--in-model)")
     if source.kind == "video" and model is not None:
         return video.read(folder, settings, model)
     if not folder.is_dir():
         raise InputError(f"{folder} is not a folder; correct source.path")
-    if source.kind in ALONE and model is None:
-        raise ConfigError(f"{source.kind} bring no poses; give the artifact of stage pose (--in-model)")
     modules = {
         "colmap": colmap,
         "transforms": transforms,

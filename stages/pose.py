@@ -6,6 +6,7 @@ import logging
 from pathlib import Path
 from types import ModuleType
 
+from chebsplat.errors import DataFailure
 from chebsplat.formats import artifact
 from chebsplat.formats.photo_model import PhotoModel
 from chebsplat.stages.reconstruction import judge, posing
@@ -41,17 +42,23 @@ def _best(job: Job) -> PhotoModel:
     source, settings = job.config.source, job.config.pose
     folder, of = Path(str(source.path)).expanduser(), SOURCES[source.kind]
     best: PhotoModel | None = None
-    for finer in (1, 2) if source.kind == "video" else (1,):
+    for finer in (1, 2) if source.kind == "video" and settings.max_views is None else (1,):
         shots, notes = of.shots(folder, settings, job.progress, finer)
         pictures = job.scratch / f"images-{finer}"
         pictures.mkdir(parents=True, exist_ok=True)
         of.save(shots, folder, pictures, settings.max_side)
         found = posing.found(job, shots, pictures, settings)
-        if best is None or len(found.names) / len(shots) > best.judged["n_registered"] / best.judged["n_given"]:
+        if found is not None and (best is None or share(found) > share(best)):
             best = found
             best.notes[:0] = notes
-        if len(best.names) * posing.MORE >= best.judged["n_given"]:
+        if best is not None and share(best) * posing.MORE >= 1:
             break
-    assert best is not None
+    if best is None:
+        raise DataFailure(f"no two photos of {folder} could be registered; {judge.REMEDY}, of more texture")
     judge.check(best, settings.min_registered)
     return best
+
+
+def share(model: PhotoModel) -> float:
+    """The part of the photos that a model has."""
+    return len(model.names) / float(model.judged["n_given"])

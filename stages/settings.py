@@ -65,7 +65,7 @@ class IngestSection(Section):
 class PoseSection(Section):
     """Of photos and videos that come alone."""
 
-    max_side: int = number(1600, "pixels; photos are matched at this, never enlarged", 16, 8192)
+    max_side: int = number(1600, "pixels; photos are matched at this, never enlarged", 16, 3200)
     max_views: int | None = number(
         None, "at most so many photos or frames, evenly chosen; default: all, of a video 150", 2, 100_000
     )

@@ -7,6 +7,7 @@ camera-to-world matrix in metres, is held against it, too: medians of the angle 
 from __future__ import annotations
 
 import json
+import os
 import time
 from collections.abc import Sequence
 from pathlib import Path
@@ -29,12 +30,13 @@ def main(arguments: Sequence[str]) -> int:
     parser.add_argument("captures", type=Path, nargs="+", help="folders of photos, each with its photos in images/")
     parser.add_argument("--threads", type=int, default=2)
     options = parser.parse_args(arguments)
+    os.environ["OMP_NUM_THREADS"] = str(options.threads)
     print(shared.machine())
     print("| capture | photos | registered | theirs | points | theirs | error | theirs | seconds | theirs | truth |")
     print("|---|---|---|---|---|---|---|---|---|---|---|")
     for folder in options.captures:
-        photos, place = folder / "images", TemporaryDirectory()
-        with place as scratch:
+        photos = folder / "images"
+        with TemporaryDirectory() as scratch:
             theirs, their_seconds = defaults(photos, Path(scratch), options.threads)
             began = time.perf_counter()
             try:
@@ -42,7 +44,7 @@ def main(arguments: Sequence[str]) -> int:
                     "pose", Path(scratch) / "model", source={"kind": "photos", "path": str(photos)}
                 ))  # fmt: skip
             except ChebsplatError as error:
-                print(f"| {folder.name} | {error} |", flush=True)
+                print(f"| {folder.name} | {len(os.listdir(photos))} | {error} |{' |' * 8}", flush=True)
                 continue
             seconds, held = time.perf_counter() - began, model.judged
             print(f"| {folder.name} | {held['n_given']} | {held['n_registered']} | {theirs.get('n')} | "

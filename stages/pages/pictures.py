@@ -91,8 +91,9 @@ def cameras(eyes: np.ndarray, ups: np.ndarray, points: np.ndarray, errors: np.nd
           errors: [V] pixels.
     """
     matplotlib.use("Agg")
-    axes = np.linalg.svd(np.eye(3) - np.outer(*[ups.mean(0) / np.linalg.norm(ups.mean(0))] * 2))[0][:, :2]
-    axes = np.column_stack([axes, ups.mean(0) / np.linalg.norm(ups.mean(0))])
+    up = ups.mean(0) / max(np.linalg.norm(ups.mean(0)), 1e-9)
+    across = np.linalg.svd(np.eye(3) - np.outer(up, up))[0][:, 0]
+    axes = np.column_stack([across, np.cross(up, across), up])
     near = np.abs(points - np.median(points, 0)).max(1) if len(points) else np.zeros(0)
     shown = points[near <= np.quantile(near, 0.95)] @ axes if len(points) else np.zeros((0, 3))
     shown, placed = shown[:: max(len(shown) // 1500, 1)], eyes @ axes

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -15,7 +16,7 @@ from chebsplat.formats.photo_model import PhotoModel
 LEAST = 30  # verified matches of a pair that counts
 SOUND = 0.6  # of the pairs
 DENIED = 0.05  # of a pair's matches: where fewer are, the pair contradicts it
-MOSTLY = 0.3  # of a photo's pairs: where more contradict its place, it is left out
+CONTRADICTED = 0.3  # of a photo's pairs: where more contradict its place, it is left out
 CONFIRMED = 0.3  # of a pair's matches: where so many are points of the model, the pair agrees with it
 AGREE = 0.8  # of the pairs: of six real captures all that are right have .88 and more, a repetitive board .5
 FLAT = 2.0  # degrees between the rays of the median point: below, depth is a guess
@@ -32,7 +33,7 @@ class Pairs(NamedTuple):
     """The pairs of a model's photos that have LEAST verified matches.
 
     images: ids [N] of the photos; rows: [P, 2] into them; confirmed: [P] the share of a pair's matches that are points
-    of the model; level: of the pairs, whose matches one homography explains.
+    of the model; level: the share of the pairs whose matches one homography explains.
     """
 
     images: list[int]
@@ -42,7 +43,7 @@ class Pairs(NamedTuple):
 
 
 def pairs(model: pycolmap.Reconstruction, database: Path) -> Pairs:
-    """Pairs of photos, and how far the model has put them where their matches say."""
+    """Pairs of a model's photos, and the share of each one's matches that the model confirms."""
     points = {
         image.image_id: np.array([p.point3D_id if p.has_point3D() else -1 for p in image.points2D], np.int64)
         for image in model.images.values()
@@ -64,9 +65,8 @@ def pairs(model: pycolmap.Reconstruction, database: Path) -> Pairs:
 def misplaced(found: Pairs) -> list[int]:
     """Ids of photos that many of their pairs contradict, for they were put beside something that only looks alike.
 
-    Choices: the one that most of its pairs contradict goes first, and with it what it says of others. One pair alone
-      tells nothing. Of groups of photos that no pair holds together then, the largest stays; photos without pairs
-      stay, too. Where less than SOUND of all pairs agree, matches are no witnesses, and all stay.
+    Choices: the photo with the largest share of contradicting pairs goes first, and its pairs no longer count. One pair
+      alone tells nothing. Of groups then linked by no agreeing pair the largest stays; photos without pairs stay, too. Where less than SOUND of all pairs agree, matches are no witnesses, and all stay.
     """
     if not len(found.confirmed) or np.mean(found.confirmed >= CONFIRMED) < SOUND:
         return []
@@ -80,7 +80,7 @@ def misplaced(found: Pairs) -> list[int]:
         against = deny @ kept
         share = np.where(kept & (against > 1), against / np.maximum(against + agree @ kept, 1), 0)
         worst = np.lexsort((against, share))[-1]
-        if share[worst] <= MOSTLY:
+        if share[worst] <= CONTRADICTED:
             break
         kept[worst] = False
     held = np.flatnonzero(kept & agree.any(1))
@@ -90,11 +90,17 @@ def misplaced(found: Pairs) -> list[int]:
 
 
 def judged(
-    model: pycolmap.Reconstruction, found: Pairs, n_photos: int, others: list[int], n_misplaced: int
+    model: pycolmap.Reconstruction,
+    found: Pairs,
+    n_photos: int,
+    others: list[int],
+    n_misplaced: int,
+    mapped_error: float,
 ) -> dict[str, Any]:
     """What tells whether a model is right, and `doubts` in words.
 
-    Args: others: photos in each further model, which share nothing with this one; n_misplaced: left out of it.
+    Args: others: photos in each further model, which share nothing with this one; n_misplaced: left out of it;
+          mapped_error: pixels, before what strays was left out.
     """
     images = [model.images[key] for key in found.images if model.images[key].has_pose]
     side = max(max(camera.width, camera.height) for camera in model.cameras.values())
@@ -109,6 +115,7 @@ def judged(
         "track_length": round(float(model.compute_mean_track_length()), 2),
         "reprojection_error_px": round(float(model.compute_mean_reprojection_error()), 3),
         "reprojection_error": float(model.compute_mean_reprojection_error() / side),
+        "mapped_error": float(mapped_error / side),
         "pairs_agree": float(np.mean(found.confirmed >= CONFIRMED)) if len(found.confirmed) else 0.0,
         "pairs_level": found.level,
         "angle_degrees": angle(model, {image.image_id: image.projection_center() for image in images}),
@@ -128,11 +135,11 @@ def angle(model: pycolmap.Reconstruction, eyes: dict[int, np.ndarray]) -> float:
 
 def doubts(found: dict[str, Any]) -> list[str]:
     """What speaks against a model, and what to do about it; nothing of a good one."""
-    absent, others = found["n_given"] - found["n_registered"], found["n_in_others"]
+    absent, others = found["n_given"] - found["n_registered"] - found["n_misplaced"], found["n_in_others"]
     said = []
     if others and absent > 0.1 * found["n_given"]:
         said.append(
-            f"The photos fall into {len(others) + 1} groups that share nothing; the largest is used, {absent} photos "
+            f"The photos fall into {len(others) + 1} groups that hardly meet; the largest is used, {absent} photos "
             "are not: photograph what lies between, or make a scene of each."
         )
     elif absent > 0.1 * found["n_given"]:
@@ -144,9 +151,9 @@ def doubts(found: dict[str, Any]) -> list[str]:
             f"Only {found['pairs_agree']:.0%} of the pairs of photos agree with where the model puts them: something "
             f"repeats, mirrors or moves in the scene, or the lens changed; check the poses, and {REMEDY}."
         )
-    if found["reprojection_error"] > LOOSE:
+    if found["mapped_error"] > LOOSE:
         said.append(
-            f"Points miss their photos by {found['reprojection_error_px']:.2f} pixels: the lens or what is shown moved "
+            f"Points miss their photos by {found['mapped_error']:.1e} of their side: the lens or what is shown moved "
             "while it was photographed; lock focus and zoom."
         )
     if found["points_a_view"] < SCARCE:
@@ -166,10 +173,11 @@ def sentence(found: dict[str, Any]) -> str:
 def check(model: PhotoModel, least: float) -> None:
     """Raise DataFailure on a model that is not to be believed."""
     found, n_photos = model.judged, model.judged["n_given"]
-    if len(model.names) < max(least * n_photos, 3):
+    needed = max(math.ceil(least * n_photos), 3)
+    if len(model.names) < needed:
         more = f" {' '.join(found['doubts'])}" if found["doubts"] else ""
         raise DataFailure(
-            f"{len(model.names)} of {n_photos} photos registered; at least {least:.0%} are needed "
+            f"{len(model.names)} of {n_photos} photos registered; at least {needed} are needed "
             f"(pose.min_registered); {REMEDY}.{more}"
         )
     if found["angle_degrees"] < FLAT or found["pairs_level"] > LEVEL:

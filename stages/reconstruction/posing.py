@@ -13,7 +13,6 @@ from typing import Any
 import numpy as np
 import pycolmap
 
-from chebsplat.errors import DataFailure
 from chebsplat.formats.photo_model import PhotoModel
 from chebsplat.stages.reconstruction import judge
 from chebsplat.stages.reconstruction.matching import chosen_pairs, empty_database, extract, match_freely
@@ -23,8 +22,8 @@ from chebsplat.stages.sources.cameras import EQUIRECTANGULAR
 from chebsplat.stages.sources.common import Shot, file_of
 
 log = logging.getLogger("chebsplat")
-MORE = 1.1  # times the photos of an earlier attempt, which one that costs more must register
-HALF = 0.5  # of the photos: where a plain lens registers so many, it is found
+MORE = 1.1  # times the photos of the best so far, that a costlier attempt must register
+HALF = 0.5  # of the photos: where a plain lens registers so many, no fisheye's is tried
 FISHEYE = "OPENCV_FISHEYE"
 FAINT = 0.002  # SIFT's peak threshold where the usual one finds too little; it costs exactness
 WIDE = 0.5  # a fisheye's focal length in longer sides, where EXIF says nothing
@@ -34,12 +33,11 @@ FLATTEST = 1.5  # degrees between the rays of a point: COLMAP's own
 LENSES = {"SIMPLE_PINHOLE": 0, "SIMPLE_RADIAL": 1, "OPENCV": 4, "OPENCV_FISHEYE": 4}  # and their terms
 
 
-def found(job: Job, shots: Sequence[Shot], pictures: Path, settings: PoseSection) -> PhotoModel:
-    """The model of photos whose reduced pictures lie in a folder, named by their rows.
+def found(job: Job, shots: Sequence[Shot], pictures: Path, settings: PoseSection) -> PhotoModel | None:
+    """The model of photos whose reduced pictures lie in a folder, named by their rows; None where no two register.
 
-    Raises:  DataFailure where no two photos register.
-    Choices: attempts end where no further one could register MORE than the best, which is what counts: what costs more
-      also finds more that only looks alike. One thread maps, for with it mapping repeats.
+    Choices: attempts end once none could register MORE times the photos of the best; a costlier one replaces it only
+      with so many, for faint features also match what only looks alike. Mapping runs on one thread, to be repeatable.
     """
 
     def mapped(lens: str, peak: float) -> PhotoModel | None:
@@ -58,8 +56,6 @@ def found(job: Job, shots: Sequence[Shot], pictures: Path, settings: PoseSection
         tried = mapped(other, peak)
         if tried is not None and len(tried.names) > MORE * n_registered:
             best = tried
-    if best is None:
-        raise DataFailure("no two photos could be registered; add photos with more overlap and texture")
     return best
 
 
@@ -75,14 +71,16 @@ def further(lens: str, settings: PoseSection, registered: float) -> list[tuple[s
 def _matched(job: Job, shots: Sequence[Shot], pictures: Path, lens: str, settings: PoseSection) -> Path:
     """A database of the photos' features and matches.
 
-    Choices: photos of one size and focal length have one camera. A focal length that nothing tells is a guess, which
-      holds nobody to it.
+    Choices: photos of one size and focal length have one camera. Where EXIF tells no focal length there is none before
+      mapping, but for a fisheye's, which is not found without.
     """
     database = empty_database(job.scratch / "database.db")
-    alike: dict[tuple[tuple[int, int], float | None], list[int]] = {}
+    alike: dict[tuple[tuple[int, int], float | None, bool], list[int]] = {}
     for row, shot in enumerate(shots):
-        alike.setdefault((shot.size, shot.focal), []).append(row)
-    for (_, focal), rows in alike.items():
+        alike.setdefault((shot.size, shot.focal, shot.panorama), []).append(row)
+    named = lens
+    for (_, focal, panorama), rows in alike.items():
+        lens = EQUIRECTANGULAR if panorama and settings.camera == "auto" else named
         width, height = shots[rows[0]].reduced(settings.max_side)
         reader = pycolmap.ImageReaderOptions()
         reader.camera_model = lens
@@ -92,7 +90,7 @@ def _matched(job: Job, shots: Sequence[Shot], pictures: Path, lens: str, setting
             pixels = max(width, height) * (WIDE if focal is None else focal / FILM)
             focals = [pixels] * (2 if lens.startswith("OPENCV") else 1)
             reader.camera_params = ",".join(map(str, [*focals, width / 2, height / 2, *[0.0] * LENSES[lens]]))
-        if any(shots[row].mask for row in rows):
+        if any(shot.mask for shot in shots):
             reader.mask_path = str(pictures / "masks")
         files = [file_of(row) for row in rows]
         extract(job, database, pictures, files, reader, pycolmap.CameraMode.SINGLE, settings)
@@ -101,7 +99,7 @@ def _matched(job: Job, shots: Sequence[Shot], pictures: Path, lens: str, setting
 
 
 def _mapped(job: Job, shots: Sequence[Shot], pictures: Path, database: Path, seed: int) -> PhotoModel | None:
-    """The largest model that mapping finds, in pixels of the photos; None of none."""
+    """The largest model that mapping finds, in pixels of the photos; None where there is none."""
     options = pycolmap.IncrementalPipelineOptions()
     options.num_threads, options.random_seed = 1, seed
     out = job.scratch / "mapped"
@@ -120,12 +118,12 @@ def _mapped(job: Job, shots: Sequence[Shot], pictures: Path, database: Path, see
         return None
     sizes = sorted((model.num_reg_images() for model in models.values()), reverse=True)
     model = max(models.values(), key=lambda held: held.num_reg_images())
-    pairs = judge.pairs(model, database)
-    misplaced = judge.misplaced(pairs)
+    misplaced = judge.misplaced(judge.pairs(model, database))
     for identity in misplaced:
         model.deregister_frame(model.images[identity].frame_id)
+    mapped_error = model.compute_mean_reprojection_error()
     _refine(model)
-    judged = judge.judged(model, pairs, len(shots), sizes[1:], len(misplaced))
+    judged = judge.judged(model, judge.pairs(model, database), len(shots), sizes[1:], len(misplaced), mapped_error)
     return _collected(model, shots, judged)
 
 
@@ -139,6 +137,7 @@ def _refine(model: pycolmap.Reconstruction) -> None:
     options = pycolmap.BundleAdjustmentOptions()
     options.print_summary = False
     options.ceres.loss_function_type = pycolmap.LossFunctionType.CAUCHY
+    options.ceres.solver_options.num_threads = 1
     options.ceres.solver_options.function_tolerance = 1e-5  # of 0 it takes five times as long for the same cameras
     for _ in range(2):
         pycolmap.bundle_adjustment(model, options)

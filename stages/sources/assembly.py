@@ -154,6 +154,11 @@ def chosen(listing: Listing, settings: IngestSection) -> tuple[list[Frame], list
     return frames, notes
 
 
+def face_names(name: str) -> list[str]:
+    """What the views are called that a photo of all directions gives."""
+    return [f"{name}.{face}" for face in FACES]
+
+
 def faces(frame: Frame) -> list[Frame]:
     """The views of a photo: itself, or of one of all directions its faces.
 
@@ -162,11 +167,11 @@ def faces(frame: Frame) -> list[Frame]:
     if frame.camera.model != EQUIRECTANGULAR:
         return [frame]
     views = []
-    for name, turn in FACES.items():
+    for name, turn in zip(face_names(frame.name), FACES.values(), strict=True):
         camera, pose = replace(frame.camera, turn=turn), frame.pose
         if pose is not None:
             pose = np.vstack([camera.turned.T @ pose[:3], pose[3:]])
-        views.append(replace(frame, name=f"{frame.name}.{name}", camera=camera, pose=pose))
+        views.append(replace(frame, name=name, camera=camera, pose=pose))
     return views
 
 

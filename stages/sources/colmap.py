@@ -152,9 +152,13 @@ def points_of(
             notes.append(f"{good.sum()} points are left, fewer than {LEAST}: none is used, and photos are matched.")
         return {}
     view = {name: row for row, name in enumerate(names)}
-    of_image = np.array([view.get(name, -1) for name in images])
+    of_image = np.array([[view.get(each, -1) for each in (name, *assembly.face_names(name))] for name in images])
     of_point = np.where(good, np.cumsum(good) - 1, -1)
-    tracks = np.stack([of_point[cloud.tracks[:, 0]], of_image[cloud.tracks[:, 1]]], 1)
+    rows = of_image.reshape(len(images), -1)[cloud.tracks[:, 1]]  # of each track, of which one sees the point
+    ahead = np.concatenate([fields["cam_from_world"][:, 2], np.zeros((1, 4))])[rows]
+    depth = np.einsum("trk,tk->tr", ahead[..., :3], cloud.means[cloud.tracks[:, 0]]) + ahead[..., 3]
+    seen = np.take_along_axis(rows, np.where(rows < 0, -np.inf, depth).argmax(1)[:, None], 1)[:, 0]
+    tracks = np.stack([of_point[cloud.tracks[:, 0]], seen], 1)
     return {
         "points": cloud.means[good],
         "point_colors": cloud.colors[good],

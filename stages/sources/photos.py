@@ -12,7 +12,7 @@ from PIL import Image
 
 from chebsplat.errors import InputError
 from chebsplat.formats.artifact import sha256_file
-from chebsplat.formats.images import header, is_image
+from chebsplat.formats.images import header, is_image, opened
 from chebsplat.formats.photo_model import PhotoModel
 from chebsplat.stages.runtime.progress import Progress
 from chebsplat.stages.settings import IngestSection, PoseSection
@@ -20,7 +20,7 @@ from chebsplat.stages.sources import assembly, cameras, common
 from chebsplat.stages.sources.colmap import points_of
 from chebsplat.stages.sources.colmap_model import Cloud
 from chebsplat.stages.sources.common import Frame, Listing, Shot, file_of
-from chebsplat.stages.sources.pictures import open_photo
+from chebsplat.stages.sources.pictures import DEEP, open_photo
 
 SEAM = 3.0  # times what neighbouring columns differ by: a panorama's first and last differ by less
 
@@ -28,12 +28,16 @@ SEAM = 3.0  # times what neighbouring columns differ by: a panorama's first and 
 def read(folder: Path, settings: IngestSection, model: PhotoModel) -> dict[str, Any]:
     """The fields of a capture: the photos of a model, without what their lenses bend, and its points."""
     shots = {shot.name: shot for shot in _listed(folder)[0]}
+    if absent := [name for name in model.names if name not in shots]:
+        raise InputError(f"{folder} has no photo {absent[0]}, which the model has; restore it, or run pose again")
     frames = []
     for view, name in enumerate(model.names):
         camera = cameras.camera_of(shots[name].path, *model.cameras[model.camera[view]])
         frames.append(Frame(name, shots[name].path, camera, model.cam_from_world[view], mask=shots[name].mask))
-    fields = assembly.assemble(Listing("photos", frames, notes=list(model.notes), upright=True), settings)
-    return fields | points_of(Cloud(model.points, model.colors, model.errors, model.tracks), model.names, fields)
+    listing = Listing("photos", frames, notes=list(model.notes), upright=True)
+    fields = assembly.assemble(listing, settings)
+    lost = assembly.in_empty_space(model.points, fields, listing)
+    return fields | points_of(Cloud(model.points, model.colors, model.errors, model.tracks), model.names, fields, lost)
 
 
 def probe(folder: Path) -> dict[str, bool]:
@@ -68,7 +72,7 @@ def _photos(folder: Path) -> tuple[Path, list[str]]:
     return place, sorted(common.printable(place, names))
 
 
-def shots(folder: Path, settings: PoseSection, _: Progress | None, __: int) -> tuple[list[Shot], list[str]]:
+def shots(folder: Path, settings: PoseSection, shown: Progress | None, finer: int) -> tuple[list[Shot], list[str]]:
     """The photos of a folder, at most `max_views` of them, evenly chosen, and notes about them."""
     found, notes = _listed(folder)
     first: dict[str, Shot] = {}
@@ -93,11 +97,14 @@ def save(found: Sequence[Shot], _: Path, pictures: Path, max_side: int) -> None:
         with open_photo(shot.path, shot.size, upright=True) as (image, _opaque):
             small = image if image.size == size else image.resize(size, Image.Resampling.BOX)
             small.save(pictures / file_of(row), compress_level=1)
-        if shot.mask is not None:
+        if any(other.mask for other in found):  # pycolmap wants one of every photo then
             (pictures / "masks").mkdir(exist_ok=True)
-            with open_photo(shot.mask, shot.size, upright=True) as (mask, _opaque):
-                seen = mask.convert("L").point(lambda value: 255 if value else 0)
-                seen.resize(size, Image.Resampling.NEAREST).save(pictures / "masks" / f"{file_of(row)}.png")
+            seen = np.full(shot.size[::-1], 255, np.uint8)
+            if shot.mask is not None:
+                with opened(shot.mask) as mask:
+                    seen = np.where(np.asarray(mask.convert("L") if mask.mode not in DEEP else mask) > 0, 255, 0)
+            mask = Image.fromarray(seen.astype(np.uint8)).resize(size, Image.Resampling.NEAREST)
+            mask.save(pictures / "masks" / f"{file_of(row)}.png")
 
 
 def _listed(folder: Path) -> tuple[list[Shot], list[str]]:
@@ -106,8 +113,7 @@ def _listed(folder: Path) -> tuple[list[Shot], list[str]]:
     found = []
     for name in names:
         size, focal = header(place / name)
-        panorama = size[0] == 2 * size[1] and wraps(place / name, size)
-        focal = None if panorama else focal
+        panorama = focal is None and size[0] == 2 * size[1] and wraps(place / name, size)
         found.append(Shot(common.stem(name), place / name, size, focal, masks.get(name), panorama))
     used = {place.name, *(name.partition("/")[0] for name in names)}
     if beside := set(common.with_photos(folder)) - used:

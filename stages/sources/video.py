@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 from PIL import Image
 
-from chebsplat.errors import DataFailure, InputError
+from chebsplat.errors import ConfigError, DataFailure, InputError
 from chebsplat.formats import videos
 from chebsplat.formats.photo_model import PhotoModel
 from chebsplat.photos.frames import BLOCK, STEP, choose, laplacian_variance, progress, shifts
@@ -29,10 +29,13 @@ def shots(path: Path, settings: PoseSection, shown: Progress | None, finer: int)
     """The frames to pose, named by their time in seconds, and notes about them.
 
     Args:    finer: so many frames in place of one.
-    Raises:  InputError where the video cannot be read; DataFailure where its picture hardly moves.
+    Raises:  InputError where the video cannot be read; DataFailure where its picture hardly moves; ConfigError where it
+             is asked to show all directions.
     Choices: the file is decoded anew whenever frames are taken, since they do not fit into memory.
     """
     (file,) = files(path)
+    if settings.camera == cameras.EQUIRECTANGULAR:
+        raise ConfigError("pose.camera EQUIRECTANGULAR is of photos: take frames of the video as photos")
     video = videos.describe(file)
     times, sharpness, moves = _measured(file, video, shown)
     at_most = settings.max_views or finer * MOST
@@ -44,7 +47,7 @@ def shots(path: Path, settings: PoseSection, shown: Progress | None, finer: int)
         )
     notes = [
         f"{len(taken)} of {len(times)} frames are used, one for each time that the picture moves by "
-        f"{STEP / finer:.1%} of its width, at most {at_most} (pose.max_views)."
+        f"{STEP / finer:.1%} of its width, or fewer: at most {at_most} (pose.max_views)."
     ]
     if video.hdr:
         notes.append("The video is HDR, and its colours are read as they are coded: film in SDR, or convert it.")
