@@ -66,7 +66,8 @@ def misplaced(found: Pairs) -> list[int]:
     """Ids of photos that many of their pairs contradict, for they were put beside something that only looks alike.
 
     Choices: the photo with the largest share of contradicting pairs goes first, and its pairs no longer count. One pair
-      alone tells nothing. Of groups then linked by no agreeing pair the largest stays; photos without pairs stay, too. Where less than SOUND of all pairs agree, matches are no witnesses, and all stay.
+      alone tells nothing. Of groups then linked by no agreeing pair the largest stays; photos without pairs stay, too.
+      Where less than SOUND of all pairs agree, matches are no witnesses, and all stay.
     """
     if not len(found.confirmed) or np.mean(found.confirmed >= CONFIRMED) < SOUND:
         return []
