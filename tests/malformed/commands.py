@@ -231,7 +231,7 @@ PLACES: dict[str, tuple[Callable[[Path], object], str, int]] = {  # what stands 
 def places() -> Iterator[Row]:
     def ingest(folder: Path) -> list[str | Path]:
         """Of a folder that is not there: what is refused later names that."""
-        return stage("ingest", folder, {"source": {"kind": "photos", "path": "nowhere"}})
+        return stage("ingest", folder, {"source": {"kind": "colmap", "path": "nowhere"}})
 
     yield Row("setting", "source.path = 'nowhere'", ingest, ("nowhere", "source.path"))
     for what, (stands, place, code) in PLACES.items():
