@@ -90,7 +90,8 @@ def test_frames_are_apart_sharp_in_order_and_the_same_again(tmp_path, capfd):
     fields = filmed(file, IngestSection(max_side=96))
     assert fields["names"] == names and fields["images"].shape == (len(names), 64, 96, 3)
     video.save(shots, file, tmp_path, 64)
-    assert Image.open(tmp_path / file_of(len(shots) - 1)).size == (64, 43)
+    with Image.open(tmp_path / file_of(len(shots) - 1)) as last:
+        assert last.size == (64, 43)
     assert media_packages([file]) == ("av",)
 
 
