@@ -16,7 +16,8 @@ from chebsplat.formats.photo_model import PhotoModel
 LEAST = 30  # verified matches of a pair that counts
 SOUND = 0.6  # of the pairs
 DENIED = 0.05  # of a pair's matches: where fewer are, the pair contradicts it
-CONTRADICTED = 0.3  # of a photo's pairs: where more contradict its place, it is left out
+CONTRADICTED = 0.5  # of a photo's pairs: where more contradict its place, it is left out; of right photos .44 did
+DISPUTED = 0.3  # of a photo's pairs: where more contradict its place, it speaks for no costlier model
 CONFIRMED = 0.3  # of a pair's matches: where so many are points of the model, the pair agrees with it
 AGREE = 0.8  # of the pairs: of six real captures all that are right have .88 and more, a repetitive board .5
 FLAT = 2.0  # degrees between the rays of the median point: below, depth is a guess
@@ -62,9 +63,10 @@ def pairs(model: pycolmap.Reconstruction, database: Path) -> Pairs:
     return Pairs(images, np.array(rows, int).reshape(-1, 2), np.array(confirmed), float(np.mean(level or [False])))
 
 
-def misplaced(found: Pairs) -> list[int]:
+def misplaced(found: Pairs, most: float = CONTRADICTED) -> list[int]:
     """Ids of photos that many of their pairs contradict, for they were put beside something that only looks alike.
 
+    Args:    most: of a photo's pairs, that may contradict its place.
     Choices: the photo with the largest share of contradicting pairs goes first, and its pairs no longer count. One pair
       alone tells nothing. Of groups then linked by no agreeing pair the largest stays; photos without pairs stay, too.
       Where less than SOUND of all pairs agree, matches are no witnesses, and all stay.
@@ -81,7 +83,7 @@ def misplaced(found: Pairs) -> list[int]:
         against = deny @ kept
         share = np.where(kept & (against > 1), against / np.maximum(against + agree @ kept, 1), 0)
         worst = np.lexsort((against, share))[-1]
-        if share[worst] <= CONTRADICTED:
+        if share[worst] <= most:
             break
         kept[worst] = False
     held = np.flatnonzero(kept & agree.any(1))
@@ -111,6 +113,7 @@ def judged(
         "n_given": n_photos,
         "n_in_others": others,
         "n_misplaced": n_misplaced,
+        "n_undisputed": len(images) - len(misplaced(found, DISPUTED)),
         "n_points": model.num_points3D(),
         "points_a_view": float(np.median([image.num_points3D for image in images])),
         "track_length": round(float(model.compute_mean_track_length()), 2),

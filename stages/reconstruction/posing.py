@@ -37,7 +37,8 @@ def found(job: Job, shots: Sequence[Shot], pictures: Path, settings: PoseSection
     """The model of photos whose reduced pictures lie in a folder, named by their rows; None where no two register.
 
     Choices: attempts end once none could register MORE times the photos of the best; a costlier one replaces it only
-      with so many, for faint features also match what only looks alike. Mapping runs on one thread, to be repeatable.
+      with so many that are undisputed, for faint features also match what only looks alike. Mapping runs on one
+      thread, to be repeatable.
     """
 
     def mapped(lens: str, peak: float) -> PhotoModel | None:
@@ -54,7 +55,8 @@ def found(job: Job, shots: Sequence[Shot], pictures: Path, settings: PoseSection
             break
         log.info("%d of %d photos registered; trying %s, features from %g on", n_registered, len(shots), other, peak)
         tried = mapped(other, peak)
-        if tried is not None and len(tried.names) > MORE * n_registered:
+        undisputed = 0 if best is None else best.judged["n_undisputed"]
+        if tried is not None and tried.judged["n_undisputed"] > MORE * undisputed:
             best = tried
     return best
 
