@@ -29,6 +29,8 @@ class Capture(Record):
     depth, labels, pseudo_labels, confidence, loss_mask: of each pixel, or None. class_names[labels] names a pixel.
     points:         f32 [N, 3] in the world, where the source has its own, with point_colors u8 [N, 3] or None, and
                     tracks i32 [T, 2] (point, view), who sees them, or None.
+    taken:          u8 [T, H', W', 3], test photos as they were before undistortion, or None; lenses: of each the view's
+                    name, COLMAP's model and parameters, width and height.
     source:         which source, and notes about what was dropped or changed; protocol: name and parameters.
     """
 
@@ -53,6 +55,8 @@ class Capture(Record):
     ] = None
     confidence: Annotated[Stack | None, Array("float16", PIXELS, "of the pseudo labels, 0 to 1", by_view=True)] = None
     tracks: Annotated[np.ndarray | None, Array("int32", ("observation", 2), "index of a point, of a view")] = None
+    taken: Annotated[Stack | None, Array("uint8", ("photo", "its row", "its column", 3), "sRGB", by_view=True)] = None
+    lenses: list[list[Any]] = field(default_factory=list)
 
     @property
     def size(self) -> tuple[int, int]:

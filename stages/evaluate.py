@@ -21,7 +21,7 @@ from chebsplat.formats.features import Features
 from chebsplat.formats.scene import Scene
 from chebsplat.labels.decode import decode_labels
 from chebsplat.render import SceneRenderer
-from chebsplat.stages.measuring.image_quality import frame_split, image_figures, perceptual, timing
+from chebsplat.stages.measuring.image_quality import frame_split, image_figures, perceptual, psnr_as_taken, timing
 from chebsplat.stages.runtime.command import Job
 from chebsplat.views import View
 
@@ -80,8 +80,10 @@ def run(job: Job) -> None:
         job.left_out("LPIPS", "evaluate.lpips_weights names no file: not measured")
     else:
         figures["lpips_net"] = {"net": NET, "normalize": NORMALIZE}
-    if lenses := capture.source.get("undistorted"):
-        job.left_out("PSNR on the photos as taken", f"they are undistorted ({', '.join(lenses)}), and measured so")
+    Ks = {name: scene.cameras.Ks[k] for name, k in zip(names, places, strict=True)}
+    as_taken = psnr_as_taken(capture, dict(zip(names, pictures["renders"], strict=True)), Ks)
+    if as_taken is not None:
+        figures["image"]["psnr_as_taken"] = as_taken
     if segmentation is not None:
         figures["segmentation"] = segmentation
     figures["left_out"] = scene.summary.get("left_out", {}) | job.facts.get("left_out", {})

@@ -172,6 +172,7 @@ def summary_rows(figures: dict[str, Any], by_degree: list[int] | None, trained: 
         ["figure", "scene", "2D teacher"],
         [f"PSNR, dB (8-bit, mean over views{of})", f"{image['psnr']:.2f}", ""],
         ["PSNR after a colour fit by view, dB", shown(image.get("psnr_fit"), "{:.2f}"), ""],
+        *([["PSNR on the photos as taken, dB", f"{taken:.2f}", ""]] if (taken := image.get("psnr_as_taken")) else []),
         ["SSIM (window 11, σ 1.5)", f"{image['ssim']:.4f}", ""],
         ["LPIPS (vgg, images in [0, 1])", shown(figures["lpips"], "{:.3f}"), ""],
     ]

@@ -55,6 +55,7 @@ def table(evaluation: Path) -> list[tuple[str, str, str]]:
     others = ", ".join(f"{name} {shown}" for name, shown in size.items() if shown and name != "ply")
     rows = [
         ("test PSNR", psnr, text("SSIM {:.3f}", number(measured, "image", "ssim"))),
+        ("as taken", text("{:.1f} dB", number(measured, "image", "psnr_as_taken")), "on photos before undistortion"),
         ("mIoU", miou, f"its 2D teacher {teacher}" if teacher else ""),
         ("Gaussians", text("{:,}", number(measured, "n_gaussians")), ""),
         ("PLY", size["ply"], others),

@@ -12,10 +12,12 @@ import numpy as np
 import torch
 from safetensors import SafetensorError
 from safetensors.torch import load_file
+from scipy.ndimage import map_coordinates
 
 from chebsplat.errors import InputError
 from chebsplat.evaluation.lpips import Lpips
 from chebsplat.evaluation.metrics import color_fitted, psnr
+from chebsplat.formats.capture import Capture
 from chebsplat.render import PARTS, SceneRenderer, frame_parts
 from chebsplat.training.losses import ssim
 from chebsplat.views import View
@@ -44,6 +46,36 @@ def image_figures(
             per_view["lpips"].append(lpips.distance(filled, true))
     means = {name: float(np.array(values).mean()) for name, values in per_view.items()}
     return {"lpips": None} | means | {"per_view": per_view}
+
+
+def psnr_as_taken(capture: Capture, renders: dict[str, np.ndarray], Ks: dict[str, np.ndarray]) -> float | None:
+    """PSNR of renders u8 [H, W, 3] on the test photos as they were taken, dB; None where no lens bends one.
+
+    Args:    Ks: [3, 3] of each render.
+    Choices: a render is interpolated, by cubic splines, where the photo's pixels lie in it. What a photo has beyond its
+      undistorted view, or is masked there, does not count.
+    """
+    if capture.taken is None:
+        return None
+    import pycolmap
+
+    figures = []
+    for photo, (name, model, params, width, height) in zip(capture.taken[:], capture.lenses, strict=True):
+        if name not in renders:
+            continue
+        pixels = np.stack(np.meshgrid(np.arange(width) + 0.5, np.arange(height) + 0.5), -1).reshape(-1, 2)
+        lens = pycolmap.Camera(model=model, params=params, width=width, height=height)
+        places = (lens.cam_from_img(pixels) @ Ks[name][:2, :2].T + Ks[name][:2, 2] - 0.5).T[::-1]
+        rows, columns = renders[name].shape[:2]
+        inside = ((places >= 0) & (places <= [[rows - 1], [columns - 1]])).all(0)
+        if capture.loss_mask is not None:
+            row, column = places[:, inside].round().astype(int)
+            inside[inside] = capture.loss_mask[capture.names.index(name)][row, column]
+        channels = np.moveaxis(renders[name].astype(np.float32), -1, 0)
+        shown = np.stack([map_coordinates(c, places[:, inside], np.float32, mode="nearest") for c in channels], -1)
+        wanted = photo[:height, :width].reshape(-1, 3)[inside]
+        figures.append(min(psnr(shown.round().clip(0, 255).astype(np.uint8), wanted), 100.0))
+    return float(np.mean(figures)) if figures else None
 
 
 def perceptual(path: Path) -> Lpips:

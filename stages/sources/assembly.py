@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import functools
+from collections.abc import Iterable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from typing import Any
@@ -87,9 +88,37 @@ def assemble(listing: Listing, settings: IngestSection, class_names: tuple[str, 
     if (least := min(shape.factor for shape in shapes)) < 1:
         notes.append(f"Images are reduced by {least:.3f} (ingest.max_side).")
     if models := sorted({frame.camera.model for frame in frames} & set(DISTORTED)):
-        notes.append(f"Images are undistorted ({', '.join(models)}), and figures are of these, not of photos as taken.")
+        notes.append(f"Images are undistorted ({', '.join(models)}), and figures are of these where they do not say.")
     source = {"kind": listing.kind, "notes": notes} | ({"undistorted": models} if models else {})
-    return fields | {"source": source}
+    return fields | {"source": source, "as_taken": lambda names: as_taken(bent(frames, listing, names), settings)}
+
+
+def bent(frames: list[Frame], listing: Listing, names: set[str]) -> Iterator[tuple[str, Camera, Any]]:
+    """Those of the views `names` whose photo a lens bends: name, camera, photo; none that is a face of its photo."""
+    for frame in frames:
+        if frame.name in names and frame.camera.model in DISTORTED and frame.camera.model != EQUIRECTANGULAR:
+            with open_photo(frame.image, (frame.camera.width, frame.camera.height), listing.upright) as (image, _):
+                yield frame.name, frame.camera, image
+
+
+def as_taken(photos: Iterable[tuple[str, Camera, Any]], settings: IngestSection) -> dict[str, Any]:
+    """Fields `taken` u8 [T, H, W, 3] and `lenses` of a capture: photos reduced to `max_side` as they are, each with its
+    name and camera; smaller ones are padded at the right and the bottom.
+    """
+    small, lenses = [], []
+    for name, camera, image in photos:
+        factor = min(1.0, settings.max_side / max(image.size))
+        width, height = (max(round(side * factor), 1) for side in image.size)
+        small.append(np.asarray(image.resize((width, height), Image.Resampling.BOX)))
+        held = camera.colmap
+        held.rescale(width, height)
+        lenses.append([name, camera.model, [float(value) for value in held.params], width, height])
+    if not small:
+        return {}
+    taken = np.zeros(np.max([(len(small), *photo.shape) for photo in small], 0), np.uint8)
+    for place, photo in zip(taken, small, strict=True):
+        place[: photo.shape[0], : photo.shape[1]] = photo
+    return {"taken": taken, "lenses": lenses}
 
 
 def in_empty_space(points: np.ndarray, fields: dict[str, Any], listing: Listing) -> np.ndarray:

@@ -70,16 +70,27 @@ def read(path: Path, settings: IngestSection, model: PhotoModel) -> dict[str, An
     camera = cameras.camera_of(file, *model.cameras[0])
     view = assembly.geometry(camera, settings.max_side)
     at = assembly.positions(camera, view)
-    images = [assembly.resampled(image, camera, view, at) for _, image in _taken(file, set(model.frames))]
-    notes = list(model.notes)
+    notes, rows = list(model.notes), np.arange(len(model.names))
+    if settings.max_views is not None and settings.max_views < len(rows):
+        rows = np.linspace(0, len(rows) - 1, settings.max_views).round().astype(int)
+        notes.append(f"{len(rows)} of {len(model.names)} views are used (ingest.max_views).")
     if view.factor < 1:
         notes.append(f"Images are reduced by {view.factor:.3f} (ingest.max_side).")
+    named = {model.frames[row]: model.names[row] for row in rows}
+    images = [assembly.resampled(image, camera, view, at) for _, image in _taken(file, set(named))]
+
+    def as_taken(names: set[str]) -> dict[str, Any]:
+        wanted = {frame for frame, name in named.items() if name in names and camera.model in cameras.DISTORTED}
+        photos = ((named[frame], camera, image) for frame, image in _taken(file, wanted))
+        return assembly.as_taken(photos, settings)
+
     fields = {
-        "names": model.names,
+        "names": list(named.values()),
         "images": np.stack(images),
         "Ks": np.tile(view.K, (len(images), 1, 1)),
-        "cam_from_world": model.cam_from_world,
+        "cam_from_world": model.cam_from_world[rows],
         "source": {"kind": "video", "notes": notes},
+        "as_taken": as_taken,
     }
     return fields | points_of(Cloud(model.points, model.colors, model.errors, model.tracks), model.names, fields)
 
@@ -130,7 +141,7 @@ def _thumbnail(grey: np.ndarray) -> np.ndarray:
 def _taken(file: Path, wanted: set[int]) -> Iterator[tuple[int, Any]]:
     """The frames of these numbers, each with its number, as RGB images."""
     left = len(wanted)
-    for k, frame in enumerate(videos.frames(file)):
+    for k, frame in enumerate(videos.frames(file) if left else ()):
         if k in wanted:
             yield k, Image.fromarray(frame.pixels())
             left -= 1

@@ -12,6 +12,7 @@ from source_folders import SETTINGS, alone, image, save, write_colmap
 
 from chebsplat.formats.artifact import read_manifest
 from chebsplat.formats.capture import Capture
+from chebsplat.stages.measuring.image_quality import psnr_as_taken
 from chebsplat.stages.settings import IngestSection, PoseSection
 from chebsplat.stages.sources import assembly, colmap, colmap_model, common, photos
 from chebsplat.stages.sources.cameras import Camera
@@ -279,6 +280,28 @@ def test_undoing_a_lens_keeps_the_detail_of_a_photo(photo, side):
     inner = plain[cut[0] : -cut[0], cut[1] : -cut[1]]
     kept, before = (laplace(pixels.mean(-1, dtype=float)).var() for pixels in (found[4:-4, 4:-4], inner))
     assert 0.93 < kept / before < 1.3
+
+
+@pytest.mark.data
+@pytest.mark.parametrize("max_side", [160, 8192])
+def test_test_photos_are_held_as_they_were_taken_and_measured_so(tmp_path, max_side):
+    """The best picture there is of a scene, its undistorted photo, and that of a lens that is wrong by a fifth."""
+    photo = Image.open(data("captures") / "kitchen/images/13.jpg").convert("RGB").resize((400, 300))
+    folder = write_colmap(tmp_path / "source", "OPENCV 400 300 390 400 203.3 148 -0.2 0.05 0.002 -0.003")
+    for name in "abc":
+        photo.save(folder / f"images/{name}.png")
+    config = {"source": {"kind": "colmap", "path": str(folder)}, "ingest": {"max_side": max_side}}
+    assert run_stage("ingest", tmp_path / "capture", config=config) == 0
+    capture = Capture.read(tmp_path / "capture")
+    tests = [name for name, is_test in zip(capture.names, capture.is_test, strict=True) if is_test]
+    assert [lens[0] for lens in capture.lenses] == tests
+    size = (400, 300) if max_side > 400 else (160, 120)
+    np.testing.assert_array_equal(capture.taken[0], photo.resize(size, Image.Resampling.BOX))
+    renders = {name: capture.images[capture.names.index(name)] for name in tests}
+    Ks = {name: capture.Ks[capture.names.index(name)] for name in tests}
+    right = psnr_as_taken(capture, renders, Ks)
+    capture.lenses[0][2][4] *= 1.2
+    assert right > 30 and psnr_as_taken(capture, renders, Ks) < right - 3
 
 
 def test_pixels_where_a_distortion_folds_back_do_not_count(tmp_path):
