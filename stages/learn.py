@@ -79,7 +79,7 @@ def run(job: Job) -> None:
         weights = odds(n_views, labels)
         in_channels = settings.points is None and of_features(features)
         words = words_by_label(start, features)[labels] if in_channels else said
-    except (DataFailure, ValueError) as error:
+    except DataFailure as error:
         job.left_out("a lesson", str(error))
         p, d = start.map.shape
         nothing = Sums(np.zeros((p, p)), np.zeros((p, d)), 0.0)

@@ -10,6 +10,8 @@ from typing import NamedTuple
 import numpy as np
 from scipy.linalg import cho_factor, cho_solve, eigh
 
+from chebsplat.errors import DataFailure
+
 SHIPPED_WORTH = 3.0  # scenes that what ships counts for
 RIDGE = 1e-2  # in units of the diagonal of A
 LEAST_VIEWS = 2  # that a point to learn from was seen in
@@ -50,12 +52,12 @@ def odds(n_views: np.ndarray, labels: np.ndarray) -> np.ndarray:
     """How much each of N points teaches, f64 [N], sum 1: half alike, half by 1 / sqrt(frequency of its label).
 
     Args: n_views [N], that see it; labels [N] that its teacher gives it.
-    Raises: ValueError where none is seen in LEAST_VIEWS views.
+    Raises: DataFailure where none is seen in LEAST_VIEWS views.
     """
     seen = (n_views >= LEAST_VIEWS).astype(np.float64)
-    rare = seen / np.sqrt(np.bincount(labels, minlength=1)[labels])
     if not seen.any():
-        raise ValueError(f"no point is seen in {LEAST_VIEWS} views")
+        raise DataFailure(f"no point is seen in {LEAST_VIEWS} views")
+    rare = seen / np.sqrt(np.maximum(np.bincount(labels, seen), 1)[labels])
     return np.asarray(0.5 * seen / seen.sum() + 0.5 * rare / rare.sum())
 
 

@@ -5,6 +5,7 @@ import math
 import numpy as np
 import pytest
 
+from chebsplat.errors import DataFailure
 from chebsplat.shape.lessons import (
     KAPPA,
     RIDGE,
@@ -92,5 +93,7 @@ def test_rare_things_teach_more_and_what_one_view_saw_nothing():
     assert found.sum() == pytest.approx(1)
     assert found[-1] == 0
     assert 1.5 < found[95] / found[0] < math.sqrt(10)
-    with pytest.raises(ValueError, match="seen in 2 views"):
+    unseen = odds(np.array([3] * 99 + [1] * 900), np.array([0] * 90 + [1] * 9 + [0] * 900))
+    np.testing.assert_allclose(unseen[:99], found[:99])
+    with pytest.raises(DataFailure, match="seen in 2 views"):
         odds(np.ones(3, int), np.zeros(3, int))
