@@ -13,7 +13,7 @@ from chebsplat.formats.capture import Capture
 from chebsplat.formats.points import Points
 from chebsplat.photos.colors import tell_of
 from chebsplat.splats.gaussians import local_shape
-from chebsplat.stages.reconstruction.dense import MOST, swept, wants_more
+from chebsplat.stages.reconstruction.dense import MOST, backdrop, swept, wants_more
 from chebsplat.stages.reconstruction.pose_check import wants_adjustment
 from chebsplat.stages.reconstruction.thinning import by_color, edge_of, thin
 from chebsplat.stages.reconstruction.triangulation import reconstruct
@@ -54,6 +54,9 @@ def run(job: Job) -> None:
         more = swept(job, capture, cloud)
         depths = more.pop("depths")
         cloud = filled(cloud, more, min(MOST, settings.max_points), name="n_swept")
+    if capture.depth is None and settings.dense != "off":
+        behind = backdrop(capture, cloud)
+        cloud = joined(cloud, behind) | {"notes": cloud["notes"] | {"n_behind": len(behind["means"])}}
     means = cloud["means"]
     if len(means) < 16:
         raise DataFailure(f"only {len(means)} points were found, at least 16 are needed; add views with more overlap")
@@ -83,11 +86,14 @@ def filled(cloud: Cloud, more: Cloud, count: int, spacing: str = "even", name: s
     Choices: triangulated points show where the photos have texture, those of depth what lies between; a cube with both
       keeps the triangulated one.
     """
-    own = len(cloud["means"])
-    both = cloud | {key: np.concatenate([cloud[key], more[key]]) for key in ("means", "colors", "seen_from")}
-    kept, found = reduced(both, count, spacing)
-    found["notes"] |= {name: int((kept >= own).sum())}
+    kept, found = reduced(joined(cloud, more), count, spacing)
+    found["notes"] |= {name: int((kept >= len(cloud["means"])).sum())}
     return found
+
+
+def joined(cloud: Cloud, more: Cloud) -> Cloud:
+    """A cloud with the points of another one of the same views after its own."""
+    return cloud | {key: np.concatenate([cloud[key], more[key]]) for key in ("means", "colors", "seen_from")}
 
 
 def reduced(cloud: Cloud, count: int, spacing: str) -> tuple[np.ndarray, Cloud]:

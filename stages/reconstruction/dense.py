@@ -1,12 +1,16 @@
-"""Points between those that were matched: depth of the photos by a plane sweep, and where several views agree on it."""
+"""Points beside those that were matched: depth of the photos by a plane sweep, where several views agree on it; and far
+behind all of them, where a photo shows what no point is known of.
+"""
 
 from __future__ import annotations
 
 import logging
+import math
 from typing import Any
 
 import numpy as np
 import torch
+from PIL import Image
 
 from chebsplat.cameras import unproject
 from chebsplat.formats.capture import Capture
@@ -28,19 +32,22 @@ MOST_COST, AGREE = 0.5, 2  # what counts: cost, views that confirm a depth
 LEAST = 0.2  # of the points in the cube of a middling one, and three: what few pixels show is seldom there
 MOST = 12_000  # points in all: the first Gaussians, which growth needs room beside
 CELLS = 20  # cells along the longer side of a photo, of which it is asked how many hold a point
+BEHIND = 1.5  # times the farthest point: how deep what no point is known of is supposed to lie
 COVERED = 0.8  # part of the cells under which matched points leave too much of the photos empty
 
 
 def covered(Ks: np.ndarray, poses: np.ndarray, means: np.ndarray, size: tuple[int, int]) -> float:
     """The share of the views' cells, CELLS along the longer side of `size`, in which a point [N, 3] lies."""
-    width, height = size
+    return float(np.mean([cells_with(K, pose, means, size) for K, pose in zip(Ks, poses, strict=True)]))
+
+
+def cells_with(K: np.ndarray, pose: np.ndarray, means: np.ndarray, size: tuple[int, int]) -> np.ndarray:
+    """Which cells of a photo of `size` (width, height) a point [N, 3] lies in, bool [rows, columns]."""
     edge = max(size) / CELLS
-    columns, rows = int(np.ceil(width / edge)), int(np.ceil(height / edge))
-    shares = []
-    for K, pose in zip(Ks, poses, strict=True):
-        cells = (in_photo(K, pose, means, size)[:, :2] // edge).astype(int)
-        shares.append(len(np.unique(cells[:, 1] * columns + cells[:, 0])) / (columns * rows))
-    return float(np.mean(shares))
+    held = np.zeros((math.ceil(size[1] / edge), math.ceil(size[0] / edge)), bool)
+    column, row = (in_photo(K, pose, means, size)[:, :2] // edge).astype(int).T
+    held[row, column] = True
+    return held
 
 
 def in_photo(K: np.ndarray, pose: np.ndarray, means: np.ndarray, size: tuple[int, int]) -> np.ndarray:
@@ -148,6 +155,32 @@ def fused(means: np.ndarray, colors: np.ndarray, seen_from: np.ndarray) -> dict[
     _, first, cube = np.unique(numbers, return_index=True, return_inverse=True)
     is_dense, middle, color = means_of_each(cube, LEAST, means, colors)
     return {"means": middle, "colors": color.round().astype(np.uint8), "seen_from": seen_from[first[is_dense]]}
+
+
+def backdrop(capture: Capture, cloud: dict[str, Any]) -> dict[str, Any]:
+    """means, colors and seen_from of points far behind all others, as a cloud has them: one in each cell of a training
+    photo in which no point lies, of that cell's mean colour.
+
+    Choices: as deep as BEHIND times the farthest point in any photo (99th percentile). What such a cell shows is built
+      from what lies nearest otherwise, which looks right from there and stands before other cameras.
+    """
+    row, (width, height) = {name: k for k, name in enumerate(capture.names)}, capture.size
+    used = [k for k, name in enumerate(cloud["names"]) if not capture.is_test[row[name]]]
+    Ks, poses = cloud["Ks"], cloud["cam_from_world"]
+    depths = [in_photo(Ks[k], poses[k], cloud["means"], capture.size)[:, 2] for k in used]
+    far = BEHIND * max((np.percentile(z, 99) for z in depths if len(z)), default=0.0)
+    means, colors, seen = [np.zeros((0, 3))], [np.zeros((0, 3), np.uint8)], [np.zeros(0, np.int64)]
+    for k in used:
+        empty, view = ~cells_with(Ks[k], poses[k], cloud["means"], capture.size), row[cloud["names"][k]]
+        small = Image.fromarray(capture.images[view]).resize(empty.shape[::-1], Image.Resampling.BOX)
+        if capture.loss_mask is not None:
+            counted = Image.fromarray(capture.loss_mask[view]).resize(empty.shape[::-1], Image.Resampling.NEAREST)
+            empty &= np.asarray(counted)
+        pixels, scale = np.argwhere(empty), np.array([empty.shape[1] / width, empty.shape[0] / height, 1.0])
+        means.append(unproject(np.full(empty.shape, far), scale[:, None] * Ks[k], poses[k], pixels))
+        colors.append(np.asarray(small)[tuple(pixels.T)])
+        seen.append(np.full(len(pixels), k))
+    return {"means": np.concatenate(means), "colors": np.concatenate(colors), "seen_from": np.concatenate(seen)}
 
 
 def reduced(image: np.ndarray, factor: int) -> np.ndarray:

@@ -160,3 +160,20 @@ def test_points_are_added_where_most_cells_are_empty_and_never_beside_depth(wall
     assert not dense.wants_more(job, capture_of(wall), full, settings)
     assert job.facts["covered"] > 0.9
     assert dense.wants_more(job, capture_of(wall), full, SfmSection(dense="on"))
+
+
+def test_where_no_point_is_known_points_of_the_photos_colours_lie_far_behind_all_others(wall):
+    """All points but the last are in the middle; the last, five deep, is the farthest 99 of 100 times."""
+    cloud, mask = cloud_of(wall), np.ones(wall[0].shape[:3], bool)
+    cloud["means"] = np.concatenate([cloud["means"], np.tile([[0.0, 0.0, 5.0]], (20, 1))])
+    mask[:, :, :24] = False
+    found = dense.backdrop(capture_of(wall, loss_mask=mask), cloud)
+    assert set(found["seen_from"].tolist()) == {0, 1, 3, 4}  # none of the view that is tested
+    np.testing.assert_allclose(found["means"][:, 2], 7.5)
+    first = found["seen_from"] == 0
+    x, y = ((found["means"][first, :2] + [0.4, 0]) / 7.5 * FOCAL + [80, 60]).T
+    assert x.min() == pytest.approx(28) and x.max() == pytest.approx(156)  # middles of cells of 8 pixels
+    held = dense.cells_with(wall[1][0], wall[2][0], cloud["means"], SIZE)
+    assert len(x) == (~held)[:, 3:].sum() and held.any()
+    cells = wall[0][0].reshape(15, 8, 20, 8, 3).mean((1, 3))
+    np.testing.assert_allclose(found["colors"][first], cells[(y / 8).astype(int), (x / 8).astype(int)], atol=1)
