@@ -12,7 +12,7 @@ import numpy as np
 from chebsplat.errors import InputError
 from chebsplat.formats.artifact import read_manifest
 from chebsplat.formats.capture import Capture
-from chebsplat.formats.evaluation import Evaluation
+from chebsplat.formats.evaluation import Evaluation, rests
 from chebsplat.formats.gaussians import Gaussians
 from chebsplat.formats.scene import read_label_names
 
@@ -69,8 +69,8 @@ def tiles(figures: dict[str, Any], gaussians: Gaussians) -> list[tuple[str, str,
     tiles = [(f"{image['psnr']:.1f} dB", "PSNR", f"SSIM {image['ssim']:.3f}")]
     if segmentation and segmentation["scene"]["miou"] is not None:
         of_teacher = segmentation.get("teacher", {}).get("miou")
-        detail = "" if of_teacher is None else f"its 2D teacher: {of_teacher:.1%}"
-        tiles.append((f"{segmentation['scene']['miou']:.1%}", "mIoU", detail))
+        details = [rests(segmentation), "" if of_teacher is None else f"its 2D teacher: {of_teacher:.1%}"]
+        tiles.append((f"{segmentation['scene']['miou']:.1%}", "mIoU", "; ".join(filter(None, details))))
     if segmentation and segmentation["scene"].get("oa") is not None:
         tiles.append((f"{segmentation['scene']['oa']:.1%}", "pixels right", "overall accuracy"))
     tiles.append((f"{figures['n_gaussians']:,}", "Gaussians", f"PLY {figures['bytes']['ply'] / 1e6:.1f} MB"))

@@ -11,6 +11,7 @@ import numpy as np
 
 from chebsplat.cameras import centers
 from chebsplat.errors import InputError
+from chebsplat.formats.names import few
 from chebsplat.formats.world import World
 from chebsplat.stages.sources import assembly, cameras, common, texts
 from chebsplat.stages.sources.colmap_model import Cloud, Model, read_model, size_of
@@ -191,10 +192,10 @@ def _listing(folder: Path) -> tuple[Listing, Model]:
     rest = set(on_disk) - set(files.values())
     absent = [name for name in wanted if name not in files]
     if absent:
-        notes.append(f"{len(absent)} of {len(wanted)} images of the model are absent on disk ({common.few(absent)}).")
+        notes.append(f"{len(absent)} of {len(wanted)} images of the model are absent on disk ({few(absent)}).")
     if rest:
         notes.append(
-            f"{len(rest)} of {len(on_disk)} images on disk are not in the model and are left out ({common.few(rest)})."
+            f"{len(rest)} of {len(on_disk)} images on disk are not in the model and are left out ({few(rest)})."
         )
     if by_stem := sum(name != file for name, file in files.items()):
         notes.append(f"{by_stem} of the model's images have another path on disk and are told by their names.")

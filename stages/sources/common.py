@@ -245,13 +245,6 @@ def matched(wanted: Sequence[str], there: Collection[str]) -> dict[str, str]:
     return found
 
 
-def few(names: Iterable[str]) -> str:
-    """Three of some names, for a message, and whether there are more."""
-    ordered = sorted(names, key=natural)
-    shown = [f"{name!a}"[1:-1] if unprintable(name) else name for name in ordered[:3]]
-    return ", ".join(shown) + ", ..." * (len(ordered) > 3)
-
-
 def masks_in(folder: Path, names: Iterable[str]) -> tuple[dict[str, Path], list[str]]:
     """The masks of photos by the photos' names, in masks/ and called like a photo or its stem; a note if some lack."""
     held = {stem(name): folder / "masks" / name for name in names_below(folder / "masks")}

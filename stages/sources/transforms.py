@@ -11,6 +11,7 @@ import numpy as np
 
 from chebsplat.errors import InputError
 from chebsplat.formats.images import header, is_image
+from chebsplat.formats.names import few
 from chebsplat.formats.points import read_cloud
 from chebsplat.stages.sources import assembly, cameras, common
 from chebsplat.stages.sources.cameras import Camera
@@ -210,11 +211,11 @@ def _listing(folder: Path, entries: list[Entry]) -> Listing:
     notes = []
     if absent:
         total = len(absent) + len(present)
-        notes.append(f"{len(absent)} of {total} listed frames are absent on disk ({common.few(absent)}).")
+        notes.append(f"{len(absent)} of {total} listed frames are absent on disk ({few(absent)}).")
         used = {image for _, image in present}
         there = [name for name in common.names_below(folder) if name.partition("/")[0] not in common.BESIDE]
         if others := [name for name in there if os.path.join(folder, name) not in used]:
-            notes.append(f"Images that no frame lists: {common.few(others)}.")
+            notes.append(f"Images that no frame lists: {few(others)}.")
     if elsewhere := sum(frame.name != _name(os.path.relpath(frame.image, folder)) for frame in frames):
         notes.append(f"{elsewhere} photos have another path on disk than is listed, and are told by their names.")
     return Listing("transforms", frames, notes=notes + _unused(folder, entries, frames))

@@ -14,6 +14,7 @@ import numpy as np
 from chebsplat.errors import InputError
 from chebsplat.formats.names import suggest
 from chebsplat.formats.teacher_model import read_label_table
+from chebsplat.labels.names import folded
 from chebsplat.stages.teacher_models.onnx_session import Model
 
 if TYPE_CHECKING:
@@ -55,11 +56,6 @@ def found(names: list[str], known: list[str], last_word: bool = True) -> list[in
     """Where each name stands among those known, -1 where it does not; looked up as in a table of labels."""
     row = {folded(name): k for k, name in reversed(list(enumerate(known)))}  # the first of equal ones
     return [next((row[form] for form in forms(name, last_word) if form in row), -1) for name in names]
-
-
-def folded(name: str) -> str:
-    """A name as it is compared."""
-    return " ".join(name.lower().replace("_", " ").replace("-", " ").split())
 
 
 def forms(name: str, last_word: bool = True) -> Iterator[str]:

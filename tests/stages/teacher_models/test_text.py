@@ -11,9 +11,10 @@ from shared import ROOT
 from chebsplat.errors import InputError
 from chebsplat.formats.teacher_model import EMBEDDED, TeacherModel, read_label_set, read_label_table, read_teacher
 from chebsplat.labels.decode import VOCABULARY
+from chebsplat.labels.names import folded
 from chebsplat.stages.teacher_models import text_encoder
 from chebsplat.stages.teacher_models.label_space import IN_ROOMS, label_set
-from chebsplat.stages.teacher_models.text_encoder import folded, text_embeddings
+from chebsplat.stages.teacher_models.text_encoder import text_embeddings
 from chebsplat.synthetic import CLASS_NAMES
 from chebsplat.teachers.words import NOUNS, TABLE
 
