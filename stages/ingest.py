@@ -167,7 +167,7 @@ def run(job: Job) -> None:
     model = PhotoModel.read(job.inputs["model"]) if "model" in job.inputs else None
     fields = read(name, source, settings, model)
     fields["source"] = {"name": name} | fields["source"]
-    for note in fields["source"].get("notes", []):
+    for note in (*filter(None, [fields["source"].get("labels")]), *fields["source"].get("notes", [])):
         log.info("%s", note)
     if source.kind != "generated" and (blur := blur_note(fields)):
         log.warning("%s", blur)
