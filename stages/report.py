@@ -97,6 +97,8 @@ def run(job: Job) -> None:
         tiles=parts.tiles(figures, gaussians),
         legend=parts.legend(pixels, names, colors),
         classes=parts.class_rows(figures, colors),
+        beside=parts.beside_truth(evaluation, names, job.inputs),
+        unmatched=(figures.get("segmentation") or {}).get("unmatched", {}),
         pictures=pictures,
         modes=parts.modes(pictures),
         curves=draw.curves(gaussians.trace, figures["image"]["psnr"]),
