@@ -119,7 +119,7 @@ def test_miou_macc_and_oa_are_those_of_sets_of_pixels(seed, n_classes, n_views):
     """Oracle: each class as the set of its pixels in all views, as scikit-learn's macro averages are defined."""
     rng = np.random.default_rng(seed)
     classes = [f"class {k}" for k in range(n_classes)]
-    names = [f"Class_{k}" for k in rng.permutation(n_classes)][:-1] + ["no class of the truth"]
+    names = [*(f"Class_{k}" for k in rng.permutation(n_classes)[:-1]), "no class of the truth"]
     truths = rng.integers(-1, max(n_classes - 2, 2), (n_views, 17, 23))  # some classes are only predicted
     own = np.array([*(classes.index(name.lower().replace("_", " ")) for name in names[:-1]), -1])
     taken = rng.integers(0, n_classes, truths.shape)
