@@ -6,16 +6,21 @@ from collections.abc import Iterable
 
 
 def folded(name: str) -> str:
-    """A name as it is compared: case, underscores, hyphens and blanks around or beside one another do not matter."""
+    """The words of a name: lower case, one blank between them; underscores and hyphens are blanks."""
     return " ".join(name.lower().replace("_", " ").replace("-", " ").split())
+
+
+def joined(name: str) -> str:
+    """A name as it is compared: tv-screen, TV_Screen and TVScreen are one."""
+    return folded(name).replace(" ", "")
 
 
 def rows_of(names: Iterable[str], known: Iterable[str]) -> list[int]:
     """Where each name stands among those known, the first of equal ones; -1 where it does not."""
     row: dict[str, int] = {}
     for place, name in enumerate(known):
-        row.setdefault(folded(name), place)
-    return [row.get(folded(name), -1) for name in names]
+        row.setdefault(joined(name), place)
+    return [row.get(joined(name), -1) for name in names]
 
 
 def lacking(names: Iterable[str], known: Iterable[str]) -> list[str]:

@@ -18,17 +18,17 @@ from chebsplat.errors import DataFailure, InputError
 from chebsplat.formats.images import opened
 from chebsplat.formats.names import few
 from chebsplat.formats.tensors import read_npy
-from chebsplat.labels.names import folded, rows_of
+from chebsplat.labels.names import joined, rows_of
 from chebsplat.stages.sources import common, texts
 from chebsplat.stages.sources.common import LABELS, Frame, LabelFile, Listing
 from chebsplat.stages.sources.pictures import DEEP, GREY, companion, fits, nearest, same_shape
 from chebsplat.stages.sources.texts import LONGEST, shortened, whole
 
 IDS, COLORS, SCORES, MASKS = "ids", "colours", "scores by class", "one mask a class"
-# Folded and without blanks: what sets call pixels that nobody labelled. "Other" and the like are classes.
+# Joined: what sets call pixels that nobody labelled. "Other" and the like are classes.
 VOID = {"void", "ignore", "ignored", "ignoreregion", "unlabeled", "unlabelled", "notlabeled", "notlabelled", "nolabel",
         "unannotated", "notannotated", "unassigned", "unclassified", "undefined", "unknown", "invalid", "none", "null",
-        "nan", "n/a"}  # fmt: skip
+        "nan", "n/a", "noclass", "dontcare", "outlier"}  # fmt: skip
 BACKGROUND = "background"  # void where it has an id that stands for void, otherwise a class
 CODES = (255, 65_535)  # the highest of 8 and 16 bits, which stand for void
 MAX_ID = 65_535  # what 16 bits hold
@@ -287,7 +287,7 @@ def indexed(
         of = ", ".join(dict.fromkeys(known[v] for v in void))
         notes.append(f"{what}s called {of} are void and ignored: {_told(void, shares, kind)}.")
     named = {v: known[v] for v in present if v in known and v not in void}
-    result = list(class_names or {folded(name): name for name in named.values()}.values())
+    result = list(class_names or {joined(name): name for name in named.values()}.values())
     rows = dict(zip(named, rows_of(named.values(), result), strict=True))
     if foreign := sorted({named[v] for v, row in rows.items() if row < 0}):
         notes.append(f"{what}s that are not among the class names are ignored: {', '.join(foreign)}.")
@@ -329,8 +329,7 @@ def void_code(present: Sequence[int]) -> int | None:
 
 def is_void(name: str, which: int) -> bool:
     """Whether a name says that nobody labelled the pixels of that id."""
-    plain = folded(name).replace(" ", "")
-    return plain in VOID or (plain == BACKGROUND and which in (0, *CODES))
+    return joined(name) in VOID or (joined(name) == BACKGROUND and which in (0, *CODES))
 
 
 def _shares(raw: np.ndarray) -> Counter[int]:

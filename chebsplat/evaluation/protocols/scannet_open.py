@@ -18,7 +18,7 @@ import numpy as np
 from chebsplat.evaluation.metrics import confusion
 from chebsplat.evaluation.protocols.task import EvaluatedView, Task, counted, mean_over, required, resized, translated
 from chebsplat.labels.decode import decode_labels
-from chebsplat.labels.names import folded
+from chebsplat.labels.names import joined
 
 NAME = "scannet-open"
 TEST_EVERY, TEST_OFFSET, ADJUSTABLE, OWN_SPLIT, ON_TRAINING, TRUTH = 1, 0, False, False, True, "labels"
@@ -31,7 +31,7 @@ SIZE = (484, 648)  # (H, W)
 def measure(views: Iterable[EvaluatedView], task: Task) -> dict[str, Any]:
     """Figures of one scene, and its `confusion` [20, 20] by truth, to be summed over scenes. Raises DataFailure."""
     required(task.names, CLASSES, NAME, also=(OTHER,))
-    asked = [k for k, name in enumerate(task.names) if folded(name) != OTHER]
+    asked = [k for k, name in enumerate(task.names) if joined(name) != OTHER]
     names, embeddings = [task.names[k] for k in asked], task.embeddings[asked]
     classes = list(CLASSES)
     sums: dict[str, np.ndarray] = {}

@@ -148,7 +148,7 @@ def test_one_class_alone_has_no_miou_and_every_miou_says_what_it_rests_on(protoc
         assert found["scene"]["miou"] == (None if classes == 1 else 1)
 
 
-SPELLINGS = ["Wall", "WALL", " wall ", "wall"], ["TV_Screen", "tv-screen", "tv  screen", "\ttv screen\n"]
+SPELLINGS = ["Wall", "WALL", " wall ", "wall"], ["TV_Screen", "tv-screen", "tv  screen", "\ttv screen\n", "TVScreen"]
 
 
 @pytest.mark.parametrize("wall", SPELLINGS[0])
