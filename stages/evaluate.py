@@ -118,7 +118,7 @@ def too_little(rests: dict[str, int]) -> str:
     """Why there is no mIoU of a truth of so many `classes` and `pixels`."""
     if not rests["classes"]:
         return "no pixel of the evaluated views has a label; label some of them, or choose others (ingest.test_every)"
-    return f"the evaluated views show one class alone ({rests['pixels']:,} pixels): any scene of it would have 100 %"
+    return f"the evaluated views show one class alone ({rests['pixels']:,} pixels): a mean over classes needs two"
 
 
 def unmatched(names: list[str], classes: list[str]) -> dict[str, list[str]]:
