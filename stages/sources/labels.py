@@ -85,6 +85,9 @@ def files(folder: Path) -> list[Path]:
 def give(listing: Listing, folder: Path) -> None:
     """Give the frames of a listing the maps of a source's folder, where it holds any, and the listing their names."""
     place = place_in(folder)
+    if place is None:
+        held = {place: os.listdir(folder / place) for place in LABELS if (folder / place).is_dir()}
+        listing.notes += [f"{place}/ holds no PNG or .npy: not read ({few(found)})." for place, found in held.items()]
     if place is None or not listing.frames:
         return
     listing.label_names = names_in(folder)

@@ -189,6 +189,15 @@ def test_views_without_a_map_are_unknown_and_counted(tmp_path):
     assert "2 of 3 views have labels; the others count as unknown." in said(fields)
 
 
+def test_maps_of_another_kind_are_named_and_not_passed_over(tmp_path):
+    folder = source(tmp_path, ids(ONE), BY_ID)
+    for path in (folder / "semantic").iterdir():
+        path.rename(path.with_suffix(".tif"))
+    fields = colmap.read(folder, SETTINGS)
+    assert "labels" not in fields
+    assert "semantic/ holds no PNG or .npy: not read (a.tif, b.tif, c.tif)." in fields["source"]["notes"]
+
+
 def test_a_name_given_twice_in_other_letters_is_one_class(tmp_path):
     fields = colmap.read(source(tmp_path, ids(ONE), BY_ID | {"2": "Wall_"}), SETTINGS)
     assert len(fields["class_names"]) == 2
