@@ -63,6 +63,12 @@ def read_figures(path: Path, manifest: Manifest) -> dict[str, Any]:
     return figures
 
 
+def rests(segmentation: Any, figure: str = "miou") -> str:
+    """How many classes and pixels (or points) of truth a mIoU rests on, in words; empty where it is not known."""
+    of = segmentation.get("counted", {}).get(figure)
+    return f"{of['classes']} classes, {of['pixels']:,} {'points' if figure == 'point_miou' else 'pixels'}" if of else ""
+
+
 @dataclass
 class ViewAgreement(Record):
     """agreement: 1 if views always agree, 0 if by chance alone, None where no point was seen twice.

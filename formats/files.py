@@ -31,6 +31,7 @@ ENDLESS_KEY = re.compile(r"""(?<![\w"'-])(?:[\w"'-]++[ \t]*+\.[ \t]*+){64}""")
 SURROGATE = re.compile(r"\\u[dD][89a-fA-F]")
 CLOSED = {errno.EROFS, errno.EACCES, errno.EPERM}
 REFUSALS = {errno.ENOSPC, errno.EDQUOT} | CLOSED
+OUTPUT = "standard output"  # the name of the file in an error of writing it (`stages.runtime.stopping.streams`)
 
 
 def regular(path: Path, remedy: str = RESTORE, error: type[ChebsplatError] = InputError) -> os.stat_result:
@@ -161,6 +162,10 @@ def explained(folder: Path, scratch: bool = False) -> Iterator[None]:
 
 
 def _failure(fault: OSError, folder: Path, scratch: bool) -> ChebsplatError:
+    if fault.filename == OUTPUT:
+        return DiskFailure(
+            f"{OUTPUT} cannot be written ({fault.strerror}); make room where it goes, or send it elsewhere"
+        )
     file = Path(os.fsdecode(fault.filename)) if isinstance(fault.filename, str | bytes) else folder
     if fault.errno in CLOSED:
         if file.exists() and not os.access(file, os.R_OK):

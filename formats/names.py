@@ -43,3 +43,10 @@ def natural(name: str) -> tuple[Any, ...]:
     """Sort key under which frame_2 precedes frame_10; equal numbers are told apart by their spelling."""
     parts = re.split(r"(\d+)", name)
     return tuple(int(part) if k % 2 else part for k, part in enumerate(parts)), name
+
+
+def few(names: Iterable[str]) -> str:
+    """Three of some names, for a message, and whether there are more."""
+    ordered = sorted(names, key=natural)
+    shown = [f"{name!a}"[1:-1] if unprintable(name) else name for name in ordered[:3]]
+    return ", ".join(shown) + ", ..." * (len(ordered) > 3)

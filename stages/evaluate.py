@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Iterator
 from pathlib import Path
+from types import ModuleType
 from typing import Any
 
 import numpy as np
@@ -18,12 +20,16 @@ from chebsplat.evaluation.protocols.task import EvaluatedView, MapsByName, Task,
 from chebsplat.formats.capture import Capture
 from chebsplat.formats.evaluation import Evaluation
 from chebsplat.formats.features import Features
+from chebsplat.formats.names import few
 from chebsplat.formats.scene import Scene
 from chebsplat.labels.decode import decode_labels
+from chebsplat.labels.names import lacking
 from chebsplat.render import SceneRenderer
 from chebsplat.stages.measuring.image_quality import frame_split, image_figures, perceptual, psnr_as_taken, timing
 from chebsplat.stages.runtime.command import Job
 from chebsplat.views import View
+
+log = logging.getLogger("chebsplat")
 
 
 def run(job: Job) -> None:
@@ -57,16 +63,7 @@ def run(job: Job) -> None:
     figures: dict[str, Any] = {"names": names, "protocol": capture.protocol, "source": capture.source}
     shown: dict[str, list[np.ndarray]] = {"renders": []}
     views = evaluated_views(job, renderer, dict(zip(names, cameras, strict=True)), capture, scene, shown)
-    segmentation = None
-    if scene.labels is None:
-        job.left_out("segmentation", "the scene has no semantics")
-    elif protocol.TRUTH == "labels" and (capture.labels is None or capture.class_names is None):
-        job.left_out("mIoU", "the capture has no labels to compare with")
-        segmentation = {}
-    else:
-        segmentation = protocol.measure(views, task(job, capture, scene, renderer))
-        if "point_miou" in segmentation["scene"] and segmentation["scene"]["point_miou"] is None:
-            job.left_out("3D point mIoU", "the capture has no depth with poses")
+    segmentation = segmented(job, protocol, views, capture, scene, renderer)
     for _ in views:  # whatever the protocol did not look at
         pass
     pictures |= {name: np.stack(maps) for name, maps in shown.items()}
@@ -89,8 +86,51 @@ def run(job: Job) -> None:
     figures["left_out"] = scene.summary.get("left_out", {}) | job.facts.get("left_out", {})
     job.facts |= {"psnr": figures["image"]["psnr"], "n_test": len(names)}
     if segmentation:
-        job.facts["miou"] = segmentation["scene"]["miou"]
+        job.facts |= {"miou": segmentation["scene"]["miou"], "miou_of": segmentation["counted"]["miou"]}
     Evaluation(figures, pictures).write(job.out)
+
+
+def segmented(
+    job: Job,
+    protocol: ModuleType,
+    views: Iterator[EvaluatedView],
+    capture: Capture,
+    scene: Scene,
+    renderer: SceneRenderer,
+) -> dict[str, Any] | None:
+    """What the protocol says of the scene's labels, and what matches nothing; None of a scene without semantics."""
+    if scene.labels is None:
+        job.left_out("segmentation", "the scene has no semantics")
+        return None
+    if protocol.TRUTH == "labels" and (capture.labels is None or capture.class_names is None):
+        job.left_out("mIoU", "the capture has no labels to compare with")
+        return {}
+    found: dict[str, Any] = protocol.measure(views, task(job, capture, scene, renderer))
+    if found["scene"]["miou"] is None:
+        job.left_out("mIoU", too_little(found["counted"]["miou"]))
+    elif "point_miou" in found["scene"] and found["scene"]["point_miou"] is None:
+        rests = found["counted"]["point_miou"]
+        job.left_out("3D point mIoU", too_little(rests) if rests["classes"] else "the capture has no depth with poses")
+    if protocol.TRUTH == "labels":
+        found["unmatched"] = unmatched(scene.label_names or [], capture.class_names or [])
+    return found
+
+
+def too_little(rests: dict[str, int]) -> str:
+    """Why there is no mIoU of a truth of so many `classes` and `pixels`."""
+    if not rests["classes"]:
+        return "no pixel of the evaluated views has a label; label some of them, or choose others (ingest.test_every)"
+    return f"the evaluated views show one class alone ({rests['pixels']:,} pixels): a mean over classes needs two"
+
+
+def unmatched(names: list[str], classes: list[str]) -> dict[str, list[str]]:
+    """The scene's labels that no class of the truth is called like, and the classes that no label is; said, too."""
+    found = {"scene": lacking(names, classes), "truth": lacking(classes, names)}
+    if found["truth"]:
+        log.warning("no label of the scene is called like these classes of the truth: %s", few(found["truth"]))
+    if found["scene"]:
+        log.info("labels of the scene that the truth has no class for: %s", few(found["scene"]))
+    return {side: some for side, some in found.items() if some}
 
 
 def timings(job: Job, renderer: SceneRenderer, cameras: list[View], semantic: bool) -> dict[str, Any]:

@@ -16,6 +16,7 @@ from chebsplat.formats.capture import MAPS, Capture
 from chebsplat.formats.names import natural
 from chebsplat.formats.photo_model import PhotoModel
 from chebsplat.formats.world import HERE, World
+from chebsplat.labels.names import lacking, rows_of
 from chebsplat.photos.exposures import relit
 from chebsplat.photos.frames import blurred, detail
 from chebsplat.stages.runtime.command import Job
@@ -149,10 +150,10 @@ def renamed(fields: dict[str, Any], classes: dict[str, list[str]]) -> dict[str, 
     own, labels = fields.get("class_names"), fields.get("labels")
     if own is None or labels is None:
         raise ConfigError("ingest.classes renames a source's labels, and this one has none; leave it away")
-    if absent := [name for group in classes.values() for name in group if name not in own]:
-        raise ConfigError(f"ingest.classes: the source has no class {absent[0]}; it has {', '.join(own)}")
     number = {name: k for k, group in enumerate(classes.values()) for name in group}
-    table = np.array([*(number.get(name, -1) for name in own), -1], np.int16)
+    if absent := lacking(number, own):
+        raise ConfigError(f"ingest.classes: the source has no class {absent[0]}; it has {', '.join(own)}")
+    table = np.array([*([*number.values(), -1][row] for row in rows_of(own, number)), -1], np.int16)
     return {"labels": table[np.asarray(labels[:])], "class_names": list(classes)}
 
 
@@ -166,7 +167,7 @@ def run(job: Job) -> None:
     model = PhotoModel.read(job.inputs["model"]) if "model" in job.inputs else None
     fields = read(name, source, settings, model)
     fields["source"] = {"name": name} | fields["source"]
-    for note in fields["source"].get("notes", []):
+    for note in (*filter(None, [fields["source"].get("labels")]), *fields["source"].get("notes", [])):
         log.info("%s", note)
     if source.kind != "generated" and (blur := blur_note(fields)):
         log.warning("%s", blur)

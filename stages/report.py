@@ -13,7 +13,7 @@ import numpy as np
 from chebsplat.cameras import centers
 from chebsplat.errors import DataFailure
 from chebsplat.formats.artifact import read_manifest
-from chebsplat.formats.evaluation import Evaluation
+from chebsplat.formats.evaluation import Evaluation, rests
 from chebsplat.formats.gaussians import Gaussians
 from chebsplat.formats.photo_model import PhotoModel
 from chebsplat.stages.pages import parts
@@ -97,6 +97,8 @@ def run(job: Job) -> None:
         tiles=parts.tiles(figures, gaussians),
         legend=parts.legend(pixels, names, colors),
         classes=parts.class_rows(figures, colors),
+        beside=parts.beside_truth(evaluation, names, job.inputs),
+        unmatched=(figures.get("segmentation") or {}).get("unmatched", {}),
         pictures=pictures,
         modes=parts.modes(pictures),
         curves=draw.curves(gaussians.trace, figures["image"]["psnr"]),
@@ -183,7 +185,8 @@ def summary_rows(figures: dict[str, Any], by_degree: list[int] | None, trained: 
         if key in segmentation.get("scene", {}):
             teacher = segmentation.get("teacher")
             values = [segmentation["scene"][key], teacher[key] if teacher else None]
-            rows.append([name, shown(values[0], "{:.1%}"), shown(values[1], "{:.1%}") if teacher else ""])
+            of_truth = f" ({words})" if (words := rests(segmentation, key)) else ""
+            rows.append([name + of_truth, shown(values[0], "{:.1%}"), shown(values[1], "{:.1%}") if teacher else ""])
     rows.append(["Gaussians", f"{figures['n_gaussians']:,}", ""])
     if by_degree is not None:
         rows.append(["Gaussians of SH degree 0, 1, 2, 3", " / ".join(f"{n:,}" for n in by_degree), ""])

@@ -99,8 +99,8 @@ class SfmSection(Section):
     )
     dense: Literal["auto", "on", "off"] = setting(
         "auto",
-        "where no depth is given: points of a plane sweep of the photos, and far ones where none is found; auto: a sweep "
-        "where a fifth of their cells hold no point",
+        "where no depth is given: points of a plane sweep, and far ones where none is found; auto: a sweep where a "
+        "fifth of the photos' cells hold no point",
     )
     seed: int = seed("of the choice among points, and of the matches")
 

@@ -10,12 +10,17 @@ import click
 
 from chebsplat.formats.splats import is_splat
 from chebsplat.pipelines.cli import about, knowledge, renders, runs, upkeep, uses
-from chebsplat.pipelines.cli.group import Guarded, logged
+from chebsplat.pipelines.cli.group import Guarded, logged, say
 from chebsplat.stages.registry import STAGES
+from chebsplat.stages.runtime.stopping import streams
 
 
 class Commands(Guarded):
     """Stages are listed from their table and imported only when called, so that --help stays instant."""
+
+    def main(self, *arguments: Any, **options: Any) -> Any:
+        with streams(say):
+            return super().main(*arguments, **options)
 
     def invoke(self, context: click.Context) -> NoReturn:
         with logged(context):

@@ -47,7 +47,8 @@ FIGURES = (
     Figure("frames_per_second", "frames/s", 1, 1, True),
     Figure("train_seconds", "training, s", 1, 1, True),
 )
-OTHERS = ("miou_teacher", "protocol", "held_in_psnr", "steps", "threads", "device", "train_key", "evaluate_key")
+OTHERS = ("miou_teacher", "classes", "pixels", "protocol", "held_in_psnr", "steps", "threads", "device",
+          "train_key", "evaluate_key")  # fmt: skip
 IDENTITY = ("condition", "variant", "budget", "scene", "seed", "state")
 POOLED = ("miou", "miou_gain", "macc", "oa")  # what a protocol may work out over all scenes together
 COLUMNS = (*IDENTITY, *(figure.key for figure in FIGURES), *OTHERS)
@@ -81,6 +82,7 @@ def row_of(run: Run, failed: dict[str, tuple[int, str, Path]]) -> Row:
     return row | {
         "state": "done",
         "segmentation": segmentation,
+        **segmentation.get("counted", {}).get("miou", {}),
         "left_out": figures["left_out"],
         "psnr": figures["image"]["psnr"],
         "psnr_fit": figures["image"].get("psnr_fit"),

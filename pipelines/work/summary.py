@@ -14,6 +14,7 @@ from typing import Any
 from chebsplat.errors import InputError
 from chebsplat.formats import artifact
 from chebsplat.formats.artifact import read_document
+from chebsplat.formats.names import few
 from chebsplat.pipelines.work import store
 
 RUNS, FAILED, WAITS, LEFT, DONE = "runs", "failed", "waits", "not begun", "done"
@@ -49,19 +50,33 @@ def quality(figures: Any) -> tuple[str, str, str]:
 
 def table(evaluation: Path) -> list[tuple[str, str, str]]:
     """(what, value, beside it) of a scene that was evaluated; what was not measured is not there."""
+    from chebsplat.formats.evaluation import rests  # with zarr, which a list of scenes does not wait for
+
     measured = figures(evaluation)
     psnr, miou, teacher = quality(measured)
     size = {name: text("{:.1f} MB", scaled(number(measured, "bytes", name))) for name in ("ply", "split", "ragged")}
     others = ", ".join(f"{name} {shown}" for name, shown in size.items() if shown and name != "ply")
+    segmentation = (measured or {}).get("segmentation") or {}
+    beside = [rests(segmentation), f"its 2D teacher {teacher}" if teacher else ""]
+    if segmentation and not miou:
+        miou, beside = "none", [measured["left_out"].get("mIoU", "")]
     rows = [
         ("test PSNR", psnr, text("SSIM {:.3f}", number(measured, "image", "ssim"))),
         ("as taken", text("{:.1f} dB", number(measured, "image", "psnr_as_taken")), "on photos before undistortion"),
-        ("mIoU", miou, f"its 2D teacher {teacher}" if teacher else ""),
+        ("mIoU", miou, "; ".join(filter(None, beside))),
+        *((what, str(len(names)), few(names)) for what, names in strangers(segmentation)),
         ("Gaussians", text("{:,}", number(measured, "n_gaussians")), ""),
         ("PLY", size["ply"], others),
         ("frames/s", text("{:.0f}", number(measured, "frames_per_second", "color")), "colour alone"),
     ]
     return [row for row in rows if row[1]]
+
+
+def strangers(segmentation: Any) -> list[tuple[str, list[str]]]:
+    """Classes of the truth, and labels of the scene, that the other has no name for; nothing where there are none."""
+    words = {"truth": "true classes without a label", "scene": "labels that are no class"}
+    found = segmentation.get("unmatched", {})
+    return [(what, found[side]) for side, what in words.items() if side in found]
 
 
 def doubts(made: dict[str, Path]) -> list[str]:

@@ -10,11 +10,13 @@ import jinja2
 import numpy as np
 
 from chebsplat.errors import InputError
+from chebsplat.evaluation.metrics import confusion
 from chebsplat.formats.artifact import read_manifest
 from chebsplat.formats.capture import Capture
-from chebsplat.formats.evaluation import Evaluation
+from chebsplat.formats.evaluation import Evaluation, rests
 from chebsplat.formats.gaussians import Gaussians
 from chebsplat.formats.scene import read_label_names
+from chebsplat.labels.names import rows_of
 
 IN_LEGEND = 30  # labels; an open vocabulary has hundreds
 CAPTIONS = {
@@ -69,8 +71,8 @@ def tiles(figures: dict[str, Any], gaussians: Gaussians) -> list[tuple[str, str,
     tiles = [(f"{image['psnr']:.1f} dB", "PSNR", f"SSIM {image['ssim']:.3f}")]
     if segmentation and segmentation["scene"]["miou"] is not None:
         of_teacher = segmentation.get("teacher", {}).get("miou")
-        detail = "" if of_teacher is None else f"its 2D teacher: {of_teacher:.1%}"
-        tiles.append((f"{segmentation['scene']['miou']:.1%}", "mIoU", detail))
+        details = [rests(segmentation), "" if of_teacher is None else f"its 2D teacher: {of_teacher:.1%}"]
+        tiles.append((f"{segmentation['scene']['miou']:.1%}", "mIoU", "; ".join(filter(None, details))))
     if segmentation and segmentation["scene"].get("oa") is not None:
         tiles.append((f"{segmentation['scene']['oa']:.1%}", "pixels right", "overall accuracy"))
     tiles.append((f"{figures['n_gaussians']:,}", "Gaussians", f"PLY {figures['bytes']['ply'] / 1e6:.1f} MB"))
@@ -89,6 +91,32 @@ def class_rows(figures: dict[str, Any], colors: dict[str, str]) -> list[tuple[st
         (name, colors.get(name, "#999"), iou, of_teacher.get(name)) for name, iou in of_scene.items() if iou is not None
     ]
     return sorted(rows, key=lambda row: -row[2])
+
+
+def beside_truth(evaluation: Evaluation, names: list[str], inputs: dict[str, Path]) -> list[dict[str, Any]]:
+    """A row a true class that the pictures show, the most pixels first, at most IN_LEGEND: its `name`; the scene's
+    `label` that is called so, None without one; its `share` of the labelled pixels; of its pixels what they are
+    `taken` for: (name, share) of the classes of all rows, in their order, and of anything else.
+    """
+    pictures = evaluation.pictures
+    if not {"labels", "predicted"} <= pictures.keys():
+        return []
+    n = len(names)
+    matrix = np.zeros((n, n + 1), int)
+    for view in range(len(pictures["labels"])):
+        labels = pictures["predicted"][view]
+        matrix += confusion(np.where(labels < 0, n, labels), pictures["labels"][view], n + 1)[:-1]
+    pixels = matrix.sum(1)
+    kept = [int(k) for k in np.argsort(-pixels, kind="stable")[:IN_LEGEND] if pixels[k]]
+    known = read_label_names(inputs["scene"], read_manifest(inputs["scene"])) if "scene" in inputs else names
+    rows = dict(zip(kept, rows_of([names[k] for k in kept], known), strict=True))
+    found = []
+    for k in kept:
+        shares = matrix[k, kept] / pixels[k]
+        taken = [*zip([names[other] for other in kept], shares, strict=True), ("anything else", 1 - shares.sum())]
+        label = known[rows[k]] if rows[k] >= 0 else None
+        found.append({"name": names[k], "label": label, "share": pixels[k] / pixels.sum(), "taken": taken})
+    return found
 
 
 def legend(pixels: Counter[int], names: list[str], colors: dict[str, str]) -> list[tuple[str, str]]:

@@ -19,7 +19,7 @@ class Progress:
     """`show` forces or forbids the bar; by default it follows whether stderr is a terminal."""
 
     def __init__(self, show: bool | None = None, every: float = 10.0):
-        self.show = sys.stderr.isatty() if show is None else show
+        self.show = (sys.stderr is not None and sys.stderr.isatty()) if show is None else show
         self.every = every  # seconds between plain lines
         self._log: TextIO | None = None
 

@@ -14,18 +14,19 @@ import sys
 import threading
 import time
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, redirect_stdout, suppress
 from pathlib import Path
 from types import FrameType
-from typing import Any
+from typing import Any, TextIO, cast
 
 import click
 
-from chebsplat.errors import ChebsplatError, Stopped
-from chebsplat.formats.files import explained
+from chebsplat.errors import ChebsplatError, DiskFailure, Stopped
+from chebsplat.formats.files import OUTPUT, REFUSALS, explained
 
 log = logging.getLogger("chebsplat")
 SIGNALS = signal.SIGINT, signal.SIGTERM, signal.SIGHUP
+STREAMS = 2  # the highest number of a standard stream
 PATIENCE = 2.5  # seconds from being asked to being killed
 KEPT = "what was finished is kept, and the same command goes on from there"
 
@@ -54,6 +55,65 @@ def exit_code(
     except Exception:
         log.exception("crashed; nothing was published")
         return 1
+
+
+class _Output:
+    """Standard output whose refusals name it. The first is kept in `refusal`, since click tries streams in silence;
+    what comes after it is dropped.
+    """
+
+    def __init__(self, stream: TextIO):
+        self._stream = stream
+        self.refusal: OSError | None = None
+
+    def __getattr__(self, name: str) -> Any:
+        return getattr(self._stream, name)
+
+    def write(self, text: str) -> int:
+        with self._named():
+            return self._stream.write(text)
+
+    def flush(self) -> None:
+        with self._named():
+            self._stream.flush()
+
+    @contextmanager
+    def _named(self) -> Iterator[None]:
+        try:
+            yield
+        except OSError as error:
+            if error.errno in REFUSALS:
+                error.filename, self.refusal = OUTPUT, error
+                with open(os.devnull, "w") as nowhere, suppress(OSError):
+                    os.dup2(nowhere.fileno(), self._stream.fileno())
+            raise
+
+
+@contextmanager
+def streams(tell: Callable[[str], object]) -> Iterator[None]:
+    """Standard streams as a command needs them: closed ones lead nowhere, and not into the next file that is opened;
+    an output that takes nothing is a DiskFailure that names it. Raises SystemExit.
+    """
+    while (number := os.open(os.devnull, os.O_RDWR)) <= STREAMS:
+        os.set_inheritable(number, True)
+    os.close(number)
+    for name in ("stdout", "stderr"):
+        if getattr(sys, name) is None:
+            setattr(sys, name, open(os.devnull, "w"))  # noqa: SIM115
+    output = _Output(sys.stdout)
+    try:
+        with explained(Path.cwd()), redirect_stdout(cast(TextIO, output)):
+            try:
+                yield
+            except SystemExit as stop:
+                with suppress(BrokenPipeError):
+                    output.flush()
+                if output.refusal is None or stop.code == DiskFailure.exit_code:
+                    raise
+                raise output.refusal from None
+    except DiskFailure as error:
+        tell(str(error))
+        sys.exit(error.exit_code)
 
 
 class Asked:

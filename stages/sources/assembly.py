@@ -16,18 +16,10 @@ from scipy.ndimage import map_coordinates
 from chebsplat.errors import DataFailure
 from chebsplat.formats.images import header
 from chebsplat.stages.settings import IngestSection
+from chebsplat.stages.sources import labels
 from chebsplat.stages.sources.cameras import DISTORTED, EQUIRECTANGULAR, FACES, Camera, scaled, undistorted
 from chebsplat.stages.sources.common import Frame, Listing, distinct, natural
-from chebsplat.stages.sources.pictures import (
-    DEEP,
-    GREY,
-    companion,
-    confidences,
-    indexed,
-    label_ids,
-    nearest,
-    open_photo,
-)
+from chebsplat.stages.sources.pictures import DEEP, GREY, companion, confidences, nearest, open_photo
 
 WORKERS = 4
 MOST_EMPTY = 1 / 3  # of the views that see a point
@@ -39,26 +31,21 @@ def assemble(listing: Listing, settings: IngestSection, class_names: tuple[str, 
     Choices: `max_views` picks evenly from the naturally sorted frames. Images are reduced to `max_side` by averaging,
       and undistorted in the same step where a lens bends them (`resampled`); depth, labels and masks take the nearest
       pixel of the file. Smaller views are padded at the right and the bottom, where the loss mask is false, as it is
-      in a photo that is all transparent. Depth and labels are taken only if every frame of the source has them.
+      in a photo that is all transparent. Depth is taken only if every frame of the source has it; pixels of a frame
+      without labels have none.
     Raises:  InputError naming a bad file, DataFailure under `min_views` or where no label has a name.
     """
     frames, notes = chosen(listing, settings)
     shapes = [geometry(frame.camera, settings.max_side) for frame in frames]
     full = (len(frames), max(shape.height for shape in shapes), max(shape.width for shape in shapes))
-    stacks = {"images": np.zeros((*full, 3), np.uint8), "loss_mask": np.zeros(full, bool)}
-    empties = {"depth": np.float32(np.nan), "labels": np.int32(-1), "pseudo_labels": np.int32(0)}
-    for name, empty in (empties | {"confidence": np.float16(0)}).items():
-        if listing.has(name):
-            stacks[name] = np.full(full, empty)
-        elif n := sum(getattr(frame, name) is not None for frame in listing.frames):
-            notes.append(f"Only {n} of {len(listing.frames)} frames have {name.replace('_', ' ')}, which are left out.")
+    stacks = room(listing, frames, full, notes)
     lookup = functools.lru_cache(8)(positions)  # frames of one camera share it
 
     def fill(k: int) -> None:
         view = read_view(frames[k], listing, shapes[k], lookup(frames[k].camera, shapes[k]), set(stacks))
         if not view["opaque"].all():
             listing.empty[frames[k].name] = ~view["opaque"]
-        for name in stacks:
+        for name in stacks.keys() & view.keys():
             stacks[name][k, : shapes[k].height, : shapes[k].width] = view[name]
 
     with ThreadPoolExecutor(WORKERS) as pool:
@@ -70,13 +57,17 @@ def assemble(listing: Listing, settings: IngestSection, class_names: tuple[str, 
     fields["cam_from_world"] = np.stack([frame.pose for frame in frames]) if listing.has("pose") else None  # type: ignore[misc]
     if "depth" in stacks:
         fields["depth"] = stacks["depth"]
+    told = {}
     if "labels" in stacks:
         wanted = class_names or listing.class_names
-        fields["labels"], fields["class_names"], remarks = indexed(stacks["labels"], listing.label_names, wanted)
+        kind, raw = labels.resolved(listing, stacks.pop("labels"))
+        fields["labels"], fields["class_names"], remarks = labels.indexed(raw, listing.label_names, wanted, kind)
         notes += remarks
+        told = {"labels": labels.line(listing, kind, fields["labels"])}
     if "pseudo_labels" in stacks:
         wanted = fields.get("class_names") or class_names or listing.class_names
-        found = indexed(stacks["pseudo_labels"], listing.pseudo_names, wanted and tuple(wanted))
+        own = listing.pseudo_names, wanted and tuple(wanted)
+        found = labels.indexed(stacks["pseudo_labels"], *own, what="Pseudo label")
         fields["pseudo_labels"], fields["class_names"], remarks = found
         fields["confidence"] = stacks["confidence"]
         notes += remarks
@@ -89,7 +80,7 @@ def assemble(listing: Listing, settings: IngestSection, class_names: tuple[str, 
         notes.append(f"Images are reduced by {least:.3f} (ingest.max_side).")
     if models := sorted({frame.camera.model for frame in frames} & set(DISTORTED)):
         notes.append(f"Images are undistorted ({', '.join(models)}), and figures are of these where they do not say.")
-    source = {"kind": listing.kind, "notes": notes} | ({"undistorted": models} if models else {})
+    source = {"kind": listing.kind, "notes": notes} | told | ({"undistorted": models} if models else {})
     return fields | {"source": source, "as_taken": lambda names: as_taken(bent(frames, listing, names), settings)}
 
 
@@ -119,6 +110,21 @@ def as_taken(photos: Iterable[tuple[str, Camera, Any]], settings: IngestSection)
     for place, photo in zip(taken, small, strict=True):
         place[: photo.shape[0], : photo.shape[1]] = photo
     return {"taken": taken, "lenses": lenses}
+
+
+def room(listing: Listing, frames: list[Frame], full: tuple[int, int, int], notes: list[str]) -> dict[str, np.ndarray]:
+    """Empty stacks of what the views will have, by name; notes on what only some of them have."""
+    stacks = {"images": np.zeros((*full, 3), np.uint8), "loss_mask": np.zeros(full, bool)}
+    empties = {"depth": np.float32(np.nan), "labels": np.int32(-1), "pseudo_labels": np.int32(0)}
+    for name, empty in (empties | {"confidence": np.float16(0)}).items():
+        n, of = sum(getattr(frame, name) is not None for frame in listing.frames), len(listing.frames)
+        if n == of or (name == "labels" and any(frame.labels for frame in frames)):
+            stacks[name] = np.full(full, empty)
+            if n < of:
+                notes.append(f"{n} of {of} views have labels; the others count as unknown.")
+        elif n:
+            notes.append(f"Only {n} of {of} frames have {name.replace('_', ' ')}, which are left out.")
+    return stacks
 
 
 def in_empty_space(points: np.ndarray, fields: dict[str, Any], listing: Listing) -> np.ndarray:
@@ -266,7 +272,7 @@ def read_view(
             known &= companion(frame.sureness, field, place) > 0
         fields["depth"] = np.where(known, stored / np.float32(listing.depth_scale), np.float32(np.nan))
     if "labels" in wanted and frame.labels is not None:
-        fields["labels"] = np.where(inside, label_ids(frame, listing, size, at), np.int32(-1))
+        fields["labels"] = np.where(inside, labels.read(frame, listing, size, at), np.int32(-1))
     if "pseudo_labels" in wanted and frame.pseudo_labels is not None and frame.confidence is not None:
         ids = companion(frame.pseudo_labels, size, at, GREY, "8- or 16-bit ids")
         fields["pseudo_labels"] = np.where(inside, ids.astype(np.int32), np.int32(0))

@@ -1,4 +1,4 @@
-"""The COLMAP source: images/ and models in sparse/, with depth/, semantic/ and masks/ where they are given."""
+"""The COLMAP source: images/ and models in sparse/, with depth/, label maps and masks/ where they are given."""
 
 from __future__ import annotations
 
@@ -11,14 +11,13 @@ import numpy as np
 
 from chebsplat.cameras import centers
 from chebsplat.errors import InputError
+from chebsplat.formats.names import few
 from chebsplat.formats.world import World
-from chebsplat.stages.sources import assembly, cameras, common, texts
+from chebsplat.stages.sources import assembly, cameras, common, labels, texts
 from chebsplat.stages.sources.colmap_model import Cloud, Model, read_model, size_of
 from chebsplat.stages.sources.common import Frame, Listing
-from chebsplat.stages.sources.pictures import names_by_id
 
 HELP = "correct source.path; a COLMAP source holds images/ and sparse/0/{cameras,images,points3D}.bin or .txt"
-COMPANIONS = {"depth": "depth", "semantic": "labels"}  # folder: what its PNGs are
 FEW = 10**6  # more than any test_every
 MIN_TRACK = 3  # images that see a point: two can agree by chance
 MAX_ERROR = 4.0  # pixels, of a point's mean reprojection error
@@ -49,17 +48,17 @@ def read(folder: Path, settings: Any, class_names: tuple[str, ...] | None = None
 
 
 def probe(folder: Path) -> dict[str, bool]:
-    """Light: reads names only. A folder with PNGs is a promise: `read` fails if a view of the model has none."""
-    return {"poses": True} | {of: any(_pngs(folder / place)) for place, of in COMPANIONS.items()}
+    """Light: reads names only. Depth of one view is a promise: `read` fails if another view of the model has none."""
+    return {"poses": True, "depth": any(_pngs(folder / "depth")), "labels": labels.place_in(folder) is not None}
 
 
 def files(folder: Path) -> list[Path]:
-    """The model, scene.json, labels.json, and every image, depth, label and mask."""
+    """The model, scene.json, labels.json, and every image, depth, label map and mask."""
     model = [path for place in _models(folder) for path in place.iterdir() if path.suffix in (".bin", ".txt")]
-    documents = [folder / name for name in ("scene.json", "labels.json") if common.present(folder / name)]
-    places = [common.photo_folder(folder), *(folder / name for name in (*COMPANIONS, "masks", "confidence"))]
+    documents = [folder / name for name in labels.NAMES if common.present(folder / name)]
+    places = [common.photo_folder(folder), *(folder / name for name in ("depth", "masks", "confidence"))]
     data = [place / name for place in places for name in common.names_below(place)]
-    return sorted([*model, *documents, *data])
+    return sorted([*model, *documents, *data, *labels.files(folder)])
 
 
 def _pngs(folder: Path) -> Iterator[tuple[str, Path]]:
@@ -113,20 +112,6 @@ def _split(folder: Path, names: list[str]) -> set[str] | None:
     return set((listed or sorted(names, key=common.natural))[::every])
 
 
-def _label_names(folder: Path) -> dict[int, str] | None:
-    """Class names by id, of scene.json's "labels" or of labels.json: {"id": name}."""
-    path, document = folder / "scene.json", _document(folder)
-    if "labels" in document:
-        table = document["labels"]
-    elif common.present(path := folder / "labels.json"):
-        table = texts.read_json(path)
-    else:
-        return None
-    if not isinstance(table, dict):
-        raise InputError(f"{path}: labels must map ids to names; correct it")
-    return names_by_id(path, table.items())
-
-
 def points_of(
     cloud: Cloud, images: list[str], fields: dict[str, Any], lost: np.ndarray | None = None
 ) -> dict[str, Any]:
@@ -176,29 +161,29 @@ def _listing(folder: Path) -> tuple[Listing, Model]:
     notes += model.notes
     on_disk, wanted = common.images_in(images), [image.name for image in model.images]
     files = common.matched(wanted, on_disk)
-    pngs = {of: dict(_pngs(folder / place)) for place, of in COMPANIONS.items()}
+    pngs = dict(_pngs(folder / "depth"))
     masks, unmasked = common.masks_in(folder, files.values())
     frames = []
     for image in model.images:
         if file := files.get(image.name):
             name = common.stem(file)
             camera = cameras.camera_of(model.origin, *model.cameras[image.camera])
-            beside = {
-                of: pngs[of].get(name, folder / place / f"{name}.png") for place, of in COMPANIONS.items() if pngs[of]
-            }
-            sure = common.sureness(beside["depth"]) if "depth" in beside else None
-            frames.append(Frame(name, images / file, camera, image.pose, sureness=sure, mask=masks.get(file), **beside))
+            depth = pngs.get(name, folder / f"depth/{name}.png") if pngs else None
+            sure = common.sureness(depth) if depth else None
+            frames.append(Frame(name, images / file, camera, image.pose, depth, sureness=sure, mask=masks.get(file)))
     rest = set(on_disk) - set(files.values())
     absent = [name for name in wanted if name not in files]
     if absent:
-        notes.append(f"{len(absent)} of {len(wanted)} images of the model are absent on disk ({common.few(absent)}).")
+        notes.append(f"{len(absent)} of {len(wanted)} images of the model are absent on disk ({few(absent)}).")
     if rest:
         notes.append(
-            f"{len(rest)} of {len(on_disk)} images on disk are not in the model and are left out ({common.few(rest)})."
+            f"{len(rest)} of {len(on_disk)} images on disk are not in the model and are left out ({few(rest)})."
         )
     if by_stem := sum(name != file for name, file in files.items()):
         notes.append(f"{by_stem} of the model's images have another path on disk and are told by their names.")
     if images.name != "images":
         notes.append(f"Photos are those of {images.name}/.")
     model = replace(model, images=[replace(image, name=files.get(image.name, "")) for image in model.images])
-    return Listing("colmap", frames, _label_names(folder), notes=notes + unmasked), model
+    listing = Listing("colmap", frames, notes=notes + unmasked)
+    labels.give(listing, folder)
+    return listing, model

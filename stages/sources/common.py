@@ -21,9 +21,11 @@ from chebsplat.formats.videos import is_video
 from chebsplat.stages.settings import SourceSection
 from chebsplat.stages.sources.cameras import Camera
 
+# where label maps lie; the first that is there is read
+LABELS = ("semantic", "semantics", "semantic_class", "label", "labels", "segmentation", "segmentations")
 # folders of what belongs to photos, or is made of them
-BESIDE = {"masks", "mask", "depth", "depths", "confidence", "semantic", "labels", "instance", "normals", "thumbs",
-          "thumbnails"}  # fmt: skip
+BESIDE = {"masks", "mask", "depth", "depths", "confidence", "instance", "normals", "thumbs", "thumbnails", *LABELS}
+LabelFile = Path | dict[str, Path]  # a view's map, or its masks by class
 ENDING = re.compile(r"\.[a-zA-Z]\w{1,4}$")  # of an image's name
 # What cameras leave beside photos, or instead of them, and what makes JPEGs of it.
 UNREAD = (
@@ -42,7 +44,7 @@ class Frame:
     camera: Camera
     pose: np.ndarray | None = None
     depth: Path | None = None
-    labels: Path | None = None
+    labels: LabelFile | None = None
     mask: Path | None = None
     objects: Path | None = None  # ids of objects, as large as the labels
     pseudo_labels: Path | None = None  # what a 2D network took the photo for
@@ -73,7 +75,8 @@ class Shot(NamedTuple):
 class Listing:
     """All frames of a source.
 
-    label_names:  by raw id. class_names: all classes in order; None: those that occur.
+    label_names:  by raw id; label_place: the folder of their maps; label_kinds: what these were taken for, by view,
+                  once they are read (`labels.read`). class_names: all classes in order; None: those that occur.
     corrections:  object id -> raw id of the label that its pixels take instead.
     pseudo_names: by id in the pseudo labels; 0 is none.
     depth_scale:  stored units in one scene unit; no_depth: stored values that mean "unknown".
@@ -83,6 +86,8 @@ class Listing:
     kind: str
     frames: list[Frame]
     label_names: dict[int, str] | None = None
+    label_place: str = ""
+    label_kinds: dict[str, str] = field(default_factory=dict)
     class_names: tuple[str, ...] | None = None
     corrections: dict[int, int] = field(default_factory=dict)
     pseudo_names: dict[int, str] | None = None
@@ -243,13 +248,6 @@ def matched(wanted: Sequence[str], there: Collection[str]) -> dict[str, str]:
             if len(names_of) == len(places[1].get(key, ())) == 1:
                 found[names_of[0]] = places[1][key][0]
     return found
-
-
-def few(names: Iterable[str]) -> str:
-    """Three of some names, for a message, and whether there are more."""
-    ordered = sorted(names, key=natural)
-    shown = [f"{name!a}"[1:-1] if unprintable(name) else name for name in ordered[:3]]
-    return ", ".join(shown) + ", ..." * (len(ordered) > 3)
 
 
 def masks_in(folder: Path, names: Iterable[str]) -> tuple[dict[str, Path], list[str]]:

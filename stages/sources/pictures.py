@@ -1,8 +1,8 @@
-"""The images of a source: photos, the one-channel images that belong to them, and what label ids mean."""
+"""The images of a source: photos, the one-channel images that belong to them."""
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
@@ -10,19 +10,15 @@ from typing import Any
 import numpy as np
 from PIL import Image
 
-from chebsplat.errors import DataFailure, InputError
+from chebsplat.errors import InputError
 from chebsplat.formats.images import opened, seen_size, turned
 from chebsplat.formats.tensors import finite32, read_npz
 from chebsplat.stages.sources.cameras import SAME_SHAPE
-from chebsplat.stages.sources.common import Frame, Listing
-from chebsplat.stages.sources.texts import LONGEST, shortened, whole
 
 EIGHT_BIT = {"1", "L", "LA", "P", "PA", "RGB", "RGBA", "CMYK", "YCbCr"}  # PIL's modes of photos
 DEEP = {"I", "I;16", "I;16B"}  # 16-bit
 GREY = DEEP | {"L", "P"}
 LARGEST = 16 << 20  # bytes of a view's confidences: 4 million in single precision
-IGNORED = {"void", "ignore", "ignored", "unlabeled", "unlabelled", "undefined", "unknown"}
-MAX_ID = 65_535  # what 16 bits hold
 
 
 @contextmanager
@@ -72,13 +68,22 @@ def companion(
     def check(image: Any) -> None:
         if modes is not None and image.mode not in modes:
             raise InputError(f"{path} has mode {image.mode}, not {wanted} in one channel; convert it")
-        alike = abs(image.width * size[1] / (image.height * size[0]) - 1) < SAME_SHAPE
-        if image.size != size and not alike:
-            raise InputError(f"{path} is {_by(image.size)}, its photo {_by(size)}; restore it")
+        same_shape(path, image.size, size)
 
     with opened(path, "add it, or take its folder away to do without", check) as image:
         grey = image if modes is not None or image.mode in DEEP else image.convert("L")
         return nearest(np.asarray(grey), at, size)
+
+
+def fits(found: tuple[int, int], size: tuple[int, int]) -> bool:
+    """Whether (width, height) are those of a photo, or have their shape."""
+    return found == size or abs(found[0] * size[1] / (found[1] * size[0]) - 1) < SAME_SHAPE
+
+
+def same_shape(path: Path, found: tuple[int, int], size: tuple[int, int]) -> None:
+    """Raise InputError where what belongs to a photo has not its shape."""
+    if not fits(found, size):
+        raise InputError(f"{path} is {_by(found)}, its photo {_by(size)}; restore it")
 
 
 def confidences(path: Path) -> np.ndarray:
@@ -91,8 +96,10 @@ def confidences(path: Path) -> np.ndarray:
 
 
 def nearest(values: np.ndarray, at: np.ndarray, size: tuple[int, int]) -> np.ndarray:
-    """The stored pixels [H, W] of `values` [h, w] that hold positions `at` [2, H, W] in a photo of (width, height)."""
-    height, width = values.shape
+    """Those stored pixels [H, W] of `values` [h, w], or [h, w, C], that hold positions `at` [2, H, W] in a photo of
+    (width, height).
+    """
+    height, width = values.shape[:2]
     column = np.clip(np.floor(at[0] * (width / size[0])).astype(int), 0, width - 1)
     row = np.clip(np.floor(at[1] * (height / size[1])).astype(int), 0, height - 1)
     return values[row, column]
@@ -100,60 +107,3 @@ def nearest(values: np.ndarray, at: np.ndarray, size: tuple[int, int]) -> np.nda
 
 def _by(size: tuple[int, int]) -> str:
     return f"{size[0]}x{size[1]}"
-
-
-def label_ids(frame: Frame, listing: Listing, size: tuple[int, int], at: np.ndarray) -> np.ndarray:
-    """Raw ids i32 [H, W] at positions `at` [2, H, W] of a frame's label image, its corrected objects replaced."""
-    assert frame.labels is not None
-    ids = companion(frame.labels, size, at, GREY, "8- or 16-bit ids").astype(np.int32)
-    if frame.objects is not None and listing.corrections:
-        objects = companion(frame.objects, size, at, GREY, "8- or 16-bit ids")
-        for which, value in listing.corrections.items():
-            ids[objects == which] = value
-    return ids
-
-
-def names_by_id(path: Path, entries: Iterable[tuple[Any, Any]]) -> dict[int, str]:
-    """Class names by id, from pairs in a document; ids may be written as text. Raises InputError."""
-    names: dict[int, str] = {}
-    for key, name in entries:
-        try:
-            which = whole(int(key) if isinstance(key, str) else key, 0, MAX_ID)
-        except ValueError as error:
-            raise InputError(f"{path}: a label's id is not usable ({str(error)[:LONGEST]}); correct it") from None
-        if not isinstance(name, str) or not name.strip():
-            raise InputError(f"{path}: label {which} has {shortened(name)} for a name; give a text that is not empty")
-        names[which] = name
-    return names
-
-
-def indexed(
-    raw: np.ndarray, names: dict[int, str] | None, class_names: tuple[str, ...] | None
-) -> tuple[np.ndarray, list[str], list[str]]:
-    """Raw ids [V, H, W] (-1: none) as indices i16 into class names; the names, and notes on what became -1.
-
-    Choices: the classes are those that occur, in the order of their ids, or `class_names` where given. Ids are named
-      by `names`, else by their place in `class_names`, else class_<id> with 0 ignored.
-    Raises:  DataFailure if nothing is left.
-    """
-    counts = sum(np.bincount(view.ravel() + 1, minlength=MAX_ID + 2) for view in raw)
-    present = [int(v) for v in np.flatnonzero(counts) - 1 if v >= 0]
-    known = names if names is not None else dict(enumerate(class_names or ()))
-    if names is None and class_names is None:
-        known = {v: f"class_{v}" for v in present if v != 0}
-    named = {v: known[v] for v in present if v in known and known[v].lower() not in IGNORED}
-    result = list(class_names or dict.fromkeys(named.values()))
-    notes = []
-    if nameless := [str(v) for v in present if v not in known and v != 0]:
-        notes.append(f"Label ids without a name are ignored: {', '.join(nameless)}.")
-    if foreign := sorted(set(named.values()) - set(result)):
-        notes.append(f"Labels that are not among the class names are ignored: {', '.join(foreign)}.")
-    table = np.full(MAX_ID + 2, -1, np.int16)
-    for value, name in named.items():
-        table[value + 1] = result.index(name) if name in result else -1
-    if (table < 0).all():
-        raise DataFailure(f"no label has a name (ids {present[:8]}); give names, or take the labels away")
-    labels = np.empty(raw.shape, np.int16)
-    for k, view in enumerate(raw):  # one by one: a copy of all would be the largest thing in memory
-        labels[k] = table[view + 1]
-    return labels, result, notes

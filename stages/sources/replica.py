@@ -10,12 +10,11 @@ import numpy as np
 
 from chebsplat.errors import InputError
 from chebsplat.formats.images import header
-from chebsplat.stages.sources import assembly, cameras, common, texts
+from chebsplat.stages.sources import assembly, cameras, common, labels, texts
 from chebsplat.stages.sources.common import Frame, Listing
-from chebsplat.stages.sources.pictures import names_by_id
 
 VOID = 0  # Semantic-NeRF's id of pixels without a class
-SEQUENCE = "Sequence_1"
+SEQUENCE, CLASSES = "Sequence_1", "semantic_class"
 SCALES = (0.1, 1e6)  # stored units in one scene unit: depth stays below 1e6, and is never rounded to 0
 
 
@@ -25,18 +24,18 @@ def read(folder: Path, settings: Any, class_names: tuple[str, ...] | None = None
 
 
 def probe(folder: Path) -> dict[str, bool]:
-    """Light: reads names only. What some image has, every image must have: `read` fails otherwise."""
+    """Light: reads names only. Depth that some image has, every image must have: `read` fails otherwise."""
     if (folder / "results").is_dir():
         depth = any(name.startswith("depth") for name in common.names_below(folder / "results"))
         return {"poses": True, "depth": depth, "labels": False}
-    depth, labels = (any(common.names_below(folder / SEQUENCE / part)) for part in ("depth", "semantic_class"))
-    return {"poses": True, "depth": depth, "labels": labels}
+    depth, labelled = (any(common.names_below(folder / SEQUENCE / part)) for part in ("depth", CLASSES))
+    return {"poses": True, "depth": depth, "labels": labelled}
 
 
 def files(folder: Path) -> list[Path]:
     """Trajectory, camera, class names, and every image, depth and label."""
     tables = [folder / "traj.txt", folder / SEQUENCE / "traj_w_c.txt", *_parameter_files(folder), *_class_files(folder)]
-    places = [folder / "results", *(folder / SEQUENCE / part for part in ("rgb", "depth", "semantic_class"))]
+    places = [folder / "results", *(folder / SEQUENCE / part for part in ("rgb", "depth", CLASSES))]
     data = [place / name for place in places for name in common.names_below(place)]
     return sorted([*(path for path in tables if common.present(path)), *data])
 
@@ -122,6 +121,8 @@ def _semantic_nerf(folder: Path) -> Listing:
     camera = cameras.camera_of(sequence, "PINHOLE", (width / 2, width / 2, width / 2, height / 2), width, height)
     has = probe(folder)
     names = [common.stem(name) for name in images]
+    of_labels = [name.replace("rgb", CLASSES, 1) for name in names]
+    maps = labels.of_views(sequence / CLASSES, of_labels) if has["labels"] else {}
     frames = []
     for name, image, pose in zip(names, images, _trajectory(sequence / "traj_w_c.txt", names), strict=True):
         n = name.removeprefix("rgb_")
@@ -132,10 +133,11 @@ def _semantic_nerf(folder: Path) -> Listing:
                 camera,
                 pose,
                 sequence / f"depth/depth_{n}.png" if has["depth"] else None,
-                sequence / f"semantic_class/semantic_class_{n}.png" if has["labels"] else None,
+                maps.get(f"{CLASSES}_{n}"),
             )
         )
-    return Listing("replica", frames, _class_names(folder), notes=["Replica as Semantic-NeRF renders it."])
+    classes = _class_names(folder)
+    return Listing("replica", frames, classes, CLASSES, notes=["Replica as Semantic-NeRF renders it."])
 
 
 def _class_names(folder: Path) -> dict[int, str] | None:
@@ -147,5 +149,5 @@ def _class_names(folder: Path) -> dict[int, str] | None:
         pairs = [(entry["id"], entry["name"]) for entry in texts.read_json(path)["classes"]]
     except (KeyError, TypeError) as error:
         raise InputError(f"{path} lacks classes with id and name ({error}); restore the file") from None
-    names = names_by_id(path, pairs)
+    names = labels.names_by_id(path, pairs)
     return {k: name for k, name in names.items() if k != VOID}

@@ -1,4 +1,6 @@
-"""ScanNet as two groups lay it out: Semantic Gaussians (SG: points3d.ply) and Panoptic Lifting (PL: splits.json)."""
+"""ScanNet as its own tools export it, and as two groups lay it out: Semantic Gaussians (SG: points3d.ply and a table of
+20 classes) and Panoptic Lifting (PL: splits.json).
+"""
 
 from __future__ import annotations
 
@@ -11,7 +13,7 @@ from chebsplat.errors import InputError
 from chebsplat.evaluation.protocols import scannet_closed, scannet_open
 from chebsplat.formats.images import header
 from chebsplat.formats.points import read_cloud
-from chebsplat.stages.sources import assembly, cameras, common, texts
+from chebsplat.stages.sources import assembly, cameras, common, labels, texts
 from chebsplat.stages.sources.cameras import Camera
 from chebsplat.stages.sources.common import Frame, Listing, present
 from chebsplat.stages.sources.texts import LONGEST, read_table
@@ -22,6 +24,12 @@ POINTS = "points3d.ply"
 PSEUDO, CONFIDENCE = "m2f_semantics", "m2f_probabilities"  # of Mask2Former with test-time augmentation
 OF_PL = ("splits.json", "segmentation_data.pkl", "rs_semantics", "m2f_semantics")  # never in an SG folder
 MODIFIED, COMBINED = "scannetv2-labels.modified.tsv", "scannet-labels.combined.tsv"
+OWN = "scannetv2-labels.combined.tsv"  # ScanNet's, of which COMBINED is PL's copy
+NYU = ("wall", "floor", "cabinet", "bed", "chair", "sofa", "table", "door", "window", "bookshelf", "picture", "counter",
+       "blinds", "desk", "shelves", "curtain", "dresser", "pillow", "mirror", "floor mat", "clothes", "ceiling",
+       "books", "refrigerator", "television", "paper", "towel", "shower curtain", "box", "whiteboard", "person",
+       "night stand", "toilet", "sink", "lamp", "bathtub", "bag", "otherstructure", "otherfurniture",
+       "otherprop")  # fmt: skip
 OTHER = "otherprop"  # SG's id 0: known and ignored
 CORRECTED = 60_000  # plus an NYU class: raw ids of hand-corrected objects, above all of ScanNet's
 # Objects that the authors of Panoptic Lifting relabel by hand, as ScanNet has them wrong: object id -> NYU class.
@@ -39,10 +47,7 @@ CORRECTIONS: dict[str, dict[int, int]] = {
 
 
 def read(folder: Path, settings: Any, class_names: tuple[str, ...] | None = None) -> dict[str, Any]:
-    """The fields of a capture; SG's `points` and `point_colors`, PL's `is_test`.
-
-    Raises:  InputError where points3d.ply is missing: random points in its place would be another experiment.
-    """
+    """The fields of a capture; SG's `points` and `point_colors`, PL's `is_test`."""
     listing = _listing(folder)
     reduced = _is_reduced(folder)
     split = _split(folder / "splits.json") if reduced else None
@@ -55,27 +60,28 @@ def read(folder: Path, settings: Any, class_names: tuple[str, ...] | None = None
     fields = assembly.assemble(listing, settings, class_names)
     if split is not None:
         assembly.give_split(fields, split[1], "splits.json")
-    if not reduced:
+    if not reduced and common.present(folder / POINTS):
         fields["points"], fields["point_colors"] = read_cloud(folder / POINTS)
     return fields
 
 
 def probe(folder: Path) -> dict[str, bool]:
-    """Light: reads names only. What some frame has, every frame must have: `read` fails otherwise."""
+    """Light: reads names only. Depth that some frame has, every frame must have: `read` fails otherwise."""
     return {"poses": True, "depth": any(common.names_below(folder / "depth")),
             "labels": _labels_folder(folder) is not None, "pseudo_labels": _has_pseudo_labels(folder)}  # fmt: skip
 
 
 def files(folder: Path) -> list[Path]:
     """Poses, intrinsics, points, split, label table, and every image, depth, label and object image."""
-    labels, table = _labels_folder(folder), _table(folder)
-    places = ["color", "depth", *([labels] if labels else []), *(["instance"] if labels == "semantics" else [])]
-    data = [folder / place / name for place in places for name in common.names_below(folder / place)]
+    place, table = _labels_folder(folder), _table(folder)
+    places = ["color", "depth", *(["instance"] if place == "semantics" else [])]
+    data = [folder / of / name for of in places for name in common.names_below(folder / of)]
+    data += [folder / place / name for name in labels.files_below(folder / place)] if place else []
     texts = [path for place in ("pose", "intrinsic") for path in (folder / place).glob("*.txt")]
     if _has_pseudo_labels(folder):
         data += [folder / PSEUDO / name for name in common.names_below(folder / PSEUDO)]
         texts += list((folder / CONFIDENCE).glob("*.npz"))
-    single = [folder / name for name in (POINTS, "splits.json") if common.present(folder / name)]
+    single = [folder / name for name in (POINTS, "splits.json", *labels.NAMES) if common.present(folder / name)]
     return sorted([*data, *texts, *single, *([table] if table is not None and common.present(table) else [])])
 
 
@@ -89,17 +95,46 @@ def _is_reduced(folder: Path) -> bool:
 
 
 def _labels_folder(folder: Path) -> str | None:
-    wanted = ("rs_semantics", "semantics") if _is_reduced(folder) else ("label-filt",)
-    return next((place for place in wanted if any(common.names_below(folder / place))), None)
+    wanted = ("rs_semantics", "semantics") if _is_reduced(folder) else ("label-filt", *common.LABELS)
+    return labels.place_in(folder, wanted)
 
 
 def _table(folder: Path) -> Path | None:
-    """The table of ScanNet's ids that the labels need; where it is missing, the place where it should be."""
-    place = _labels_folder(folder)
-    if place in (None, "rs_semantics"):
+    """The nearest table that ScanNet's ids may be looked up in; where there is none, the place where it should be."""
+    wanted = (COMBINED,) if _labels_folder(folder) == "semantics" else (MODIFIED, OWN, COMBINED)
+    if _labels_folder(folder) in (None, "rs_semantics"):
         return None
-    name = COMBINED if place == "semantics" else MODIFIED
-    return common.nearest_file(folder, name) or folder / name
+    return next(filter(None, (common.nearest_file(folder, name) for name in wanted)), folder / wanted[0])
+
+
+def _give_names(listing: Listing, folder: Path, place: str) -> None:
+    """Name the ids of a label folder.
+
+    Choices: those of labels.json go first. In label/ and the like ids of 16 bits are ScanNet's own, those of 8 bits
+      NYU's 40, as the set of 25,000 frames has them.
+    """
+    maps = [frame.labels for frame in listing.frames if isinstance(frame.labels, Path)]
+    own = labels.names_in(folder)
+    if place == "rs_semantics":
+        listing.label_names = dict(enumerate(("void", *scannet_closed.CLASSES)))
+    elif place == "semantics":
+        listing.label_names, listing.corrections = reduced_names(_table(folder), folder.resolve().name)
+        if listing.corrections:
+            listing.notes.append(f"{len(listing.corrections)} objects take the hand-corrected labels of this scene.")
+    elif own is not None:
+        listing.label_names, listing.class_names = own, None
+    elif place != "label-filt" and maps and not labels.is_deep(maps[0]):
+        listing.label_names, listing.class_names = dict(enumerate(("void", *NYU))), None
+        listing.notes.append(f"Ids of {place}/ have 8 bits and are taken for NYU's 40 classes.")
+    elif (table := _table(folder)) is not None and table.name != MODIFIED:
+        nyu = _column(table, OWN, "nyu40id", 41, empty=40)
+        listing.label_names, listing.class_names = (
+            {raw: ("void", *NYU)[k] for raw, k in nyu.items()} | {0: "void"},
+            None,
+        )
+        listing.notes.append(f"Classes are NYU's 40, of {table.name}; scannet-open has 20, of {MODIFIED}.")
+    else:
+        listing.label_names = mapped(table)
 
 
 def _camera(folder: Path, kind: str, size: tuple[int, int], sensor: int) -> Camera:
@@ -140,6 +175,7 @@ def _listing(folder: Path) -> Listing:
     size, _ = header(folder / "color" / images[0])
     camera = _camera(folder, "color", size, SENSOR)
     has, place = probe(folder), _labels_folder(folder)
+    maps = labels.of_views(folder / place, names) if place else {}
     pseudo = has["pseudo_labels"]
     frames = [
         Frame(
@@ -148,8 +184,8 @@ def _listing(folder: Path) -> Listing:
             camera,
             pose,
             folder / f"depth/{name}.png" if has["depth"] else None,
-            folder / f"{place}/{name}.png" if place else None,
-            objects=folder / f"instance/{name}.png" if place == "semantics" else None,
+            maps.get(name),
+            objects=folder / f"instance/{name}.png" if place == "semantics" and name in maps else None,
             pseudo_labels=folder / f"{PSEUDO}/{name}.png" if pseudo else None,
             confidence=folder / f"{CONFIDENCE}/{name}.npz" if pseudo else None,
         )
@@ -158,24 +194,20 @@ def _listing(folder: Path) -> Listing:
     reduced = _is_reduced(folder)
     protocol = scannet_closed if reduced else scannet_open
     listing = Listing("scannet", frames, class_names=protocol.CLASSES if place or pseudo else None)
-    by_id = dict(enumerate(("void", *scannet_closed.CLASSES)))
-    listing.pseudo_names = by_id if pseudo else None
+    listing.pseudo_names = dict(enumerate(("void", *scannet_closed.CLASSES))) if pseudo else None
     intrinsics = folder / "intrinsic/intrinsic_color.txt"
     listing.notes += texts.skew_note(intrinsics, texts.read_matrix(intrinsics))
     listing.notes.append(f"ScanNet as {'Panoptic Lifting' if reduced else 'Semantic Gaussians'} lays it out.")
+    if not reduced and not common.present(folder / POINTS):
+        listing.notes[-1] = f"ScanNet as its own tools export it, without {POINTS}: points are of depth, or matched."
     if extra := sum(path.stem not in set(names) for path in (folder / "pose").glob("*.txt")):
         listing.notes.append(f"{extra} poses have no image in color/ and are left out.")
     if has["depth"] and common.present(folder / "intrinsic/intrinsic_depth.txt"):
         depth_size, _ = header(folder / f"depth/{names[0]}.png")
         listing.depth_camera = _camera(folder, "depth", depth_size, depth_size[0])
-    if place == "rs_semantics":
-        listing.label_names = by_id
-    elif place == "semantics":
-        listing.label_names, listing.corrections = reduced_names(_table(folder), folder.resolve().name)
-        if listing.corrections:
-            listing.notes.append(f"{len(listing.corrections)} objects take the hand-corrected labels of this scene.")
-    elif place == "label-filt":
-        listing.label_names = mapped(_table(folder))
+    if place:
+        listing.label_place = place
+        _give_names(listing, folder, place)
     others = ("segmentation_data.pkl", "m2f_invalid", *(() if pseudo else (PSEUDO, CONFIDENCE)))
     if unused := [name for name in others if (folder / name).exists()]:
         listing.notes.append(f"Not read: {', '.join(unused)}.")

@@ -11,8 +11,9 @@ import numpy as np
 
 from chebsplat.errors import InputError
 from chebsplat.formats.images import header, is_image
+from chebsplat.formats.names import few
 from chebsplat.formats.points import read_cloud
-from chebsplat.stages.sources import assembly, cameras, common
+from chebsplat.stages.sources import assembly, cameras, common, labels
 from chebsplat.stages.sources.cameras import Camera
 from chebsplat.stages.sources.colmap import LEAST
 from chebsplat.stages.sources.common import Frame, Listing
@@ -42,7 +43,7 @@ class Entry(NamedTuple):
 
 
 def read(folder: Path, settings: Any, class_names: tuple[str, ...] | None = None) -> dict[str, Any]:
-    """The fields of a capture. `class_names` is of no use here: the format has no labels.
+    """The fields of a capture; its labels are those of maps beside the document (`labels.give`).
 
     Choices: the points of `ply_file_path` are taken unless there is depth, which gives more. Test views are those of
       nerfstudio's lists (test and validation), or of transforms_test.json, of transforms_val.json where there is none.
@@ -71,16 +72,17 @@ def probe(folder: Path) -> dict[str, bool]:
     if depth:
         present, _ = _present(folder, entries)
         depth = bool(present) and all(entry.values.get("depth_file_path") for entry, _ in present)
-    return {"poses": True, "depth": depth, "labels": False}
+    return {"poses": True, "depth": depth, "labels": labels.place_in(folder) is not None}
 
 
 def files(folder: Path) -> list[Path]:
-    """The JSON, the points, and every image, depth and mask of a frame that is on disk."""
+    """The JSON, the points, label maps and their names, and every image, depth and mask of a frame that is on disk."""
     entries = _entries(folder)
     present, _ = _present(folder, entries)
     beside = [path for entry, _ in present for part in PARTS[1:] if (path := _part(folder, entry, part))]
     beside += [sure for path in beside if (sure := common.sureness(path))]
     cloud = _cloud(folder, entries[0])
+    beside += [*labels.files(folder), *(folder / name for name in labels.NAMES if common.present(folder / name))]
     return sorted([*_documents(folder), *(Path(image) for _, image in present), *beside, *([cloud] if cloud else [])])
 
 
@@ -210,14 +212,16 @@ def _listing(folder: Path, entries: list[Entry]) -> Listing:
     notes = []
     if absent:
         total = len(absent) + len(present)
-        notes.append(f"{len(absent)} of {total} listed frames are absent on disk ({common.few(absent)}).")
+        notes.append(f"{len(absent)} of {total} listed frames are absent on disk ({few(absent)}).")
         used = {image for _, image in present}
         there = [name for name in common.names_below(folder) if name.partition("/")[0] not in common.BESIDE]
         if others := [name for name in there if os.path.join(folder, name) not in used]:
-            notes.append(f"Images that no frame lists: {common.few(others)}.")
+            notes.append(f"Images that no frame lists: {few(others)}.")
     if elsewhere := sum(frame.name != _name(os.path.relpath(frame.image, folder)) for frame in frames):
         notes.append(f"{elsewhere} photos have another path on disk than is listed, and are told by their names.")
-    return Listing("transforms", frames, notes=notes + _unused(folder, entries, frames))
+    listing = Listing("transforms", frames, notes=notes + _unused(folder, entries, frames))
+    labels.give(listing, folder)
+    return listing
 
 
 def _unused(folder: Path, entries: list[Entry], frames: list[Frame]) -> list[str]:

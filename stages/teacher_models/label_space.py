@@ -12,7 +12,8 @@ import numpy as np
 from chebsplat.errors import ConfigError, InputError
 from chebsplat.formats.teacher_model import read_label_set, read_label_table
 from chebsplat.labels.decode import class_codes, decode
-from chebsplat.stages.teacher_models.text_encoder import folded, text_embeddings
+from chebsplat.labels.names import folded, joined
+from chebsplat.stages.teacher_models.text_encoder import text_embeddings
 
 if TYPE_CHECKING:
     import numpy as np
@@ -110,8 +111,8 @@ def closed_set(teacher: TeacherModel, labels: dict[str, list[str]] | None, n_cha
             f"{teacher.path} gives {n_channels} channels, {teacher.labels} names {len(classes)} classes; name every "
             "channel in order"
         )
-    label_of = {word.lower(): name for name, group in (labels or {}).items() for word in group}
-    named = [label_of.get(word.lower(), word) for word in classes]
+    label_of = {joined(word): name for name, group in (labels or {}).items() for word in group}
+    named = [label_of.get(joined(word), word) for word in classes]
     absent = [name for name in labels or {} if name not in named]
     if absent:
         raise InputError(f"no class of {teacher.labels} is called {absent[0]} or one of its synonyms; correct the file")

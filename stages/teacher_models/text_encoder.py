@@ -14,6 +14,7 @@ import numpy as np
 from chebsplat.errors import InputError
 from chebsplat.formats.names import suggest
 from chebsplat.formats.teacher_model import read_label_table
+from chebsplat.labels.names import folded, rows_of
 from chebsplat.stages.teacher_models.onnx_session import Model
 
 if TYPE_CHECKING:
@@ -54,12 +55,8 @@ def text_embeddings(names: list[str], teacher: TeacherModel) -> np.ndarray:
 def found(names: list[str], known: list[str], last_word: bool = True) -> list[int]:
     """Where each name stands among those known, -1 where it does not; looked up as in a table of labels."""
     row = {folded(name): k for k, name in reversed(list(enumerate(known)))}  # the first of equal ones
-    return [next((row[form] for form in forms(name, last_word) if form in row), -1) for name in names]
-
-
-def folded(name: str) -> str:
-    """A name as it is compared."""
-    return " ".join(name.lower().replace("_", " ").replace("-", " ").split())
+    tight = zip(names, rows_of(names, known), strict=True)
+    return [next((row[form] for form in forms(name, last_word) if form in row), place) for name, place in tight]
 
 
 def forms(name: str, last_word: bool = True) -> Iterator[str]:

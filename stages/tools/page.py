@@ -23,8 +23,8 @@ from chebsplat.formats.splats import read_splats
 from chebsplat.formats.teacher_model import EMBEDDED, read_label_set, read_label_table, read_teacher
 from chebsplat.formats.world import HERE, World
 from chebsplat.labels.calibration import Calibration
+from chebsplat.labels.names import folded
 from chebsplat.stages.pages.parts import rendered
-from chebsplat.stages.teacher_models.text_encoder import folded
 from chebsplat.stages.tools.query import are_words, embedded, is_closed, taught, teacher_of, understood
 from chebsplat.stages.tools.up import Up, up_of
 

@@ -15,7 +15,8 @@ from chebsplat.formats.features import Features
 from chebsplat.formats.names import suggest
 from chebsplat.formats.teacher_model import EMBEDDED, TeacherModel, read_label_table, read_teacher
 from chebsplat.labels.calibration import CUT, Calibration, presence, probability, relevancy
-from chebsplat.stages.teacher_models.text_encoder import folded, found, text_embeddings
+from chebsplat.labels.names import folded
+from chebsplat.stages.teacher_models.text_encoder import found, text_embeddings
 
 log = logging.getLogger("chebsplat")
 

@@ -18,6 +18,7 @@ from chebsplat.formats.ply import write_ply
 from chebsplat.formats.scene import Scene
 from chebsplat.formats.world import World
 from chebsplat.labels.decode import decode_labels
+from chebsplat.labels.names import lacking, rows_of
 from chebsplat.render import SceneRenderer
 from chebsplat.splats.gaussians import surface_of
 from chebsplat.stages.tools.query import Query, Relevancy, understood
@@ -232,9 +233,8 @@ def has_label(scene: Scene, path: Path, names: tuple[str, ...]) -> np.ndarray:
     if scene.labels is None or scene.label_names is None:
         why = scene.summary.get("left_out", {}).get("labels", "it has no semantics")
         raise ConfigError(f"{path} has no labels: {why}")
-    for name in names:
-        if name not in scene.label_names:
-            near = suggest(name, scene.label_names, 1)
-            advice = f"did you mean {near[0]}?" if near else f"there are: {', '.join(scene.label_names)}"
-            raise ConfigError(f"no label is called {name}; {advice}")
-    return np.isin(scene.labels, [scene.label_names.index(name) for name in names])
+    for name in lacking(names, scene.label_names):
+        near = suggest(name, scene.label_names, 1)
+        advice = f"did you mean {near[0]}?" if near else f"there are: {', '.join(scene.label_names)}"
+        raise ConfigError(f"no label is called {name}; {advice}")
+    return np.isin(scene.labels, rows_of(names, scene.label_names))

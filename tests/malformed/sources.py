@@ -144,10 +144,28 @@ def companions() -> Iterator[Row]:
     depth, labels = "depth/b.png", "semantic/b.png"
     cases += [
         (depth, "missing", remove(depth), "is missing"),
-        (labels, "missing", remove(labels), "is missing"),
         (depth, "8 bits", picture(depth, mode="L"), "16-bit depth"),
         (depth, "coloured", picture(depth), "16-bit depth"),
-        (labels, "coloured", picture(labels), "ids in one channel"),
+        (labels, "of a photo", picture(labels, form="JPEG"), "is a JPEG picture"),
+        (labels, "an array beside it", put("semantic/b.npy", npy(np.zeros((6, 8), np.uint8))), "are both view"),
+        ("semantic/", "one is coloured", picture(labels), "several kinds: colours (b), ids (a, c)"),
+        (
+            "semantic/",
+            "of other photos",
+            all_of(*(remove(f"semantic/{n}.png") for n in "abc"), picture("semantic/z.png")),
+            "none is called like a photo",
+        ),
+        *(
+            (path, what, all_of(remove(labels), put(path, npy(values))), word)
+            for path, what, values, word in (
+                ("semantic/b.npy", "of a photo's transpose", np.zeros((8, 6), np.uint8), "is 6x8, its photo 8x6"),
+                ("semantic/b.npy", "halves", np.full((6, 8), 0.5), "no ids"),
+                ("semantic/b.npy", "nan", np.full((6, 8), NAN), "not finite"),
+                ("semantic/b.npy", "scores of another shape", np.zeros((4, 4, 4)), "has not the shape"),
+                ("semantic/b.npy", "words", np.array(["sofa"]), "neither ids nor scores"),
+            )
+        ),
+        ("semantic/b.npy", "cut short", all_of(remove(labels), put("semantic/b.npy", b"\x93NUMPY")), "not a readable"),
     ]
     yield from met(write_companions, cases)
     heavy: list[Case] = [(f"{place}/b.png", "10,000 million pixels", declared_png(100_000, 100_000, 0), "too large")
@@ -397,7 +415,7 @@ def replica() -> Iterator[Row]:
         entry = {"id": value, "name": "a"}
         cases.append((CLASSES, f"an id of {value}", keys(CLASSES, classes=[entry]), "a label's id is not usable"))
     cases.append((CLASSES, "no name", keys(CLASSES, classes=[{"id": 1, "name": ""}]), "label 1 has ''"))
-    for name in ("traj_w_c.txt", "semantic_class/semantic_class_2.png", "depth/depth_2.png"):
+    for name in ("traj_w_c.txt", "depth/depth_2.png"):
         cases.append((f"Sequence_1/{name}", "missing", remove(f"Sequence_1/{name}"), "is missing"))
     yield from met(write_nerf, cases)
     strangers = keys(CLASSES, classes=[{"id": 9, "name": "wall"}])
@@ -464,7 +482,7 @@ def scannet() -> Iterator[Row]:
         *((POINTS, what, content, word) for what, content, word in clouds),
         *((TABLE, what, text, word) for what, text, word in tables),
         *((place, "missing", remove(place), "is missing")
-          for place in (pose, intrinsics, "label-filt/20.png", TABLE, POINTS)),
+          for place in (pose, intrinsics, TABLE)),
     ]  # fmt: skip
     yield from met(write_sg, cases)
     bombs = {"10^12 points": header(10**12) + coordinates(), "10^12 points as text": header(10**12, "ascii 1.0"),

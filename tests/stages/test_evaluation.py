@@ -17,6 +17,7 @@ from chebsplat.formats.evaluation import Evaluation
 from chebsplat.formats.features import Features
 from chebsplat.formats.scene import Scene
 from chebsplat.pipelines.planning.plan import Planner
+from chebsplat.pipelines.work import summary
 from chebsplat.render import SceneRenderer, frame_parts
 from chebsplat.stages.evaluate import camera
 from chebsplat.stages.measuring.image_quality import image_figures, perceptual
@@ -197,6 +198,39 @@ def test_points_are_measured_where_depth_and_poses_say_where_they_lie(toy, tmp_p
     assert figures["segmentation"]["scene"]["point_miou"] is None
     assert "depth" in figures["left_out"]["3D point mIoU"]
     assert figures["segmentation"]["scene"]["miou"] == measured["scene"]["miou"]
+
+
+@pytest.mark.xdist_group("toy")
+def test_names_are_matched_however_they_are_spelt_and_the_end_of_a_run_lists_what_matches_nothing(toy, tmp_path):
+    record, wanted = Capture.read(toy["ingest"]), Evaluation.read(toy["evaluate"]).figures["segmentation"]
+    own = record.class_names
+    for k, names in enumerate(([name.upper().replace("-", "_") for name in own], ["my own word", *own[1:]])):
+        record.class_names = names
+        inputs = inputs_of(toy, "evaluate") | {"capture": published(tmp_path / f"c{k}", record)}
+        assert run_stage("evaluate", tmp_path / f"out{k}", inputs) == 0
+        found = Evaluation.read(tmp_path / f"out{k}").figures["segmentation"]
+        shown = {row[0]: row[1:] for row in summary.table(tmp_path / f"out{k}")}
+        assert "classes" in shown["mIoU"][1] and "pixels" in shown["mIoU"][1]
+        if k == 0:
+            assert found["scene"]["miou"] == wanted["scene"]["miou"] and found["unmatched"] == {}
+        else:
+            assert found["scene"]["miou"] < wanted["scene"]["miou"]
+            assert found["unmatched"] == {"scene": own[:1], "truth": ["my own word"]}
+            assert shown["true classes without a label"] == ("1", "my own word")
+            assert shown["labels that are no class"] == ("1", own[0])
+
+
+@pytest.mark.xdist_group("toy")
+def test_a_truth_of_one_class_gives_no_miou_and_says_why(toy, tmp_path):
+    record = Capture.read(toy["ingest"])
+    record.labels = np.where(np.asarray(record.labels[:]) == 0, np.int16(0), np.int16(-1))
+    inputs = inputs_of(toy, "evaluate") | {"capture": published(tmp_path / "c", record)}
+    assert run_stage("evaluate", tmp_path / "out", inputs) == 0
+    figures = Evaluation.read(tmp_path / "out").figures
+    assert figures["segmentation"]["scene"]["miou"] is None
+    assert "one class alone" in figures["left_out"]["mIoU"]
+    shown = {row[0]: row[1:] for row in summary.table(tmp_path / "out")}
+    assert shown["mIoU"] == ("none", figures["left_out"]["mIoU"])
 
 
 @pytest.mark.slow

@@ -26,6 +26,11 @@ def test_elsewhere_lines_are_logged_now_and_then_and_at_the_end(caplog):
     assert [record.getMessage().split("  ")[0] for record in caplog.records] == ["work 3/3"]
 
 
+def test_without_stderr_there_is_no_bar_and_no_crash(monkeypatch):
+    monkeypatch.setattr("sys.stderr", None)
+    assert Progress().show is False
+
+
 def test_records_become_lines_of_json(tmp_path):
     progress = Progress(show=False)
     with progress.log_to(tmp_path / "log.jsonl"):

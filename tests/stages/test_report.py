@@ -22,7 +22,7 @@ from chebsplat.formats.evaluation import Evaluation
 from chebsplat.formats.manifest import Manifest
 from chebsplat.stages import report
 from chebsplat.stages.pages import pictures as draw
-from chebsplat.stages.pages.parts import class_rows, label_names, legend, picture_rows
+from chebsplat.stages.pages.parts import beside_truth, class_rows, label_names, legend, picture_rows
 from chebsplat.stages.training.defaults import DEFAULTS
 
 pytestmark = pytest.mark.xdist_group("toy")
@@ -112,6 +112,22 @@ def test_classes_are_listed_best_first_and_those_that_never_occur_are_not():
     figures = {"segmentation": {"scene": {"iou": iou}, "teacher": {"iou": {"wall": 0.5}}}}
     rows = class_rows(figures, {"wall": "#1", "sofa": "#2"})
     assert rows == [("sofa", "#2", 0.9, None), ("wall", "#1", 0.2, 0.5)]
+
+
+def test_true_classes_stand_beside_the_scene_s_labels_and_what_they_are_taken_for(toy, tmp_path):
+    held = Evaluation.read(toy["evaluate"])
+    truth = np.array([[[0, 0, 0, 0, 1, 1, -1, 2]]], np.int16)
+    taken = np.array([[[0, 0, 1, -1, 1, 0, 0, 2]]], np.int16)
+    held.pictures = {"labels": truth, "predicted": taken}
+    names = ["wall", "floor", "lamp", "bed"]
+    with publish(tmp_path / "scene", Manifest("chebsplat.scene/1", KEY, "export", {}, {}, 0)) as out:
+        (out / "labels.json").write_text(json.dumps({"0": "Floor", "1": "WALL"}))
+    wall, floor, lamp = beside_truth(held, names, {"scene": tmp_path / "scene"})
+    assert [row["label"] for row in (wall, floor, lamp)] == ["WALL", "Floor", None]
+    assert [row["share"] for row in (wall, floor, lamp)] == [4 / 7, 2 / 7, 1 / 7]
+    assert wall["taken"] == [("wall", 0.5), ("floor", 0.25), ("lamp", 0), ("anything else", 0.25)]
+    assert floor["taken"] == [("wall", 0.5), ("floor", 0.5), ("lamp", 0), ("anything else", 0)]
+    assert "Labels beside the truth" in (toy["report"] / "report.html").read_text()
 
 
 def test_error_pictures_show_where_it_is_wrong_and_nowhere_else():

@@ -1,6 +1,7 @@
 """A disk that is full, read-only or not ours ends a command with exit code 4, the file, the bytes and no traceback."""
 
 import errno
+import json
 import os
 import re
 import subprocess
@@ -8,11 +9,12 @@ import sys
 from types import SimpleNamespace
 
 import pytest
-from shared import ROOT
+from shared import ROOT, TOY
 from soak.disk import namespace
 
 from chebsplat.errors import DiskFailure, InputError
 from chebsplat.formats import artifact, files
+from chebsplat.formats.capture import Capture
 from chebsplat.formats.manifest import Manifest
 from chebsplat.pipelines.running.run import failures
 from chebsplat.stages.training.saves import Saves
@@ -59,6 +61,36 @@ def test_a_home_folder_that_takes_nothing_stops_no_run(tmp_path, monkeypatch):
     monkeypatch.setenv("CHEBSPLAT_WORK", str(tmp_path / "work"))
     done = on_a_disk(tmp_path / "home", "ro", "run", "--scene", "toy", "--stage", "ingest")
     assert done.returncode == 0, done.stderr
+
+
+def in_a_shell(folder, words, buffered=""):
+    """A `chebsplat` command in a shell, whose streams `words` may redirect; its work folder is `folder`."""
+    env = os.environ | {"CHEBSPLAT_WORK": str(folder), "PYTHONUNBUFFERED": buffered, "PYTHONPATH": str(ROOT)}
+    command = f"{sys.executable} -P -m chebsplat.pipelines.cli {words}"
+    return subprocess.run(["sh", "-c", command], cwd=folder, env=env, capture_output=True, text=True)
+
+
+@pytest.mark.parametrize(
+    ("words", "buffered"),
+    [("settings", "1"), ("settings --help", ""), ("--help", "1"), ("ingest --config toy.json --out made", "")],
+)
+def test_a_full_standard_output_is_named_and_no_folder_is_blamed(tmp_path, words, buffered):
+    (tmp_path / "toy.json").write_text(json.dumps(TOY))
+    done = in_a_shell(tmp_path, f"{words} > /dev/full", buffered)
+    assert done.returncode == 4 and "Traceback" not in done.stderr
+    assert done.stderr.count("standard output cannot be written (No space left on device)") == 1
+    assert str(tmp_path) not in done.stderr
+    if "made" in words:
+        artifact.verify(tmp_path / "made", Capture.SCHEMA)
+
+
+@pytest.mark.parametrize(("closed", "printed"), [("2>&-", "{}/made\n"), ("<&- >&- 2>&-", "")])
+def test_closed_streams_keep_nothing_from_being_made_and_no_file_takes_their_place(tmp_path, closed, printed):
+    (tmp_path / "toy.json").write_text(json.dumps(TOY))
+    done = in_a_shell(tmp_path, f"ingest --config toy.json --out made {closed}")
+    assert (done.returncode, done.stdout) == (0, printed.format(tmp_path))
+    artifact.verify(tmp_path / "made", Capture.SCHEMA)
+    assert in_a_shell(tmp_path, f"settings nonsense {closed}").returncode == 2
 
 
 def test_a_full_disk_is_recognised_behind_a_library_s_own_error(tmp_path):

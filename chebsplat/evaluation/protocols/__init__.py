@@ -9,7 +9,8 @@ parameters go with every figure. Every module has
     OWN_SPLIT    whether a source's own split goes first
     ON_TRAINING  whether the training views are evaluated, and none is held out
     TRUTH        "labels" of the capture, or "teacher": the teacher's own
-    measure(views, task) -> dict with `classes` and `scene`, and `teacher` where the truth is the capture's
+    measure(views, task) -> dict with `classes`, `scene` and what its mIoU rests on (`task.counted`), by name of the
+                 figure; `teacher` where the truth is the capture's
     over_scenes(scenes) -> dict, where figures of several scenes together are no plain mean of every run's
 """
 

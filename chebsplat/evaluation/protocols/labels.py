@@ -17,7 +17,7 @@ from typing import Any
 import numpy as np
 
 from chebsplat.evaluation.metrics import IGNORE, boundary_band, confusion, segmentation, thinned
-from chebsplat.evaluation.protocols.task import EvaluatedView, Task, predicted
+from chebsplat.evaluation.protocols.task import EvaluatedView, Task, counted, mean_over, predicted
 from chebsplat.labels.decode import decode_labels
 
 NAME = "labels"
@@ -28,7 +28,9 @@ PER_VIEW = 40_000  # pixels of a view that become points, about, on a regular gr
 
 
 def measure(views: Iterable[EvaluatedView], task: Task) -> dict[str, Any]:
-    """mIoU (of pixels, boundary pixels and points), mAcc, OA, IoU by class: of the scene, and of its teacher."""
+    """mIoU (of pixels, boundary pixels and points), mAcc, OA, IoU by class: of the scene, and of its teacher; and what
+    each mIoU rests on (`task.counted`).
+    """
     n = len(task.classes)
     sums: dict[str, np.ndarray] = {}
     points: list[tuple[np.ndarray, ...]] = []  # (position, truth, teacher's label) of a view's pixels with both
@@ -47,14 +49,16 @@ def measure(views: Iterable[EvaluatedView], task: Task) -> dict[str, Any]:
             known = (truth != IGNORE) & np.isfinite(positions).all(-1)
             points.append(tuple(of[known] for of in (positions, truth, *of_teacher)))
     figures = {side: _figures(whole, edges, task.classes) for side, (whole, edges) in sums.items()}
-    of_points = _point_mious(points, task) if points and task.at is not None else {}
-    return {"classes": task.classes} | {
+    of_points, there = _point_mious(points, task) if points and task.at is not None else ({}, np.zeros(n))
+    by_class, edge = (part.sum(1)[:-1] for part in sums["scene"])
+    rests = {"miou": by_class, "boundary_miou": edge, "rarest_miou": by_class[rarest(by_class)], "point_miou": there}
+    return {"classes": task.classes, "counted": {name: counted(pixels) for name, pixels in rests.items()}} | {
         side: of_side | {"point_miou": of_points.get(side)} for side, of_side in figures.items()
     }
 
 
-def _point_mious(points: list[tuple[np.ndarray, ...]], task: Task) -> dict[str, float | None]:
-    """mIoU of scene and teacher over points of surfaces."""
+def _point_mious(points: list[tuple[np.ndarray, ...]], task: Task) -> tuple[dict[str, float | None], np.ndarray]:
+    """mIoU of scene and teacher over points of surfaces; how many of these are of each class."""
     assert task.at is not None
     positions, truth, *of_teacher = (np.concatenate(parts) for parts in zip(*points, strict=True))
     kept, n = thinned(positions), len(task.classes)
@@ -63,11 +67,9 @@ def _point_mious(points: list[tuple[np.ndarray, ...]], task: Task) -> dict[str, 
     sides = {"scene": np.where(weights > 0, labels, n)}
     if of_teacher:
         sides["teacher"] = predicted(of_teacher[0][kept], task.names, task.classes, n)
-    return {side: _mean(segmentation(confusion(labels, truth[kept], n + 1)).iou[:-1]) for side, labels in sides.items()}
-
-
-def _mean(values: np.ndarray) -> float | None:
-    return None if np.isnan(values).all() else float(np.nanmean(values))
+    there = np.bincount(truth[kept], minlength=n)
+    ious = {side: segmentation(confusion(labels, truth[kept], n + 1)).iou for side, labels in sides.items()}
+    return {side: mean_over(iou[:-1], there) for side, iou in ious.items()}, there
 
 
 def rarest(pixels: np.ndarray) -> np.ndarray:
@@ -76,12 +78,13 @@ def rarest(pixels: np.ndarray) -> np.ndarray:
 
 
 def _figures(whole: np.ndarray, edges: np.ndarray, classes: list[str]) -> dict[str, Any]:
-    scores = segmentation(whole)
+    scores, (pixels, edge) = segmentation(whole), (part.sum(1)[:-1] for part in (whole, edges))
+    rare = rarest(pixels)
     return {
-        "miou": _mean(scores.iou[:-1]),
-        "macc": _mean(np.array([scores.macc])),
-        "oa": _mean(np.array([scores.oa])),
-        "boundary_miou": _mean(segmentation(edges).iou[:-1]),
-        "rarest_miou": _mean(scores.iou[rarest(whole.sum(1)[:-1])]),
+        "miou": mean_over(scores.iou[:-1], pixels),
+        "macc": mean_over(np.array([scores.macc]), pixels),
+        "oa": None if np.isnan(scores.oa) else scores.oa,
+        "boundary_miou": mean_over(segmentation(edges).iou[:-1], edge),
+        "rarest_miou": mean_over(scores.iou[rare], pixels[rare]),
         "iou": {name: None if np.isnan(v) else float(v) for name, v in zip(classes, scores.iou, strict=False)},
     }

@@ -17,8 +17,9 @@ from typing import Any
 import numpy as np
 
 from chebsplat.errors import DataFailure
-from chebsplat.evaluation.protocols.task import EvaluatedView, Task, bilinear, resized
+from chebsplat.evaluation.protocols.task import EvaluatedView, Task, bilinear, counted, mean_over, resized
 from chebsplat.labels.decode import decode_labels
+from chebsplat.labels.names import folded
 
 NAME = "replica-f3"
 TEST_EVERY, TEST_OFFSET, ADJUSTABLE, OWN_SPLIT, ON_TRAINING, TRUTH = 8, 2, False, False, False, "teacher"
@@ -33,7 +34,8 @@ def measure(views: Iterable[EvaluatedView], task: Task) -> dict[str, Any]:
 
     Raises: DataFailure unless the teacher's labels are ADE20K's, and without a teacher.
     """
-    wrong = [k for k, name in SPELT.items() if len(task.names) != N_LABELS or not task.names[k - 1].startswith(name)]
+    names = [folded(name) for name in task.names]
+    wrong = [k for k, name in SPELT.items() if len(names) != N_LABELS or not names[k - 1].startswith(name)]
     if wrong:
         raise DataFailure(
             f"the protocol asks for the 150 labels of ADE20K in their order (label {wrong[0]}: {SPELT[wrong[0]]}); "
@@ -41,18 +43,21 @@ def measure(views: Iterable[EvaluatedView], task: Task) -> dict[str, Any]:
         )
     rows: list[tuple[float, float]] = []  # (mIoU, OA) of each image
     by_label: dict[int, list[float]] = {k: [] for k in range(1, N_LABELS + 1)}
+    of_teacher = np.zeros(N_LABELS + 1, int)
     for view in views:
         if view.teacher is None:
             raise DataFailure(f"view {view.name} has no features of a teacher, which the protocol compares with")
         student, teacher = (_labels(f, view, task.embeddings) for f in (view.features, view.teacher))
         ious = frequent_ious(student, teacher)
         rows.append((float(np.mean(list(ious.values()))), float(np.mean(student == teacher))))
+        of_teacher += np.bincount(teacher.ravel(), minlength=N_LABELS + 1)
         for k, value in ious.items():
             by_label[k].append(value)
     miou, oa = np.mean(rows, 0)
     iou = {name: float(np.mean(by_label[k])) if by_label[k] else None for k, name in enumerate(task.names, 1)}
-    scene = {"miou": float(miou), "macc": None, "oa": float(oa), "boundary_miou": None, "iou": iou}
-    return {"classes": task.names, "scene": scene}
+    there = {"miou": counted(of_teacher)}
+    scene = {"miou": mean_over(miou, of_teacher), "macc": None, "oa": float(oa), "boundary_miou": None, "iou": iou}
+    return {"classes": task.names, "counted": there, "scene": scene}
 
 
 def _labels(features: np.ndarray, view: EvaluatedView, embeddings: np.ndarray) -> np.ndarray:

@@ -17,7 +17,16 @@ from typing import Any
 import numpy as np
 
 from chebsplat.evaluation.metrics import confusion
-from chebsplat.evaluation.protocols.task import EvaluatedView, Task, predicted, required, resized, translated
+from chebsplat.evaluation.protocols.task import (
+    LEAST,
+    EvaluatedView,
+    Task,
+    counted,
+    predicted,
+    required,
+    resized,
+    translated,
+)
 
 NAME = "scannet-closed"
 TEST_EVERY, TEST_OFFSET, ADJUSTABLE, OWN_SPLIT, ON_TRAINING, TRUTH = 5, 0, False, True, False, "labels"
@@ -45,7 +54,8 @@ def measure(views: Iterable[EvaluatedView], task: Task) -> dict[str, Any]:
             if labels is not None:
                 prediction = resized(predicted(labels, task.names, classes, 0), SIZE, centred=True)
                 sums[side] = sums.get(side, 0) + confusion(prediction, np.where(truth == 0, -1, truth), len(classes))
-    return {"classes": list(CLASSES)} | {side: figures(matrix) for side, matrix in sums.items()}
+    there = {"miou": counted(sums["scene"].sum(1)[1:])}
+    return {"classes": list(CLASSES), "counted": there} | {side: figures(matrix) for side, matrix in sums.items()}
 
 
 def figures(matrix: np.ndarray) -> dict[str, Any]:
@@ -54,7 +64,8 @@ def figures(matrix: np.ndarray) -> dict[str, Any]:
     kept = np.maximum(n_true, n_predicted) >= RARE * max(matrix.sum(), 1)
     iou = {name: float(r / (t + f - r)) if k else None
            for name, r, t, f, k in zip((VOID, *CLASSES), n_right, n_true, n_predicted, kept, strict=True)}  # fmt: skip
-    return {"miou": averaged(list(iou.values())), "macc": None, "oa": None, "boundary_miou": None, "iou": iou}
+    miou = averaged(list(iou.values())) if counted(n_true)["classes"] >= LEAST else None
+    return {"miou": miou, "macc": None, "oa": None, "boundary_miou": None, "iou": iou}
 
 
 def over_scenes(scenes: list[dict[str, Any]]) -> dict[str, Any]:

@@ -16,8 +16,9 @@ from typing import Any
 import numpy as np
 
 from chebsplat.evaluation.metrics import confusion
-from chebsplat.evaluation.protocols.task import EvaluatedView, Task, required, resized, translated
+from chebsplat.evaluation.protocols.task import EvaluatedView, Task, counted, mean_over, required, resized, translated
 from chebsplat.labels.decode import decode_labels
+from chebsplat.labels.names import joined
 
 NAME = "scannet-open"
 TEST_EVERY, TEST_OFFSET, ADJUSTABLE, OWN_SPLIT, ON_TRAINING, TRUTH = 1, 0, False, False, True, "labels"
@@ -30,7 +31,7 @@ SIZE = (484, 648)  # (H, W)
 def measure(views: Iterable[EvaluatedView], task: Task) -> dict[str, Any]:
     """Figures of one scene, and its `confusion` [20, 20] by truth, to be summed over scenes. Raises DataFailure."""
     required(task.names, CLASSES, NAME, also=(OTHER,))
-    asked = [k for k, name in enumerate(task.names) if name != OTHER]
+    asked = [k for k, name in enumerate(task.names) if joined(name) != OTHER]
     names, embeddings = [task.names[k] for k in asked], task.embeddings[asked]
     classes = list(CLASSES)
     sums: dict[str, np.ndarray] = {}
@@ -42,7 +43,8 @@ def measure(views: Iterable[EvaluatedView], task: Task) -> dict[str, Any]:
             labels = translated(decode_labels(features, embeddings), names, classes, -1)
             prediction = resized(labels, SIZE, centred=True)
             sums[side] = sums.get(side, 0) + confusion(prediction, truth, len(classes))
-    return {"classes": classes} | {side: summed([matrix]) for side, matrix in sums.items()}
+    there = {"miou": counted(sums["scene"].sum(1))}
+    return {"classes": classes, "counted": there} | {side: summed([matrix]) for side, matrix in sums.items()}
 
 
 def over_scenes(scenes: list[dict[str, Any]]) -> dict[str, Any]:
@@ -56,9 +58,10 @@ def summed(matrices: list[np.ndarray]) -> dict[str, Any]:
     right, truth = np.diag(matrix).astype(float), matrix.sum(1)
     present = truth > 0
     iou = right[present] / (truth + matrix.sum(0) - right)[present]
-    mean = {"miou": float(iou.mean()), "macc": float((right[present] / truth[present]).mean())} if present.any() else {}
+    mean = {"miou": mean_over(iou, truth), "macc": mean_over(right[present] / truth[present], truth)}
     by_class = dict(zip(np.array(CLASSES)[present].tolist(), iou.tolist(), strict=True))
-    return {"miou": None, "macc": None, "oa": float(right.sum() / matrix.sum()) if present.any() else None} | mean | {
+    return mean | {
+        "oa": float(right.sum() / matrix.sum()) if present.any() else None,
         "boundary_miou": None,
         "iou": {name: by_class.get(name) for name in CLASSES},
         "confusion": matrix.tolist(),

@@ -10,6 +10,9 @@ import numpy as np
 
 from chebsplat.errors import DataFailure
 from chebsplat.evaluation.metrics import IGNORE
+from chebsplat.labels.names import lacking, rows_of
+
+LEAST = 2  # classes that a mean over classes needs
 
 
 @dataclass
@@ -63,9 +66,23 @@ class MapsByName(Mapping[str, np.ndarray]):
         return len(self.rows)
 
 
+def counted(pixels: np.ndarray) -> dict[str, int]:
+    """What a mean over classes rests on: how many `classes` the truth has, and its `pixels`, of [L] counts by class."""
+    return {"classes": int((pixels > 0).sum()), "pixels": int(pixels.sum())}
+
+
+def mean_over(values: np.ndarray, pixels: np.ndarray) -> float | None:
+    """Mean of the figures of classes that are defined, not nan; None where the truth, of so many `pixels` by class,
+    has fewer than LEAST: of one class alone any scene that knows no other has 100 %.
+    """
+    if counted(pixels)["classes"] < LEAST or np.isnan(values).all():
+        return None
+    return float(np.nanmean(values))
+
+
 def translated(labels: np.ndarray, names: list[str], classes: list[str], unknown: int) -> np.ndarray:
     """Labels among `names` as indices into `classes`, IGNORE kept; a name that is no class becomes `unknown`."""
-    table = np.array([*(classes.index(name) if name in classes else unknown for name in names), IGNORE])
+    table = np.array([*(unknown if row < 0 else row for row in rows_of(names, classes)), IGNORE])
     result: np.ndarray = table[labels]
     return result
 
@@ -77,9 +94,9 @@ def predicted(labels: np.ndarray, names: list[str], classes: list[str], unknown:
 
 def required(names: list[str], classes: tuple[str, ...], protocol: str, also: tuple[str, ...] = ()) -> None:
     """Raise DataFailure unless `names` are all the `classes`, in any order, and nothing else but some of `also`."""
-    if lacking := [name for name in classes if name not in names]:
-        raise DataFailure(f"{protocol} asks for its {len(classes)} classes; the teacher has no {', '.join(lacking)}")
-    if foreign := [name for name in names if name not in (*classes, *also)]:
+    if absent := lacking(classes, names):
+        raise DataFailure(f"{protocol} asks for its {len(classes)} classes; the teacher has no {', '.join(absent)}")
+    if foreign := lacking(names, (*classes, *also)):
         raise DataFailure(f"{protocol} knows no {', '.join(foreign)}; give the teacher the protocol's classes alone")
 
 

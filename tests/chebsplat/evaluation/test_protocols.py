@@ -114,6 +114,54 @@ def test_where_nothing_is_known_nothing_is_measured():
     }
 
 
+@pytest.mark.parametrize(("seed", "n_classes", "n_views"), [(0, 4, 3), (1, 13, 5), (2, 40, 2)])
+def test_miou_macc_and_oa_are_those_of_sets_of_pixels(seed, n_classes, n_views):
+    """Oracle: each class as the set of its pixels in all views, as scikit-learn's macro averages are defined."""
+    rng = np.random.default_rng(seed)
+    classes = [f"class {k}" for k in range(n_classes)]
+    names = [*(f"Class_{k}" for k in rng.permutation(n_classes)[:-1]), "no class of the truth"]
+    truths = rng.integers(-1, max(n_classes - 2, 2), (n_views, 17, 23))  # some classes are only predicted
+    own = np.array([*(classes.index(name.lower().replace("_", " ")) for name in names[:-1]), -1])
+    taken = rng.integers(0, n_classes, truths.shape)
+    right = np.argsort(own)[np.maximum(truths, 0) + 1]
+    taken = np.where((rng.random(truths.shape) < 0.6) & np.isin(truths, own), right, taken)
+    seen = [view(ids, n_classes, truth=truth) for ids, truth in zip(taken, truths, strict=True)]
+    found = labels.measure(seen, Task(names, np.eye(n_classes), classes))
+    known = truths >= 0
+    truth, labelled = truths[known], own[taken[known]]
+    sets = [(set(np.flatnonzero(truth == k)), set(np.flatnonzero(labelled == k))) for k in range(n_classes)]
+    assert found["scene"]["miou"] == pytest.approx(np.mean([len(a & b) / len(a | b) for a, b in sets if a | b]))
+    assert found["scene"]["macc"] == pytest.approx(np.mean([len(a & b) / len(a) for a, b in sets if a]))
+    assert found["scene"]["oa"] == pytest.approx(sum(len(a & b) for a, b in sets) / known.sum())
+    assert found["counted"]["miou"] == {"classes": sum(bool(a) for a, _ in sets), "pixels": known.sum()}
+
+
+@pytest.mark.parametrize("protocol", [labels, replica_f3, scannet_closed, scannet_open])
+def test_one_class_alone_has_no_miou_and_every_miou_says_what_it_rests_on(protocol):
+    names = {replica_f3: ADE, labels: ["wall", "floor"]}.get(protocol) or list(protocol.CLASSES)
+    task, n = Task(names, np.eye(len(names), dtype=np.float32), names), len(names)
+    for ids, classes in (([[0, 0], [0, 0]], 1), ([[0, 1], [0, 1]], 2)):
+        truth, teacher = (np.array(ids), one_hot(ids, n)) if protocol is replica_f3 else (np.array(ids), None)
+        found = protocol.measure([view(ids, n, truth=truth, teacher=teacher)], task)
+        pixels = {labels: 4, replica_f3: HEIGHT * WIDTH, scannet_closed: 512**2, scannet_open: 484 * 648}[protocol]
+        assert found["counted"]["miou"] == {"classes": classes, "pixels": pixels}
+        assert found["scene"]["miou"] == (None if classes == 1 else 1)
+
+
+SPELLINGS = ["Wall", "WALL", " wall ", "wall"], ["TV_Screen", "tv-screen", "tv  screen", "\ttv screen\n", "TVScreen"]
+
+
+@pytest.mark.parametrize("wall", SPELLINGS[0])
+@pytest.mark.parametrize("screen", SPELLINGS[1])
+def test_a_name_is_the_same_however_it_is_spelt_on_either_side(wall, screen):
+    truth, seen = np.array([[0, 0, 1, 1]]), [[0, 1, 1, 1]]
+    for names, classes in ((["wall", "tv screen"], [wall, screen]), ([wall, screen], ["wall", "tv screen"])):
+        found = labels.measure([view(seen, 2, truth=truth)], Task(names, np.eye(2), classes))["scene"]
+        assert found["miou"] == pytest.approx((1 / 2 + 2 / 3) / 2)
+    fields = {"class_names": [wall, screen], "labels": np.array([[[0, 1, -1]]], np.int16)}
+    assert renamed(fields, {"things": ["tv screen"]})["labels"].tolist() == [[[-1, 0, -1]]]
+
+
 def test_points_on_paper():
     # One pixel a point: three of the five lie apart, two share a cell, of which the first counts; one is unknown.
     # truth    wall wall floor (floor) ?    the scene there: wall, nothing, floor   wall 1/2, floor 1/1: mean 3/4

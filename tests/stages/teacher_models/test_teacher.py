@@ -183,7 +183,7 @@ def test_a_closed_set_segmenter_gives_its_likeliest_classes_and_their_probabilit
 
 def test_classes_of_a_segmenter_that_mean_one_label_become_it(tmp_path, capture):
     file = tmp_path / "labels.txt"
-    file.write_text("sea: blue, Green\n")
+    file.write_text("sea: blue_, GREEN\n")
     code, found = encoded(tmp_path, capture, segmenter(tmp_path), labels=str(file))
     assert (code, found.label_names) == (0, ["red", "sea"])
     file.write_text("sea: blu\n")

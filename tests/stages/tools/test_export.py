@@ -71,7 +71,8 @@ def test_filters_keep_what_they_name_and_nothing_else(mixed, tmp_path):
     wanted = names[np.bincount(scene.labels[scene.labels >= 0]).argmax()]
     low, high = np.quantile(p["means"], [0.1, 0.9], axis=0).round(3)
     box = ",".join(map(str, [*low, *high]))
-    done = run(mixed[1], "--out", tmp_path / "a.ply", "--keep-label", wanted, "--min-opacity", 0.1, f"--box={box}")
+    filters = ["--keep-label", f" {wanted.upper()}", "--min-opacity", 0.1, f"--box={box}"]
+    done = run(mixed[1], "--out", tmp_path / "a.ply", *filters)
     assert done.exit_code == 0, done.stderr
     assert done.stdout == f"{tmp_path / 'a.ply'}\n"
     keep = scene.labels == names.index(wanted)

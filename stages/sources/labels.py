@@ -1,0 +1,353 @@
+"""Label maps: where a source has them, what they are taken for, and which class each of their pixels is of.
+
+A view's map is a PNG of ids (grey, or a palette's), a PNG of colours, an .npy of ids [h, w] or of scores by class
+([C, h, w] or [h, w, C]), or a folder with one mask a class. All maps of a source are of one kind, which is said.
+"""
+
+from __future__ import annotations
+
+import os
+from collections import Counter
+from collections.abc import Iterable, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from chebsplat.errors import DataFailure, InputError
+from chebsplat.formats.images import opened
+from chebsplat.formats.names import few
+from chebsplat.formats.tensors import read_npy
+from chebsplat.labels.names import joined, rows_of
+from chebsplat.stages.sources import common, texts
+from chebsplat.stages.sources.common import LABELS, Frame, LabelFile, Listing
+from chebsplat.stages.sources.pictures import DEEP, GREY, companion, fits, nearest, same_shape
+from chebsplat.stages.sources.texts import LONGEST, shortened, whole
+
+IDS, COLORS, SCORES, MASKS = "ids", "colours", "scores by class", "one mask a class"
+# Joined: what sets call pixels that nobody labelled. "Other" and the like are classes.
+VOID = {"void", "ignore", "ignored", "ignoreregion", "unlabeled", "unlabelled", "notlabeled", "notlabelled", "nolabel",
+        "unannotated", "notannotated", "unassigned", "unclassified", "undefined", "unknown", "invalid", "none", "null",
+        "nan", "n/a", "noclass", "dontcare", "outlier"}  # fmt: skip
+BACKGROUND = "background"  # void where it has an id that stands for void, otherwise a class
+CODES = (255, 65_535)  # the highest of 8 and 16 bits, which stand for void
+MAX_ID = 65_535  # what 16 bits hold
+NAMES = ("scene.json", "labels.json")  # documents that may name ids
+MAX_COLORS = 1024  # a picture with more is no map of labels
+REMEDY = "add it, or take its folder away to do without"
+
+
+def place_in(folder: Path, places: Sequence[str] = LABELS) -> str | None:
+    """The first of these subfolders that holds maps; None where there are none."""
+    return next((place for place in places if any(files_below(folder / place))), None)
+
+
+def files_below(folder: Path) -> list[str]:
+    """Images and .npy files below a folder, as relative POSIX paths."""
+    arrays = (path.relative_to(folder).as_posix() for path in folder.rglob("*.npy") if path.name[0] != ".")
+    return sorted([*common.names_below(folder), *common.printable(folder, arrays)])
+
+
+def of_views(place: Path, names: Sequence[str]) -> dict[str, LabelFile]:
+    """The map of each view that has one: a file that is called like it; or a mask a class, as VIEW/CLASS.png or
+    CLASS/VIEW.png.
+
+    Raises: InputError where one view has two, or none of the files is called like a view.
+    """
+    files = files_below(place)
+    common.distinct(sorted((os.path.splitext(name)[0], place / name) for name in files))
+    if found := common.matched(names, files):
+        return {name: place / file for name, file in found.items()}
+    masks: dict[str, dict[str, Path]] = {}
+    folders = {os.path.dirname(file) for file in files} - {""}
+    for name, inner in common.matched(names, folders).items():
+        masks[name] = {_stem(file): place / file for file in files if os.path.dirname(file) == inner}
+    for label in {file.partition("/")[0] for file in files if "/" in file} if not masks else ():
+        own = [file.removeprefix(f"{label}/") for file in files if file.startswith(f"{label}/")]
+        for name, file in common.matched(names, own).items():
+            masks.setdefault(name, {})[label] = place / label / file
+    if not masks:
+        raise InputError(
+            f"{place}/ holds {few(files)}, of which none is called like a photo ({few(names)}); rename the label maps"
+        )
+    return dict(masks)
+
+
+def _stem(file: str) -> str:
+    return os.path.splitext(os.path.basename(file))[0]
+
+
+def files(folder: Path) -> list[Path]:
+    """The maps of a source's folder."""
+    return [folder / place / name for place in [place_in(folder)] if place for name in files_below(folder / place)]
+
+
+def give(listing: Listing, folder: Path) -> None:
+    """Give the frames of a listing the maps of a source's folder, where it holds any, and the listing their names."""
+    place = place_in(folder)
+    if place is None:
+        held = {place: os.listdir(folder / place) for place in LABELS if (folder / place).is_dir()}
+        listing.notes += [f"{place}/ holds no PNG or .npy: not read ({few(found)})." for place, found in held.items()]
+    if place is None or not listing.frames:
+        return
+    listing.label_names = names_in(folder)
+    maps = of_views(folder / place, [frame.name for frame in listing.frames])
+    for frame in listing.frames:
+        frame.labels = maps.get(frame.name)
+    listing.label_place = place
+    masks = [frame.labels for frame in listing.frames if isinstance(frame.labels, dict)]
+    if masks:
+        listing.label_names = dict(enumerate(sorted(set().union(*masks)), 1))
+    if others := [other for other in LABELS if other != place and any(files_below(folder / other))]:
+        listing.notes.append(f"Labels are those of {place}/; not read: {', '.join(others)}.")
+
+
+def is_deep(path: Path) -> bool:
+    """Whether a map's ids have 16 bits."""
+    if path.suffix == ".npy":
+        return read_npy(path, REMEDY).dtype.itemsize > 1
+    with opened(path, REMEDY) as image:
+        return image.mode in DEEP
+
+
+def names_in(folder: Path) -> dict[int, str] | None:
+    """Class names by id, of scene.json's "labels" or of labels.json: {"id": name}, or {"#rrggbb": name} of colours."""
+    scene, plain = NAMES
+    path = folder / scene
+    table = texts.read_json(path).get("labels") if common.present(path) else None
+    if table is None and common.present(path := folder / plain):
+        table = texts.read_json(path)
+    if table is None:
+        return None
+    if not isinstance(table, dict):
+        raise InputError(f"{path}: labels must map ids to names; correct it")
+    return names_by_id(path, table.items())
+
+
+def names_by_id(path: Path, entries: Iterable[tuple[Any, Any]]) -> dict[int, str]:
+    """Class names by id, from pairs in a document; ids may be written as text, colours as #rrggbb. InputError."""
+    names: dict[int, str] = {}
+    for key, name in entries:
+        try:
+            if isinstance(key, str) and len(key) == 7 and key[0] == "#":
+                which = int(key[1:], 16)
+            else:
+                which = whole(int(key) if isinstance(key, str) else key, 0, MAX_ID)
+        except ValueError as error:
+            raise InputError(f"{path}: a label's id is not usable ({str(error)[:LONGEST]}); correct it") from None
+        if not isinstance(name, str) or not name.strip():
+            raise InputError(f"{path}: label {which} has {shortened(name)} for a name; give a text that is not empty")
+        names[which] = name.strip()
+    return names
+
+
+def read(frame: Frame, listing: Listing, size: tuple[int, int], at: np.ndarray) -> np.ndarray:
+    """Raw ids i32 [H, W], -1 none, at positions `at` [2, H, W] of a frame's map, its corrected objects replaced; what
+    kind the map is of is written down in the listing.
+    """
+    assert frame.labels is not None
+    if isinstance(frame.labels, dict):
+        kind, ids = MASKS, _of_masks(frame.labels, listing.label_names or {}, size, at)
+    elif frame.labels.suffix == ".npy":
+        kind, values = _of_array(frame.labels, size)
+        ids = nearest(values, at, size)
+    else:
+        kind, ids = _of_image(frame.labels, size, at)
+    listing.label_kinds[frame.name] = kind
+    if frame.objects is not None and listing.corrections:
+        objects = companion(frame.objects, size, at, GREY, "8- or 16-bit ids")
+        for which, value in listing.corrections.items():
+            ids[objects == which] = value
+    return ids
+
+
+def _of_image(path: Path, size: tuple[int, int], at: np.ndarray) -> tuple[str, np.ndarray]:
+    """Kind and raw ids of a PNG; what is transparent has none."""
+
+    def check(image: Any) -> None:
+        if image.format != "PNG":
+            raise InputError(
+                f"{path} is a {image.format} picture, in which ids and colours are no longer exact; write label maps "
+                "as PNG or .npy"
+            )
+        if image.mode not in (*GREY, "1", "LA", "RGB", "RGBA"):
+            raise InputError(f"{path} has mode {image.mode}, which is neither ids nor colours; convert it")
+        same_shape(path, image.size, size)
+
+    with opened(path, REMEDY, check) as image:
+        mode, values = image.mode, nearest(np.asarray(image), at, size).astype(np.int32)
+    if mode in ("LA", "RGBA"):
+        clear, values = values[..., -1] < 128, values[..., :-1]
+    else:
+        clear = np.zeros(values.shape[:2], bool)
+    if values.ndim == 2 or values.shape[-1] == 1:
+        kind, ids = IDS, values.reshape(clear.shape)
+    else:
+        kind, ids = COLORS, packed(values)
+    return kind, np.where(clear, -1, ids)
+
+
+def packed(colors: np.ndarray) -> np.ndarray:
+    """Colours [..., 3] of 8 bits as one number each, red first."""
+    found: np.ndarray = colors.astype(np.int32) @ np.array([1 << 16, 1 << 8, 1], np.int32)
+    return found
+
+
+def _of_array(path: Path, size: tuple[int, int]) -> tuple[str, np.ndarray]:
+    """Kind and raw ids i32 [h, w] of an .npy, in its own resolution.
+
+    Choices: the axis of classes is the one without which the array has the photo's shape; the highest score wins, and
+      where all are equal there is no label. Negative ids are none.
+    """
+    values = read_npy(path, REMEDY)
+    if values.ndim == 3:
+        values = values[..., 0] if values.shape[2] == 1 else values[0] if values.shape[0] == 1 else values
+    if values.dtype.kind not in "biuf" or values.ndim not in (2, 3) or not values.size:
+        raise InputError(f"{path} is {values.dtype} {values.shape}, neither ids nor scores; write it again")
+    if values.dtype.kind == "f" and not np.isfinite(values).all():
+        raise InputError(f"{path} holds values that are not finite; write it again")
+    if values.ndim == 2:
+        same_shape(path, values.shape[::-1], size)
+        if (values != np.floor(values)).any() or values.max() > MAX_ID:
+            raise InputError(f"{path} holds numbers that are no ids of 0...{MAX_ID}; write ids, or scores by class")
+        return IDS, np.maximum(values.astype(np.int64), -1).astype(np.int32)
+    axis = next((k for k in (0, 2) if fits((values.shape[2 - k // 2], values.shape[1 - k // 2]), size)), None)
+    if axis is None:
+        raise InputError(f"{path} is {values.shape}, which has not the shape of its photo {size[::-1]}; write it again")
+    if axis == 2 and values.shape[2] == 3 and values.dtype == np.uint8 and values.max() > 1:
+        return COLORS, packed(values)
+    best: np.ndarray = values.argmax(axis)
+    return SCORES, np.where(values.max(axis) > values.min(axis), best, -1).astype(np.int32)
+
+
+def _of_masks(masks: dict[str, Path], names: dict[int, str], size: tuple[int, int], at: np.ndarray) -> np.ndarray:
+    """Raw ids of masks by class, -1 in none of them.
+
+    Choices: a mask is where its picture is brighter than half of its brightest; of two that overlap the smaller lies on
+      top.
+    """
+    number = {name: which for which, name in names.items()}
+    seen = {name: companion(path, size, at) for name, path in masks.items()}
+    inside = {name: 2 * grey.astype(int) > max(int(grey.max()), 1) for name, grey in seen.items()}
+    ids = np.full(at.shape[1:], -1, np.int32)
+    for name in sorted(inside, key=lambda name: (-int(inside[name].sum()), name)):
+        ids[inside[name]] = number[name]
+    return ids
+
+
+def resolved(listing: Listing, raw: np.ndarray) -> tuple[str, np.ndarray]:
+    """What all maps of a listing are taken for, and their raw ids [V, H, W]; colours that are all grey are ids.
+
+    Raises: InputError where they are of two kinds, or of more colours than labels have.
+    """
+    kinds = Counter(listing.label_kinds.values())
+    if len(kinds) > 1:
+        views = {kind: [view for view, of in listing.label_kinds.items() if of == kind] for kind in sorted(kinds)}
+        told = ", ".join(f"{kind} ({few(some)})" for kind, some in views.items())
+        raise InputError(f"{listing.label_place}/ holds label maps of several kinds: {told}; write them alike")
+    kind = next(iter(kinds))
+    if kind == COLORS and all((view[view >= 0] % packed(np.ones(3, int)) == 0).all() for view in raw):
+        return IDS, np.where(raw < 0, -1, raw & 255)
+    if kind == COLORS and (n := len(_shares(raw))) > MAX_COLORS:
+        raise InputError(f"{listing.label_place}/ holds {n} colours, more than labels have; write ids, unsmoothed")
+    return kind, raw
+
+
+def line(listing: Listing, kind: str, labels: np.ndarray) -> str:
+    """What the maps were taken for, in one sentence. labels: i16 [V, H, W], class indices, -1 none."""
+    named = "" if kind == MASKS else " with names" if listing.label_names is not None else " without names"
+    known = labels >= 0
+    return (
+        f"Labels of {listing.label_place}/ are taken for {kind}{named}: {len(np.unique(labels[known]))} classes, "
+        f"{known.mean():.1%} of the pixels, in {known.any((1, 2)).sum()} of {len(labels)} views."
+    )
+
+
+def indexed(
+    raw: np.ndarray,
+    names: dict[int, str] | None,
+    class_names: tuple[str, ...] | None,
+    kind: str = IDS,
+    what: str = "Label",
+) -> tuple[np.ndarray, list[str], list[str]]:
+    """Raw ids [V, H, W] (-1: none) as indices i16 into class names; the names, and notes on what became -1.
+
+    Choices: the classes are those that occur, in the order of their ids, or `class_names` where given; names that are
+      spelt differently are one. Ids are named by `names`, else by their place in `class_names`, else as `unnamed` does.
+      Names that say void (`is_void`) are ignored.
+    Raises:  DataFailure if nothing is left.
+    """
+    shares = _shares(raw)
+    present = [value for value in sorted(shares) if value >= 0]
+    notes: list[str] = []
+    if names is None and class_names is None:
+        known, notes = unnamed(present, shares, kind, what)
+    else:
+        known = names if names is not None else dict(enumerate(class_names or ()))
+        if nameless := [v for v in present if v not in known]:
+            notes.append(f"{what} ids without a name are ignored: {_told(nameless, shares, kind)}.")
+    if void := [v for v in present if v in known and is_void(known[v], v)]:
+        of = ", ".join(dict.fromkeys(known[v] for v in void))
+        notes.append(f"{what}s called {of} are void and ignored: {_told(void, shares, kind)}.")
+    named = {v: known[v] for v in present if v in known and v not in void}
+    result = list(class_names or {joined(name): name for name in named.values()}.values())
+    rows = dict(zip(named, rows_of(named.values(), result), strict=True))
+    if foreign := sorted({named[v] for v, row in rows.items() if row < 0}):
+        notes.append(f"{what}s that are not among the class names are ignored: {', '.join(foreign)}.")
+    if max(rows.values(), default=-1) < 0:
+        shown = ", ".join(_shown(v, kind) for v in present[:8])
+        raise DataFailure(f"no label has a name ({kind} [{shown}]); give names (labels.json), or take the labels away")
+    every = np.array(sorted(shares))
+    table = np.array([rows.get(value, -1) for value in every.tolist()], np.int16)
+    labels = np.empty(raw.shape, np.int16)
+    for k, view in enumerate(raw):  # one by one: a copy of all would be the largest thing in memory
+        labels[k] = table[np.searchsorted(every, view)]
+    return labels, result, notes
+
+
+def unnamed(present: Sequence[int], shares: Counter[int], kind: str, what: str) -> tuple[dict[int, str], list[str]]:
+    """Names of ids that a source does not name, and a note on the one that stands for void.
+
+    Choices: ids are class_<id> without 0, or without what `void_code` tells, 0 being a class then; colours are
+      themselves, without black; of scores each is a class.
+    """
+    code = void_code(present) if kind == IDS else None
+    void = [v for v in present if v == (0 if code is None else code)] if kind != SCORES else []
+    known = {v: _shown(v, kind) if kind == COLORS else f"class_{v}" for v in present if v not in void}
+    told = "is taken for none of the classes" if code is None else "is taken for void, and 0 for a class"
+    lost = f"; {_told(void, shares, kind)} {told}" if void else ""
+    return known, [f"{what}s have no names (labels.json){lost}."]
+
+
+def void_code(present: Sequence[int]) -> int | None:
+    """Which of CODES stands for void among ids without names, 0 being a class then; None where none does.
+
+    Choices: the highest id is one of them, far above the others, which are two at least and fill half of the numbers up
+      to the highest of them: a data set's ids, of which some do not occur here. 0 and 255 alone are a mask.
+    """
+    *others, code = present or [0]
+    dense = len(others) > 1 and 2 * len(others) > max(others)
+    return code if code in CODES and dense and max(others) < code - 1 else None
+
+
+def is_void(name: str, which: int) -> bool:
+    """Whether a name says that nobody labelled the pixels of that id."""
+    return joined(name) in VOID or (joined(name) == BACKGROUND and which in (0, *CODES))
+
+
+def _shares(raw: np.ndarray) -> Counter[int]:
+    """The share of the pixels that each raw id has."""
+    shares: Counter[int] = Counter()
+    for view in raw:
+        values, counts = np.unique(view, return_counts=True)
+        shares.update(dict(zip(values.tolist(), (counts / raw.size).tolist(), strict=True)))
+    return shares
+
+
+def _shown(value: int, kind: str) -> str:
+    return f"#{value:06x}" if kind == COLORS else str(value)
+
+
+def _told(values: Sequence[int], shares: Counter[int], kind: str) -> str:
+    """Ids and the share of the pixels that they have."""
+    return ", ".join(f"{_shown(v, kind)} ({shares[v]:.1%} of the pixels)" for v in values)

@@ -1,0 +1,247 @@
+"""Label maps, whatever they are written as: each pixel's class is the one that was written, and a line says so."""
+
+import json
+import re
+
+import layouts
+import numpy as np
+import pytest
+from PIL import Image
+from source_folders import save, tiny
+
+from chebsplat.errors import DataFailure, InputError
+from chebsplat.stages.settings import IngestSection
+from chebsplat.stages.sources import colmap, labels, scannet, transforms
+from chebsplat.stages.sources.common import Listing
+
+SETTINGS = IngestSection(min_views=2)
+NAMES = ["wall", "floor", "tv screen"]
+RGB = np.array([[255, 0, 0], [0, 200, 0], [7, 7, 200], [0, 0, 0]], np.uint8)  # the last: of no class
+CLASS = np.random.default_rng(0).integers(-1, 3, (3, 6, 8))
+CLASS[:, 0, :4] = [-1, 0, 1, 2]
+
+
+def source(folder, write, names=None):
+    """Three views whose maps `write(path without an ending, class [6, 8])` writes; names of labels.json."""
+    fields = tiny() | {"names": list("abc"), "labels": np.zeros((3, 6, 8), np.int16)}
+    layouts.write_colmap(folder, fields)
+    for path in (folder / "semantic").iterdir():
+        path.unlink()
+    (folder / "labels.json").unlink()
+    for name, of_view in zip("abc", CLASS, strict=True):
+        write(folder / "semantic" / name, of_view)
+    if names is not None:
+        (folder / "labels.json").write_text(json.dumps(names))
+    return folder
+
+
+def ids(table, kind=np.uint8, ending=".png"):
+    """A writer of ids, of classes 0, 1, 2 and of none."""
+
+    def write(path, of_view):
+        values = np.array(table)[of_view].astype(kind)
+        if ending == ".npy":
+            np.save(path.with_suffix(".npy"), values)
+        else:
+            Image.fromarray(values).save(path.with_suffix(ending), format="PNG")
+
+    return write
+
+
+def colors(path, of_view):
+    save(path.with_suffix(".png"), RGB[of_view])
+
+
+def transparent(path, of_view):
+    save(path.with_suffix(".png"), np.concatenate([RGB[of_view], 255 * (of_view >= 0)[..., None]], -1).astype(np.uint8))
+
+
+def grey_colors(path, of_view):
+    save(path.with_suffix(".png"), np.repeat((of_view + 1)[..., None], 3, -1).astype(np.uint8))
+
+
+def palette(path, of_view):
+    image = Image.fromarray((of_view + 1).astype(np.uint8))
+    image.putpalette([0, 0, 0, 200, 0, 0, 0, 200, 0, 0, 0, 200])
+    image.save(path.with_suffix(".png"))
+
+
+def scores(axis, kind=np.float32):
+    """A writer of one-hot scores along an axis; all equal where there is no class."""
+
+    def write(path, of_view):
+        held = np.concatenate([np.eye(3), np.zeros((1, 3))])[of_view].astype(kind)
+        np.save(path.with_suffix(".npy"), np.moveaxis(held, -1, axis))
+
+    return write
+
+
+def masks(form, swapped=False):
+    """A writer of one mask a class: VIEW/CLASS, or CLASS/VIEW."""
+
+    def write(path, of_view):
+        for k, name in enumerate(NAMES):
+            place = path.parent / name / path.name if swapped else path / name
+            place.parent.mkdir(parents=True, exist_ok=True)
+            large = np.kron(of_view == k, np.ones((16, 16), bool))  # blocks of JPEG
+            Image.fromarray((255 * large).astype(np.uint8)).save(f"{place}.{form}")
+
+    return write
+
+
+BY_ID = {"1": "wall", "2": "floor", "3": "tv screen"}
+ONE, ZERO, CODE = [1, 2, 3, 0], [0, 1, 2, 255], [0, 1, 2, 65_535]
+UNNAMED = ["class_0", "class_1", "class_2"]
+HEX = ["#ff0000", "#00c800", "#0707c8"]
+# what: (writer, labels.json, the classes that are found in the order of NAMES, what is said)
+WAYS = {
+    "ids with names": (ids(ONE), BY_ID, NAMES, "taken for ids with names: 3 classes"),
+    "16 bits": (ids(ONE, np.uint16), BY_ID, NAMES, "taken for ids with names"),
+    "a palette": (palette, BY_ID, NAMES, "taken for ids with names"),
+    "an ending in capitals": (ids(ONE, ending=".PNG"), BY_ID, NAMES, "taken for ids with names"),
+    "a PNG called .jpg": (ids(ONE, ending=".jpg"), BY_ID, NAMES, "taken for ids with names"),
+    "an array": (ids(ONE, ending=".npy"), BY_ID, NAMES, "taken for ids with names"),
+    "an array of floats": (ids(ONE, np.float32, ".npy"), BY_ID, NAMES, "taken for ids with names"),
+    "an array with -1": (ids([0, 1, 2, -1], np.int64, ".npy"), dict(enumerate(NAMES)), NAMES, "with names"),
+    "names spelt in two ways": (ids([1, 2, 3, 9]), BY_ID | {"9": " VOID "}, NAMES, "called VOID are void"),
+    "ids without names": (ids(ONE), None, ["class_1", "class_2", "class_3"], r"no names.*; 0 \(\d.*none of the cl"),
+    "255 for void": (ids(ZERO), None, UNNAMED, r"255 \(\d.* is taken for void, and 0 for a class"),
+    "65535 for void": (ids(CODE, np.uint16), None, UNNAMED, r"65535 \(\d.* is taken for void, and 0 for a class"),
+    "255 without a name": (ids(ZERO), dict(enumerate(NAMES)), NAMES, r"without a name are ignored: 255 \(\d"),
+    "colours": (colors, None, HEX, r"taken for colours without names.*#000000 \(\d"),
+    "colours with names": (colors, dict(zip(HEX, NAMES, strict=True)), NAMES, "taken for colours with names"),
+    "transparent colours": (transparent, None, HEX, "taken for colours without names"),
+    "grey colours": (grey_colors, BY_ID, NAMES, "taken for ids with names"),
+    "scores, classes last": (scores(-1), dict(enumerate(NAMES)), NAMES, "taken for scores by class with names"),
+    "scores, classes first": (scores(0), None, UNNAMED, "taken for scores by class without names"),
+    "one-hot": (scores(0, bool), dict(enumerate(NAMES)), NAMES, "taken for scores by class"),
+    "masks of a view": (masks("png"), None, NAMES, "taken for one mask a class"),
+    "masks of a view as JPEG": (masks("jpg"), None, NAMES, "taken for one mask a class"),
+    "masks of a class": (masks("png", swapped=True), None, NAMES, "taken for one mask a class"),
+}  # fmt: skip
+
+
+def check(fields, names, wanted=CLASS):
+    """Every pixel has the class that was written."""
+    by_name = np.array([*fields["class_names"], None], object)[fields["labels"]]
+    assert (by_name == np.array([*names, None], object)[wanted]).all()
+
+
+def said(fields):
+    return " ".join([fields["source"]["labels"], *fields["source"]["notes"]])
+
+
+@pytest.mark.parametrize("way", WAYS)
+def test_a_pixel_s_class_is_the_one_that_was_written_and_a_line_says_what_maps_were_taken_for(tmp_path, way):
+    write, names, found, word = WAYS[way]
+    fields = colmap.read(source(tmp_path, write, names), SETTINGS)
+    check(fields, found)
+    assert re.search(word, said(fields)), said(fields)
+    assert colmap.probe(tmp_path)["labels"]
+    listed = set(colmap.files(tmp_path))
+    assert {path for path in (tmp_path / "semantic").rglob("*") if path.is_file()} <= listed
+
+
+@pytest.mark.parametrize(
+    ("present", "code"),
+    [([0, 1, 2, 255], 255), ([0, 1, 65_535], 65_535), ([1, 2, 4, 5, 255], 255), ([0, 2, 3, 40, 255], None),
+     ([0, 255], None), ([0, 51, 102, 153, 204, 255], None), (list(range(256)), None), ([0, 1, 2], None),
+     ([0, 1, 2, 254, 255], None), ([255], None), ([], None), ([0, 1, 255, 65_535], None)],
+)  # fmt: skip
+def test_which_of_ids_without_names_is_void(present, code):
+    assert labels.void_code(present) == code
+
+
+@pytest.mark.parametrize(
+    ("name", "which", "void"),
+    [(name, 5, True) for name in ("unannotated", "Unlabeled", "unlabelled", "ignore", "IGNORED ", "void", "un-defined",
+                                  "none", "No Label", "not_labeled", "unknown")]
+    + [("background", 0, True), ("Background", 255, True), ("background", 7, False)]
+    + [(name, 0, False) for name in ("other", "others", "otherprop", "otherfurniture", "clutter", "wall", "void deck")],
+)  # fmt: skip
+def test_names_of_the_usual_sets_that_mean_nothing_are_void_and_classes_are_not(name, which, void):
+    assert labels.is_void(name, which) is void
+    raw = np.array([[[which, which, which, 9]]], np.int32)
+    found, classes, notes = labels.indexed(raw, {which: name, 9: "sofa"}, None)
+    assert classes == (["sofa"] if void else [name, "sofa"])
+    assert found.tolist() == ([[[-1, -1, -1, 0]]] if void else [[[0, 0, 0, 1]]])
+    assert void == any(f"{which} (75.0% of the pixels)" in note for note in notes)
+
+
+@pytest.mark.parametrize("place", ["semantics", "label", "labels", "segmentation"])
+@pytest.mark.parametrize("kind", ["colmap", "transforms"])
+def test_maps_lie_in_folders_of_other_names_and_beside_a_transforms_json(tmp_path, place, kind):
+    folder = source(tmp_path, ids(ONE), BY_ID)
+    (folder / "semantic").rename(folder / place)
+    if kind == "transforms":
+        frames = [{"file_path": f"images/{name}.png", "transform_matrix": np.eye(4).tolist()} for name in "abc"]
+        (folder / "transforms.json").write_text(json.dumps({"fl_x": 10.0, "frames": frames}))
+    module = {"colmap": colmap, "transforms": transforms}[kind]
+    assert module.probe(folder)["labels"] and folder / place / "a.png" in module.files(folder)
+    check(module.read(folder, SETTINGS), NAMES)
+
+
+def test_views_without_a_map_are_unknown_and_counted(tmp_path):
+    folder = source(tmp_path, ids(ONE), BY_ID)
+    (folder / "semantic/b.png").unlink()
+    fields = colmap.read(folder, SETTINGS)
+    check(fields, NAMES, np.where(np.arange(3)[:, None, None] == 1, -1, CLASS))
+    assert "2 of 3 views have labels; the others count as unknown." in said(fields)
+
+
+def test_maps_of_another_kind_are_named_and_not_passed_over(tmp_path):
+    folder = source(tmp_path, ids(ONE), BY_ID)
+    for path in (folder / "semantic").iterdir():
+        path.rename(path.with_suffix(".tif"))
+    fields = colmap.read(folder, SETTINGS)
+    assert "labels" not in fields
+    assert "semantic/ holds no PNG or .npy: not read (a.tif, b.tif, c.tif)." in fields["source"]["notes"]
+
+
+def test_a_name_given_twice_in_other_letters_is_one_class(tmp_path):
+    fields = colmap.read(source(tmp_path, ids(ONE), BY_ID | {"2": "Wall_"}), SETTINGS)
+    assert len(fields["class_names"]) == 2
+    assert np.array_equal(fields["labels"] == 0, (CLASS == 0) | (CLASS == 1))
+
+
+def test_a_lossy_map_and_a_picture_of_many_colours_are_refused(tmp_path):
+    folder = source(tmp_path, ids(ONE), BY_ID)
+    Image.fromarray(CLASS[1].astype(np.uint8)).save(folder / "semantic/b.png", format="JPEG", quality=100)
+    with pytest.raises(InputError, match=r"semantic/b\.png is a JPEG picture.*write label maps as PNG"):
+        colmap.read(folder, SETTINGS)
+    listing = Listing("colmap", [], label_place="semantic", label_kinds={"a": labels.COLORS})
+    with pytest.raises(InputError, match="holds 2000 colours"):
+        labels.resolved(listing, np.arange(2000).reshape(1, 40, 50) * 999)
+
+
+def test_colours_that_no_name_fits_are_an_error(tmp_path):
+    with pytest.raises(DataFailure, match=r"no label has a name \(colours \[#000000, #00c800"):
+        colmap.read(source(tmp_path, colors, BY_ID), SETTINGS)
+
+
+# ScanNet as its own tools export it
+
+
+@pytest.mark.parametrize("how", ["raw ids, SG's table", "raw ids, ScanNet's table", "NYU's 40", "names beside"])
+def test_scannets_own_export_needs_no_points_and_its_label_folder_is_read(tmp_path, how):
+    fields = tiny() | {"class_names": NAMES, "labels": CLASS}
+    fields["Ks"][:, 0, 2] += 0.5  # as written, half of these few pixels
+    layouts.write_scannet(tmp_path, fields)
+    raw = [layouts.SCANNET_IDS[name] for name in ("wall", "floor", "television")]
+    found = ["wall", "floor", "television"]
+    for k, of_view in enumerate(CLASS):
+        stored = layouts.raw_labels(of_view, [1, 2, 25] if how in ("NYU's 40", "names beside") else raw)
+        save(tmp_path / f"label/{10 * k}.png", stored.astype(np.uint8) if how == "NYU's 40" else stored)
+        save(tmp_path / f"depth/{10 * k}.png", layouts.stored_depth(fields["depth"][k]))
+    if "SG" in how:
+        layouts.write_table(tmp_path / scannet.MODIFIED, "cocomapid", layouts.COCO_IDS)
+    elif "ScanNet's" in how:
+        layouts.write_table(tmp_path / scannet.OWN, "nyu40id", layouts.NYU_IDS)
+    elif how == "names beside":
+        (tmp_path / "labels.json").write_text(json.dumps({"1": "wall", "2": "floor", "25": "tv screen"}))
+        found = NAMES
+    got = scannet.read(tmp_path, SETTINGS)
+    check(got, found)
+    assert "points" not in got and "without points3d.ply" in said(got)
+    assert "Labels of label/ are taken for ids with names: 3 classes" in said(got)
+    assert scannet.probe(tmp_path)["labels"] and tmp_path / "label/10.png" in scannet.files(tmp_path)
