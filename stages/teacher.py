@@ -88,11 +88,13 @@ def from_onnx(job: Job, capture: Capture, settings: TeacherSection) -> None:
     writer = FeatureWriter(job.scratch / "features", capture.names, shape, made_with)
     waiting = [view for view in range(len(capture.names)) if view not in writer.done]
     if writer.done:
+        job.watch.go_on(job.scratch)
         log.info("%d of %d views are there from a run that was stopped", len(writer.done), len(capture.names))
     for view, _ in job.progress.track(waiting, len(capture.names), "teacher", len(writer.done)):
         name = capture.names[view]
         features = network.features(capture.images[view], grid, settings.scales, settings.flips, name)
         writer.add(view, *space.split(features))
+        job.watch.keep(job.scratch)
     writer.finish(job.out, space.names, space.embeddings, convention, channels)
     job.facts |= {"kind": "onnx", "n_labels": len(space.names), "convention": convention}
 
