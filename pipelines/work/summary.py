@@ -14,6 +14,7 @@ from typing import Any
 from chebsplat.errors import InputError
 from chebsplat.formats import artifact
 from chebsplat.formats.artifact import read_document
+from chebsplat.formats.manifest import measured_on
 from chebsplat.pipelines.work import store
 
 RUNS, FAILED, WAITS, LEFT, DONE = "runs", "failed", "waits", "not begun", "done"
@@ -50,6 +51,7 @@ def quality(figures: Any) -> tuple[str, str, str]:
 def table(evaluation: Path) -> list[tuple[str, str, str]]:
     """(what, value, beside it) of a scene that was evaluated; what was not measured is not there."""
     measured = figures(evaluation)
+    where = f", measured on {measured_on(artifact.read_manifest(evaluation))}" if measured else ""
     psnr, miou, teacher = quality(measured)
     size = {name: text("{:.1f} MB", scaled(number(measured, "bytes", name))) for name in ("ply", "split", "ragged")}
     others = ", ".join(f"{name} {shown}" for name, shown in size.items() if shown and name != "ply")
@@ -58,7 +60,7 @@ def table(evaluation: Path) -> list[tuple[str, str, str]]:
         ("mIoU", miou, f"its 2D teacher {teacher}" if teacher else ""),
         ("Gaussians", text("{:,}", number(measured, "n_gaussians")), ""),
         ("PLY", size["ply"], others),
-        ("frames/s", text("{:.0f}", number(measured, "frames_per_second", "color")), "colour alone"),
+        ("frames/s", text("{:.0f}", number(measured, "frames_per_second", "color")), f"colour alone{where}"),
     ]
     return [row for row in rows if row[1]]
 

@@ -70,7 +70,11 @@ def read(path: Path, settings: IngestSection, model: PhotoModel) -> dict[str, An
     camera = cameras.camera_of(file, *model.cameras[0])
     view = assembly.geometry(camera, settings.max_side)
     at = assembly.positions(camera, view)
-    images = [assembly.resampled(image, camera, view, at) for _, image in _taken(file, set(model.frames))]
+    images, kept, step = [], [], max(len(model.frames) // assembly.COMPARED, 1)
+    for k, (_, image) in enumerate(_taken(file, set(model.frames))):
+        images.append(assembly.resampled(image, camera, view, at))
+        if k % step == 0:
+            kept.append(assembly.variance_kept(image, images[-1], at))
     notes = list(model.notes)
     if view.factor < 1:
         notes.append(f"Images are reduced by {view.factor:.3f} (ingest.max_side).")
@@ -80,6 +84,7 @@ def read(path: Path, settings: IngestSection, model: PhotoModel) -> dict[str, An
         "Ks": np.tile(view.K, (len(images), 1, 1)),
         "cam_from_world": model.cam_from_world,
         "source": {"kind": "video", "notes": notes},
+        "variance_kept": float(np.mean(kept)),
     }
     return fields | points_of(Cloud(model.points, model.colors, model.errors, model.tracks), model.names, fields)
 

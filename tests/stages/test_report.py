@@ -56,7 +56,7 @@ def test_the_report_is_one_page_that_fetches_nothing(toy):
     assert "@import" not in text
     assert "url(" not in text.replace("url(#", "")
     assert len(text) < 20_000_000
-    assert text.count("<svg") == 3
+    assert text.count("<svg") == 4
     for told in ("LPIPS", "IoU by class", "Every setting", "make view scene="):
         assert told in text
     assert (toy["report"] / "figures.csv").read_text().startswith("figure,")
