@@ -40,7 +40,7 @@ def run(job: Job) -> None:
         features = make(job, capture, settings)
         job.facts |= {"kind": settings.kind, "n_labels": len(features.label_names), "convention": features.convention}
         if features.pseudo_labels is not None:
-            said = dict(enumerate(features.pseudo_labels))
+            said = dict(enumerate(np.asarray(features.pseudo_labels)))
             job.facts["right"] = pixels_right(capture, features.label_names, said)
         features.write(job.out)
     else:
