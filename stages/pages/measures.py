@@ -32,12 +32,16 @@ class Measure:
 RIGHT = "pixels of training views with the true label"
 HALVES = "half the training views as the other half says (cosine)"
 MEASURES: dict[str, tuple[Measure, ...]] = {  # by stage: its error is the first that was measured
-    "pose": (Measure("model", "reprojection_error_px", "points off their photos", PIXELS, lower=True),),
+    "pose": (
+        Measure("model", "reprojection_error_px", "points off their photos", PIXELS, lower=True),
+        Measure("model", "registered", "photos that are registered", PERCENT),
+    ),
     "ingest": (Measure("capture", "variance_kept", "variance of the photos that views keep", PERCENT),),
     "sfm": (
         Measure("points", "reprojection_error_px", "points off their photos", PIXELS, lower=True),
         Measure("points", "depth_error", "points off other views' depth", PERCENT, lower=True),
         Measure("points", "covered", "cells of the photos that hold a point", PERCENT),
+        Measure("points", "swept", "pixels of the photos whose depth a sweep found", PERCENT),
     ),
     "channels": (Measure("channels", "relative_error", "of features lost", NUMBER, lower=True),),
     "teacher": (
