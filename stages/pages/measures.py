@@ -104,11 +104,13 @@ def row_of(stage: str, manifest: Manifest, facts: Mapping[str, dict[str, Any]]) 
 class Course(NamedTuple):
     """How a scene came to what it is. Seconds count from the start, stage after stage.
 
-    spans: (stage, begin, end) in order; colors: (seconds, PSNR) of the scene as it would have been left then;
-    meanings: (stage, seconds, value) after each stage that made features, and what the values are, in words.
+    spans: (stage, begin, end) in order; plain: PSNR of photos of one colour, which is what there is before training;
+    colors: (seconds, PSNR) of the scene as it would have been left then, as often as it was measured; meanings:
+    (stage, seconds, value) after each stage that made features, and what the values are, in words.
     """
 
     spans: list[tuple[str, float, float]]
+    plain: float
     colors: list[tuple[float, float]]
     meanings: list[tuple[str, float, float]]
     words: str
@@ -119,35 +121,35 @@ def course_of(
 ) -> Course:
     """The course of a scene.
 
-    Args: rows: of its stages, in their order; trace: of its training; plain: PSNR of photos whose every pixel has
-      their mean colour, which is what there is before training.
+    Args: rows: of its stages, in their order; trace: of its training; plain: see `Course`.
     Choices: a training's seconds, of its steps alone, are spread over those of its stage.
     """
     ends = list(itertools.accumulate(row.seconds for row in rows))
     spans = [(row.stage, end - row.seconds, end) for row, end in zip(rows, ends, strict=True)]
-    begin, end = next(((begin, end) for stage, begin, end in spans if stage == "train"), (0.0, 0.0))
+    begin, end = next((begin, end) for stage, begin, end in spans if stage == "train")
     factor = (end - begin) / max(trace[-1]["seconds"], 1e-9)
-    trained = [(begin + factor * entry["seconds"], entry["psnr"]) for entry in trace]
-    colors = [(0.0, plain), (begin, plain), *trained, (max(ends, default=end), trace[-1]["psnr"])]
+    colors = [(begin + factor * entry["seconds"], entry["psnr"]) for entry in trace]
+    colors.append((ends[-1], trace[-1]["psnr"]))
     for fact, words in (("right", RIGHT), ("halves_agree", HALVES)):
         measured = {stage: m.role for stage, of in MEASURES.items() for m in of if m.fact == fact}
         values = [(stage, end, facts.get(measured.get(stage, ""), {}).get(fact)) for stage, _, end in spans]
         if meanings := [(stage, end, value) for stage, end, value in values if value is not None]:
-            return Course(spans, colors, meanings, words)
-    return Course(spans, colors, [], "")
+            return Course(spans, plain, colors, meanings, words)
+    return Course(spans, plain, colors, [], "")
 
 
-STOPS = (("before training", 0.0), ("a quarter of the training", 0.25), ("half of the training", 0.5))
+STOPS = (("a quarter of the training", 0.25), ("half of the training", 0.5))
 
 
 def stops(course: Course) -> list[tuple[str, float, float, float | None]]:
-    """(stopped after, seconds, PSNR, meaning by then), of earlier ends and, last, of the whole."""
+    """(stopped after, seconds, PSNR, meaning by then), of earlier ends and, last, of the whole; of a training that was
+    not measured so early, none within.
+    """
     seconds, values = map(np.array, zip(*course.colors, strict=True))
     begin, end = next((begin, end) for stage, begin, end in course.spans if stage == "train")
     at = [(words, begin + share * (end - begin)) for words, share in STOPS]
+    at = [(words, when) for words, when in at if when >= seconds[0]]
     at += [(stage, end) for stage, _, end in course.spans if stage in ("train", "lift", "refine")]
-    found = []
-    for words, when in at:
-        meanings = [value for _, second, value in course.meanings if second <= when + 1e-9]
-        found.append((words, when, float(np.interp(when, seconds, values)), meanings[-1] if meanings else None))
-    return found
+    found = [("before training", begin, course.plain), *((*of, float(np.interp(of[1], seconds, values))) for of in at)]
+    by_then = [[value for _, second, value in course.meanings if second <= when + 1e-9] for _, when, _ in found]
+    return [(*of, values[-1] if values else None) for of, values in zip(found, by_then, strict=True)]

@@ -63,15 +63,16 @@ def test_a_scene_s_course_is_its_stages_one_after_the_other_and_its_stops_are_re
     facts = {"features": {"right": 0.5}, "gaussians": {"right": None}, "lifted": {"right": 0.75}}
     course = course_of(rows, facts, trace, 12.0)
     assert course.spans == [("ingest", 0, 10), ("teacher", 10, 15), ("train", 15, 55), ("lift", 55, 60)]
-    assert course.colors == [(0, 12), (15, 12), (35, 20), (55, 30), (60, 30)]
+    assert (course.plain, course.colors) == (12, [(35, 20), (55, 30), (60, 30)])
     assert course.meanings == [("teacher", 15, 0.5), ("lift", 60, 0.75)]
     assert stops(course) == [
         ("before training", 15, 12, 0.5),
-        ("a quarter of the training", 25, 16, 0.5),
-        ("half of the training", 35, 20, 0.5),
+        ("half of the training", 35, 20, 0.5),  # a quarter of it was not measured, and is not made up
         ("train", 55, 30, 0.5),
         ("lift", 60, 30, 0.75),
     ]
+    early = course_of(rows, facts, [{"seconds": 2.0, "psnr": 14.0}, *trace], 12.0)
+    assert stops(early)[1] == ("a quarter of the training", 25, 16.25, 0.5)
     without = course_of(rows, {"lifted": {"halves_agree": 0.9}}, trace, 12.0)  # no true labels: halves of the views
     assert without.meanings == [("lift", 60, 0.9)] and "half the training views" in without.words
     assert course_of(rows, {}, trace, 12.0).meanings == []
