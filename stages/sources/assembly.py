@@ -282,8 +282,8 @@ def variance_kept(image: Any, pixels: np.ndarray, at: np.ndarray) -> float:
     low, high = np.nanmin(inside, (1, 2)), np.nanmax(inside, (1, 2))
     half = (high - low) / np.maximum(2 * np.array(at.shape[:0:-1]) - 2, 1)  # of a pixel of the view
     corners = np.clip([np.floor(low - half), np.ceil(high + half)], 0, image.size).astype(int)
-    part = image.crop(corners.ravel().tolist())
-    whole, shown = (ImageStat.Stat(of.convert("L")).var[0] for of in (part, Image.fromarray(pixels)))
+    part, view = image.convert("L").crop(corners.ravel().tolist()), Image.fromarray(pixels).convert("L")
+    whole, shown = (ImageStat.Stat(of).var[0] for of in (part, view))
     return min(shown / whole, 1.0) if whole > 0 else 1.0
 
 
