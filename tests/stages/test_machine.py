@@ -71,16 +71,16 @@ def test_what_is_begun_anew_counts_no_process_before_it(tmp_path, caplog):
 
 
 @pytest.mark.xdist_group("toy")
-@pytest.mark.parametrize("stage", ["train", "teacher"])
+@pytest.mark.parametrize("stage", ["train", "teacher", pytest.param("teach", marks=pytest.mark.slow)])
 def test_a_resumed_stage_has_the_seconds_of_all_its_processes(toy, tmp_path, monkeypatch, stage):
     inputs = {role: toy[of] for role, of in INPUTS[stage].items()}
     if stage == "teacher":
         inputs["channels"] = EMBEDDED.with_suffix(".channels")
-    config, out = TOY | {"teacher": {"kind": "auto"}}, tmp_path / stage
+    config, out = TOY | {"teacher": {"kind": "auto"}} | artifact.read_manifest(toy["teach"]).config, tmp_path / stage
     monkeypatch.setattr(saves, "SECONDS", 0.0)
     with monkeypatch.context() as patched:
-        stopped_after(patched, *{"train": (saves.Saves, "offer", 5),
-                                 "teacher": (machine.Stopwatch, "keep", 2)}[stage])  # fmt: skip
+        stopped_after(patched, *{"train": (saves.Saves, "offer", 5), "teacher": (machine.Stopwatch, "keep", 2),
+                                 "teach": (machine.Stopwatch, "keep", 1)}[stage])  # fmt: skip
         assert run_stage(stage, out, inputs, config) == Stopped(15, "").exit_code
     kept = tmp_path / f".part-{stage}" / machine.KEPT
     kept.write_text(json.dumps([MACHINE]))
