@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import csv
 import os
-import platform
 from argparse import ArgumentParser, RawDescriptionHelpFormatter
 from collections.abc import Iterable, Sequence
 from contextlib import redirect_stdout
@@ -19,6 +18,7 @@ import chebsplat
 from chebsplat.pipelines.planning.plan import Plan, Planner
 from chebsplat.pipelines.running.run import execute
 from chebsplat.pipelines.work.scenes import data_of
+from chebsplat.stages.runtime.machine import cores, load, processor
 
 
 def parser(name: str, description: str | None, work: bool = False) -> ArgumentParser:
@@ -70,16 +70,9 @@ def machine() -> str:
     """What figures are measured with: versions, threads, processor, load."""
     return (
         f"chebsplat {chebsplat.__version__}, torch {torch.__version__} on {torch.get_num_threads()} threads, "
-        f"numba {numba.__version__} on {numba.get_num_threads()}; {processor()}, {os.cpu_count()} cores, "
-        f"load {os.getloadavg()[0]:.1f}"
+        f"numba {numba.__version__} on {numba.get_num_threads()}; {processor()}, {cores()} cores, "
+        f"load {load():.1f}"
     )
-
-
-def processor() -> str:
-    """The processor's name, where the system tells it, otherwise its architecture."""
-    path = Path("/proc/cpuinfo")
-    lines = path.read_text().splitlines() if path.exists() else []
-    return next((line.split(":")[1].strip() for line in lines if line.startswith("model name")), platform.machine())
 
 
 def peak_memory() -> int:

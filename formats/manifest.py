@@ -33,8 +33,19 @@ class Manifest:
     versions: dict[str, str] = field(default_factory=dict)
     device: str = "cpu"
     threads: int = 1
-    seconds: float = 0.0
+    seconds: float = 0.0  # of all processes that worked on it
+    processes: list[dict[str, Any]] = field(default_factory=list)  # see `stages.runtime.machine.Stopwatch.processes`
     files: dict[str, dict[str, Any]] = field(default_factory=dict)
+
+
+def measured_on(manifest: Manifest) -> str:
+    """The machines, each with its threads, that an artifact's seconds were measured on; seconds
+    compare where these are the same words.
+    """
+    threads = [f"{of['threads']} thread{'s' * (of['threads'] > 1)}" for of in manifest.processes]
+    named = [", ".join(filter(None, (of["gpu"], of["processor"]))) for of in manifest.processes]
+    said = dict.fromkeys(", ".join(words) for words in zip(named, threads, strict=True))
+    return " and ".join(said) or "a machine that was not recorded"
 
 
 def is_key(value: object) -> bool:

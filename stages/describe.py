@@ -8,7 +8,7 @@ from chebsplat.errors import DataFailure
 from chebsplat.formats.capture import Capture
 from chebsplat.formats.descriptors import Descriptors
 from chebsplat.formats.points import Points
-from chebsplat.shape.point_inputs import N_OWN, RADII, point_inputs
+from chebsplat.shape.point_inputs import N_OWN, RADII, point_inputs, truncation
 from chebsplat.stages.runtime.command import Job
 from chebsplat.stages.shape_models.surfaces import Cloud, scene_unit, surface_in, up_of
 
@@ -37,5 +37,6 @@ def run(job: Job) -> None:
     if not np.isfinite(inputs.descriptors).all():
         bad = int(np.sum(~np.isfinite(inputs.descriptors).all(1)))
         raise DataFailure(f"{bad} of {len(inputs.own)} points have descriptors that are not finite; report this")
-    job.facts |= {"n_points": len(inputs.own), "unit": unit, "radii": RADII, "n_own": N_OWN} | notes
+    lost = truncation(cloud.means, cloud.covariances, up=up, unit=unit, describe=settings)
+    job.facts |= {"truncation": lost, "n_points": len(inputs.own), "unit": unit, "radii": RADII, "n_own": N_OWN} | notes
     Descriptors(*inputs, origin.tolist(), up.tolist(), unit, notes).write(job.out)

@@ -30,5 +30,8 @@ def run(job: Job) -> None:
         Encoding(np.zeros((0, len(start.map)), np.float16), {"none": str(error)}).write(job.out)
         return
     features = PointEncoder.restored(start.encoder, start.weights).encode(inputs)
+    stored = features.astype(np.float16)
+    lost, spread = np.square(stored - features).mean(), features.var(0).mean()
     job.facts |= {"n_points": len(features), "n_features": features.shape[1]}
-    Encoding(features.astype(np.float16)).write(job.out)
+    job.facts["rounding"] = float(np.sqrt(lost / max(spread, 1e-30)))
+    Encoding(stored).write(job.out)

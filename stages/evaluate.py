@@ -17,11 +17,14 @@ from chebsplat.evaluation import protocols
 from chebsplat.evaluation.lpips import NET, NORMALIZE
 from chebsplat.evaluation.metrics import features_at
 from chebsplat.evaluation.protocols.task import EvaluatedView, MapsByName, Task, resized, translated
+from chebsplat.formats.artifact import checked, read_manifest
 from chebsplat.formats.capture import Capture
 from chebsplat.formats.evaluation import Evaluation
 from chebsplat.formats.features import Features
 from chebsplat.formats.names import few
+from chebsplat.formats.ply import read_ply
 from chebsplat.formats.scene import Scene
+from chebsplat.formats.world import World
 from chebsplat.labels.decode import decode_labels
 from chebsplat.labels.names import lacking
 from chebsplat.render import SceneRenderer
@@ -72,6 +75,8 @@ def run(job: Job) -> None:
     figures["n_gaussians"] = len(scene.parameters["means"])
     figures["bytes"] = scene.summary["bytes"]
     figures |= timings(job, renderer, cameras, scene.labels is not None)
+    job.facts["layouts"] = layouts(job, scene, cameras[0], pictures["renders"][0])
+    job.facts["layout_error"] = max(job.facts["layouts"].values())
     figures["lpips"] = figures["image"]["lpips"]
     if lpips is None:
         job.left_out("LPIPS", "evaluate.lpips_weights names no file: not measured")
@@ -145,6 +150,22 @@ def timings(job: Job, renderer: SceneRenderer, cameras: list[View], semantic: bo
     else:
         job.left_out("milliseconds of a frame by part", "gsplat renders a frame on the GPU in one go")
     return {"frames_per_second": per_second, "milliseconds": split}
+
+
+def layouts(job: Job, scene: Scene, view: View, image: np.ndarray) -> dict[str, int]:
+    """How far the picture of a view u8 [H, W, 3], of the ragged arrays, is from that of each layout of PLY: grey
+    levels of 255, the largest difference. Sizes are in the figures, under the same names.
+    """
+    path, world = job.inputs["scene"], World.read(scene.summary)
+    manifest, found = read_manifest(path, Scene.SCHEMA), {"ragged": 0}
+    of_degrees = sorted(name for name in manifest.files if name.startswith("scene_d") and name.endswith(".ply"))
+    for layout, names in (("ply", ["scene.ply"]), ("split", of_degrees)):
+        if names:
+            parts = [read_ply(checked(path, manifest, name), world)[0] for name in names]
+            parameters = {key: np.concatenate([part[key] for part in parts]) for key in parts[0]}
+            shown = SceneRenderer(parameters, job.device).render(view)[0]
+            found[layout] = int(np.abs(shown.astype(int) - image).max())
+    return found
 
 
 def camera(scene: Scene, index: int) -> View:

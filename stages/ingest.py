@@ -166,6 +166,7 @@ def run(job: Job) -> None:
     source = resolve_source(name, job.config.source)
     model = PhotoModel.read(job.inputs["model"]) if "model" in job.inputs else None
     fields = read(name, source, settings, model)
+    job.facts["variance_kept"] = fields.pop("variance_kept", 1.0)  # generated views are as large as they are made
     fields["source"] = {"name": name} | fields["source"]
     for note in (*filter(None, [fields["source"].get("labels")]), *fields["source"].get("notes", [])):
         log.info("%s", note)

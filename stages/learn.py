@@ -92,6 +92,7 @@ def run(job: Job) -> None:
     sums = summed(z, np.concatenate([said, words], 1), weights)
     seen, half = n_views >= LEAST_VIEWS, said.shape[1]
     answers = z @ (start.map[:, :half] if in_channels else start.map[:, half:])
+    missed = weights @ np.square(answers - said).sum(1) / max(float(weights @ np.square(said).sum(1)), 1e-30)
     rho, spread = novelty(sums, start.scale, start.basis), sums.spread()
     notes |= {
         "n_points": int(seen.sum()),
@@ -103,7 +104,7 @@ def run(job: Job) -> None:
         "familiar": familiar(said[seen], answers[seen], embeddings),
         "alike": float((decode_labels(answers[seen], embeddings) == labels[seen]).mean()),
     }
-    job.facts |= notes
+    job.facts |= notes | {"unexplained": float(missed)}
     write_lesson(job.out, Lesson(sums, notes))
 
 

@@ -29,7 +29,7 @@ def run(job: Job) -> None:
         best = _best(job)
     finally:
         artifact.discard(job.scratch)  # also of photos that cannot be posed
-    job.facts |= best.judged
+    job.facts |= best.judged | {"registered": share(best)}
     for note in best.notes:
         log.info("%s", note)
     for warning in best.judged["doubts"]:

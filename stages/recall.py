@@ -12,7 +12,7 @@ from chebsplat.errors import InputError
 from chebsplat.formats.artifact import read_manifest
 from chebsplat.formats.knowledge import Knowledge, read_knowledge, write_knowledge
 from chebsplat.formats.lesson import Lesson, read_lesson
-from chebsplat.shape.lessons import Sums, basis, combined, mapped, mean_of
+from chebsplat.shape.lessons import Sums, basis, combined, mapped, mean_of, unexplained
 from chebsplat.stages.registry import LESSON
 from chebsplat.stages.runtime.command import Job
 
@@ -35,6 +35,8 @@ def run(job: Job) -> None:
                 f"{paths[key]} is a lesson of another encoder; learn it again (`chebsplat knowledge rebuild`)"
             )
     knowledge = taught(start, lessons)
+    known = mean_of([Sums(*of) for of in (*start.shipped, *(one.sums for one in lessons.values()))])
+    job.facts["unexplained"] = unexplained(known, knowledge.map.astype(np.float64))
     job.facts |= knowledge.lessons | {"n_lessons": len(lessons), "encoder": read_manifest(job.inputs["start"]).key}
     write_knowledge(job.out, knowledge)
 

@@ -32,6 +32,7 @@ from chebsplat.splats.gaussians import surface_of
 from chebsplat.stages.runtime.command import Job
 from chebsplat.stages.shape_models.answers import into_channels, unnamed
 from chebsplat.stages.shape_models.surfaces import in_scene, scene_unit
+from chebsplat.stages.training.truth import labels_right
 
 REACH = 0.15  # metres from swept points, where an answer is half as long
 
@@ -83,6 +84,11 @@ def run(job: Job) -> None:
     notes |= {"familiar": known_to_teacher, "believed": belief}
     sure = confidence(made[1], lifted.n_views, lifted.agreement, knowledge, strength, known_to_teacher)
     Refined(made[2], sure, notes).write(job.out)
+    of_strength = choice.curve["on" if smoothed else "off"]
+    agree = float(np.interp(strength, list(of_strength), list(of_strength.values())))
+    job.facts |= {"halves_agree": agree, "gain": agree - choice.curve["off"][0.0]}
+    if capture is not None and "features" in job.inputs:
+        job.facts["right"] = labels_right(capture, p, made[2], Features.read(job.inputs["features"]))
     job.facts |= {"n_gaussians": len(features), "unit": unit, **notes} | shares(job, made)
 
 

@@ -12,12 +12,15 @@ import numpy as np
 
 from chebsplat.cameras import centers
 from chebsplat.errors import DataFailure
+from chebsplat.evaluation.metrics import psnr
 from chebsplat.formats.artifact import read_manifest
 from chebsplat.formats.evaluation import Evaluation, rests
 from chebsplat.formats.gaussians import Gaussians
+from chebsplat.formats.manifest import Manifest, measured_on
 from chebsplat.formats.photo_model import PhotoModel
 from chebsplat.stages.pages import parts
 from chebsplat.stages.pages import pictures as draw
+from chebsplat.stages.pages.measures import course_of, row_of, stops
 from chebsplat.stages.pages.parts import REPORT, rendered
 from chebsplat.stages.pages.started import started
 from chebsplat.stages.runtime.command import Job
@@ -71,15 +74,17 @@ def run(job: Job) -> None:
     left_out = absent_stages(job, gaussians) | figures["left_out"]
     for of_input in facts.values():
         left_out |= of_input.get("left_out", {})
-    stages = [(STAGE_OF[role], m.seconds, m.key, m.device, m.threads) for role, m in manifests.items()]
+    stages = [row_of(STAGE_OF[role], m, facts) for role, m in manifests.items()]
+    course = course_of(stages, facts, gaussians.trace, psnr_of_one_color(evaluation))
+    timed = {role: measured_on(manifests[role]) for role in ("evaluation", "gaussians")}
     versions: dict[str, str] = {}
     settings: dict[str, Any] = {}
     for manifest in manifests.values():
         versions |= manifest.versions
         settings |= manifest.config
     by_degree = facts["scene"]["by_degree"] if "scene" in facts else None
-    rows = summary_rows(figures, by_degree, facts["gaussians"]) + refined_rows(facts.get("refined"))
-    rows += agreement_rows(facts.get("agreement"))
+    rows = summary_rows(figures, by_degree, facts["gaussians"], timed) + refined_rows(facts.get("refined"))
+    rows += agreement_rows(facts.get("agreement")) + clock_rows(manifests["gaussians"])
     write_table(job.out / "figures.csv", rows)
     write_table(job.out / "trace.csv", [list(gaussians.trace[0]), *(list(row.values()) for row in gaussians.trace)])
     names = parts.label_names(job.inputs, figures)
@@ -102,8 +107,11 @@ def run(job: Job) -> None:
         pictures=pictures,
         modes=parts.modes(pictures),
         curves=draw.curves(gaussians.trace, figures["image"]["psnr"]),
+        course=draw.course(course, figures["image"]["psnr"]),
+        stops=stops(course),
+        meaning=course.words,
         stages=stages,
-        total=sum(seconds for _, seconds, *_ in stages),
+        total=sum(row.seconds for row in stages),
         left_out=sorted(left_out.items()),
         decided=decided_rows(facts["gaussians"]),
         started=started(job.inputs, facts),
@@ -116,6 +124,23 @@ def run(job: Job) -> None:
         raise DataFailure(f"the page would have {len(text) / 1e6:.0f} MB; lower ingest.max_side")
     (job.out / "report.html").write_text(text)
     job.facts |= {"page": "report.html", "psnr": figures["image"]["psnr"]}
+
+
+def psnr_of_one_color(evaluation: Evaluation) -> float:
+    """PSNR, dB, of some evaluated photos, if each pixel had their mean colour: what a scene shows before training."""
+    truth = evaluation.pictures["truth"]
+    photos = np.stack([truth[k] for k in range(0, len(truth), -(-len(truth) // N_PICTURES))])
+    flat = np.broadcast_to(photos.mean((0, 1, 2)).round().astype(np.uint8), photos.shape)
+    return min(psnr(flat, photos), 100.0)
+
+
+def clock_rows(training: Manifest) -> list[list[str]]:
+    """(figure, scene, teacher) of a training that its clock has ended: how far that came depends on the machine."""
+    seconds = training.config.get("train", {}).get("seconds")
+    if seconds is None:
+        return []
+    what = f"steps within {seconds:g} s by the clock (train.seconds, measured on {measured_on(training)})"
+    return [[what, f"{training.facts['steps']:,}", ""]]
 
 
 def posed(model: PhotoModel) -> dict[str, Any]:
@@ -159,10 +184,13 @@ def absent_stages(job: Job, gaussians: Gaussians) -> dict[str, str]:
     return {f"stage {STAGE_OF[role]}": why or "its artifact was not given" for role, why in absent.items()}
 
 
-def summary_rows(figures: dict[str, Any], by_degree: list[int] | None, trained: dict[str, Any]) -> list[list[str]]:
+def summary_rows(
+    figures: dict[str, Any], by_degree: list[int] | None, trained: dict[str, Any], timed: dict[str, str]
+) -> list[list[str]]:
     """Header, then (figure, scene, teacher). What was not measured says so.
 
-    Args: by_degree: Gaussians by SH degree, None where unknown; trained: facts of the training.
+    Args: by_degree: Gaussians by SH degree, None where unknown; trained: facts of the training; timed: the machines
+      that `evaluation` and training (`gaussians`) were measured on.
     """
 
     def shown(value: float | None, form: str) -> str:
@@ -194,13 +222,15 @@ def summary_rows(figures: dict[str, Any], by_degree: list[int] | None, trained: 
     for name, size in figures["bytes"].items():
         share = f" ({size / whole:.0%} of plain 3DGS)" if name in SMALLER else ""
         rows.append([f"bytes, {BYTES[name]}", f"{size:,}{share}", ""])
-    rows += [[f"frames/s, {FRAMES[name]}", f"{v:.1f}", ""] for name, v in figures["frames_per_second"].items()]
+    on = f"measured on {timed['evaluation']}"
+    rows += [[f"frames/s, {FRAMES[name]} ({on})", f"{v:.1f}", ""] for name, v in figures["frames_per_second"].items()]
     if split := figures["milliseconds"]:
         threads = "one thread" if split["threads"] == 1 else f"{split['threads']} threads"
-        under = f"{split['width']}x{split['height']}, {threads}, {split['device']}"
+        under = f"{split['width']}x{split['height']}, {threads}, {split['device']}, {on}"
         parts = {"projection": "projection", "sh": "SH", "sort": "sort", "blend": "blend"}
         rows += [[f"ms a frame, {name} ({under})", f"{split[part]:.2f}", ""] for part, name in parts.items()]
-    rows += [[f"ms a training step, {part}", f"{v:.2f}", ""] for part, v in trained["milliseconds"].items()]
+    on = f"measured on {timed['gaussians']}"
+    rows += [[f"ms a training step, {part} ({on})", f"{v:.2f}", ""] for part, v in trained["milliseconds"].items()]
     if peak := trained.get("peak_device_bytes"):
         rows.append(["bytes of the GPU's memory in training, at most", f"{peak:,}", ""])
     return rows

@@ -146,6 +146,8 @@ def prepared(job: Job, settings: TeachSection, matrix: np.ndarray) -> list[list[
     folder = job.scratch / "rooms"
     folder.mkdir(parents=True, exist_ok=True)
     missing = [seed for seed in seeds if not kept_as(folder, seed).is_file()]
+    if len(missing) < len(seeds):
+        job.watch.go_on(job.scratch)
     if missing:
         os.environ.setdefault("OMP_NUM_THREADS", "1")  # of the processes below
         context = multiprocessing.get_context("spawn")
@@ -154,6 +156,7 @@ def prepared(job: Job, settings: TeachSection, matrix: np.ndarray) -> list[list[
             done = as_completed(jobs)
             for finished, _ in job.progress.track(done, len(seeds), "rooms", len(seeds) - len(missing)):
                 finished.result()
+                job.watch.keep(job.scratch)
     return [held(folder, seed) for seed in seeds]
 
 

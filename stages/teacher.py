@@ -21,8 +21,10 @@ from chebsplat.stages.settings import MAX_CHANNELS, TeacherSection
 from chebsplat.stages.teacher_models.image_encoder import TeacherInference
 from chebsplat.stages.teacher_models.label_space import closed_set, label_set, open_vocabulary
 from chebsplat.stages.teacher_models.onnx_session import CUDA, GPU_REMEDY, providers
+from chebsplat.stages.training.truth import pixels_right
 
 log = logging.getLogger("chebsplat")
+MIRRORED = 25  # views, of which one is looked at mirrored, too: 4 % of the stage's time
 
 
 def run(job: Job) -> None:
@@ -37,6 +39,9 @@ def run(job: Job) -> None:
         make = from_labels if settings.kind == "labels" else from_pseudo_labels
         features = make(job, capture, settings)
         job.facts |= {"kind": settings.kind, "n_labels": len(features.label_names), "convention": features.convention}
+        if features.pseudo_labels is not None:
+            said = dict(enumerate(np.asarray(features.pseudo_labels)))
+            job.facts["right"] = pixels_right(capture, features.label_names, said)
         features.write(job.out)
     else:
         from_onnx(job, capture, settings)
@@ -88,13 +93,25 @@ def from_onnx(job: Job, capture: Capture, settings: TeacherSection) -> None:
     writer = FeatureWriter(job.scratch / "features", capture.names, shape, made_with)
     waiting = [view for view in range(len(capture.names)) if view not in writer.done]
     if writer.done:
+        job.watch.go_on(job.scratch)
         log.info("%d of %d views are there from a run that was stopped", len(writer.done), len(capture.names))
+    said: dict[int, np.ndarray] = {}
+    turned, alike = set(waiting[MIRRORED // 2 :: MIRRORED]), []
     for view, _ in job.progress.track(waiting, len(capture.names), "teacher", len(writer.done)):
         name = capture.names[view]
         features = network.features(capture.images[view], grid, settings.scales, settings.flips, name)
-        writer.add(view, *space.split(features))
+        kept, said[view], confidence = space.split(features)
+        writer.add(view, kept, said[view], confidence)
+        job.watch.keep(job.scratch)
+        if view in turned:
+            image, scales = capture.images[view], settings.scales
+            there = features if not settings.flips else network.features(image, grid, scales, False, name)
+            back = network.features(image[:, ::-1], grid, scales, False, name)[:, ::-1]
+            alike.append(float((space.split(there)[1] == space.split(back)[1]).mean()))
     writer.finish(job.out, space.names, space.embeddings, convention, channels)
     job.facts |= {"kind": "onnx", "n_labels": len(space.names), "convention": convention}
+    job.facts |= {"mirrored_alike": float(np.mean(alike)) if alike else None}
+    job.facts |= {"right": pixels_right(capture, space.names, said)}
 
 
 def from_labels(job: Job, capture: Capture, settings: TeacherSection) -> Features:

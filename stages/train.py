@@ -13,6 +13,7 @@ from chebsplat.stages.runtime.command import Job
 from chebsplat.stages.training.assembly import KNOWLEDGE, assemble, read_inputs
 from chebsplat.stages.training.facts import facts_of, printed_facts
 from chebsplat.stages.training.loop import follow
+from chebsplat.stages.training.truth import labels_right
 from chebsplat.training.printed import PrintedScene
 
 log = logging.getLogger("chebsplat")
@@ -37,7 +38,9 @@ def run(job: Job) -> None:
         log.warning("%d Gaussians became non-finite and were removed", population.n_broken)
     if parameters["degrees"].size == 0:
         raise DataFailure("no Gaussian is left; lower train.weight_mask or raise train.min_gaussians")
-    job.facts |= facts_of(job, trainer, parameters, features)
+    job.facts |= facts_of(job, trainer, parameters, features) | {"psnr": trace[-1]["psnr"]}
+    if features is not None and "features" in parameters:
+        job.facts["right"] = labels_right(inputs.capture, parameters, parameters["features"], features)
     modules = {
         f"{n}.{k}": v.detach().cpu().numpy()
         for n, m in trainer.model.modules.items()

@@ -23,6 +23,7 @@ from chebsplat.pipelines.api import load
 from chebsplat.splats.parts import first_of_each
 from chebsplat.stages.runtime.progress import Progress
 from chebsplat.stages.tools.mesh import LEAST_PART, LONGEST_HOLE, frames, labels_at
+from chebsplat.synthetic.rays import open3d
 
 NEAR, MIDDLE = 0.02, 0.05  # metres
 SPACING = 0.01  # metres, of the truth
@@ -87,7 +88,7 @@ def main(arguments: Sequence[str]) -> int:
         names = [list(capture.class_names or []).index(name) for name in scene.label_names or []]
         for voxel in options.voxels:
             began, spent = time.perf_counter(), time.process_time()
-            raw = fused(seen, voxel, 1e3)
+            raw = fused(open3d(), seen, voxel, 1e3)
             fusing, cleaning = time.perf_counter() - began, time.process_time()
             mesh = cleaned(raw, options.triangles, LEAST_PART * voxel, LONGEST_HOLE, voxel)
             cleaning = time.process_time() - cleaning

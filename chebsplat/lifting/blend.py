@@ -112,6 +112,16 @@ def believed(
     return max(alike_enough, 1 - worth)
 
 
+def halves_agree(halves: np.ndarray, half_views: np.ndarray) -> float:
+    """How far half of the training views tell what the other half says: mean cosine, as `calibrate`
+    has it, of features as they are. 0 without a Gaussian that both see.
+
+    Args: halves [2, N, C], features by each half; half_views [2, N] how many of them see each.
+    """
+    weights = np.where((half_views > 0).all(0), half_views.sum(0), 0).astype(np.float64)
+    return float(weights @ cosines(*halves) / max(float(weights.sum()), 1.0))
+
+
 def calibrate(
     halves: np.ndarray, half_views: np.ndarray, near: Affinities, knowledge: np.ndarray | None = None
 ) -> Calibration:

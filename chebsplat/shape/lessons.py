@@ -98,6 +98,12 @@ def solved(sums: Sums, ridge: float) -> np.ndarray:
     return np.asarray(found * (scale * used)[:, None])
 
 
+def unexplained(sums: Sums, answers: np.ndarray) -> float:
+    """Share of the meanings' square that a map W [p, C] leaves: (c - 2 <W, b> + <W, A W>) / c."""
+    left = sums.square - 2 * np.sum(answers * sums.cross) + np.sum(answers * (sums.gram @ answers))
+    return float(left / max(sums.square, 1e-300))
+
+
 def mapped(shipped: Sequence[Sums], lessons: Sequence[Sums], trust: Sequence[float]) -> np.ndarray:
     """The map W f64 [p, C] that shipped sums and lessons give.
 

@@ -7,6 +7,7 @@ from typing import NamedTuple
 
 import numpy as np
 from scipy.spatial import cKDTree
+from scipy.spatial.distance import pdist
 from scipy.spatial.transform import Rotation
 
 from chebsplat.cameras import upright
@@ -20,6 +21,7 @@ SPACING = 0.36  # of a radius, between the points that stand for a neighbourhood
 REACH = 1.3  # of a radius, to the farthest neighbour
 MEMBERS = 32  # of the region that a descriptor is of
 FLOOR = 0.005  # quantile of heights
+N_TRIED, TRIED = 128, 0.3  # points whose `truncation` is measured, and the radius, metres
 
 
 class PointInputs(NamedTuple):
@@ -66,17 +68,10 @@ def point_inputs(
     if not unit > 0 or not all(np.isfinite(v).all() for v in (means, normals, covariances, up)):
         raise ValueError("points, normals, covariances and up must be finite, and the unit positive")
 
-    turn = upright(up)
-    where = ((means - means.mean(0)) @ turn.T) / unit if len(means) else means
-    facing = normals.astype(np.float64) @ turn.T
-    values, axes = np.linalg.eigh(np.einsum("ij,njk,lk->nil", turn, covariances.astype(np.float64), turn) / unit**2)
-    deviations = np.sqrt(np.clip(values, 1e-14, None))
-    axes[np.linalg.det(axes) < 0, :, 0] *= -1
-    quats = Rotation.from_matrix(axes).as_quat(scalar_first=True) if len(axes) else np.zeros((0, 4))
+    where, facing, deviations, shape = _framed(means, normals, covariances, up, unit)
     height = where[:, 2] - np.quantile(where[:, 2], FLOOR) if len(where) else where[:, 2]
     ratios = deviations[:, :2] / deviations[:, 2:]
     own = np.column_stack([height, facing[:, 2], np.abs(facing[:, 2]), ratios, np.log(deviations[:, 2])])
-    shape = where.astype(np.float32), quats.astype(np.float32), deviations.astype(np.float32)
     parts = [_scale(where, radius, shape, describe or DescribeSection(), n_neighbors) for radius in RADII[:n_scales]]
     neighbors, descriptors = (list(part) for part in zip(*parts, strict=True))
     return PointInputs(
@@ -88,6 +83,71 @@ def point_inputs(
     )
 
 
+def truncation(
+    means: np.ndarray,
+    covariances: np.ndarray,
+    *,
+    up: np.ndarray,
+    unit: float = 1.0,
+    describe: DescribeSection | None = None,
+) -> float | None:
+    """What cutting off the Chebyshev series costs: 1 - r, of the distances between the descriptors of
+    N_TRIED points, and between these points' descriptors of twice as many degrees.
+
+    Args: as for `point_inputs`. Returns: in [0, 2]; None where fewer than 3 points, or only points of
+      one shape, are there to be told apart.
+    Choices: at the radius of middle size; points evenly through their order, which needs no seed.
+    """
+    rows = np.unique(np.linspace(0, len(means) - 1, min(N_TRIED, len(means))).round().astype(int))
+    if len(rows) < 3:
+        return None
+    settings = describe or DescribeSection()
+    where, _, _, shape = _framed(means, np.zeros_like(means), covariances, up, unit)
+    members = _regions(where, TRIED, rows)[2]
+    apart = []
+    for degree in (settings.max_degree, 2 * settings.max_degree):
+        finer = settings.model_copy(update={"max_degree": degree})
+        apart.append(pdist(describe_members(*shape, members, finer).values[:, 0].reshape(len(rows), -1)))
+    if min(of.std() for of in apart) < 1e-12:
+        return None
+    return float(1 - np.corrcoef(apart)[0, 1])
+
+
+def _framed(
+    means: np.ndarray, normals: np.ndarray, covariances: np.ndarray, up: np.ndarray, unit: float
+) -> tuple[np.ndarray, np.ndarray, np.ndarray, tuple[np.ndarray, np.ndarray, np.ndarray]]:
+    """Points [N, 3] upright in metres about their centroid, their normals, standard deviations along the axes of
+    their covariances, least first, and (means, quats, deviations) in single precision, as Gaussians.
+    """
+    turn = upright(up)
+    where = ((means - means.mean(0)) @ turn.T) / unit if len(means) else means
+    facing = normals.astype(np.float64) @ turn.T
+    values, axes = np.linalg.eigh(np.einsum("ij,njk,lk->nil", turn, covariances.astype(np.float64), turn) / unit**2)
+    deviations = np.sqrt(np.clip(values, 1e-14, None))
+    axes[np.linalg.det(axes) < 0, :, 0] *= -1
+    quats = Rotation.from_matrix(axes).as_quat(scalar_first=True) if len(axes) else np.zeros((0, 4))
+    shape = where.astype(np.float32), quats.astype(np.float32), deviations.astype(np.float32)
+    return where, facing, deviations, shape
+
+
+def _regions(means: np.ndarray, radius: float, rows: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """About R points `rows` of [N, 3]: the points nearest to each that stand for a neighbourhood of this radius and
+    their distances [R, MEMBERS], -1 and inf where there are fewer; and the members of its region [R, MEMBERS].
+    """
+    own = rows[:, None]
+    near = np.full((len(rows), MEMBERS), -1, np.int64)
+    distance = np.full((len(rows), MEMBERS), np.inf)
+    if len(rows):
+        sample = first_of_each(means, SPACING * radius)
+        count = min(MEMBERS, len(sample))
+        found, index = cKDTree(means[sample]).query(means[rows], count, workers=-1)
+        near[:, :count] = sample[index.reshape(len(rows), count)]
+        distance[:, :count] = found.reshape(len(rows), count)
+    others = np.where((near == own) | (distance > 2 * radius), -1, near)
+    order = np.argsort(others < 0, axis=1, kind="stable")
+    return near, distance, np.concatenate([own, np.take_along_axis(others, order, 1)[:, : MEMBERS - 1]], 1)
+
+
 def _scale(
     means: np.ndarray,
     radius: float,
@@ -96,19 +156,7 @@ def _scale(
     n_neighbors: int,
 ) -> tuple[np.ndarray, np.ndarray]:
     """Neighbours i32 [N, K] and descriptors f32 [N, J P] at one radius."""
-    n = len(means)
-    own = np.arange(n)[:, None]
-    near = np.full((n, MEMBERS), -1, np.int64)
-    distance = np.full((n, MEMBERS), np.inf)
-    if n:
-        sample = first_of_each(means, SPACING * radius)
-        count = min(MEMBERS, len(sample))
-        found, index = cKDTree(means[sample]).query(means, count, workers=-1)
-        near[:, :count] = sample[index.reshape(n, count)]
-        distance[:, :count] = found.reshape(n, count)
+    near, distance, members = _regions(means, radius, np.arange(len(means)))
     neighbors = np.where(distance <= REACH * radius, near, -1)[:, :n_neighbors]
-    others = np.where((near == own) | (distance > 2 * radius), -1, near)
-    order = np.argsort(others < 0, axis=1, kind="stable")
-    members = np.concatenate([own, np.take_along_axis(others, order, 1)[:, : MEMBERS - 1]], 1)
     values = describe_members(*shape, members, describe).values[:, 0]
-    return neighbors.astype(np.int32), values.reshape(n, math.prod(values.shape[1:]))
+    return neighbors.astype(np.int32), values.reshape(len(means), math.prod(values.shape[1:]))

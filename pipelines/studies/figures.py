@@ -100,7 +100,8 @@ def _of_scene(axis: Any, scene: str, rows: list[Row], traces: Traces, style: dic
 
 def _over_budgets(axis: Any, rows: list[Row], key: str, scale: float, style: dict[str, dict[str, Any]]) -> None:
     """A line a variant through the means of a figure, a point a budget."""
-    for (variant,), members in groups([row for row in rows if row[key] is not None], "variant").items():
+    known = [row for row in rows if row[key] is not None and row["train_seconds"] is not None]
+    for (variant,), members in groups(known, "variant").items():
         budgets = groups(members, "budget")
         points = [
             (name, [row["train_seconds"] for row in some], [scale * row[key] for row in some])

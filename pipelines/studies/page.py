@@ -5,7 +5,6 @@ from __future__ import annotations
 import base64
 import csv
 import html
-import platform
 import re
 from collections.abc import Sequence
 from pathlib import Path
@@ -14,9 +13,10 @@ from typing import Any
 from chebsplat.errors import DataFailure
 from chebsplat.evaluation import protocols
 from chebsplat.formats import artifact
+from chebsplat.formats.manifest import measured_on
 from chebsplat.pipelines.studies import figures
 from chebsplat.pipelines.studies.pictures import gallery
-from chebsplat.pipelines.studies.results import COLUMNS, Row, compare, traces
+from chebsplat.pipelines.studies.results import COLUMNS, Row, compare, elsewhere, on_one_machine, traces
 from chebsplat.pipelines.studies.study import Run, Study
 from chebsplat.pipelines.studies.tables import (
     Section,
@@ -50,12 +50,13 @@ def write(
         writer = csv.DictWriter(handle, COLUMNS, extrasaction="ignore")
         writer.writeheader()
         writer.writerows(rows)
+    named, rows = facts(runs, rows, command), on_one_machine(rows)
     settings = settings_of(study) if study.against else None
     figures.draw(out / PICTURE, rows, traces(runs, rows), settings, study.against)
     lines = compare(rows, study.baseline)
     parts = {
         "study": study,
-        "facts": facts(runs, rows, command),
+        "facts": named,
         "labels": labels(lines),
         "header": [*labels(lines), "runs", *(figure.heading for figure in shown_figures(lines))],
         "table": [(line.variant == study.baseline, table_row(line, lines)) for line in lines],
@@ -106,7 +107,7 @@ def facts(runs: list[Run], rows: list[Row], command: str) -> list[tuple[str, str
     """Where the figures come from."""
     done = [(run, row) for run, row in zip(runs, rows, strict=True) if row["state"] == "done"]
     manifests = [artifact.read_manifest(run.plan.targets["train"]) for run, _ in done]
-    threads = sorted({m.threads for m in manifests})
+    loads = [value for m in manifests for process in m.processes for value in process["load"]]
     versions = {f"{k} {v}" for m in manifests for k, v in m.versions.items()}
     commits = {
         m.code["commit"][:10] + (" with changes" if m.code.get("dirty") else "")
@@ -117,24 +118,13 @@ def facts(runs: list[Run], rows: list[Row], command: str) -> list[tuple[str, str
         ("command", command),
         ("protocol", ", ".join(sorted({row["protocol"] for row in rows}))),
         ("runs", f"{len(done)} of {len(rows)} done; {len({m.key for m in manifests})} different trainings"),
-        ("device", ", ".join(sorted({m.device for m in manifests})) + f" ({processor()})"),
-        ("threads a run", ", ".join(map(str, threads))),
+        ("device", ", ".join(sorted({m.device for m in manifests}))),
+        ("measured on", "; ".join(sorted({measured_on(m) for m in manifests}))),
+        ("load of the machine", f"{min(loads):g} to {max(loads):g}" if loads else "not recorded"),
         ("versions", ", ".join(sorted(versions))),
         ("commit", ", ".join(sorted(commits)) or "not in a checkout"),
     ]
-    if len(threads) > 1:
-        lines.append(("beware", "seconds and frames/s of runs with different numbers of threads do not compare"))
-    return lines
-
-
-def processor() -> str:
-    """The processor's name, where the system tells it."""
-    try:
-        lines = Path("/proc/cpuinfo").read_text().splitlines()
-    except OSError:
-        lines = []
-    names = [line.split(":", 1)[1].strip() for line in lines if line.startswith("model name")]
-    return names[0] if names else platform.machine()
+    return lines + [("beware", words) for words in elsewhere(rows)]
 
 
 def inert(text: str) -> str:

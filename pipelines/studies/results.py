@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -11,6 +12,7 @@ from chebsplat.evaluation.statistics import Difference, Summary, paired_differen
 from chebsplat.formats import artifact
 from chebsplat.formats.evaluation import read_figures
 from chebsplat.formats.gaussians import read_trace
+from chebsplat.formats.manifest import measured_on
 from chebsplat.pipelines.studies.study import Run
 
 Row = dict[str, Any]
@@ -25,6 +27,7 @@ class Figure:
     digits: int
     scale: float = 1.0
     ratio: bool = False
+    timed: str = ""  # the column that names the machine which it was measured on
 
 
 FIGURES = (
@@ -44,10 +47,11 @@ FIGURES = (
     Figure("band_spread", "spread of SH kept between classes", 3),
     Figure("bytes_ply", "PLY, MB", 2, 1e-6, True),
     Figure("bytes_ragged", "ragged, MB", 2, 1e-6, True),
-    Figure("frames_per_second", "frames/s", 1, 1, True),
-    Figure("train_seconds", "training, s", 1, 1, True),
+    Figure("frames_per_second", "frames/s", 1, 1, True, "rendered_on"),
+    Figure("train_seconds", "training, s", 1, 1, True, "trained_on"),
 )
-OTHERS = ("miou_teacher", "classes", "pixels", "protocol", "held_in_psnr", "steps", "threads", "device",
+OTHERS = ("miou_teacher", "classes", "pixels", "protocol", "held_in_psnr", "steps", "clock", "device", "trained_on",
+          "rendered_on",
           "train_key", "evaluate_key")  # fmt: skip
 IDENTITY = ("condition", "variant", "budget", "scene", "seed", "state")
 POOLED = ("miou", "miou_gain", "macc", "oa")  # what a protocol may work out over all scenes together
@@ -96,9 +100,47 @@ def row_of(run: Run, failed: dict[str, tuple[int, str, Path]]) -> Row:
         "train_seconds": trace[-1]["seconds"],
         "held_in_psnr": trace[-1]["psnr"],
         "steps": int(trace[-1]["step"]),
-        "threads": train.threads,
+        "clock": train.config["train"]["seconds"],
         "device": train.device,
+        "trained_on": measured_on(train),
+        "rendered_on": measured_on(evaluation),
     }
+
+
+def machine_of(rows: list[Row], column: str) -> str:
+    """The machine that most of these rows name; of equally many, the first."""
+    return Counter(row[column] for row in rows).most_common(1)[0][0] if rows else ""
+
+
+def on_one_machine(rows: list[Row]) -> list[Row]:
+    """The rows with the seconds and frames/s of one machine alone, that of most finished runs;
+    None elsewhere.
+
+    Choices: a training that ended by the clock of another machine (`clock`) has other figures
+      altogether: it has no part in the comparison, and its `state` says why.
+    """
+    done = [row for row in rows if row["state"] == "done"]
+    machines = {figure.key: (figure.timed, machine_of(done, figure.timed)) for figure in FIGURES if figure.timed}
+    kept = []
+    for row in rows:
+        here = row | {key: None for key, (column, machine) in machines.items() if row[column] != machine}
+        if row["state"] == "done" and row["clock"] and here["train_seconds"] is None:
+            here["state"] = f"its {row['clock']:g} s are of another machine ({row['trained_on']}): not compared"
+        kept.append(here)
+    return kept
+
+
+def elsewhere(rows: list[Row]) -> list[str]:
+    """Which seconds and frames/s a study leaves out, as `on_one_machine` does, in sentences."""
+    done, said = [row for row in rows if row["state"] == "done"], []
+    for figure in FIGURES:
+        if figure.timed and (others := Counter(row[figure.timed] for row in done)):
+            machine = machine_of(done, figure.timed)
+            n_here = others.pop(machine)
+            if others:
+                left = "; ".join(f"{n} on {name}" for name, n in others.items())
+                said.append(f"'{figure.heading}' is of the {n_here} runs on {machine} alone; not compared: {left}")
+    return said
 
 
 def segmented(scene: dict[str, Any], teacher: dict[str, Any]) -> Row:
@@ -127,10 +169,12 @@ def over_scenes(rows: list[Row]) -> list[Row]:
 
 
 def traces(runs: list[Run], rows: list[Row]) -> list[tuple[Row, list[dict[str, float]]]]:
-    """The trace of every finished run, with its row."""
+    """The trace of every finished run, with its row; of runs whose seconds `on_one_machine` leaves
+    out none.
+    """
     found = []
     for run, row in zip(runs, rows, strict=True):
-        if row["state"] == "done":
+        if row["state"] == "done" and row["train_seconds"] is not None:
             path = run.plan.targets["train"]
             found.append((row, read_trace(path, artifact.read_manifest(path))))
     return found

@@ -10,7 +10,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from chebsplat.evaluation.statistics import Difference, Summary, summarize
-from chebsplat.pipelines.studies.results import FIGURES, Figure, Line, Row, groups
+from chebsplat.pipelines.studies.results import FIGURES, Figure, Line, Row, groups, on_one_machine
 from chebsplat.pipelines.studies.study import Study
 
 COSTS = ("n_gaussians", "sh_kept", "bytes_ply", "bytes_ragged", "frames_per_second", "train_seconds")
@@ -149,7 +149,8 @@ def reach(points: Sequence[tuple[float, float]], target: float) -> Reach:
 def sections(study: Study, rows: list[Row]) -> list[Section]:
     """One section; none without two budgets, or before a scene has the baseline's last one."""
     budgets = list(study.budgets.settings())
-    done = [row for row in rows if row["state"] == "done"]
+    timed = [row for row in on_one_machine(rows) if row["train_seconds"] is not None]
+    done = [row for row in timed if row["state"] == "done"]
     table = []
     for (condition, scene), some in groups(done, "condition", "scene").items():
         by = {name: groups(of, "budget") for (name,), of in groups(some, "variant").items()}

@@ -14,6 +14,7 @@ from typing import Any
 from chebsplat.errors import InputError
 from chebsplat.formats import artifact
 from chebsplat.formats.artifact import read_document
+from chebsplat.formats.manifest import measured_on
 from chebsplat.formats.names import few
 from chebsplat.pipelines.work import store
 
@@ -53,6 +54,7 @@ def table(evaluation: Path) -> list[tuple[str, str, str]]:
     from chebsplat.formats.evaluation import rests  # with zarr, which a list of scenes does not wait for
 
     measured = figures(evaluation)
+    where = f", measured on {measured_on(artifact.read_manifest(evaluation))}" if measured else ""
     psnr, miou, teacher = quality(measured)
     size = {name: text("{:.1f} MB", scaled(number(measured, "bytes", name))) for name in ("ply", "split", "ragged")}
     others = ", ".join(f"{name} {shown}" for name, shown in size.items() if shown and name != "ply")
@@ -67,7 +69,7 @@ def table(evaluation: Path) -> list[tuple[str, str, str]]:
         *((what, str(len(names)), few(names)) for what, names in strangers(segmentation)),
         ("Gaussians", text("{:,}", number(measured, "n_gaussians")), ""),
         ("PLY", size["ply"], others),
-        ("frames/s", text("{:.0f}", number(measured, "frames_per_second", "color")), "colour alone"),
+        ("frames/s", text("{:.0f}", number(measured, "frames_per_second", "color")), f"colour alone{where}"),
     ]
     return [row for row in rows if row[1]]
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import base64
 import colorsys
 import io
+import textwrap
 from typing import Any
 
 import matplotlib
@@ -12,6 +13,8 @@ import matplotlib.pyplot as plt
 import numpy as np
 from matplotlib import colormaps
 from PIL import Image
+
+from chebsplat.stages.pages.measures import Course
 
 IGNORE = -1
 CURVES = (
@@ -109,6 +112,43 @@ def cameras(eyes: np.ndarray, ups: np.ndarray, points: np.ndarray, errors: np.nd
         panels[2].bar(np.arange(len(errors)), errors, color="#1f6feb")
         panels[2].set_title("error of each photo's points, pixels", fontsize=10)
         panels[2].set_xlabel("photos in their order", fontsize=8)
+        return svg(figure)
+
+
+def course(of: Course, test_psnr: float) -> str:
+    """What a scene would have been, had it been left earlier, as inline SVG: PSNR and what its labels are worth
+    against the seconds from the start, over bands of its stages.
+    """
+    matplotlib.use("Agg")
+    with matplotlib.rc_context({"svg.hashsalt": "course", "svg.fonttype": "none", "font.family": "sans-serif"}):
+        n = 2 if of.meanings else 1
+        figure, panels = plt.subplots(n, 1, figsize=(12.6, 2.6 * n), layout="constrained", sharex=True, squeeze=False)
+        last = max(of.spans[-1][2], 1e-3)
+        for number, (stage, begin, end) in enumerate(of.spans):
+            for panel in panels[:, 0]:
+                panel.axvspan(begin, end, color=colormaps["tab20"](2 * number % 20 + 1), alpha=0.35, linewidth=0)
+            if end - begin > 0.035 * last:
+                top = panels[0, 0].get_xaxis_transform()
+                panels[0, 0].text((begin + end) / 2, 1.02, stage, transform=top, ha="center", fontsize=8)
+        begin = next(begin for stage, begin, _ in of.spans if stage == "train")
+        panels[0, 0].plot([0, begin], [of.plain] * 2, ":", color="#1f6feb", label="photos of one colour")
+        panels[0, 0].plot(*zip(*of.colors, strict=True), color="#1f6feb", marker=".", markersize=4,
+                          label="training views")  # fmt: skip
+        panels[0, 0].plot([last], [test_psnr], "*", color="#e36209", markersize=11, label="test views", clip_on=False)
+        panels[0, 0].set_ylabel("PSNR, dB")
+        panels[0, 0].legend(fontsize=8, frameon=False, loc="lower right")
+        if of.meanings:
+            stages, seconds, values = zip(*of.meanings, strict=True)
+            panels[1, 0].plot(seconds, values, color="#1f6feb", marker="o", drawstyle="steps-post")
+            for k, at in enumerate(zip(seconds, values, strict=True)):
+                text = f"{stages[k]} {values[k]:.3f}"
+                panels[1, 0].annotate(
+                    text, at, (0, (7, -14)[k % 2]), ha="right", fontsize=8, textcoords="offset points"
+                )
+            panels[1, 0].margins(y=0.3)
+            panels[1, 0].set_ylabel(textwrap.fill(of.words, 32), fontsize=8)
+        panels[-1, 0].set_xlabel("seconds from the start, stage after stage")
+        panels[-1, 0].set_xlim(0, last)
         return svg(figure)
 
 

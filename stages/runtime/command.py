@@ -5,7 +5,6 @@ from __future__ import annotations
 import logging
 import os
 import sys
-import time
 from collections.abc import Callable
 from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass, field
@@ -19,7 +18,8 @@ from chebsplat.formats import artifact
 from chebsplat.formats.manifest import Manifest
 from chebsplat.stages.registry import MANY, STAGES, lesson_paths
 from chebsplat.stages.runtime import config as configs
-from chebsplat.stages.runtime.device import DEVICES, resolve
+from chebsplat.stages.runtime.device import DEVICES, name_of, resolve
+from chebsplat.stages.runtime.machine import Stopwatch
 from chebsplat.stages.runtime.progress import Progress
 from chebsplat.stages.runtime.stopping import exit_code
 
@@ -31,7 +31,8 @@ class Job:
     """All that a stage may touch.
 
     `out` is the directory to fill; it becomes the artifact when `run` returns. `scratch` survives a kill, for
-    stages that resume. `facts` end up in the manifest: what was found, chosen, and left out and why.
+    stages that resume, and tell `watch` so. `facts` end up in the manifest: what was found, chosen, and left out and
+    why.
     """
 
     inputs: dict[str, Path]
@@ -41,6 +42,7 @@ class Job:
     device: str = "cpu"
     progress: Progress = field(default_factory=Progress)
     facts: dict[str, Any] = field(default_factory=dict)
+    watch: Stopwatch = field(default_factory=Stopwatch)
 
     def left_out(self, what: str, why: str) -> None:
         """Record that this scene does not need `what`."""
@@ -134,13 +136,13 @@ def publish(
     manifest = Manifest(
         stage.schema, key, name, sources, settings, seed, device=device, threads=n_threads(), code=planned.code
     )
-    scratch = out.parent / f".part-{out.name}"
-    began = time.perf_counter()
+    scratch, watch = out.parent / f".part-{out.name}", Stopwatch(n_threads(), name_of(device))
     with artifact.publish(out, manifest, force) as tmp, planned.within:
-        job = Job(inputs, chosen, tmp, scratch, device, shown, manifest.facts)
+        job = Job(inputs, chosen, tmp, scratch, device, shown, manifest.facts, watch)
         with shown.log_to(tmp / "log.jsonl"):
             run(job)
-        manifest.seconds = round(time.perf_counter() - began, 3)
+        manifest.processes = watch.processes()
+        manifest.seconds = round(sum(of["seconds"] for of in manifest.processes), 3)
         manifest.versions = _versions()
     artifact.discard(scratch)
     if (jit := sys.modules.get("chebsplat.kernels.jit")) and jit.compilation.kernels:
@@ -156,19 +158,8 @@ def n_threads() -> int:
 
 def _versions() -> dict[str, str]:
     """Versions of the packages that the stage really loaded."""
-    names = {
-        "torch",
-        "numpy",
-        "scipy",
-        "numba",
-        "pycolmap",
-        "open3d",
-        "zarr",
-        "onnxruntime",
-        "fpsample",
-        "PIL",
-        "gsplat",
-    }
+    names = ("torch", "numpy", "scipy", "numba", "llvmlite", "pycolmap", "open3d", "zarr", "onnx", "onnxruntime",
+             "fpsample", "PIL", "safetensors", "plyfile", "matplotlib", "av", "pillow_heif", "gsplat")  # fmt: skip
     distributions = {"open3d": "open3d-cpu", "PIL": "pillow"}
     loaded = sorted(name for name in names if sys.modules.get(name))
     return {n: metadata.version(distributions.get(n, n)) for n in loaded} | {"python": sys.version.split()[0]}

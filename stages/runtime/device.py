@@ -27,6 +27,15 @@ def resolve(wanted: str) -> tuple[str, str]:
     return "cpu", f"an NVIDIA driver was found, but {lack}: everything runs on the CPU"
 
 
+def name_of(device: str) -> str:
+    """The GPU's name; nothing of the CPU."""
+    if device != "cuda":
+        return ""
+    import torch
+
+    return torch.cuda.get_device_name()
+
+
 def missing() -> str:
     """What a GPU lacks here to train on it, and what adds it: CUDA in torch, an answer, or gsplat; "": nothing."""
     import torch

@@ -9,7 +9,7 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
-from PIL import Image
+from PIL import Image, ImageStat
 from scipy.fft import dctn, idctn
 from scipy.ndimage import map_coordinates
 
@@ -23,6 +23,7 @@ from chebsplat.stages.sources.pictures import DEEP, GREY, companion, confidences
 
 WORKERS = 4
 MOST_EMPTY = 1 / 3  # of the views that see a point
+COMPARED = 8  # views whose variance is held against their photos'
 
 
 def assemble(listing: Listing, settings: IngestSection, class_names: tuple[str, ...] | None = None) -> dict[str, Any]:
@@ -40,9 +41,12 @@ def assemble(listing: Listing, settings: IngestSection, class_names: tuple[str, 
     full = (len(frames), max(shape.height for shape in shapes), max(shape.width for shape in shapes))
     stacks = room(listing, frames, full, notes)
     lookup = functools.lru_cache(8)(positions)  # frames of one camera share it
+    compared = set(np.linspace(0, len(frames) - 1, min(COMPARED, len(frames))).astype(int).tolist())
+    kept: list[float] = []
 
     def fill(k: int) -> None:
-        view = read_view(frames[k], listing, shapes[k], lookup(frames[k].camera, shapes[k]), set(stacks))
+        at = lookup(frames[k].camera, shapes[k])
+        view = read_view(frames[k], listing, shapes[k], at, set(stacks), kept if k in compared else None)
         if not view["opaque"].all():
             listing.empty[frames[k].name] = ~view["opaque"]
         for name in stacks.keys() & view.keys():
@@ -81,7 +85,8 @@ def assemble(listing: Listing, settings: IngestSection, class_names: tuple[str, 
     if models := sorted({frame.camera.model for frame in frames} & set(DISTORTED)):
         notes.append(f"Images are undistorted ({', '.join(models)}), and figures are of these where they do not say.")
     source = {"kind": listing.kind, "notes": notes} | told | ({"undistorted": models} if models else {})
-    return fields | {"source": source, "as_taken": lambda names: as_taken(bent(frames, listing, names), settings)}
+    fields |= {"source": source, "variance_kept": float(np.mean(kept))}
+    return fields | {"as_taken": lambda names: as_taken(bent(frames, listing, names), settings)}
 
 
 def bent(frames: list[Frame], listing: Listing, names: set[str]) -> Iterator[tuple[str, Camera, Any]]:
@@ -249,14 +254,19 @@ def positions(camera: Camera, view: Geometry) -> np.ndarray:
 
 
 def read_view(
-    frame: Frame, listing: Listing, view: Geometry, at: np.ndarray, wanted: set[str]
+    frame: Frame,
+    listing: Listing,
+    view: Geometry,
+    at: np.ndarray,
+    wanted: set[str],
+    kept: list[float] | None = None,
 ) -> dict[str, np.ndarray]:
     """images u8 [H, W, 3], loss_mask, opaque bool [H, W]; where `wanted`, depth, labels, pseudo_labels, confidence
-    [H, W].
+    [H, W]. kept: of `photo`.
     """
     camera, size = frame.camera, (frame.camera.width, frame.camera.height)
     inside = within(at, size)
-    pixels, opaque = photo(frame, listing, view, at)
+    pixels, opaque = photo(frame, listing, view, at, kept)
     counts = inside & opaque.any()
     fields = {"images": pixels, "loss_mask": counts, "opaque": opaque}
     inside &= opaque  # of empty space there is no depth, nor a label
@@ -281,12 +291,36 @@ def read_view(
     return fields
 
 
-def photo(frame: Frame, listing: Listing, view: Geometry, at: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """The view's pixels u8 [H, W, 3] and where they are opaque, bool [H, W]; the whole photo is gone on return."""
+def photo(
+    frame: Frame, listing: Listing, view: Geometry, at: np.ndarray, kept: list[float] | None = None
+) -> tuple[np.ndarray, np.ndarray]:
+    """The view's pixels u8 [H, W, 3] and where they are opaque, bool [H, W]; the whole photo is gone on return.
+
+    Args: kept: where the share of the photo's variance that the view keeps is added, if it is wanted.
+    """
     size = (frame.camera.width, frame.camera.height)
     with open_photo(frame.image, size, listing.upright) as (image, opaque):
         seen = np.ones(at.shape[1:], bool) if opaque is None else nearest(opaque, at, size)
-        return resampled(image, frame.camera, view, at), seen
+        pixels = resampled(image, frame.camera, view, at)
+        if kept is not None:
+            kept.append(variance_kept(image, pixels, at))
+        return pixels, seen
+
+
+def variance_kept(image: Any, pixels: np.ndarray, at: np.ndarray) -> float:
+    """Variance of a view's grey values u8 [H, W, 3] in that of the part of its photo which it shows, at most 1: what
+    is finer than its pixels is lost.
+
+    Args: at [2, H, W]: where the view's pixels lie in the photo.
+    Choices: the part is the box about these pixels. A photo of one grey value keeps all.
+    """
+    inside = np.where(at >= 0, at, np.nan)
+    low, high = np.nanmin(inside, (1, 2)), np.nanmax(inside, (1, 2))
+    half = (high - low) / np.maximum(2 * np.array(at.shape[:0:-1]) - 2, 1)  # of a pixel of the view
+    corners = np.clip([np.floor(low - half), np.ceil(high + half)], 0, image.size).astype(int)
+    part, view = image.convert("L").crop(corners.ravel().tolist()), Image.fromarray(pixels).convert("L")
+    whole, shown = (ImageStat.Stat(of).var[0] for of in (part, view))
+    return min(shown / whole, 1.0) if whole > 0 else 1.0
 
 
 def within(at: np.ndarray, size: tuple[int, int]) -> np.ndarray:

@@ -77,7 +77,11 @@ def read(path: Path, settings: IngestSection, model: PhotoModel) -> dict[str, An
     if view.factor < 1:
         notes.append(f"Images are reduced by {view.factor:.3f} (ingest.max_side).")
     named = {model.frames[row]: model.names[row] for row in rows}
-    images = [assembly.resampled(image, camera, view, at) for _, image in _taken(file, set(named))]
+    images, kept, step = [], [], max(len(named) // assembly.COMPARED, 1)
+    for k, (_, image) in enumerate(_taken(file, set(named))):
+        images.append(assembly.resampled(image, camera, view, at))
+        if k % step == 0:
+            kept.append(assembly.variance_kept(image, images[-1], at))
 
     def as_taken(names: set[str]) -> dict[str, Any]:
         wanted = {frame for frame, name in named.items() if name in names and camera.model in cameras.DISTORTED}
@@ -91,6 +95,7 @@ def read(path: Path, settings: IngestSection, model: PhotoModel) -> dict[str, An
         "cam_from_world": model.cam_from_world[rows],
         "source": {"kind": "video", "notes": notes},
         "as_taken": as_taken,
+        "variance_kept": float(np.mean(kept)),
     }
     return fields | points_of(Cloud(model.points, model.colors, model.errors, model.tracks), model.names, fields)
 

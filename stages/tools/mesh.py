@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from typing import Any
 
 import numpy as np
 
-from chebsplat.cameras import upright
+from chebsplat.cameras import unproject, upright
 from chebsplat.errors import ConfigError, DataFailure
 from chebsplat.evaluation.metrics import features_at
 from chebsplat.formats.meshes import Frame, Mesh, cleaned, fused, meshlab
@@ -20,13 +20,15 @@ N_VOXELS = 250  # along the longest side of the room, where no voxel is asked fo
 OPAQUE = 0.6  # least coverage of a pixel whose depth counts
 STEP = 0.05  # of its depth, by which a neighbouring pixel may lie deeper: beyond, a pixel is on an edge
 LONGEST_HOLE = 60  # edges
+N_TRIED = 100  # points of a view, at most, whose distance from the mesh is measured
 LEAST_PART = 12.0  # voxels across a connected part that stays
 
 
 def mesh_of(
     scene: OpenedScene, voxel: float | None, n_triangles: int, raw: bool, progress: Progress
 ) -> tuple[Mesh, dict[str, Any]]:
-    """The mesh of a scene in its source's frame and units, and facts: voxel, and how many triangles before and after.
+    """The mesh of a scene in its source's frame and units, and facts: voxel, how many triangles before and after, and
+    how far the surface that the views see is from it.
 
     Args: voxel: edge, scene units; None: the 250th part of the room; n_triangles: at most; raw: nothing is cleaned.
     Raises: ConfigError on a scene without cameras; DataFailure where its Gaussians show no surface.
@@ -40,7 +42,8 @@ def mesh_of(
     extent = room_extent(scene)
     edge = extent / N_VOXELS if voxel is None else voxel / scene.world.scale
     shown = f"{edge * scene.world.scale:.3g}"
-    made = fused(open3d(), frames(scene, progress), edge, 2 * extent)
+    seen: list[np.ndarray] = []
+    made = fused(open3d(), noted(frames(scene, progress), seen), edge, 2 * extent)
     if not len(made.triangles):
         raise DataFailure(f"{scene.source} shows no surface of voxels of {shown}; choose larger ones: --voxel")
     facts = {"voxel": float(shown), "triangles fused": len(made.triangles)}
@@ -48,6 +51,8 @@ def mesh_of(
         made = cleaned(made, n_triangles, LEAST_PART * edge, LONGEST_HOLE, edge)
     if not len(made.triangles):
         raise DataFailure(f"nothing of the surface is larger than {LEAST_PART:g} voxels of {shown}; take --raw")
+    off = away(made, np.concatenate(seen)) * scene.world.scale
+    facts |= {"off the depth, median": float(f"{off:.2g}")}
     if scene.features is not None and scene.label_embeddings is not None:
         made = made._replace(labels=labels_at(scene, made.vertices))
     made = made._replace(vertices=scene.world.outward(made.vertices).astype(np.float32))
@@ -60,6 +65,21 @@ def turned(mesh: Mesh, up: np.ndarray, suffix: str) -> Mesh:
     if suffix.lower() == ".glb":
         turn = np.array([[1.0, 0, 0], [0, 0, 1], [0, -1, 0]]) @ turn
     return mesh._replace(vertices=(mesh.vertices @ turn.T).astype(np.float32))
+
+
+def away(mesh: Mesh, points: np.ndarray) -> float:
+    """The median distance from points [M, 3] to a mesh, scene units."""
+    core, caster = open3d().core, open3d().t.geometry.RaycastingScene()
+    caster.add_triangles(*map(core.Tensor, (mesh.vertices.astype(np.float32), mesh.triangles.astype(np.uint32))))
+    return float(np.median(caster.compute_distance(core.Tensor(points.astype(np.float32))).numpy()))
+
+
+def noted(frames: Iterable[Frame], points: list[np.ndarray]) -> Iterator[Frame]:
+    """The frames; some of the points [M, 3] that each shows are added to `points`."""
+    for frame in frames:
+        pixels = np.argwhere(frame.depth > 0)
+        points.append(unproject(frame.depth, frame.K, frame.pose, pixels[:: len(pixels) // N_TRIED + 1]))
+        yield frame
 
 
 def frames(scene: OpenedScene, progress: Progress) -> Iterator[Frame]:

@@ -39,7 +39,7 @@ class Saves:
                 "layout": LAYOUT,
             }
         )
-        self.file = job.scratch / "training.pt"
+        self.job, self.file = job, job.scratch / "training.pt"
         self.saved = time.monotonic()
 
     def load(self) -> dict[str, Any] | None:
@@ -54,6 +54,7 @@ class Saves:
         if held["identity"] != self.identity:
             log.warning("%s is of another training: this one starts anew", self.file)
             return None
+        self.job.watch.go_on(self.job.scratch)
         return dict(held["state"])
 
     def offer(self, state: Any, now: bool = False) -> None:
@@ -65,5 +66,6 @@ class Saves:
         try:
             with atomic_path(self.file) as temporary, temporary.open("wb") as handle:
                 torch.save(held, handle)
+            self.job.watch.keep(self.job.scratch)
         except (OSError, RuntimeError) as error:  # torch has its own word for a full disk
             log.warning("%s cannot be saved (%s): the training goes on without", self.file, error)

@@ -9,7 +9,7 @@ import pytest
 
 from chebsplat.errors import ConfigError
 from chebsplat.formats.meshes import Frame, Mesh, cleaned, fused, write_mesh
-from chebsplat.stages.tools.mesh import STEP, without_edges
+from chebsplat.stages.tools.mesh import STEP, away, noted, without_edges
 from chebsplat.synthetic.rays import intrinsics, look_at, open3d
 
 SIZE = 96, 72
@@ -41,6 +41,17 @@ def test_a_fused_mesh_lies_on_the_surface_in_the_cameras_world_and_bears_its_col
     assert np.quantile(np.abs(radii - 0.5), 0.9) < 0.012  # half a voxel; distances along rays grow at the ball's rim
     assert np.abs(ball.vertices.mean(0)).max() < 0.005
     assert np.abs(ball.colors.astype(int) - (200, 40, 90)).max() <= 1
+
+
+def test_a_mesh_is_as_far_from_the_depth_of_its_views_as_it_was_moved(ball):
+    points = []
+    assert len(list(noted(of_a_ball(), points))) == 36
+    seen = np.concatenate(points)
+    assert 36 * 50 < len(seen) < 36 * 150
+    np.testing.assert_allclose(np.linalg.norm(seen, axis=1), 0.5, atol=1e-3)
+    assert away(ball, seen) < 0.005  # a quarter of a voxel
+    larger = ball._replace(vertices=ball.vertices * np.float32(1.2))
+    assert away(larger, seen) == pytest.approx(0.1, abs=0.005)
 
 
 def test_views_without_depth_make_an_empty_mesh():

@@ -9,11 +9,14 @@ import pytest
 from click.testing import CliRunner
 from shared import finish
 
+from chebsplat.formats.artifact import read_manifest
+from chebsplat.formats.manifest import measured_on
 from chebsplat.pipelines.cli import main
 from chebsplat.pipelines.planning.plan import Planner
 from chebsplat.pipelines.running import cluster, job
 from chebsplat.pipelines.running.run import entry, plan_of
 from chebsplat.pipelines.work import store
+from chebsplat.pipelines.work.summary import table
 
 pytestmark = pytest.mark.usefixtures("quick_plans")
 
@@ -119,3 +122,11 @@ def test_a_run_under_way_on_another_machine_keeps_what_it_makes_from_clean_stale
         os.rename(store.run_lease(elsewhere), store.run_lease(file.parent))
         assert len(store.unnamed()) == len(plan.steps) + 1
     assert not store.holder(store.run_lease(file.parent))
+
+
+@pytest.mark.xdist_group("toy")
+def test_frames_a_second_of_a_finished_scene_name_the_machine_that_rendered_them(toy):
+    manifest = read_manifest(toy["evaluate"])
+    beside = {what: detail for what, _, detail in table(toy["evaluate"])}
+    assert beside["frames/s"] == f"colour alone, measured on {measured_on(manifest)}"
+    assert manifest.processes[0]["processor"] in beside["frames/s"]

@@ -1,9 +1,12 @@
 """The pages: self-contained, small, and what they show is what was measured."""
 
 import base64
+import csv
+import html
 import io
 import json
 import re
+import shutil
 from collections import Counter
 from html.parser import HTMLParser
 
@@ -19,9 +22,11 @@ from shared import INPUTS, KEY, published, run_stage
 from chebsplat.errors import InputError
 from chebsplat.formats.artifact import publish, read_manifest
 from chebsplat.formats.evaluation import Evaluation
+from chebsplat.formats.gaussians import Gaussians
 from chebsplat.formats.manifest import Manifest
 from chebsplat.stages import report
 from chebsplat.stages.pages import pictures as draw
+from chebsplat.stages.pages.measures import MEASURES, figures_of
 from chebsplat.stages.pages.parts import beside_truth, class_rows, label_names, legend, picture_rows
 from chebsplat.stages.training.defaults import DEFAULTS
 
@@ -56,7 +61,7 @@ def test_the_report_is_one_page_that_fetches_nothing(toy):
     assert "@import" not in text
     assert "url(" not in text.replace("url(#", "")
     assert len(text) < 20_000_000
-    assert text.count("<svg") == 3
+    assert text.count("<svg") == 4
     for told in ("LPIPS", "IoU by class", "Every setting", "make view scene="):
         assert told in text
     assert (toy["report"] / "figures.csv").read_text().startswith("figure,")
@@ -149,6 +154,39 @@ def test_the_total_counts_every_stage_with_the_channels_and_no_size_exceeds_plai
     assert "once for all scenes of one teacher" in text
     assert all(int(share) <= 100 for share in re.findall(r"\((\d+)% of plain 3DGS\)", text))
     assert "unpruned" not in text
+
+
+def test_what_a_clock_has_measured_names_its_machine(toy, tmp_path):
+    inputs = {}
+    for role, stage, processor in (("evaluation", "evaluate", "Slow 1"), ("gaussians", "train", "Fast 2")):
+        inputs[role] = shutil.copytree(toy[stage], tmp_path / stage)
+        manifest = json.loads((inputs[role] / "artifact.json").read_text())
+        manifest["config"].get("train", {})["seconds"] = 60.0
+        manifest["processes"][0] |= {"processor": processor, "threads": 3, "cores": 5, "load": [0.2, 1.9]}
+        (inputs[role] / "artifact.json").write_text(json.dumps(manifest))
+    assert run_stage("report", tmp_path / "report", inputs) == 0
+    with (tmp_path / "report/figures.csv").open() as handle:
+        rows = {row["figure"]: row["scene"] for row in csv.DictReader(handle)}
+    assert "frames/s, colour (measured on Slow 1, 3 threads)" in rows
+    assert any(name.startswith("ms a training step") and "measured on Fast 2, 3 threads" in name for name in rows)
+    steps = Gaussians.read(toy["train"]).trace[-1]["step"]
+    clock = "steps within 60 s by the clock (train.seconds, measured on Fast 2, 3 threads)"
+    assert rows[clock] == f"{steps:g}"
+    page = (tmp_path / "report/report.html").read_text()
+    assert "Slow 1, 3 threads of 5 cores" in page and "0.2 to 1.9" in page and clock in page
+
+
+def test_the_page_shows_the_error_of_every_stage_and_what_stopping_earlier_would_have_cost(toy, tmp_path):
+    inputs = {role: toy[stage] for role, stage in report.STAGE_OF.items() if stage in toy}
+    assert run_stage("report", tmp_path / "report", inputs) == 0
+    page = (tmp_path / "report/report.html").read_text()
+    facts = {role: read_manifest(path).facts for role, path in inputs.items()}
+    for stage in MEASURES.keys() - {"pose"}:
+        for figure in figures_of(stage, facts):
+            assert html.escape(figure, quote=True).replace("&#x27;", "&#39;") in page, stage
+    told = page[page.index("What stopping earlier would have cost") :]
+    assert all(f"<td>{words}</td>" in told for words in ("before training", "half of the training", "lift", "refine"))
+    assert "not measured" not in page[page.index("error, and which way is better") : page.index("<b>total</b>")]
 
 
 def test_a_page_that_would_be_too_large_is_refused(toy, tmp_path, monkeypatch):

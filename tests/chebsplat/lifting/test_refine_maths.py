@@ -14,6 +14,7 @@ from chebsplat.lifting.blend import (
     confidence,
     effective,
     familiar,
+    halves_agree,
     reliable,
     start,
 )
@@ -182,6 +183,15 @@ def test_calibration_smooths_where_votes_are_noisy_and_not_where_neighbours_diff
     rng = np.random.default_rng(3)
     own = unit(rng.normal(size=(400, 4)))  # each Gaussian is something else, and all views agree on it
     assert not calibrate(np.stack([own, own]), n_views, near).smooth
+
+
+def test_the_halves_agree_as_calibration_has_it():
+    halves, n_views, _, near = votes(2, 1.0)
+    n_views = n_views.copy()
+    n_views[0, ::3] = 0  # of one half alone: not counted
+    assert halves_agree(halves, n_views) == pytest.approx(calibrate(halves, n_views, near).curve["off"][0.0])
+    assert halves_agree(halves[[0, 0]], n_views) == pytest.approx(1)
+    assert halves_agree(halves, n_views * np.array([[1], [0]])) == 0
 
 
 def test_calibration_trusts_knowledge_as_far_as_views_are_noisy():

@@ -19,6 +19,7 @@ from chebsplat.shape.lessons import (
     scaled_novelty,
     solved,
     summed,
+    unexplained,
 )
 
 P, D = 9, 4
@@ -31,6 +32,16 @@ def points(seed, n=200, kinds=P):
     z[:, -1] = 1
     y = z @ np.random.default_rng(99).normal(size=(P, D)) + 0.3 * rng.normal(size=(n, D))
     return z, y, rng.uniform(0, 3, n)
+
+
+def test_what_a_map_leaves_unexplained_is_that_of_the_points():
+    z, y, w = points(0)
+    sums, found = summed(z, y, w), np.random.default_rng(1).normal(size=(P, D))
+    left = (w @ ((y - z @ found) ** 2).sum(1)) / (w @ (y**2).sum(1))
+    assert unexplained(sums, found) == pytest.approx(left)
+    assert unexplained(sums, np.zeros((P, D))) == 1
+    exact = summed(z, z @ found, w)
+    assert unexplained(exact, found) == pytest.approx(0, abs=1e-12)
 
 
 def test_sums_answer_as_the_points_do():

@@ -5,10 +5,11 @@ import pytest
 import torch
 
 from chebsplat.cameras import common_up, upright
+from chebsplat.settings import DescribeSection
 from chebsplat.shape import point_encoder
 from chebsplat.shape.lessons import solved, summed
 from chebsplat.shape.point_encoder import N_HEADS, PointEncoder, Standardize, cloud_of
-from chebsplat.shape.point_inputs import RADII, REACH, point_inputs
+from chebsplat.shape.point_inputs import RADII, REACH, point_inputs, truncation
 from chebsplat.splats.gaussians import local_shape
 from chebsplat.synthetic.rays import look_at, walk
 
@@ -44,6 +45,17 @@ def encoder(seen):
     made = PointEncoder(5, seen.descriptors.shape[1])
     made.set_inputs([cloud_of(seen)], sample=1)
     return made.eval()
+
+
+def test_a_shorter_series_tells_shapes_apart_less_as_a_longer_one_does():
+    means, _, covariances = corner()
+    lost = [truncation(means, covariances, up=UP, describe=DescribeSection(max_degree=d)) for d in (2, 8)]
+    assert 0 <= lost[1] < lost[0] < 1
+    turned = truncation(10 * means + 5, 100 * covariances, up=UP, unit=10.0)
+    assert turned == pytest.approx(lost[1], abs=1e-3)  # of a scene in decimetres
+    assert truncation(means[:2], covariances[:2], up=UP) is None
+    line = np.arange(40.0)[:, None] * [[100, 0, 0]]  # no point has another near it: nothing to tell apart
+    assert truncation(line, np.tile(np.eye(3), (40, 1, 1)), up=UP) is None
 
 
 def test_a_room_that_stands_otherwise_in_another_unit_is_the_same_room(seen):

@@ -23,9 +23,9 @@ from chebsplat.pipelines.planning import plan
 from chebsplat.pipelines.studies import figures
 from chebsplat.pipelines.studies.page import write
 from chebsplat.pipelines.studies.pictures import gallery
-from chebsplat.pipelines.studies.results import compare, row_of, traces
+from chebsplat.pipelines.studies.results import compare, on_one_machine, row_of, traces
 from chebsplat.pipelines.studies.study import checked_study, execute, expand, outstanding, read_study
-from chebsplat.pipelines.studies.tables import Section
+from chebsplat.pipelines.studies.tables import Section, sections
 from chebsplat.pipelines.work.scenes import data_of, names
 from chebsplat.stages.registry import STAGES
 
@@ -47,13 +47,14 @@ def step_of(run, stage):
     return next(step for step in run.plan.steps if step.stage == stage)
 
 
-def publish_stage(run, stage, fill, **facts):
+def publish_stage(run, stage, fill, machine="A", **facts):
     """An artifact of a run, without running it. fill: what writes its files into a folder."""
     step = step_of(run, stage)
     if step.fresh:
         return
     code = {"commit": "c" * 40, "dirty": False}
-    manifest = Manifest(STAGES[stage].schema, step.key, stage, {}, step.sections, 0, facts, threads=2, code=code)
+    manifest = Manifest(STAGES[stage].schema, step.key, stage, {}, step.sections, 0, facts, code=code)
+    manifest.processes = [{"processor": machine, "gpu": "", "cores": 4, "threads": 2, "load": [0.5, 1], "seconds": 9.0}]
     step.path.parent.mkdir(parents=True, exist_ok=True)
     with publish(step.path, manifest) as tmp:
         fill(tmp)
@@ -62,7 +63,7 @@ def publish_stage(run, stage, fill, **facts):
 ONE_LABEL = np.zeros((1, 4, 6), np.int16)
 
 
-def finish(run, miou=0.5, psnr=30.0, n=100, seconds=10.0, steps=10, segmentation=None, labels=None):
+def finish(run, miou=0.5, psnr=30.0, n=100, seconds=10.0, steps=10, segmentation=None, labels=None, machine="A"):
     """Pretend that a run was made and found these figures. labels: (class names, predicted i16 [1, 4, 6])."""
     figures = {"image": {"psnr": psnr, "ssim": 0.9}, "n_gaussians": n, "bytes": {"ply": 10 * n, "ragged": 5 * n}}
     figures |= {"frames_per_second": {"color": 50.0}}
@@ -77,7 +78,7 @@ def finish(run, miou=0.5, psnr=30.0, n=100, seconds=10.0, steps=10, segmentation
         if step.stage not in ("train", "export", "evaluate"):
             publish_stage(run, step.stage, put("empty.json", "{}"))
     trace = f"step,seconds,psnr\n{steps // 2},{seconds / 2},20\n{steps},{seconds},25\n"
-    publish_stage(run, "train", put("trace.csv", trace))
+    publish_stage(run, "train", put("trace.csv", trace), machine)
     # 10 Gaussians keep degree 3 (16 coefficients) and 30 degree 0 (1): 190 of 640.
     publish_stage(run, "export", put("empty.json", "{}"), by_degree=[30, 0, 0, 10])
     figures |= {"names": ["a"], "left_out": {"LPIPS": "not measured"}}
@@ -85,7 +86,7 @@ def finish(run, miou=0.5, psnr=30.0, n=100, seconds=10.0, steps=10, segmentation
     pictures = {name: np.zeros((1, 4, 6, 3), np.uint8) for name in ("truth", "renders")}
     if labels is not None:
         pictures |= {"labels": truth, "predicted": labels[1]}
-    publish_stage(run, "evaluate", Evaluation(figures, pictures).write)
+    publish_stage(run, "evaluate", Evaluation(figures, pictures).write, machine)
 
 
 def finished(asked, **figures):
@@ -142,7 +143,8 @@ def test_figures_are_read_from_the_artifacts():
     _, (row,) = finished(asked, miou=0.75, psnr=31.5, n=40, seconds=8.0)
     expected = {"state": "done", "seed": 3, "miou": 0.75, "miou_gain": 0.5, "psnr": 31.5, "n_gaussians": 40}
     expected |= {"sh_kept": 190 / 640, "bytes_ply": 400, "bytes_ragged": 200, "frames_per_second": 50.0}
-    expected |= {"train_seconds": 8.0, "held_in_psnr": 25.0, "steps": 10, "threads": 2}
+    expected |= {"train_seconds": 8.0, "held_in_psnr": 25.0, "steps": 10, "clock": None}
+    expected |= {"trained_on": "A, 2 threads", "rendered_on": "A, 2 threads"}
     assert {key: row[key] for key in expected} == expected
 
 
@@ -165,6 +167,44 @@ def test_the_table_says_what_a_hand_works_out():
     assert gain.excluded
     assert lines["full"].differences["n_gaussians"].mean == pytest.approx(0.5)
     assert not lines["full"].differences["psnr"].excluded
+
+
+def test_seconds_of_two_machines_are_not_compared_and_the_page_says_whose_it_shows(tmp_path):
+    asked = study(scenes=["toy", "office0"], budgets={"steps": [10, 20], "seconds": [5]})
+    runs = expand(asked)
+    for run in runs:  # B has one scene's runs of a seed: twice as fast, and as good
+        on_b = (run.scene, run.seed) == ("office0", 1)
+        seconds = (8.0 if run.variant == "full" else 10.0) / (1 + on_b)
+        finish(run, psnr=30 + on_b, seconds=seconds, machine="B" if on_b else "A")
+    rows = [row_of(run, {}) for run in runs]
+    kept = on_one_machine(rows)
+    assert on_one_machine(kept) == kept
+    for row, given in zip(kept, rows, strict=True):
+        left = given["trained_on"] == "B, 2 threads"
+        assert (row["train_seconds"], row["frames_per_second"]) == (
+            (None, None) if left else (given["train_seconds"], 50.0)
+        )
+        by_clock = "its 5 s are of another machine (B, 2 threads): not compared"
+        assert row["state"] == (by_clock if left and row["budget"] == "5 s" else "done")
+        assert row["psnr"] == given["psnr"]
+    lines = {(line.budget, line.variant): line for line in compare(kept, "less")}
+    ratio = lines["20 steps", "full"].differences["train_seconds"]
+    assert (ratio.mean, ratio.n_pairs) == (pytest.approx(0.8), 3)
+    assert lines["20 steps", "full"].differences["psnr"].n_pairs == 4  # which no machine changes
+    assert lines["5 s", "full"].differences["psnr"].n_pairs == 3
+    assert lines["20 steps", "less"].summaries["train_seconds"].mean == 10
+    page = write(tmp_path, asked, runs, rows, "c", sections(asked, rows))
+    for text in (page.read_text(), (tmp_path / "results.md").read_text().replace("\\", "")):
+        assert "training, s" in text and "is of the 18 runs on A, 2 threads alone; not compared: 6 on B" in text
+        assert "A, 2 threads; B, 2 threads" in text and "0.5 to 1" in text and by_clock in text
+    with (tmp_path / "results.csv").open() as handle:
+        assert {row["trained_on"] for row in csv.DictReader(handle)} == {"A, 2 threads", "B, 2 threads"}
+
+
+def test_a_study_of_one_machine_bewares_of_nothing(tmp_path):
+    asked = study(seeds=[0])
+    page = write(tmp_path, asked, *finished(asked, machine="C"), "c").read_text()
+    assert "C, 2 threads" in page and "beware" not in page
 
 
 def test_scannet_opens_scenes_are_summed_and_those_of_scannet_closed_averaged_before_seeds_are_compared(tmp_path):

@@ -38,6 +38,31 @@ def test_a_colmap_text_model_with_depth_and_labels_reads(tmp_path):
     assert list(dtypes.values()) == ["uint8", "float64", "float64", "float32", "int16"]
 
 
+def fine_and_coarse(width, height):
+    """Stripes a pixel wide of ± 30 grey values, a variance of 900, over steps of 32 pixels of ± 30."""
+    x = np.tile(np.arange(width), (height, 1))
+    grey = 128 + 30 * (2 * (x % 2) - 1) + 30 * (2 * (x // 32 % 2) - 1)
+    return np.repeat(grey.astype(np.uint8)[..., None], 3, 2)
+
+
+@pytest.mark.parametrize(("max_side", "kept"), [(256, 1.0), (640, 1.0), (128, 0.5)])
+def test_reduced_photos_keep_the_variance_that_is_coarser_than_their_pixels(tmp_path, max_side, kept):
+    Image.fromarray(fine_and_coarse(256, 64)).save(tmp_path / "a.png")
+    frame = common.Frame("a", tmp_path / "a.png", Camera("PINHOLE", (200.0, 200.0, 128.0, 32.0), 256, 64))
+    settings = IngestSection(min_views=1, max_side=max_side)
+    fields = assembly.assemble(common.Listing("photos", [frame], upright=True), settings)
+    assert fields["variance_kept"] == pytest.approx(kept, abs=1e-6)
+
+
+def test_variance_is_compared_over_the_part_of_a_photo_that_a_view_shows(tmp_path):
+    photo = fine_and_coarse(256, 64)
+    photo[:, 128:] = 128  # and of the view, the left half
+    at = np.stack(np.meshgrid(np.arange(128) + 0.5, np.arange(64) + 0.5))
+    assert assembly.variance_kept(Image.fromarray(photo), photo[:, :128], at) == 1
+    assert assembly.variance_kept(Image.fromarray(photo), np.full_like(photo[:, :128], 9), at) == 0
+    assert assembly.variance_kept(Image.fromarray(np.full_like(photo, 9)), photo[:, :128], at) == 1
+
+
 @pytest.mark.parametrize("suffix", ["bin", "txt"])
 def test_models_that_colmap_writes_today_read(tmp_path, suffix):
     options = pycolmap.SyntheticDatasetOptions()

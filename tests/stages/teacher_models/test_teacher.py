@@ -202,6 +202,42 @@ def test_check_teacher_tells_what_a_teacher_is_and_sees(tmp_path):
         assert what in told.stdout
 
 
+def sidelong_teacher(folder):
+    """A colour teacher that says of four pixels what the four to their right show."""
+    path = color_teacher(folder)
+    kernel = np.zeros((3, 3, 4, 8), np.float32)
+    kernel[..., 4:] = np.eye(3)[:, :, None, None] / 16
+    node = helper.make_node("Conv", ["image", "kernel"], ["features"], strides=[4, 4], pads=[0, 0, 0, 4])
+    write_model(path, [node], constants={"kernel": kernel})
+    return path
+
+
+@pytest.mark.parametrize(("flips", "calls"), [(False, 27), (True, 28)])
+def test_one_view_in_25_is_looked_at_mirrored_and_labels_are_held_against_the_truth(
+    tmp_path, monkeypatch, flips, calls
+):
+    views = [painted(np.random.default_rng(k)) for k in range(26)]
+    images, labels = (np.stack(part) for part in zip(*views, strict=True))
+    labels[1] = (labels[1] + 1) % 3  # one of 19 training views is labelled wrongly
+    many, seen, encode = published_capture(tmp_path / "many", images, labels), [], TeacherInference.features
+    monkeypatch.setattr(TeacherInference, "features", lambda *given: seen.append(given[5]) or encode(*given))
+    alike = {}
+    for name, make in (("upright", color_teacher), ("sidelong", sidelong_teacher)):
+        (tmp_path / name).mkdir()
+        seen.clear()
+        assert encoded(tmp_path / name, many, make(tmp_path / name), flips=flips)[0] == 0
+        facts = artifact.read_manifest(tmp_path / name / "out").facts
+        alike[name] = facts["mirrored_alike"]
+        assert len(seen) == calls and len(set(seen)) == 26
+        assert name == "sidelong" or facts["right"] == pytest.approx(18 / 19)
+    assert alike["upright"] == 1 and 0.2 < alike["sidelong"] < 0.9
+
+
+def test_few_views_are_not_looked_at_mirrored(tmp_path, capture):
+    assert encoded(tmp_path, capture, color_teacher(tmp_path))[0] == 0
+    assert artifact.read_manifest(tmp_path / "out").facts["mirrored_alike"] is None
+
+
 # a run that is killed
 
 

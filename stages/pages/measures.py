@@ -1,0 +1,155 @@
+"""What each stage costs and what it gets wrong: the one table of which fact of a stage is its error, and the course
+of a scene's error through its stages.
+"""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from chebsplat.formats.manifest import Manifest, measured_on
+
+PERCENT, PIXELS, DECIBELS, LEVELS, NUMBER = "{:.2%}", "{:.2f} px", "{:.2f} dB", "{:g} of 255", "{:.3g}"
+
+
+@dataclass(frozen=True)
+class Measure:
+    """A figure of a stage. `fact` of the manifest of `role`, an input of the report; `form` shows it with its unit;
+    lower: less is better.
+    """
+
+    role: str
+    fact: str
+    words: str
+    form: str
+    lower: bool = False
+
+
+RIGHT = "pixels of training views with the true label"
+HALVES = "half the training views as the other half says (cosine)"
+MEASURES: dict[str, tuple[Measure, ...]] = {  # by stage: its error is the first that was measured
+    "pose": (
+        Measure("model", "reprojection_error_px", "points off their photos", PIXELS, lower=True),
+        Measure("model", "registered", "photos that are registered", PERCENT),
+    ),
+    "ingest": (Measure("capture", "variance_kept", "variance of the photos that views keep", PERCENT),),
+    "sfm": (
+        Measure("points", "reprojection_error_px", "points off their photos", PIXELS, lower=True),
+        Measure("points", "depth_error", "points off other views' depth", PERCENT, lower=True),
+        Measure("points", "covered", "cells of the photos that hold a point", PERCENT),
+        Measure("points", "swept", "pixels of the photos whose depth a sweep found", PERCENT),
+    ),
+    "channels": (Measure("channels", "relative_error", "of features lost", NUMBER, lower=True),),
+    "teacher": (
+        Measure("features", "right", RIGHT, PERCENT),
+        Measure("features", "mirrored_alike", "pixels with the same label in the mirrored photo", PERCENT),
+        Measure("agreement", "agreement", "agreement of views on points", NUMBER),
+    ),
+    "agree": (Measure("agreement", "agreement", "agreement of views on points", NUMBER),),
+    "describe": (Measure("descriptors", "truncation", "of distances, cut off at their degree", PERCENT, lower=True),),
+    "encode": (Measure("encoding", "rounding", "of features lost by half precision", PERCENT, lower=True),),
+    "learn": (Measure("learned", "unexplained", "of what views mean, not foretold by shape", PERCENT, lower=True),),
+    "recall": (Measure("knowledge", "unexplained", "of what rooms mean, not in the map", PERCENT, lower=True),),
+    "onnx": (Measure("encoder", "largest_difference", "from torch", NUMBER, lower=True),),
+    "train": (
+        Measure("gaussians", "psnr", "PSNR on watched training views", DECIBELS),
+        Measure("gaussians", "right", RIGHT, PERCENT),
+    ),
+    "lift": (Measure("lifted", "halves_agree", HALVES, NUMBER), Measure("lifted", "right", RIGHT, PERCENT)),
+    "refine": (
+        Measure("refined", "halves_agree", HALVES, NUMBER),
+        Measure("refined", "gain", "more than lifting alone", NUMBER),
+        Measure("refined", "right", RIGHT, PERCENT),
+    ),
+    "export": (Measure("evaluation", "layout_error", "between a view's pictures by layout", LEVELS, lower=True),),
+    "evaluate": (Measure("evaluation", "psnr", "test PSNR", DECIBELS),),
+}
+
+
+class Row(NamedTuple):
+    """A stage of the report's table: seconds, its figures in words, on what it was measured."""
+
+    stage: str
+    seconds: float
+    key: str
+    figures: list[str]
+    machine: str
+    load: str
+
+
+def figures_of(stage: str, facts: Mapping[str, dict[str, Any]]) -> list[str]:
+    """What was measured of a stage, in words, its error first; an arrow says which way is better.
+
+    Args: facts: of the report's inputs, by role.
+    """
+    values = [(of, facts.get(of.role, {}).get(of.fact)) for of in MEASURES[stage]]
+    known = [(of, value) for of, value in values if value is not None]
+    return [f"{of.form.format(value)} {'↓' if of.lower else '↑'} {of.words}" for of, value in known]
+
+
+def row_of(stage: str, manifest: Manifest, facts: Mapping[str, dict[str, Any]]) -> Row:
+    """The row of a stage whose artifact this is."""
+    of, loads = manifest.processes, [value for process in manifest.processes for value in process["load"]]
+    cores = " and ".join(dict.fromkeys(str(process["cores"]) for process in of))
+    machine = measured_on(manifest) + (f" of {cores} cores" if of else "")
+    machine += f", in {len(of)} processes" if len(of) > 1 else ""
+    load = f"{min(loads):.1f} to {max(loads):.1f}" if loads else ""
+    return Row(stage, manifest.seconds, manifest.key, figures_of(stage, facts), machine, load)
+
+
+class Course(NamedTuple):
+    """How a scene came to what it is. Seconds count from the start, stage after stage.
+
+    spans: (stage, begin, end) in order; plain: PSNR of photos of one colour, which is what there is before training;
+    colors: (seconds, PSNR) of the scene as it would have been left then, as often as it was measured; meanings:
+    (stage, seconds, value) after each stage that made features, and what the values are, in words.
+    """
+
+    spans: list[tuple[str, float, float]]
+    plain: float
+    colors: list[tuple[float, float]]
+    meanings: list[tuple[str, float, float]]
+    words: str
+
+
+def course_of(
+    rows: Sequence[Row], facts: Mapping[str, dict[str, Any]], trace: list[dict[str, float]], plain: float
+) -> Course:
+    """The course of a scene.
+
+    Args: rows: of its stages, in their order; trace: of its training; plain: see `Course`.
+    Choices: a training's seconds, of its steps alone, are spread over those of its stage.
+    """
+    ends = list(itertools.accumulate(row.seconds for row in rows))
+    spans = [(row.stage, end - row.seconds, end) for row, end in zip(rows, ends, strict=True)]
+    begin, end = next((begin, end) for stage, begin, end in spans if stage == "train")
+    factor = (end - begin) / max(trace[-1]["seconds"], 1e-9)
+    colors = [(begin + factor * entry["seconds"], entry["psnr"]) for entry in trace]
+    colors.append((ends[-1], trace[-1]["psnr"]))
+    for fact, words in (("right", RIGHT), ("halves_agree", HALVES)):
+        measured = {stage: m.role for stage, of in MEASURES.items() for m in of if m.fact == fact}
+        values = [(stage, end, facts.get(measured.get(stage, ""), {}).get(fact)) for stage, _, end in spans]
+        if meanings := [(stage, end, value) for stage, end, value in values if value is not None]:
+            return Course(spans, plain, colors, meanings, words)
+    return Course(spans, plain, colors, [], "")
+
+
+STOPS = (("a quarter of the training", 0.25), ("half of the training", 0.5))
+
+
+def stops(course: Course) -> list[tuple[str, float, float, float | None]]:
+    """(stopped after, seconds, PSNR, meaning by then), of earlier ends and, last, of the whole; of a training that was
+    not measured so early, none within.
+    """
+    seconds, values = map(np.array, zip(*course.colors, strict=True))
+    begin, end = next((begin, end) for stage, begin, end in course.spans if stage == "train")
+    at = [(words, begin + share * (end - begin)) for words, share in STOPS]
+    at = [(words, when) for words, when in at if when >= seconds[0]]
+    at += [(stage, end) for stage, _, end in course.spans if stage in ("train", "lift", "refine")]
+    found = [("before training", begin, course.plain), *((*of, float(np.interp(of[1], seconds, values))) for of in at)]
+    by_then = [[value for _, second, value in course.meanings if second <= when + 1e-9] for _, when, _ in found]
+    return [(*of, values[-1] if values else None) for of, values in zip(found, by_then, strict=True)]

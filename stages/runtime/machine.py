@@ -1,0 +1,72 @@
+"""What seconds were measured on, of every process that worked on an artifact: processor, cores, threads, load."""
+
+from __future__ import annotations
+
+import json
+import logging
+import os
+import platform
+import time
+from dataclasses import dataclass, field
+from functools import cache
+from pathlib import Path
+from typing import Any
+
+from chebsplat.errors import InputError
+from chebsplat.formats.files import atomic_write, parse_json
+
+log = logging.getLogger("chebsplat")
+KEPT = "processes.json"  # in the scratch folder of a stage that resumes
+
+
+@cache
+def processor() -> str:
+    """The processor's name, where the system tells it, otherwise its architecture."""
+    path = Path("/proc/cpuinfo")
+    lines = path.read_text().splitlines() if path.exists() else []
+    return next((line.split(":", 1)[1].strip() for line in lines if line.startswith("model name")), platform.machine())
+
+
+def cores() -> int:
+    """Cores that this process may run on."""
+    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+
+
+def load() -> float:
+    """Processes that wanted a core of the machine in the last minute, anyone's."""
+    return round(os.getloadavg()[0], 2)
+
+
+@dataclass
+class Stopwatch:
+    """Seconds of this process, and of those before it whose work it goes on from; and what they
+    ran on.
+
+    A stage that resumes calls `keep` whenever it has kept something in its scratch folder, and
+    `go_on` where it takes up what an earlier process has kept: so the seconds are those of the
+    work in the artifact, whoever did it.
+    """
+
+    threads: int = 1
+    gpu: str = ""
+    earlier: list[dict[str, Any]] = field(default_factory=list)
+
+    def __post_init__(self) -> None:
+        self.began, self.load = time.perf_counter(), load()
+
+    def processes(self) -> list[dict[str, Any]]:
+        """Of each process, in their order: processor, gpu, cores, threads, load at start and now, seconds."""
+        of_machine = {"processor": processor(), "gpu": self.gpu, "cores": cores(), "threads": self.threads}
+        seconds = round(time.perf_counter() - self.began, 3)
+        return [*self.earlier, of_machine | {"load": [self.load, load()], "seconds": seconds}]
+
+    def keep(self, scratch: Path) -> None:
+        """Remember beside what was kept what it has taken."""
+        atomic_write(scratch / KEPT, json.dumps(self.processes()))
+
+    def go_on(self, scratch: Path) -> None:
+        """Count the processes that have made what is kept there, too."""
+        try:
+            self.earlier = parse_json(scratch / KEPT)
+        except InputError as error:  # a power cut may have spoiled it; what was kept is worth more than its seconds
+            log.warning("seconds of what was done before are not counted: %s", error)

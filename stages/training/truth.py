@@ -1,0 +1,71 @@
+"""How far the labels that a source brings are met on training views, by a teacher and by Gaussians."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+import numpy as np
+from scipy.spatial import cKDTree
+
+from chebsplat.cameras import unproject
+from chebsplat.evaluation.metrics import IGNORE
+from chebsplat.evaluation.protocols.task import resized, translated
+from chebsplat.formats.capture import Capture
+from chebsplat.formats.features import Features
+from chebsplat.labels.decode import decode_labels
+
+N_VIEWS, N_PIXELS = 16, 256  # training views that are looked at, and pixels of each
+SEED = 0  # of the choice of pixels
+
+
+def labels_right(
+    capture: Capture, parameters: dict[str, np.ndarray], features: np.ndarray, teacher: Features
+) -> float | None:
+    """Share of some pixels of training views that the Gaussian nearest to their surface gives the
+    true label; None where the capture has no labels with depth and poses. No test view is looked at.
+
+    Args: parameters: raw, of N Gaussians; features [N, C]; teacher: whose labels they are decoded to.
+    Choices: Gaussians that are half transparent are no surface. Pixels of classes that are none of
+      the teacher's labels are not asked.
+    """
+    if capture.labels is None or capture.depth is None or capture.cam_from_world is None:
+        return None
+    rng, training = np.random.default_rng(SEED), np.flatnonzero(~capture.is_test)
+    points, truth = [np.zeros((0, 3))], [np.zeros(0, np.int64)]
+    for view in training[np.linspace(0, len(training) - 1, min(N_VIEWS, len(training))).astype(int)]:
+        depth, labels = capture.depth[view], true_labels(capture, view, teacher.label_names)
+        usable = (depth > 0) & (labels >= 0)
+        if capture.loss_mask is not None:
+            usable &= capture.loss_mask[view]
+        pixels = np.argwhere(usable)
+        pixels = pixels[rng.choice(len(pixels), min(N_PIXELS, len(pixels)), replace=False)]
+        points.append(unproject(depth, capture.Ks[view], capture.cam_from_world[view], pixels))
+        truth.append(labels[tuple(pixels.T)])
+    solid = np.flatnonzero(parameters["logit_opacities"] > 0)
+    if not len(solid) or not sum(map(len, truth)):
+        return None
+    nearest = solid[cKDTree(parameters["means"][solid]).query(np.concatenate(points))[1]]
+    said = decode_labels(features[nearest], teacher.label_embeddings)
+    return float((said == np.concatenate(truth)).mean())
+
+
+def pixels_right(capture: Capture, label_names: list[str], said: Mapping[int, np.ndarray]) -> float | None:
+    """Share of the pixels of training views that have the true label; None where the capture has no labels.
+
+    Args: said: by view, labels [h, w] among `label_names`, -1 none, which is as wrong as any other.
+    """
+    if capture.labels is None:
+        return None
+    right = counted = 0
+    for view, labels in said.items():
+        if not capture.is_test[view]:
+            truth = resized(true_labels(capture, view, label_names), labels.shape, centred=True)
+            right += int(((labels == truth) & (truth >= 0)).sum())
+            counted += int((truth >= 0).sum())
+    return right / counted if counted else None
+
+
+def true_labels(capture: Capture, view: int, label_names: list[str]) -> np.ndarray:
+    """A view's labels [H, W] among these, -1 where it has none, or a class that is none of them."""
+    assert capture.labels is not None
+    return translated(capture.labels[view], capture.class_names or [], label_names, IGNORE)
