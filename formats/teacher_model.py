@@ -12,6 +12,7 @@ from chebsplat.errors import InputError
 from chebsplat.formats.artifact import sha256_file
 from chebsplat.formats.files import parse_toml, read_text
 from chebsplat.formats.names import check_names, suggest, unprintable
+from chebsplat.formats.onnx_files import model_files, model_sha256
 from chebsplat.formats.tensors import finite32, read_npz
 
 if TYPE_CHECKING:
@@ -33,7 +34,7 @@ class TeacherModel:
     mean, std: of RGB in [0, 1].
     size:      (H, W) that the model takes, or None: any whose sides are multiples of `multiple`.
     base:      long side in pixels that an image is resized to at scale 1, or None: its own.
-    origin:    where it was fetched, sha256: of the .onnx then; None of one that was not.
+    origin:    where it was fetched, sha256: of the model then (`model_sha256`); None of one that was not.
     labels:    table of names and embeddings; text, tokenizer: encoder of any words; prompt: what a name is put into.
     """
 
@@ -63,8 +64,8 @@ class TeacherModel:
         return self.path.with_suffix(".channels")
 
     def verify(self) -> None:
-        """Raises InputError if the encoder is not the file whose checksum was recorded."""
-        if self.sha256 is not None and (found := sha256_file(self.path)) != self.sha256:
+        """Raises InputError if the encoder is not the one whose checksum was recorded."""
+        if self.sha256 is not None and (found := model_sha256(self.path)) != self.sha256:
             raise InputError(
                 f"{self.path} has the sha256 {found}, {self.settings} says {self.sha256}: it was damaged or replaced; "
                 f"remove the folder and fetch it again (chebsplat get-teacher), or correct `sha256`"
@@ -72,9 +73,12 @@ class TeacherModel:
 
     def files(self) -> list[Path]:
         """All files that the teacher's results depend on."""
-        weights = self.path.with_name(self.path.name + ".data")  # where torch puts weights that do not fit one file
-        named = [getattr(self, name) for name in FILES]
-        return [self.path, self.settings, *filter(Path.is_file, [weights]), *(p for p in named if isinstance(p, Path))]
+        files = model_files(self.path)
+        files.insert(1, self.settings)
+        for named in (getattr(self, name) for name in FILES):
+            if isinstance(named, Path):
+                files += model_files(named) if named == self.text else [named]
+        return files
 
     def digest(self) -> str:
         """One sha256 over these files."""

@@ -13,6 +13,7 @@ from chebsplat.formats.artifact import read_manifest, sha256_file
 from chebsplat.formats.capture import Capture
 from chebsplat.formats.channels import ChannelMap
 from chebsplat.formats.features import Features, FeatureWriter
+from chebsplat.formats.onnx_files import model_sha256
 from chebsplat.formats.teacher_model import EMBEDDED, read_teacher
 from chebsplat.labels import noisy_teacher as model
 from chebsplat.labels.decode import class_codes, decode, voted
@@ -69,7 +70,7 @@ def from_onnx(job: Job, capture: Capture, settings: TeacherSection) -> None:
     convention = {
         "kind": "onnx",
         "teacher": teacher.name,
-        "sha256": sha256_file(teacher.path),
+        "sha256": model_sha256(teacher.path),
         "output": teacher.output,
         "normalized": True,  # before `channels`
         "n_scales": len(settings.scales),

@@ -10,7 +10,7 @@ import os
 import re
 import shutil
 import time
-from pathlib import Path
+from pathlib import Path, PurePosixPath
 from typing import Any, Literal
 from urllib.parse import urlsplit
 
@@ -20,6 +20,7 @@ from chebsplat.errors import ChebsplatError, ConfigError, InputError
 from chebsplat.formats.artifact import sha256_file
 from chebsplat.formats.files import parse_json
 from chebsplat.formats.images import read_rgb
+from chebsplat.formats.onnx_files import model_sha256, weight_files
 from chebsplat.formats.teacher_model import read_teacher
 from chebsplat.labels.tiling import window_starts
 from chebsplat.stages.runtime.command import n_threads
@@ -53,16 +54,23 @@ def get_teacher(name: str, out: Path | None = None, graph: str = GRAPH) -> tuple
             raise ConfigError(f"{folder} exists and is not {origin}; remove it, or choose another --out")
         return model, check(model)
     held = {file: fetched(repository, file, revision) for file in (CLASSES, PREPARATION, graph)}
+    weights = {
+        name: fetched(repository, f"{PurePosixPath(graph).parent / name}", revision)
+        for name in weight_files(held[graph])
+    }
     part = folder.with_name(f".part-{folder.name}")
     shutil.rmtree(part, ignore_errors=True)
     part.mkdir(parents=True)
     try:
         made = part / model.name
         shutil.copyfile(held[graph], made)
+        for name, file in weights.items():
+            (part / name).parent.mkdir(parents=True, exist_ok=True)
+            shutil.copyfile(file, part / name)
         classes = class_names(held[CLASSES], repository)
         made.with_suffix(".txt").write_text("\n".join(classes) + "\n", encoding="utf-8")
         values = {"name": short, "output": "logits", "labels": f"{short}.txt", "origin": origin}
-        values |= {"sha256": sha256_file(made)} | preparation(held[PREPARATION], repository)
+        values |= {"sha256": model_sha256(made)} | preparation(held[PREPARATION], repository)
         lines = (f"{k} = {json.dumps(value, ensure_ascii=False)}\n" for k, value in values.items())
         made.with_suffix(".toml").write_text("".join(lines), encoding="utf-8")
         part.rename(folder)

@@ -20,6 +20,12 @@ def write_model(path, nodes, outputs=("features",), shape=(1, 3, "H", "W"), kind
     onnx.save(model, path)
 
 
+def moved_out(path, location):
+    """Put a model's weights into a file beside it, as exporters do with many."""
+    model = onnx.load(path)
+    onnx.save(model, path, save_as_external_data=True, location=location, size_threshold=0, convert_attribute=True)
+
+
 def write_settings(path, **values):
     """The TOML beside a model, and the table of the three colours."""
     held = {"name": "tiny", "labels": "tiny.npz", "mean": [0.5] * 3, "std": [0.5] * 3} | values
