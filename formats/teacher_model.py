@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import re
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -30,7 +30,9 @@ class TeacherModel:
     """What `read_teacher` returns; docs/teachers.md says what each key means to a user.
 
     path:      the image encoder, `[1, 3, H, W]` float32 -> `[1, C, h, w]`.
-    output:    "features", or "logits" of a closed-set segmenter: channel = index into the label list.
+    output:    "features", or "logits" of a closed-set segmenter: channel = index into the label list. Where the TOML
+               does not say it (`told`), labels that are names alone, without `text`, are a segmenter's.
+    tensor:    the graph's output, or None: the one that fits.
     mean, std: of RGB in [0, 1].
     size:      (H, W) that the model takes, or None: any whose sides are multiples of `multiple`.
     base:      long side in pixels that an image is resized to at scale 1, or None: its own.
@@ -52,6 +54,8 @@ class TeacherModel:
     base: int | None = None
     origin: str | None = None
     sha256: str | None = None
+    tensor: str | None = None
+    told: bool = True
 
     @property
     def settings(self) -> Path:
@@ -107,6 +111,9 @@ def read_teacher(path: Path) -> TeacherModel:
             if not values[key].is_file():
                 raise InputError(f"{values[key]} is missing; correct `{key}` in {settings}")
     teacher = TeacherModel(path, **({"name": path.stem} | values))
+    if "output" not in values and teacher.labels is not None and teacher.text is None:
+        closed = read_label_table(teacher.labels)[1] is None
+        teacher = replace(teacher, output="logits" if closed else "features", told=not closed)
     if teacher.output == "features" and teacher.labels is None and teacher.text is None:
         raise InputError(f"{settings} has neither `labels` nor `text`: no label could be told; add one of them")
     if teacher.output == "logits" and teacher.labels is None:
@@ -134,6 +141,7 @@ def _is_text(value: Any) -> bool:
 RULES = {
     "name": ("a word", _is_text),
     "output": ('"features" or "logits"', lambda v: v in ("features", "logits")),
+    "tensor": ("the name of an output", _is_text),
     "mean": ("three numbers", lambda v: _is_list(v, (int, float), 3, -1e3, 1e3)),
     "std": ("three numbers above 0", lambda v: _is_list(v, (int, float), 3, 1e-6, 1e3)),
     "size": (f"[height, width], 1 to {MAX_SIDE} pixels", lambda v: _is_list(v, (int,), 2, 1, MAX_SIDE)),

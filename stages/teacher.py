@@ -52,11 +52,14 @@ def from_onnx(job: Job, capture: Capture, settings: TeacherSection) -> None:
     network = TeacherInference(teacher, n_threads(), job.device)
     if job.device == "cuda" and CUDA not in providers(job.device):
         job.left_out("the teacher on the GPU", f"onnxruntime here has no CUDA ({GPU_REMEDY})")
+    if not teacher.told:
+        log.info("%s has no `output`: logits, as %s holds names alone", teacher.settings, teacher.labels)
     grid, n_channels = network.grid(capture.images[0], settings.downscale)
     channels = None
     if teacher.output == "logits":
         labels = label_set(teacher, settings.labels, None) if settings.labels else None
         space = closed_set(teacher, labels, n_channels, settings.n_channels)
+        network.judge(capture.images)
     else:
         if "channels" in job.inputs:
             channels = ChannelMap.read(job.inputs["channels"])
@@ -72,6 +75,7 @@ def from_onnx(job: Job, capture: Capture, settings: TeacherSection) -> None:
         "teacher": teacher.name,
         "sha256": model_sha256(teacher.path),
         "output": teacher.output,
+        "scores": network.scores if teacher.output == "logits" else None,
         "normalized": True,  # before `channels`
         "n_scales": len(settings.scales),
         "scales": list(settings.scales),

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 import math
 from typing import Any
 
@@ -10,17 +11,22 @@ import onnxruntime
 from PIL import Image
 
 from chebsplat.errors import DataFailure, InputError
-from chebsplat.formats.teacher_model import MAX_SIDE, TeacherModel
+from chebsplat.formats.record import Stack
+from chebsplat.formats.teacher_model import MAX_SIDE, TeacherModel, read_label_table
+from chebsplat.labels.scores import LOGITS, kind_of, probabilities
 from chebsplat.labels.tiling import blended, window_starts
 from chebsplat.stages.teacher_models.onnx_session import Model
 
+log = logging.getLogger("chebsplat")
 MAX_WINDOWS = 4096  # of a view
+JUDGED = 4  # images whose values tell what a segmenter gives
 MAX_SHARE = 0.5  # of the image's side that an entry of the map may be wide
 
 
 class TeacherInference:
     """Runs one teacher, one window at a time: on a CPU a batch gains nothing, and memory stays that of one window.
 
+    scores: what the values of a segmenter are, once `judge` has seen some.
     Args: threads: that onnxruntime may use; device: cpu, or cuda where onnxruntime has it.
     Raises: InputError naming a model that cannot be used.
     """
@@ -35,6 +41,8 @@ class TeacherInference:
         remedy = f"correct `size` or `multiple` in {teacher.settings}, or export it again"
         self.model = Model(teacher.path, remedy, options, device)
         self.size = self._window_size()
+        self.scores = LOGITS
+        self._place: int | None = None  # of the output that is read, once some are seen
 
     def _window_size(self) -> tuple[int, int] | None:
         """(H, W) of the graph or of the TOML; None where the model takes any size."""
@@ -103,6 +111,23 @@ class TeacherInference:
             sides.append(math.ceil(n / entry - 1e-9))
         return (sides[0], sides[1]), cells.shape[0]
 
+    def judge(self, images: Stack | list[np.ndarray]) -> str:
+        """Tell from windows of a few of the images what a segmenter's values are; all later maps are read so.
+
+        Choices: the windows are of the images' middles, where most is to be seen.
+        """
+        windows = []
+        for image in images[:: -(-len(images) // JUDGED)]:
+            size = self.scaled_size(image, 1.0)
+            side, resized = self.window(size), _resized(image, size)
+            top, left = (max(n - m, 0) // 2 for n, m in zip(size, side, strict=True))
+            part = resized[top : top + side[0], left : left + side[1]]
+            windows.append(self.run(_padded(part, side), "a view"))
+        self.scores = kind_of(windows)
+        if self.scores != LOGITS:
+            log.info("%s gives no logits but what a %s gives: taken as such", self.teacher.path.name, self.scores)
+        return self.scores
+
     def features(
         self, image: np.ndarray, grid: tuple[int, int], scales: tuple[float, ...], flips: bool, name: str
     ) -> np.ndarray:
@@ -120,7 +145,9 @@ class TeacherInference:
 
                 def entries(top: int, left: int, padded: Any = padded, side: Any = side) -> np.ndarray:
                     output = self.run(padded[top : top + side[0], left : left + side[1]], name)
-                    return softmax(output) if self.teacher.output == "logits" else unit(output, 0)
+                    if self.teacher.output == "logits":
+                        return probabilities(output, self.scores)
+                    return unit(output, 0)
 
                 part = self._normal(blended(entries, size, side, grid))
                 part = part[:, ::-1] if flip else part
@@ -138,7 +165,10 @@ class TeacherInference:
         teacher = self.teacher
         mean, std = (np.array(v, np.float32)[:, None, None] for v in (teacher.mean, teacher.std))
         image = (window.transpose(2, 0, 1).astype(np.float32) / 255 - mean) / std
-        output = self.model.run({self.model.inputs[0].name: image[None]})[0]
+        outputs = self.model.run({self.model.inputs[0].name: image[None]})
+        if self._place is None:
+            self._place = self._place_of(outputs)
+        output = outputs[self._place]
         if output.ndim != 4 or output.shape[0] != 1 or not output.size:
             raise InputError(f"{teacher.path} gives {list(output.shape)}; [1, C, h, w] is needed: export it again")
         if not np.isfinite(output).all():
@@ -148,16 +178,37 @@ class TeacherInference:
             )
         return output[0].astype(np.float32)
 
+    def _place_of(self, outputs: list[np.ndarray]) -> int:
+        """Which of the graph's outputs is the map: the one that the TOML names, or the one that fits.
+
+        Raises: InputError listing them where none or several do.
+        """
+        teacher, names = self.teacher, [entry.name for entry in self.model.outputs]
+        listed = ", ".join(f"{name} {list(value.shape)}" for name, value in zip(names, outputs, strict=True))
+        if teacher.tensor is not None:
+            if teacher.tensor not in names:
+                why = f"no output is called {teacher.tensor}: there are {listed}"
+                raise InputError(f"{teacher.settings}: {why}; correct `tensor`")
+            return names.index(teacher.tensor)
+        if len(outputs) == 1:
+            return 0
+        found = [k for k, value in enumerate(outputs) if value.ndim == 4 and len(value) == 1 and value.size]
+        if len(found) > 1 and teacher.labels is not None:
+            table, embeddings = read_label_table(teacher.labels)
+            wanted = len(table) if teacher.output == "logits" or embeddings is None else embeddings.shape[1]
+            found = [k for k in found if outputs[k].shape[1] == wanted]
+        if len(found) != 1:
+            fit = f"{'more than one' if found else 'none'} fits {teacher.labels or '[1, C, h, w]'}"
+            raise InputError(
+                f"{teacher.path} gives {listed}: {fit}; name the right one as `tensor` in {teacher.settings}"
+            )
+        log.info("%s gives %s: %s is taken", teacher.path.name, listed, names[found[0]])
+        return found[0]
+
 
 def unit(values: np.ndarray, axis: int) -> np.ndarray:
     """Unit vectors along an axis; a vector of length 0 stays."""
     return values / np.linalg.norm(values, axis=axis, keepdims=True).clip(1e-6)
-
-
-def softmax(logits: np.ndarray) -> np.ndarray:
-    """Probabilities [C, h, w] of logits [C, h, w]."""
-    weights = np.exp(logits - logits.max(0))
-    return weights / weights.sum(0)
 
 
 def _resized(image: np.ndarray, size: tuple[int, int]) -> np.ndarray:

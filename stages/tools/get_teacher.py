@@ -216,6 +216,7 @@ def check(model: Path, photo: Path | None = None, labels: str | None = None) -> 
     if teacher.output == "logits":
         asked = label_set(teacher, labels, None) if labels else None
         space = closed_set(teacher, asked, n_channels, settings.n_channels)
+        network.judge([image])
     else:
         space = open_vocabulary(teacher, label_set(teacher, labels, None), n_channels, None)
     began = time.perf_counter()

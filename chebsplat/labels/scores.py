@@ -1,0 +1,46 @@
+"""What a segmenter's outputs are, told by their values, and the probabilities that they stand for."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+
+SUM = 0.004  # that sums of probabilities may be off 1: those of bfloat16
+RANGE = 1e-3  # that values may lie beyond what they cannot
+SURE = 0.5  # that some sigmoid reaches; cosines of an image and of words stay below where none is negative
+SCALE = 100.0  # of cosines before a softmax: CLIP's
+LEAST = 1e-6  # of a probability whose odds are taken
+
+LOGITS, SOFTMAX, SIGMOID, COSINES = "logits", "softmax", "sigmoid", "cosines"
+
+
+def kind_of(maps: Sequence[np.ndarray]) -> str:
+    """What values [C, h, w] of windows are: logits, or what a softmax, sigmoids or cosines give.
+
+    Choices: sums of 1 over the classes are a softmax, whatever a resize made of its range; values of 0 to 1 are
+      sigmoids if some class is surer than SURE; what else stays within -1 to 1 is cosines. Logits that small would say
+      nothing: scaled as cosines, they keep their order.
+    """
+    low, high = min(values.min() for values in maps), max(values.max() for values in maps)
+    if all((np.abs(values.sum(0) - 1) < SUM).all() for values in maps):
+        return SOFTMAX
+    if low < -1 - RANGE or high > 1 + RANGE:
+        return LOGITS
+    return SIGMOID if low >= -RANGE and high > SURE else COSINES
+
+
+def probabilities(values: np.ndarray, kind: str) -> np.ndarray:
+    """Of the classes, [C, h, w], of sum 1. Args: kind: as `kind_of` tells it.
+
+    Choices: of sigmoids the softmax of the logits that they were taken of, which is their odds made to sum to 1.
+    """
+    if kind == SOFTMAX:
+        weights = values.clip(0)
+    elif kind == SIGMOID:
+        weights = values.clip(LEAST, 1 - LEAST) / (1 - values.clip(LEAST, 1 - LEAST))
+    else:
+        logits = values * SCALE if kind == COSINES else values
+        weights = np.exp(logits - logits.max(0))
+    shares: np.ndarray = weights / weights.sum(0)
+    return shares
