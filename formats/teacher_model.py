@@ -21,6 +21,7 @@ if TYPE_CHECKING:
 EMBEDDED = Path(__file__).parents[1] / "teachers/embedded.onnx"  # ships with the package
 MAX_LABELS = 2**15 - 1  # what maps of int16 can number
 MAX_SIDE = 4096  # pixels of what a model is fed
+RESAMPLING = ("nearest", "lanczos", "bilinear", "bicubic", "box", "hamming")  # by Pillow's numbers
 FILES = ("labels", "text", "tokenizer")
 TEXT_PACKAGE = "minilm"  # `text` may name the optional extra instead of a file
 
@@ -33,7 +34,8 @@ class TeacherModel:
     output:    "features", or "logits" of a closed-set segmenter: channel = index into the label list. Where the TOML
                does not say it (`told`), labels that are names alone, without `text`, are a segmenter's.
     tensor:    the graph's output, or None: the one that fits.
-    mean, std: of RGB in [0, 1].
+    mean, std: of colours in [0, 1], in the order that the model is fed, `order`: "RGB" or "BGR".
+    resample:  how photos are resized, of RESAMPLING.
     size:      (H, W) that the model takes, or None: any whose sides are multiples of `multiple`.
     base:      long side in pixels that an image is resized to at scale 1, or None: its own.
     origin:    where it was fetched, sha256: of the model then (`model_sha256`); None of one that was not.
@@ -45,6 +47,8 @@ class TeacherModel:
     output: str = "features"
     mean: tuple[float, ...] = (0.5, 0.5, 0.5)
     std: tuple[float, ...] = (0.5, 0.5, 0.5)
+    order: str = "RGB"
+    resample: str = "bilinear"
     size: tuple[int, int] | None = None
     multiple: int = 1
     labels: Path | None = None
@@ -110,6 +114,7 @@ def read_teacher(path: Path) -> TeacherModel:
             values[key] = settings.parent / values[key]
             if not values[key].is_file():
                 raise InputError(f"{values[key]} is missing; correct `{key}` in {settings}")
+    _check_range(settings, values)
     teacher = TeacherModel(path, **({"name": path.stem} | values))
     if "output" not in values and teacher.labels is not None and teacher.text is None:
         closed = read_label_table(teacher.labels)[1] is None
@@ -144,6 +149,8 @@ RULES = {
     "tensor": ("the name of an output", _is_text),
     "mean": ("three numbers", lambda v: _is_list(v, (int, float), 3, -1e3, 1e3)),
     "std": ("three numbers above 0", lambda v: _is_list(v, (int, float), 3, 1e-6, 1e3)),
+    "order": ('"RGB" or "BGR"', lambda v: v in ("RGB", "BGR")),
+    "resample": (", ".join(RESAMPLING), lambda v: v in RESAMPLING),
     "size": (f"[height, width], 1 to {MAX_SIDE} pixels", lambda v: _is_list(v, (int,), 2, 1, MAX_SIDE)),
     "multiple": (f"a whole number, 1 to {MAX_SIDE}", _is_side),
     "base": (f"a whole number of pixels, 1 to {MAX_SIDE}", _is_side),
@@ -164,6 +171,17 @@ def _check(settings: Path, key: str, value: Any) -> None:
     wanted, fits = RULES[key]
     if not fits(value):
         raise InputError(f"{settings}: {key} = {value!r:.60} is not {wanted}; correct it")
+
+
+def _check_range(settings: Path, values: dict[str, Any]) -> None:
+    """Mean and std are of colours in 0 to 1, and never above 1: with those of 0 to 255 all photos look alike."""
+    given = {key: values[key] for key in ("mean", "std") if key in values}
+    large = [key for key, value in given.items() if max(value) > 1]
+    if large:
+        right = {key: [float(f"{v / 255:.4g}") for v in given[key]] for key in large}
+        advice = ", ".join(f"{key} = {value}" for key, value in right.items())
+        what = f"{' and '.join(large)} of colours in 0 to 255, where those of 0 to 1 are needed"
+        raise InputError(f"{settings}: {what}; write {advice}")
 
 
 def read_label_table(path: Path) -> tuple[list[str], np.ndarray | None]:

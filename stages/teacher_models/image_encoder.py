@@ -99,7 +99,7 @@ class TeacherInference:
                 f"{self.teacher.settings}: a view takes {count:,} windows of {side[1]} x {side[0]}; {MAX_WINDOWS:,} of "
                 f"sides up to {MAX_SIDE} are possible: correct `base`, `size` or `multiple`"
             )
-        cells = self.run(_padded(_resized(image, scaled), side)[: side[0], : side[1]], "the first view")
+        cells = self.run(_padded(self._resized(image, scaled), side)[: side[0], : side[1]], "the first view")
         sides = []
         for n, m, window, count in zip(image.shape[:2], scaled, side, cells.shape[1:], strict=True):
             entry = max(window / count * n / m, downscale)
@@ -119,7 +119,7 @@ class TeacherInference:
         windows = []
         for image in images[:: -(-len(images) // JUDGED)]:
             size = self.scaled_size(image, 1.0)
-            side, resized = self.window(size), _resized(image, size)
+            side, resized = self.window(size), self._resized(image, size)
             top, left = (max(n - m, 0) // 2 for n, m in zip(size, side, strict=True))
             part = resized[top : top + side[0], left : left + side[1]]
             windows.append(self.run(_padded(part, side), "a view"))
@@ -139,7 +139,7 @@ class TeacherInference:
         total = np.zeros(0)
         for scale in scales:
             size = self.scaled_size(image, scale)
-            side, resized = self.window(size), _resized(image, size)
+            side, resized = self.window(size), self._resized(image, size)
             for flip in (False, True) if flips else (False,):
                 padded = _padded(resized[:, ::-1] if flip else resized, side)
 
@@ -164,7 +164,8 @@ class TeacherInference:
         """
         teacher = self.teacher
         mean, std = (np.array(v, np.float32)[:, None, None] for v in (teacher.mean, teacher.std))
-        image = (window.transpose(2, 0, 1).astype(np.float32) / 255 - mean) / std
+        fed = window[..., ::-1] if teacher.order == "BGR" else window
+        image = (fed.transpose(2, 0, 1).astype(np.float32) / 255 - mean) / std
         outputs = self.model.run({self.model.inputs[0].name: image[None]})
         if self._place is None:
             self._place = self._place_of(outputs)
@@ -177,6 +178,12 @@ class TeacherInference:
                 f"in {teacher.settings}, and export it in float32"
             )
         return output[0].astype(np.float32)
+
+    def _resized(self, image: np.ndarray, size: tuple[int, int]) -> np.ndarray:
+        if image.shape[:2] == size:
+            return image
+        how = Image.Resampling[self.teacher.resample.upper()]
+        return np.asarray(Image.fromarray(image).resize((size[1], size[0]), how))
 
     def _place_of(self, outputs: list[np.ndarray]) -> int:
         """Which of the graph's outputs is the map: the one that the TOML names, or the one that fits.
@@ -209,12 +216,6 @@ class TeacherInference:
 def unit(values: np.ndarray, axis: int) -> np.ndarray:
     """Unit vectors along an axis; a vector of length 0 stays."""
     return values / np.linalg.norm(values, axis=axis, keepdims=True).clip(1e-6)
-
-
-def _resized(image: np.ndarray, size: tuple[int, int]) -> np.ndarray:
-    if image.shape[:2] == size:
-        return image
-    return np.asarray(Image.fromarray(image).resize((size[1], size[0]), Image.Resampling.BILINEAR))
 
 
 def _padded(image: np.ndarray, side: tuple[int, int]) -> np.ndarray:

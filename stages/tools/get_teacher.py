@@ -10,6 +10,7 @@ import os
 import re
 import shutil
 import time
+from collections.abc import Callable
 from pathlib import Path, PurePosixPath
 from typing import Any, Literal
 from urllib.parse import urlsplit
@@ -21,7 +22,7 @@ from chebsplat.formats.artifact import sha256_file
 from chebsplat.formats.files import parse_json
 from chebsplat.formats.images import read_rgb
 from chebsplat.formats.onnx_files import model_sha256, weight_files
-from chebsplat.formats.teacher_model import read_teacher
+from chebsplat.formats.teacher_model import RESAMPLING, read_teacher
 from chebsplat.labels.tiling import window_starts
 from chebsplat.stages.runtime.command import n_threads
 from chebsplat.stages.settings import MAX_CHANNELS, TeacherSection
@@ -32,6 +33,9 @@ TEACHERS = {"segformer-b0-ade": "Xenova/segformer-b0-finetuned-ade-512-512"}  # 
 REPOSITORY = re.compile(r"hf:([\w.-]+/[\w.-]+?)(?:@([\w./-]+))?")
 GRAPH, CLASSES, PREPARATION = "onnx/model.onnx", "config.json", "preprocessor_config.json"
 WIDER = 4 / 3  # of a photo than of the square that a segmenter is trained on
+STEPS = (  # of an image processor: what the keys of a TOML stand for, and what does nothing to a photo
+    "resize", "center_crop", "rescale", "normalize", "flip_channel_order", "convert_rgb", "reduce_labels", "pad",
+)  # fmt: skip
 AGAIN = "run the same command again"
 SHOWN = 8  # labels
 
@@ -186,19 +190,75 @@ def class_names(path: Path, repository: str) -> list[str]:
 
 
 def preparation(path: Path, repository: str) -> dict[str, Any]:
-    """mean, std, size and base of what the model is fed."""
-    values = document(path)
-    size = values.get("size")
-    if isinstance(size, dict):
-        size = [size.get("height", size.get("shortest_edge")), size.get("width", size.get("shortest_edge"))]
-    sides: list[Any] = list(size) if isinstance(size, list) else [size, size]
-    mean, std = values.get("image_mean"), values.get("image_std")
-    if len(sides) != 2 or not all(isinstance(side, int) for side in sides) or mean is None or std is None:
-        raise InputError(
-            f"hf:{repository}: {PREPARATION} has no size, image_mean or image_std as an image encoder needs; export "
-            "the model yourself (docs/teachers.md)"
-        )
-    return {"mean": mean, "std": std, "size": sides, "base": round(max(sides) * WIDER)}
+    """Keys of a teacher's TOML that feed a model as its image processor does.
+
+    Raises: InputError naming a step or a value that no key stands for.
+    Choices: what is cropped from a photo's middle is a window's size; a photo keeps its aspect ratio.
+    """
+    values = {key: value for key, value in document(path).items() if value is not None}
+
+    def refused(what: str) -> InputError:
+        where = f"hf:{repository}: {PREPARATION}"
+        return InputError(f"{where} {what}; export the model yourself (docs/teachers.md)")
+
+    def does(step: str, usual: bool) -> bool:
+        return bool(values.get(f"do_{step}", usual))
+
+    kind = values.get("image_processor_type", values.get("feature_extractor_type", ""))
+    flipped = does("flip_channel_order", "MobileViT" in str(kind))
+    others = [key for key, value in values.items() if (key.startswith("do_") or "offset" in key) and value]
+    if unknown := sorted({*others} - {f"do_{step}" for step in STEPS}):
+        raise refused(f"asks for {', '.join(unknown)}, which no key of a teacher stands for")
+    mean, std = [0.0] * 3, [1.0] * 3
+    if does("normalize", not flipped or "image_mean" in values):
+        mean, std = (three(values.get(key)) for key in ("image_mean", "image_std"))
+        if not mean or not std:
+            raise refused("has no image_mean or image_std of three numbers")
+    factor = values.get("rescale_factor", 1 / 255) if does("rescale", True) else 1
+    if not isinstance(factor, int | float) or not 0 < factor < 1e3:
+        raise refused(f"has a rescale_factor of {factor!r:.40}")
+    if flipped and len({*mean}) + len({*std}) > 2:
+        raise refused("turns the order of channels that are normalised apart (do_flip_channel_order)")
+    whole = 1 if np.isclose(255 * factor, 1, 1e-9) else 255 * factor  # what 255 becomes
+    if max(*mean, *std) > 1 and whole <= 1:
+        raise refused("has image_mean or image_std of colours in 0 to 255, and rescales to 0 to 1 before")
+    number = values.get("resample", 2)
+    if number not in range(len(RESAMPLING)):
+        raise refused(f"has a resample of {number!r:.40}")
+    found: dict[str, Any] = {"mean": [m / whole for m in mean], "std": [s / whole for s in std]}
+    found |= {"order": "BGR"} if flipped else {}
+    found |= {"resample": RESAMPLING[number]} if number != 2 else {}
+    return found | window_of(values, does("resize", True), does("center_crop", False), refused)
+
+
+def three(value: Any) -> list[float]:
+    """Three numbers of a list or of one number; none of anything else."""
+    listed = value if isinstance(value, list) else [value] * 3
+    return listed if len(listed) == 3 and all(type(v) in (int, float) for v in listed) else []
+
+
+def window_of(
+    values: dict[str, Any], resized: bool, cropped: bool, refused: Callable[[str], InputError]
+) -> dict[str, Any]:
+    """`size` and `base` of a TOML: the sides of a window, and a photo's long side."""
+
+    def sides(key: str) -> tuple[list[int], int | None]:
+        of = values.get(key)
+        of = dict(zip(("height", "width"), of, strict=False)) if isinstance(of, list) else of
+        of = of if isinstance(of, dict) else {"shortest_edge": of}
+        longest = of.get("longest_edge")
+        short = of.get("shortest_edge", longest)
+        found = [side for side in (of.get("height", short), of.get("width", short)) if type(side) is int]
+        if len(found) < 2 or not isinstance(longest, int | None):
+            raise refused(f"has no {key} of whole numbers")
+        return found, longest
+
+    crop = {"size": sides("crop_size")[0]} if cropped else {}
+    if not resized:
+        return crop
+    size, longest = sides("size")
+    base = round(max(size) * WIDER)
+    return {"size": size, "base": base if longest is None else min(base, longest)} | crop
 
 
 def check(model: Path, photo: Path | None = None, labels: str | None = None) -> list[tuple[str, str]]:
