@@ -14,12 +14,13 @@ from chebsplat.formats.features import Features
 from chebsplat.formats.points import Points
 from chebsplat.labels.agreement import UNSEEN, between, far_pairs, project, unhidden
 from chebsplat.labels.decode import decode_labels
+from chebsplat.labels.scores import UNSURE, sureness
 from chebsplat.stages.reconstruction.thinning import even
 from chebsplat.stages.runtime.command import Job
 
 log = logging.getLogger("chebsplat")
 SEED = 0  # of the choice among points
-AGREED, UNSURE = 0.3, 0.25  # a real segmenter on real rooms is sure by .5 to .8 (`sureness`)
+AGREED = 0.3  # agreement that no teacher has by chance
 
 
 def run(job: Job) -> None:
@@ -47,7 +48,7 @@ def run(job: Job) -> None:
     job.facts |= {"agreement": value, "n_points": len(row), "n_views": len(views), "n_labels": len(labels)}
     if value is None:
         log.warning("no point has a label in two views: how far they agree is not known")
-    elif value >= AGREED and (sure := sureness(features, [at for _, _, at in views])) < UNSURE:
+    elif value >= AGREED and (sure := sure_of(features, [at for _, _, at in views])) < UNSURE:
         job.facts["doubt"] = (
             f"views agree by {value:.2f} on what points are (1: always, 0: by chance), and the teacher is sure by "
             f"{sure:.2f} only: its outputs are flat, as of a softmax taken twice, of logits that were scaled down, or "
@@ -65,15 +66,12 @@ def run(job: Job) -> None:
     ViewAgreement(value, len(row), len(views), labels).write(job.out)
 
 
-def sureness(features: Features, views: list[int]) -> float:
-    """How sure a segmenter is of its likeliest class, on average: 0 where all are alike, 1 where it is certain; 1 of
-    other teachers, whose cosines say nothing of it.
-    """
+def sure_of(features: Features, views: list[int]) -> float:
+    """How sure a segmenter is of its likeliest class; 1 of other teachers, whose cosines say nothing of it."""
     if features.convention.get("output") != "logits" or features.confidence is None:
         return 1.0
-    chance = 1 / len(features.label_names)
     mean = np.mean([np.asarray(features.confidence[view], np.float32).mean() for view in views])
-    return float((mean - chance) / max(1 - chance, chance))
+    return sureness(float(mean), len(features.label_names))
 
 
 def training_views(capture: Capture, points: Points, features: Features) -> list[tuple[int, int, int]]:

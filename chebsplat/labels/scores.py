@@ -10,7 +10,8 @@ SUM = 0.004  # that sums of probabilities may be off 1: those of bfloat16
 RANGE = 1e-3  # that values may lie beyond what they cannot
 SURE = 0.5  # that some sigmoid reaches; cosines of an image and of words stay below where none is negative
 SCALE = 100.0  # of cosines before a softmax: CLIP's
-LEAST = 1e-6  # of a probability whose odds are taken
+UNSURE = 0.25  # a segmenter of photos is sure by .5 to .8
+LEAST, NONE = 1e-6, 1e-12  # of a probability whose odds, or logarithm, are taken
 
 LOGITS, SOFTMAX, SIGMOID, COSINES = "logits", "softmax", "sigmoid", "cosines"
 
@@ -30,17 +31,25 @@ def kind_of(maps: Sequence[np.ndarray]) -> str:
     return SIGMOID if low >= -RANGE and high > SURE else COSINES
 
 
-def probabilities(values: np.ndarray, kind: str) -> np.ndarray:
-    """Of the classes, [C, h, w], of sum 1. Args: kind: as `kind_of` tells it.
-
-    Choices: of sigmoids the softmax of the logits that they were taken of, which is their odds made to sum to 1.
-    """
+def logits_of(values: np.ndarray, kind: str) -> np.ndarray:
+    """What values [C, h, w] are the softmax, the sigmoids or the cosines of. Args: kind: as `kind_of` tells it."""
+    logits: np.ndarray = values * SCALE if kind == COSINES else values
     if kind == SOFTMAX:
-        weights = values.clip(0)
+        logits = np.log(values.clip(NONE))
     elif kind == SIGMOID:
-        weights = values.clip(LEAST, 1 - LEAST) / (1 - values.clip(LEAST, 1 - LEAST))
-    else:
-        logits = values * SCALE if kind == COSINES else values
-        weights = np.exp(logits - logits.max(0))
+        shares = values.clip(LEAST, 1 - LEAST)
+        logits = np.log(shares / (1 - shares))
+    return logits
+
+
+def probabilities(values: np.ndarray, kind: str) -> np.ndarray:
+    """Of the classes, [C, h, w], of sum 1. Args: kind: as `kind_of` tells it."""
+    logits = logits_of(values, kind)
+    weights = np.exp(logits - logits.max(0))
     shares: np.ndarray = weights / weights.sum(0)
     return shares
+
+
+def sureness(confidence: float, n_classes: int) -> float:
+    """How sure a mean confidence is: 0 where all classes are alike, 1 where one is certain."""
+    return (confidence * n_classes - 1) / max(n_classes - 1, 1)

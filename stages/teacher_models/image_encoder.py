@@ -112,21 +112,19 @@ class TeacherInference:
         return (sides[0], sides[1]), cells.shape[0]
 
     def judge(self, images: Stack | list[np.ndarray]) -> str:
-        """Tell from windows of a few of the images what a segmenter's values are; all later maps are read so.
-
-        Choices: the windows are of the images' middles, where most is to be seen.
-        """
-        windows = []
-        for image in images[:: -(-len(images) // JUDGED)]:
-            size = self.scaled_size(image, 1.0)
-            side, resized = self.window(size), self._resized(image, size)
-            top, left = (max(n - m, 0) // 2 for n, m in zip(size, side, strict=True))
-            part = resized[top : top + side[0], left : left + side[1]]
-            windows.append(self.run(_padded(part, side), "a view"))
-        self.scores = kind_of(windows)
+        """Tell from the middles of a few of the images what a segmenter's values are; all later maps are read so."""
+        few = images[:: -(-len(images) // JUDGED)]
+        self.scores = kind_of([self.run(self.middle(image), "a view") for image in few])
         if self.scores != LOGITS:
             log.info("%s gives no logits but what a %s gives: taken as such", self.teacher.path.name, self.scores)
         return self.scores
+
+    def middle(self, image: np.ndarray) -> np.ndarray:
+        """The window in an image's middle, u8 [H, W, 3]."""
+        size = self.scaled_size(image, 1.0)
+        side, resized = self.window(size), self._resized(image, size)
+        top, left = (max(n - m, 0) // 2 for n, m in zip(size, side, strict=True))
+        return _padded(resized[top : top + side[0], left : left + side[1]], side)
 
     def features(
         self, image: np.ndarray, grid: tuple[int, int], scales: tuple[float, ...], flips: bool, name: str

@@ -10,7 +10,7 @@ import os
 import re
 import shutil
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path, PurePosixPath
 from typing import Any, Literal
 from urllib.parse import urlsplit
@@ -20,9 +20,10 @@ import numpy as np
 from chebsplat.errors import ChebsplatError, ConfigError, InputError
 from chebsplat.formats.artifact import sha256_file
 from chebsplat.formats.files import parse_json
-from chebsplat.formats.images import read_rgb
+from chebsplat.formats.images import images_below, read_rgb
 from chebsplat.formats.onnx_files import model_sha256, weight_files
-from chebsplat.formats.teacher_model import RESAMPLING, read_teacher
+from chebsplat.formats.teacher_model import RESAMPLING, read_label_table, read_teacher
+from chebsplat.labels.scores import LOGITS, UNSURE, sureness
 from chebsplat.labels.tiling import window_starts
 from chebsplat.stages.runtime.command import n_threads
 from chebsplat.stages.settings import MAX_CHANNELS, TeacherSection
@@ -38,6 +39,7 @@ STEPS = (  # of an image processor: what the keys of a TOML stand for, and what 
 )  # fmt: skip
 AGAIN = "run the same command again"
 SHOWN = 8  # labels
+TRIED = 8  # photos
 
 
 def get_teacher(name: str, out: Path | None = None, graph: str = GRAPH) -> tuple[Path, list[tuple[str, str]]]:
@@ -261,22 +263,28 @@ def window_of(
     return {"size": size, "base": base if longest is None else min(base, longest)} | crop
 
 
-def check(model: Path, photo: Path | None = None, labels: str | None = None) -> list[tuple[str, str]]:
+def check(model: Path, photos: Sequence[Path] = (), labels: str | None = None) -> list[tuple[str, str]]:
     """(what, finding) of a teacher. Raises what the teacher stage would.
 
-    Args: photo: None: a view of a generated room; labels: as teacher.labels, None: the teacher's own.
+    Args: photos: by which the usual mistakes are told (`teacher_models/trials.py`), or folders of them; none: a view
+          of a generated room; labels: as teacher.labels, None: the teacher's own.
     """
     from chebsplat.stages.teacher_models.image_encoder import TeacherInference
+    from chebsplat.stages.teacher_models.trials import tried
 
     settings = TeacherSection()
     teacher = read_teacher(model)
     network = TeacherInference(teacher, n_threads())
-    name, image = shown(photo)
+    files = [
+        file for path in photos for file in (images_below(path, "give another --photo") if path.is_dir() else [path])
+    ]
+    looked_at = [shown(file) for file in files[:: -(-len(files) // TRIED)]] if files else [shown(None)]
+    (name, image), images = looked_at[0], [image for _, image in looked_at]
     grid, n_channels = network.grid(image, settings.downscale)
     if teacher.output == "logits":
         asked = label_set(teacher, labels, None) if labels else None
         space = closed_set(teacher, asked, n_channels, settings.n_channels)
-        network.judge([image])
+        network.judge(images)
     else:
         space = open_vocabulary(teacher, label_set(teacher, labels, None), n_channels, None)
     began = time.perf_counter()
@@ -287,9 +295,19 @@ def check(model: Path, photo: Path | None = None, labels: str | None = None) -> 
     counts = np.bincount(pseudo_labels.ravel(), minlength=len(space.names))
     seen = [f"{space.names[k]} {counts[k] / pseudo_labels.size:.0%}" for k in np.argsort(-counts, kind="stable")[:SHOWN] if counts[k]]  # fmt: skip  # noqa: E501
     wide = teacher.output == "features" and n_channels > MAX_CHANNELS
+    by = "" if teacher.told else ", as its labels are names alone"
+    findings = []
+    if teacher.output == "logits":
+        taken = "" if network.scores == LOGITS else ", told by its values, and taken as such"
+        if sureness(float(confidence.mean()), len(space.names)) < UNSURE:
+            taken += "; unsure of everything, as of a softmax taken twice or of logits that were scaled down"
+        findings.append(("scores", network.scores + taken))
+    if files:
+        classes = read_label_table(teacher.labels)[0] if teacher.output == "logits" and teacher.labels else space.names
+        findings += tried(network, images, classes, space.embeddings)
     return [
         ("name", f"{teacher.name} ({model}, {model.stat().st_size / 2**20:.1f} MB)"),
-        ("output", f"{teacher.output}, {n_channels} channels" + (", reduced to fewer in a scene" if wide else "")),
+        ("output", f"{teacher.output}{by}, {n_channels} channels" + (", reduced to fewer in a scene" if wide else "")),
         ("image", f"{name}, {image.shape[1]} x {image.shape[0]}, seen at {size[1]} x {size[0]}"),
         (
             "windows",
@@ -299,6 +317,7 @@ def check(model: Path, photo: Path | None = None, labels: str | None = None) -> 
         ("labels", f"{len(space.names)}, from {labels or teacher.labels}"),
         ("seconds", f"{seconds:.2f} a view, on {n_threads()} threads"),
         ("sees", f"{', '.join(seen)} (mean confidence {confidence.mean():.2f})"),
+        *findings,
     ]
 
 
