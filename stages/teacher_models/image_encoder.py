@@ -50,7 +50,7 @@ class TeacherInference:
         shape, kind = list(entries[0].shape), entries[0].type
         if len(entries) != 1:
             raise InputError(f"{path} has {len(entries)} inputs; one image [1, 3, H, W] is needed: export it again")
-        if len(shape) != 4 or not (shape[1] == 3 or shape[1] is None or isinstance(shape[1], str)):
+        if len(shape) != 4 or ((isinstance(shape[1], int) or shape[3] == 3) and shape[1] != 3):
             raise InputError(f"{path} takes {shape}; one image [1, 3, H, W] is needed: export it again")
         if kind != "tensor(float)":
             raise InputError(f"{path} takes {kind}; export it with a float32 input (weights may be float16)")
