@@ -148,7 +148,7 @@ def names_of(plain: np.ndarray, names: list[str]) -> str:
     indoors = frozenset(word for name in IN_ROOMS for word in name.split())
     off = {by: sense(shares, list(np.roll(words, by)), indoors) for by in (-1, 0, 1)}
     second, by = sorted(off, key=lambda of: off[of])[1:]
-    if off[by] < SENSIBLE or off[by] < off[second] + BETTER:
+    if off[by] < SENSIBLE or off[by] < off[0 if by else second] + BETTER:
         return f"{UNTOLD}: too little is seen of floors, ceilings, and what rooms hold and others do not"
     if by == 0:
         return f"make sense of a room ({off[0]:.2f} of 2)"

@@ -263,7 +263,7 @@ def window_of(
     return {"size": size, "base": base if longest is None else min(base, longest)} | crop
 
 
-def check(model: Path, photos: Sequence[Path] = (), labels: str | None = None) -> list[tuple[str, str]]:
+def check(model: Path, photos: Path | Sequence[Path] = (), labels: str | None = None) -> list[tuple[str, str]]:
     """(what, finding) of a teacher. Raises what the teacher stage would.
 
     Args: photos: by which the usual mistakes are told (`teacher_models/trials.py`), or folders of them; none: a view
@@ -275,9 +275,9 @@ def check(model: Path, photos: Sequence[Path] = (), labels: str | None = None) -
     settings = TeacherSection()
     teacher = read_teacher(model)
     network = TeacherInference(teacher, n_threads())
-    files = [
-        file for path in photos for file in (images_below(path, "give another --photo") if path.is_dir() else [path])
-    ]
+    given = [photos] if isinstance(photos, Path) else photos
+    found = [images_below(path, "give another --photo") if path.is_dir() else [path] for path in given]
+    files = [file for of in found for file in of]
     looked_at = [shown(file) for file in files[:: -(-len(files) // TRIED)]] if files else [shown(None)]
     (name, image), images = looked_at[0], [image for _, image in looked_at]
     grid, n_channels = network.grid(image, settings.downscale)
