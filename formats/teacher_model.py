@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import re
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -117,8 +118,9 @@ def read_teacher(path: Path) -> TeacherModel:
     _check_range(settings, values)
     teacher = TeacherModel(path, **({"name": path.stem} | values))
     if "output" not in values and teacher.labels is not None and teacher.text is None:
-        closed = read_label_table(teacher.labels)[1] is None
-        teacher = replace(teacher, output="logits" if closed else "features", told=not closed)
+        with suppress(InputError):  # which whoever needs the table raises
+            if read_label_table(teacher.labels)[1] is None:
+                teacher = replace(teacher, output="logits", told=False)
     if teacher.output == "features" and teacher.labels is None and teacher.text is None:
         raise InputError(f"{settings} has neither `labels` nor `text`: no label could be told; add one of them")
     if teacher.output == "logits" and teacher.labels is None:
