@@ -32,14 +32,15 @@ class TeacherModel:
     """What `read_teacher` returns; docs/teachers.md says what each key means to a user.
 
     path:      the image encoder, `[1, 3, H, W]` float32 -> `[1, C, h, w]`.
-    output:    "features", or "logits" of a closed-set segmenter: channel = index into the label list. Where the TOML
-               does not say it (`told`), labels that are names alone, without `text`, are a segmenter's.
+    output:    "features", or "logits" of a closed-set segmenter: channel = index into the label list.
+    told:      whether the TOML says so; else labels that are names alone, without `text`, are a
+               segmenter's.
     tensor:    the graph's output, or None: the one that fits.
     mean, std: of colours in [0, 1], in the order that the model is fed, `order`: "RGB" or "BGR".
     resample:  how photos are resized, of RESAMPLING.
     size:      (H, W) that the model takes, or None: any whose sides are multiples of `multiple`.
     base:      long side in pixels that an image is resized to at scale 1, or None: its own.
-    origin:    where it was fetched, sha256: of the model then (`model_sha256`); None of one that was not.
+    origin:    where it was fetched, sha256: of the model then (`model_sha256`); None if it was not.
     labels:    table of names and embeddings; text, tokenizer: encoder of any words; prompt: what a name is put into.
     """
 
@@ -176,7 +177,7 @@ def _check(settings: Path, key: str, value: Any) -> None:
 
 
 def _check_range(settings: Path, values: dict[str, Any]) -> None:
-    """Mean and std are of colours in 0 to 1, and never above 1: with those of 0 to 255 all photos look alike."""
+    """Mean and std are of colours in 0 to 1: with those of 0 to 255 all photos would look alike."""
     given = {key: values[key] for key in ("mean", "std") if key in values}
     large = [key for key, value in given.items() if max(value) > 1]
     if large:

@@ -67,7 +67,7 @@ def run(job: Job) -> None:
 
 
 def sure_of(features: Features, views: list[int]) -> float:
-    """How sure a segmenter is of its likeliest class; 1 of other teachers, whose cosines say nothing of it."""
+    """How sure a segmenter is of its likeliest class; 1 of others, whose cosines do not tell."""
     if features.convention.get("output") != "logits" or features.confidence is None:
         return 1.0
     mean = np.mean([np.asarray(features.confidence[view], np.float32).mean() for view in views])

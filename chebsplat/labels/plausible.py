@@ -1,5 +1,5 @@
-"""Whether what a teacher says of photos makes sense, without true labels: how much of it outlives a change of a photo,
-where in the map such a change is seen, and whether what lies above and below is called so.
+"""Whether what a teacher says of photos makes sense, without true labels: how much of it outlives a
+change of a photo, where in the map such a change is seen, and whether what lies above is called so.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ def spread(values: np.ndarray) -> float:
 
 
 def soft(values: np.ndarray, deviation: float) -> np.ndarray:
-    """Shares [V, L, h, w] of labels, by a softmax of values over a deviation: how large they are does not matter."""
+    """Shares [V, L, h, w] of labels: a softmax of values whose size does not matter."""
     scaled = values * (SHARPNESS / max(deviation, 1e-9))
     weights = np.exp(scaled - scaled.max(1, keepdims=True))
     shares: np.ndarray = weights / weights.sum(1, keepdims=True)
@@ -30,8 +30,8 @@ def soft(values: np.ndarray, deviation: float) -> np.ndarray:
 
 
 def information(first: np.ndarray, second: np.ndarray) -> float:
-    """Mutual information, nats, of the labels that shares [V, L, h, w] of the same pixels give: none where one label is
-    said of everything, or where what is said depends on how a photo was taken.
+    """Mutual information, nats, of the labels that shares [V, L, h, w] of the same pixels give: none
+    where one label is said of everything, or where a label depends on how a photo was taken.
     """
     a, b = (np.moveaxis(shares, 1, 0).reshape(shares.shape[1], -1).astype(np.float64) for shares in (first, second))
     joint = a @ b.T / a.shape[1]
@@ -53,8 +53,9 @@ def changes(before: np.ndarray, after: np.ndarray) -> np.ndarray:
 
 
 def sense(shares: np.ndarray, names: list[str], indoors: frozenset[str]) -> float:
-    """How much sense the names make of shares [V, L, h, w] in photos of rooms, at most 2: what is called a floor lies
-    below the middle and a ceiling above it (at most 1), and rooms hold what is seen rather than outdoors (at most 1).
+    """How much sense the names make of shares [V, L, h, w] in photos of rooms, at most 2: what is
+    called a floor lies below the middle and a ceiling above it (at most 1), and rooms hold what is
+    seen rather than outdoors (at most 1).
 
     Args: names [L], as they are compared; indoors: words of rooms.
     Choices: a name counts by its words, so that "floor-wood" is a floor.

@@ -1,4 +1,4 @@
-"""What a segmenter's outputs are, told by their values, and the probabilities that they stand for."""
+"""What a segmenter's outputs are, told by their values, and what probabilities they stand for."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ import numpy as np
 
 SUM = 0.004  # that sums of probabilities may be off 1: those of bfloat16
 RANGE = 1e-3  # that values may lie beyond what they cannot
-SURE = 0.5  # that some sigmoid reaches; cosines of an image and of words stay below where none is negative
+SURE = 0.5  # that some sigmoid reaches; cosines with words stay below where none is negative
 SCALE = 100.0  # of cosines before a softmax: CLIP's
 UNSURE = 0.25  # a segmenter of photos is sure by .5 to .8
 LEAST, NONE = 1e-6, 1e-12  # of a probability whose odds, or logarithm, are taken
@@ -19,9 +19,9 @@ LOGITS, SOFTMAX, SIGMOID, COSINES = "logits", "softmax", "sigmoid", "cosines"
 def kind_of(maps: Sequence[np.ndarray]) -> str:
     """What values [C, h, w] of windows are: logits, or what a softmax, sigmoids or cosines give.
 
-    Choices: sums of 1 over the classes are a softmax, whatever a resize made of its range; values of 0 to 1 are
-      sigmoids if some class is surer than SURE; what else stays within -1 to 1 is cosines. Logits that small would say
-      nothing: scaled as cosines, they keep their order.
+    Choices: sums of 1 over the classes are a softmax, whatever a resize made of its range; values
+      of 0 to 1 are sigmoids if some class is surer than SURE; what else stays within -1 to 1 is
+      cosines. Logits that small would say nothing: scaled as cosines, they keep their order.
     """
     low, high = min(values.min() for values in maps), max(values.max() for values in maps)
     if all((np.abs(values.sum(0) - 1) < SUM).all() for values in maps):
@@ -32,7 +32,10 @@ def kind_of(maps: Sequence[np.ndarray]) -> str:
 
 
 def logits_of(values: np.ndarray, kind: str) -> np.ndarray:
-    """What values [C, h, w] are the softmax, the sigmoids or the cosines of. Args: kind: as `kind_of` tells it."""
+    """What a softmax takes [C, h, w] of values. Args: kind: as `kind_of` tells it.
+
+    Choices: those of sigmoids are the logits that they were taken of.
+    """
     logits: np.ndarray = values * SCALE if kind == COSINES else values
     if kind == SOFTMAX:
         logits = np.log(values.clip(NONE))

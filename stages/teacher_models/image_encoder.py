@@ -112,11 +112,11 @@ class TeacherInference:
         return (sides[0], sides[1]), cells.shape[0]
 
     def judge(self, images: Stack | list[np.ndarray]) -> str:
-        """Tell from the middles of a few of the images what a segmenter's values are; all later maps are read so."""
+        """Tell from a few of the images what a segmenter's values are; all later maps are read so."""
         few = images[:: -(-len(images) // JUDGED)]
         self.scores = kind_of([self.run(self.middle(image), "a view") for image in few])
         if self.scores != LOGITS:
-            log.info("%s gives no logits but what a %s gives: taken as such", self.teacher.path.name, self.scores)
+            log.info("%s gives values of %s, not logits: taken as such", self.teacher.path.name, self.scores)
         return self.scores
 
     def middle(self, image: np.ndarray) -> np.ndarray:
@@ -184,7 +184,7 @@ class TeacherInference:
         return np.asarray(Image.fromarray(image).resize((size[1], size[0]), how))
 
     def _place_of(self, outputs: list[np.ndarray]) -> int:
-        """Which of the graph's outputs is the map: the one that the TOML names, or the one that fits.
+        """Which of the graph's outputs is the map: the one that the TOML names, or that fits.
 
         Raises: InputError listing them where none or several do.
         """

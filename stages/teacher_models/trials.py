@@ -1,4 +1,4 @@
-"""A teacher tried on photos in the usual other ways: what of its TOML, its graph or its names is likely to be wrong."""
+"""A teacher tried on photos in the usual other ways: what of its TOML, graph or names may be wrong."""
 
 from __future__ import annotations
 
@@ -26,10 +26,11 @@ RANGES = {  # of colours that models are fed: mean and std
     "0 to 255": ((0.0,) * 3, BYTE),
     "0 to 255 less ImageNet's mean": (IMAGENET[0], BYTE),
 }
-# Measured with a real segmenter on six sets of eight photos: the right range has 1.14 to 60 times the information of
-# any other; the right order 1.015 to 1.6 times less entropy; in rooms names have a sense of 0.74 to 1.44, and one class
-# off at most 0.15.
+# Measured with a real segmenter on six sets of eight photos: the right range has 1.14 to 60 times the
+# information of any other; the right order 1.015 to 1.6 times less entropy; in rooms names have a
+# sense of 0.74 to 1.44, and one class off at most 0.15.
 MORE, LESS, SENSIBLE, BETTER = 1.1, 1.05, 0.7, 0.4
+ENOUGH = 4  # photos: of one alone, a wrong range may tell more
 LEAST = 0.02  # nats of information that tell anything
 CLEARLY = 1.2  # more change in one quarter than in any other
 GAMMA, INNER = 1.3, 8  # of the changed photo, and the eighth that it lacks on each side
@@ -40,28 +41,34 @@ UNTOLD = "cannot be told from these photos"
 class Trials:
     """What a teacher gives of the middle windows of photos, fed in one way or another.
 
-    Args: values: a window's output [C, h, w] -> what is compared of labels, [L, h, w]: logits, or cosines.
+    Args: values: of a window's output [C, h, w] what is compared of labels, [L, h, w].
     """
 
     def __init__(self, network: TeacherInference, images: list[np.ndarray], values: Callable[[np.ndarray], np.ndarray]):
         self.network, self.values = network, values
-        self.windows = [network.middle(image) for image in images]
+        self.own, windows = network.teacher, [network.middle(image) for image in images]
+        sides = [min(window.shape[k] for window in windows) for k in (0, 1)]  # models of any size see photos of any
+        self.windows = [window[middle(window, sides)] for window in windows]
         self.turned = False
+        self.plain = self.fed(self.own)
 
     def fed(self, teacher: TeacherModel, change: Callable[[np.ndarray], np.ndarray] | None = None) -> np.ndarray:
-        """Values [V, L, h, w] of the windows, changed or not, with a teacher's mean, std and order."""
-        own, self.network.teacher = self.network.teacher, teacher
+        """Values [V, L, h, w] of the windows, changed or not, by a teacher's mean, std, order."""
+        self.network.teacher = teacher
         try:
             windows = [window if change is None else change(window) for window in self.windows]
             found = [self.values(self.network.run(window, "a photo")) for window in windows]
         finally:
-            self.network.teacher = own
+            self.network.teacher = self.own
         stacked = np.stack(found)
         return stacked.swapaxes(2, 3) if self.turned else stacked
 
     def informed(self, teacher: TeacherModel) -> tuple[float, np.ndarray]:
-        """Information that photos have in common with their own middles, mirrored and darkened; the plain values."""
-        plain, changed = self.fed(teacher), self.fed(teacher, closer)[..., ::-1]
+        """Information that photos share with their own middles, mirrored and darkened; the plain
+        values.
+        """
+        plain = self.plain if teacher == self.own else self.fed(teacher)
+        changed = self.fed(teacher, closer)[..., ::-1]
         inner = [slice(n // INNER, n - n // INNER) for n in plain.shape[2:]]
         there = plain[:, :, inner[0], inner[1]]
         rows, columns = ((np.arange(n) + 0.5) * m / n for n, m in zip(there.shape[2:], changed.shape[2:], strict=True))
@@ -72,9 +79,9 @@ class Trials:
 def tried(
     network: TeacherInference, images: list[np.ndarray], names: list[str], embeddings: np.ndarray
 ) -> list[tuple[str, str]]:
-    """(what, finding) about the map's layout, the range and order of colours, and the names of classes.
+    """(what, finding) about the map's layout, the range and order of colours, the names of classes.
 
-    Args: names: of the channels of a segmenter, or of the rows of `embeddings` that features are compared with.
+    Args: names: of the channels of a segmenter, or of the rows of `embeddings` of other teachers.
     """
     teacher = network.teacher
     closed = teacher.output == "logits"
@@ -85,15 +92,17 @@ def tried(
         return np.tensordot(embeddings, unit(output, 0), 1)
 
     trials = Trials(network, images, values)
-    found = [layout(trials, teacher)]
+    found = [layout(trials)]
+    if len(images) < ENOUGH:
+        return [*found, ("more", "with eight photos, or a folder, range and order of colours and names are tried, too")]
     told, best, plain = range_of(trials, teacher)
     found += [("range", told), ("order", order_of(trials, best, plain))]
     return [*found, ("names", names_of(plain, names))] if closed else found
 
 
-def layout(trials: Trials, teacher: TeacherModel) -> tuple[str, str]:
-    """Where in the map a change of the photos' top right is seen. A transposed map is turned for the trials after."""
-    before, after = trials.fed(teacher), trials.fed(teacher, top_right_inverted)
+def layout(trials: Trials) -> tuple[str, str]:
+    """Where in the map a change of the photos' top right is seen. A transposed map is turned."""
+    before, after = trials.plain, trials.fed(trials.own, top_right_inverted)
     deviation = spread(before)
     moved = changes(soft(before, deviation), soft(after, deviation))
     second, first = np.argsort(moved)[-2:]
@@ -102,7 +111,8 @@ def layout(trials: Trials, teacher: TeacherModel) -> tuple[str, str]:
     how = ("mirrored", "as the photos", "transposed", "upside down")[first]
     if first == 1:
         return "layout", how
-    trials.turned = first == 2
+    if first == 2:
+        trials.turned, trials.plain = True, before.swapaxes(2, 3)
     return "layout", f"{how}: a change of the photos' top right is seen at the {QUARTERS[first]}; export it again"
 
 
@@ -156,6 +166,12 @@ def names_of(plain: np.ndarray, names: list[str]) -> str:
     said = f"one class off, if these are rooms: each makes more sense with the name {which} its own"
     asked = "is a background named that the model has not, or the other way round?"
     return f"{said} ({off[by]:.2f} of 2, {off[0]:.2f} as given); {asked}"
+
+
+def middle(window: np.ndarray, sides: list[int]) -> tuple[slice, ...]:
+    """Where a window's middle of these sides lies."""
+    starts = [(n - side) // 2 for n, side in zip(window.shape, sides, strict=False)]
+    return tuple(slice(start, start + side) for start, side in zip(starts, sides, strict=True))
 
 
 def closer(window: np.ndarray) -> np.ndarray:

@@ -34,7 +34,7 @@ TEACHERS = {"segformer-b0-ade": "Xenova/segformer-b0-finetuned-ade-512-512"}  # 
 REPOSITORY = re.compile(r"hf:([\w.-]+/[\w.-]+?)(?:@([\w./-]+))?")
 GRAPH, CLASSES, PREPARATION = "onnx/model.onnx", "config.json", "preprocessor_config.json"
 WIDER = 4 / 3  # of a photo than of the square that a segmenter is trained on
-STEPS = (  # of an image processor: what the keys of a TOML stand for, and what does nothing to a photo
+STEPS = (  # of an image processor: what keys of a TOML stand for, and what leaves a photo alone
     "resize", "center_crop", "rescale", "normalize", "flip_channel_order", "convert_rgb", "reduce_labels", "pad",
 )  # fmt: skip
 AGAIN = "run the same command again"
@@ -266,8 +266,8 @@ def window_of(
 def check(model: Path, photos: Path | Sequence[Path] = (), labels: str | None = None) -> list[tuple[str, str]]:
     """(what, finding) of a teacher. Raises what the teacher stage would.
 
-    Args: photos: by which the usual mistakes are told (`teacher_models/trials.py`), or folders of them; none: a view
-          of a generated room; labels: as teacher.labels, None: the teacher's own.
+    Args: photos: or folders of them, which tell the usual mistakes (`teacher_models/trials.py`);
+          none: a view of a generated room; labels: as teacher.labels, None: the teacher's own.
     """
     from chebsplat.stages.teacher_models.image_encoder import TeacherInference
     from chebsplat.stages.teacher_models.trials import tried

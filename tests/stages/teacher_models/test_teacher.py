@@ -210,7 +210,7 @@ def test_a_segmenter_means_the_same_whatever_its_export_ends_with(tmp_path, capt
     assert code == 0 and found.convention["scores"] == scores
     assert np.array_equal(found.pseudo_labels[:], Capture.read(capture).labels[:, ::4, ::4])
     assert found.confidence[:].min() > 0.99
-    told = "what a" in capsys.readouterr().err
+    told = "not logits: taken as such" in capsys.readouterr().err
     assert told == (scores != "logits")
 
 

@@ -23,20 +23,19 @@ WRONG_SCALE = {"mean": [123.675, 116.28, 103.53], "std": [0.229, 0.224, 0.225]}
 
 @pytest.fixture(scope="module")
 def photos(tmp_path_factory):
-    """Eight pictures of blocks of any colours, in a folder."""
+    """Eight pictures of blocks of any colours in a folder, one of them upright."""
     folder = tmp_path_factory.mktemp("photos")
     for k in range(8):
         blocks = np.random.default_rng(k).integers(40, 216, (6, 8, 3), np.uint8)
-        Image.fromarray(np.kron(blocks, np.ones((8, 8, 1), np.uint8))).save(folder / f"{k}.png")
+        picture = np.kron(blocks, np.ones((8, 8, 1), np.uint8))
+        Image.fromarray(picture if k else picture.swapaxes(0, 1)).save(folder / f"{k}.png")
     return folder
 
 
 def of_colors(folder, *nodes, **settings):
     """The tiny segmenter of three colours."""
     (folder / "classes.txt").write_text("red\ngreen\nblue\n")
-    model = color_teacher(
-        folder, weights=5 * np.eye(3), output="logits", labels="classes.txt", size=[48, 48], **settings
-    )
+    model = color_teacher(folder, weights=5 * np.eye(3), output="logits", labels="classes.txt", **settings)
     return ending(model, *nodes) if nodes else model
 
 
