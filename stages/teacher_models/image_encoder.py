@@ -43,6 +43,7 @@ class TeacherInference:
         self.size = self._window_size()
         self.scores = LOGITS
         self._place: int | None = None  # of the output that is read, once some are seen
+        self._last = False  # its channels come last
 
     def _window_size(self) -> tuple[int, int] | None:
         """(H, W) of the graph or of the TOML; None where the model takes any size."""
@@ -166,10 +167,13 @@ class TeacherInference:
         image = (fed.transpose(2, 0, 1).astype(np.float32) / 255 - mean) / std
         outputs = self.model.run({self.model.inputs[0].name: image[None]})
         if self._place is None:
-            self._place = self._place_of(outputs)
+            self._place, self._last = self._place_of(outputs)
         output = outputs[self._place]
+        if output.dtype.kind in "iu" and (output.ndim == 3 or output.shape[1:2] == (1,)):
+            raise InputError(f"{teacher.path} gives the likeliest class alone, {list(output.shape)}; export its logits")
         if output.ndim != 4 or output.shape[0] != 1 or not output.size:
             raise InputError(f"{teacher.path} gives {list(output.shape)}; [1, C, h, w] is needed: export it again")
+        output = np.moveaxis(output, 3, 1) if self._last else output
         if not np.isfinite(output).all():
             raise DataFailure(
                 f"{teacher.path} gives {np.sum(~np.isfinite(output))} non-finite values for {name}; check mean and std "
@@ -183,32 +187,39 @@ class TeacherInference:
         how = Image.Resampling[self.teacher.resample.upper()]
         return np.asarray(Image.fromarray(image).resize((size[1], size[0]), how))
 
-    def _place_of(self, outputs: list[np.ndarray]) -> int:
-        """Which of the graph's outputs is the map: the one that the TOML names, or that fits.
+    def _place_of(self, outputs: list[np.ndarray]) -> tuple[int, bool]:
+        """Which of the graph's outputs is the map, and whether its channels come last: the one that
+        the TOML names, or that fits the labels.
 
         Raises: InputError listing them where none or several do.
         """
         teacher, names = self.teacher, [entry.name for entry in self.model.outputs]
         listed = ", ".join(f"{name} {list(value.shape)}" for name, value in zip(names, outputs, strict=True))
+        asked = range(len(outputs))
         if teacher.tensor is not None:
             if teacher.tensor not in names:
                 why = f"no output is called {teacher.tensor}: there are {listed}"
                 raise InputError(f"{teacher.settings}: {why}; correct `tensor`")
-            return names.index(teacher.tensor)
-        if len(outputs) == 1:
-            return 0
-        found = [k for k, value in enumerate(outputs) if value.ndim == 4 and len(value) == 1 and value.size]
-        if len(found) > 1 and teacher.labels is not None:
-            table, embeddings = read_label_table(teacher.labels)
-            wanted = len(table) if teacher.output == "logits" or embeddings is None else embeddings.shape[1]
-            found = [k for k in found if outputs[k].shape[1] == wanted]
-        if len(found) != 1:
-            fit = f"{'more than one' if found else 'none'} fits {teacher.labels or '[1, C, h, w]'}"
-            raise InputError(
-                f"{teacher.path} gives {listed}: {fit}; name the right one as `tensor` in {teacher.settings}"
-            )
-        log.info("%s gives %s: %s is taken", teacher.path.name, listed, names[found[0]])
-        return found[0]
+            asked = range(names.index(teacher.tensor), names.index(teacher.tensor) + 1)
+        maps = [k for k in asked if outputs[k].ndim == 4 and len(outputs[k]) == 1 and outputs[k].size]
+        found = [(k, False) for k in maps]
+        table, embeddings = ([], None) if teacher.labels is None else read_label_table(teacher.labels)
+        closed = teacher.output == "logits"
+        if closed or embeddings is not None:
+            wanted = len(table) if closed or embeddings is None else embeddings.shape[1]
+            first, last = ([k for k in maps if outputs[k].shape[axis] == wanted] for axis in (1, 3))
+            found = [(k, False) for k in first] or [(k, True) for k in last]
+        if len(found) == 1:
+            place, last_axis = found[0]
+            if last_axis:
+                log.info("%s gives %s: channels come last, and are taken so", teacher.path.name, listed)
+            elif len(asked) > 1:
+                log.info("%s gives %s: %s is taken", teacher.path.name, listed, names[place])
+            return found[0]
+        if len(asked) == 1:  # which whoever needs the channels refuses
+            return asked[0], False
+        fit = f"{'more than one' if found else 'none'} fits {teacher.labels or '[1, C, h, w]'}"
+        raise InputError(f"{teacher.path} gives {listed}: {fit}; name the right one as `tensor` in {teacher.settings}")
 
 
 def unit(values: np.ndarray, axis: int) -> np.ndarray:

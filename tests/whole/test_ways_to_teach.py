@@ -72,6 +72,13 @@ def with_another_output(folder):
     ending(path, outputs=["auxiliary", "features"])
 
 
+def likeliest(folder):
+    path = segmenter(folder, SIGNED, node("ArgMax", axis=1, keepdims=0))
+    model = onnx.load(path)
+    model.graph.output[0].type.tensor_type.elem_type = TensorProto.INT64
+    onnx.save(model, path)
+
+
 def channels_last_in(folder):
     path = segmenter(folder, SIGNED)
     model = onnx.load(path)
@@ -100,8 +107,9 @@ WAYS = {  # how it is brought, and a word of what is said, "" where nothing need
     "cosines": (lambda f: segmenter(f, SIGNED, node("LpNormalization", axis=1)), "values of cosines"),
     "no output in the TOML": (lambda f: segmenter(f, SIGNED, output=None), "has no `output`: logits"),
     "an output of fewer classes first": (with_another_output, "features is taken"),
-    "channels last": (lambda f: segmenter(f, SIGNED, node("Transpose", perm=[0, 2, 3, 1])), "names 3 classes"),
-    "the likeliest class alone": (lambda f: segmenter(f, SIGNED, node("ArgMax", axis=1), FLOAT), "names 3 classes"),
+    "channels last": (lambda f: segmenter(f, SIGNED, node("Transpose", perm=[0, 2, 3, 1])), "channels come last"),
+    "the likeliest class alone": (likeliest, "the likeliest class alone"),
+    "and as numbers": (lambda f: segmenter(f, SIGNED, node("ArgMax", axis=1), FLOAT), "names 3 classes"),
     "channels last, of photos": (channels_last_in, "one image [1, 3, H, W] is needed"),
     "mean and std of 0 to 255": (
         lambda f: segmenter(f, IMAGENET, mean=[123.675, 116.28, 103.53], std=[58.395, 57.12, 57.375]),
