@@ -11,9 +11,9 @@ from pydantic import TypeAdapter, ValidationError
 from typing_extensions import TypedDict
 
 from chebsplat.errors import InputError
-from chebsplat.formats.artifact import sha256_file
 from chebsplat.formats.files import atomic_write, parse_json
 from chebsplat.formats.names import check_names
+from chebsplat.formats.onnx_files import model_sha256
 from chebsplat.formats.teacher_model import EMBEDDED
 
 SCHEMA = "chebsplat.relevancy/1"
@@ -60,7 +60,7 @@ def calibration_of(model: Path) -> TeacherCalibration | None:
     Raises: as `read_calibration`.
     """
     found = read_calibration(model)
-    same = found is None and model != EMBEDDED and sha256_file(model) == sha256_file(EMBEDDED)
+    same = found is None and model != EMBEDDED and model_sha256(model) == model_sha256(EMBEDDED)
     return read_calibration(EMBEDDED) if same else found
 
 
@@ -87,6 +87,6 @@ def read_calibration(model: Path) -> TeacherCalibration | None:
     if not found.rivals:
         raise InputError(f"{path}: rivals: at least one word is needed; {REMEDY}")
     check_names(found.rivals, "rivals", path, REMEDY)
-    if found.sha256 != sha256_file(model):
+    if found.sha256 != model_sha256(model):
         raise InputError(f"{path} is of another model than {model.name}; {REMEDY}")
     return found

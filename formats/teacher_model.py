@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import hashlib
 import re
-from dataclasses import dataclass
+from contextlib import suppress
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -12,6 +13,7 @@ from chebsplat.errors import InputError
 from chebsplat.formats.artifact import sha256_file
 from chebsplat.formats.files import parse_toml, read_text
 from chebsplat.formats.names import check_names, suggest, unprintable
+from chebsplat.formats.onnx_files import model_files, model_sha256
 from chebsplat.formats.tensors import finite32, read_npz
 
 if TYPE_CHECKING:
@@ -20,6 +22,7 @@ if TYPE_CHECKING:
 EMBEDDED = Path(__file__).parents[1] / "teachers/embedded.onnx"  # ships with the package
 MAX_LABELS = 2**15 - 1  # what maps of int16 can number
 MAX_SIDE = 4096  # pixels of what a model is fed
+RESAMPLING = ("nearest", "lanczos", "bilinear", "bicubic", "box", "hamming")  # by Pillow's numbers
 FILES = ("labels", "text", "tokenizer")
 TEXT_PACKAGE = "minilm"  # `text` may name the optional extra instead of a file
 
@@ -30,10 +33,14 @@ class TeacherModel:
 
     path:      the image encoder, `[1, 3, H, W]` float32 -> `[1, C, h, w]`.
     output:    "features", or "logits" of a closed-set segmenter: channel = index into the label list.
-    mean, std: of RGB in [0, 1].
+    told:      whether the TOML says so; else labels that are names alone, without `text`, are a
+               segmenter's.
+    tensor:    the graph's output, or None: the one that fits.
+    mean, std: of colours in [0, 1], in the order that the model is fed, `order`: "RGB" or "BGR".
+    resample:  how photos are resized, of RESAMPLING.
     size:      (H, W) that the model takes, or None: any whose sides are multiples of `multiple`.
     base:      long side in pixels that an image is resized to at scale 1, or None: its own.
-    origin:    where it was fetched, sha256: of the .onnx then; None of one that was not.
+    origin:    where it was fetched, sha256: of the model then (`model_sha256`); None if it was not.
     labels:    table of names and embeddings; text, tokenizer: encoder of any words; prompt: what a name is put into.
     """
 
@@ -42,6 +49,8 @@ class TeacherModel:
     output: str = "features"
     mean: tuple[float, ...] = (0.5, 0.5, 0.5)
     std: tuple[float, ...] = (0.5, 0.5, 0.5)
+    order: str = "RGB"
+    resample: str = "bilinear"
     size: tuple[int, int] | None = None
     multiple: int = 1
     labels: Path | None = None
@@ -51,6 +60,8 @@ class TeacherModel:
     base: int | None = None
     origin: str | None = None
     sha256: str | None = None
+    tensor: str | None = None
+    told: bool = True
 
     @property
     def settings(self) -> Path:
@@ -63,8 +74,8 @@ class TeacherModel:
         return self.path.with_suffix(".channels")
 
     def verify(self) -> None:
-        """Raises InputError if the encoder is not the file whose checksum was recorded."""
-        if self.sha256 is not None and (found := sha256_file(self.path)) != self.sha256:
+        """Raises InputError if the encoder is not the one whose checksum was recorded."""
+        if self.sha256 is not None and (found := model_sha256(self.path)) != self.sha256:
             raise InputError(
                 f"{self.path} has the sha256 {found}, {self.settings} says {self.sha256}: it was damaged or replaced; "
                 f"remove the folder and fetch it again (chebsplat get-teacher), or correct `sha256`"
@@ -72,9 +83,12 @@ class TeacherModel:
 
     def files(self) -> list[Path]:
         """All files that the teacher's results depend on."""
-        weights = self.path.with_name(self.path.name + ".data")  # where torch puts weights that do not fit one file
-        named = [getattr(self, name) for name in FILES]
-        return [self.path, self.settings, *filter(Path.is_file, [weights]), *(p for p in named if isinstance(p, Path))]
+        files = model_files(self.path)
+        files.insert(1, self.settings)
+        for named in (getattr(self, name) for name in FILES):
+            if isinstance(named, Path):
+                files += model_files(named) if named == self.text else [named]
+        return files
 
     def digest(self) -> str:
         """One sha256 over these files."""
@@ -102,7 +116,12 @@ def read_teacher(path: Path) -> TeacherModel:
             values[key] = settings.parent / values[key]
             if not values[key].is_file():
                 raise InputError(f"{values[key]} is missing; correct `{key}` in {settings}")
+    _check_range(settings, values)
     teacher = TeacherModel(path, **({"name": path.stem} | values))
+    if "output" not in values and teacher.labels is not None and teacher.text is None:
+        with suppress(InputError):  # which whoever needs the table raises
+            if read_label_table(teacher.labels)[1] is None:
+                teacher = replace(teacher, output="logits", told=False)
     if teacher.output == "features" and teacher.labels is None and teacher.text is None:
         raise InputError(f"{settings} has neither `labels` nor `text`: no label could be told; add one of them")
     if teacher.output == "logits" and teacher.labels is None:
@@ -130,8 +149,11 @@ def _is_text(value: Any) -> bool:
 RULES = {
     "name": ("a word", _is_text),
     "output": ('"features" or "logits"', lambda v: v in ("features", "logits")),
+    "tensor": ("the name of an output", _is_text),
     "mean": ("three numbers", lambda v: _is_list(v, (int, float), 3, -1e3, 1e3)),
     "std": ("three numbers above 0", lambda v: _is_list(v, (int, float), 3, 1e-6, 1e3)),
+    "order": ('"RGB" or "BGR"', lambda v: v in ("RGB", "BGR")),
+    "resample": (", ".join(RESAMPLING), lambda v: v in RESAMPLING),
     "size": (f"[height, width], 1 to {MAX_SIDE} pixels", lambda v: _is_list(v, (int,), 2, 1, MAX_SIDE)),
     "multiple": (f"a whole number, 1 to {MAX_SIDE}", _is_side),
     "base": (f"a whole number of pixels, 1 to {MAX_SIDE}", _is_side),
@@ -152,6 +174,17 @@ def _check(settings: Path, key: str, value: Any) -> None:
     wanted, fits = RULES[key]
     if not fits(value):
         raise InputError(f"{settings}: {key} = {value!r:.60} is not {wanted}; correct it")
+
+
+def _check_range(settings: Path, values: dict[str, Any]) -> None:
+    """Mean and std are of colours in 0 to 1: with those of 0 to 255 all photos would look alike."""
+    given = {key: values[key] for key in ("mean", "std") if key in values}
+    large = [key for key, value in given.items() if max(value) > 1]
+    if large:
+        right = {key: [float(f"{v / 255:.4g}") for v in given[key]] for key in large}
+        advice = ", ".join(f"{key} = {value}" for key, value in right.items())
+        what = f"{' and '.join(large)} of colours in 0 to 255, where those of 0 to 1 are needed"
+        raise InputError(f"{settings}: {what}; write {advice}")
 
 
 def read_label_table(path: Path) -> tuple[list[str], np.ndarray | None]:

@@ -14,11 +14,13 @@ from chebsplat.formats.features import Features
 from chebsplat.formats.points import Points
 from chebsplat.labels.agreement import UNSEEN, between, far_pairs, project, unhidden
 from chebsplat.labels.decode import decode_labels
+from chebsplat.labels.scores import UNSURE, sureness
 from chebsplat.stages.reconstruction.thinning import even
 from chebsplat.stages.runtime.command import Job
 
 log = logging.getLogger("chebsplat")
 SEED = 0  # of the choice among points
+AGREED = 0.3  # agreement that no teacher has by chance
 
 
 def run(job: Job) -> None:
@@ -46,6 +48,13 @@ def run(job: Job) -> None:
     job.facts |= {"agreement": value, "n_points": len(row), "n_views": len(views), "n_labels": len(labels)}
     if value is None:
         log.warning("no point has a label in two views: how far they agree is not known")
+    elif value >= AGREED and (sure := sure_of(features, [at for _, _, at in views])) < UNSURE:
+        job.facts["doubt"] = (
+            f"views agree by {value:.2f} on what points are (1: always, 0: by chance), and the teacher is sure by "
+            f"{sure:.2f} only: its outputs are flat, as of a softmax taken twice, of logits that were scaled down, or "
+            "of photos in another range than it was trained on; `chebsplat check-teacher` tries the usual ones"
+        )
+        log.warning("%s", job.facts["doubt"])
     elif value < settings.low:
         job.facts["doubt"] = (
             f"views agree by {value:.2f} on what points are (1: always, 0: by chance), below {settings.low:g}: the 2D "
@@ -55,6 +64,14 @@ def run(job: Job) -> None:
     else:
         log.info("views agree by %.2f on what points are (1: always, 0: by chance)", value)
     ViewAgreement(value, len(row), len(views), labels).write(job.out)
+
+
+def sure_of(features: Features, views: list[int]) -> float:
+    """How sure a segmenter is of its likeliest class; 1 of others, whose cosines do not tell."""
+    if features.convention.get("output") != "logits" or features.confidence is None:
+        return 1.0
+    mean = np.mean([np.asarray(features.confidence[view], np.float32).mean() for view in views])
+    return sureness(float(mean), len(features.label_names))
 
 
 def training_views(capture: Capture, points: Points, features: Features) -> list[tuple[int, int, int]]:

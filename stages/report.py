@@ -169,7 +169,8 @@ def teacher_words(facts: dict[str, Any]) -> tuple[str, str]:
         return "pseudo labels", f"the source's own with a confidence by pixel, {facts['n_labels']} labels"
     scales = "one scale" if convention["n_scales"] == 1 else f"{convention['n_scales']} scales"
     views = f"{scales}{' and flips' if convention['flips'] else ''}"
-    return convention["teacher"], f"ONNX {convention['output']} at {views}, {facts['n_labels']} labels"
+    gives = convention.get("scores") or convention["output"]
+    return convention["teacher"], f"ONNX {gives} at {views}, {facts['n_labels']} labels"
 
 
 def absent_stages(job: Job, gaussians: Gaussians) -> dict[str, str]:

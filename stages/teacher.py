@@ -13,6 +13,7 @@ from chebsplat.formats.artifact import read_manifest, sha256_file
 from chebsplat.formats.capture import Capture
 from chebsplat.formats.channels import ChannelMap
 from chebsplat.formats.features import Features, FeatureWriter
+from chebsplat.formats.onnx_files import model_sha256
 from chebsplat.formats.teacher_model import EMBEDDED, read_teacher
 from chebsplat.labels import noisy_teacher as model
 from chebsplat.labels.decode import class_codes, decode, voted
@@ -56,11 +57,14 @@ def from_onnx(job: Job, capture: Capture, settings: TeacherSection) -> None:
     network = TeacherInference(teacher, n_threads(), job.device)
     if job.device == "cuda" and CUDA not in providers(job.device):
         job.left_out("the teacher on the GPU", f"onnxruntime here has no CUDA ({GPU_REMEDY})")
+    if not teacher.told:
+        log.info("%s has no `output`: logits, as %s holds names alone", teacher.settings, teacher.labels)
     grid, n_channels = network.grid(capture.images[0], settings.downscale)
     channels = None
     if teacher.output == "logits":
         labels = label_set(teacher, settings.labels, None) if settings.labels else None
         space = closed_set(teacher, labels, n_channels, settings.n_channels)
+        network.judge(capture.images)
     else:
         if "channels" in job.inputs:
             channels = ChannelMap.read(job.inputs["channels"])
@@ -74,8 +78,9 @@ def from_onnx(job: Job, capture: Capture, settings: TeacherSection) -> None:
     convention = {
         "kind": "onnx",
         "teacher": teacher.name,
-        "sha256": sha256_file(teacher.path),
+        "sha256": model_sha256(teacher.path),
         "output": teacher.output,
+        "scores": network.scores if teacher.output == "logits" else None,
         "normalized": True,  # before `channels`
         "n_scales": len(settings.scales),
         "scales": list(settings.scales),

@@ -39,13 +39,19 @@ def query(scene: str, text: str, against: list[str], top: int) -> None:
 
 @click.command("check-teacher")
 @click.argument("model", type=click.Path(path_type=Path))
-@click.option("--photo", type=click.Path(path_type=Path), help="default: a view of a generated room")
+@click.option(
+    "--photo",
+    "photos",
+    type=click.Path(path_type=Path),
+    multiple=True,
+    help="yours, or a folder: eight tell the usual mistakes; default: a view of a generated room",
+)
 @click.option("--labels", help="text file of labels; default: the teacher's own")
-def check_teacher(model: Path, photo: Path | None, labels: str | None) -> None:
-    """Run one image through a teacher MODEL (.onnx): what it is, what it costs, what it sees."""
+def check_teacher(model: Path, photos: tuple[Path, ...], labels: str | None) -> None:
+    """Run images through a teacher MODEL (.onnx): what it is, costs and sees, what may be wrong."""
     from chebsplat.stages.tools.get_teacher import check
 
-    for what, finding in check(model, photo, labels):
+    for what, finding in check(model, photos, labels):
         print(f"{what:9s}{finding}")
 
 

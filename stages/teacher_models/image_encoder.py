@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 import math
 from typing import Any
 
@@ -10,17 +11,22 @@ import onnxruntime
 from PIL import Image
 
 from chebsplat.errors import DataFailure, InputError
-from chebsplat.formats.teacher_model import MAX_SIDE, TeacherModel
+from chebsplat.formats.record import Stack
+from chebsplat.formats.teacher_model import MAX_SIDE, TeacherModel, read_label_table
+from chebsplat.labels.scores import LOGITS, kind_of, probabilities
 from chebsplat.labels.tiling import blended, window_starts
 from chebsplat.stages.teacher_models.onnx_session import Model
 
+log = logging.getLogger("chebsplat")
 MAX_WINDOWS = 4096  # of a view
+JUDGED = 4  # images whose values tell what a segmenter gives
 MAX_SHARE = 0.5  # of the image's side that an entry of the map may be wide
 
 
 class TeacherInference:
     """Runs one teacher, one window at a time: on a CPU a batch gains nothing, and memory stays that of one window.
 
+    scores: what the values of a segmenter are, once `judge` has seen some.
     Args: threads: that onnxruntime may use; device: cpu, or cuda where onnxruntime has it.
     Raises: InputError naming a model that cannot be used.
     """
@@ -35,6 +41,9 @@ class TeacherInference:
         remedy = f"correct `size` or `multiple` in {teacher.settings}, or export it again"
         self.model = Model(teacher.path, remedy, options, device)
         self.size = self._window_size()
+        self.scores = LOGITS
+        self._place: int | None = None  # of the output that is read, once some are seen
+        self._last = False  # its channels come last
 
     def _window_size(self) -> tuple[int, int] | None:
         """(H, W) of the graph or of the TOML; None where the model takes any size."""
@@ -42,7 +51,7 @@ class TeacherInference:
         shape, kind = list(entries[0].shape), entries[0].type
         if len(entries) != 1:
             raise InputError(f"{path} has {len(entries)} inputs; one image [1, 3, H, W] is needed: export it again")
-        if len(shape) != 4 or not (shape[1] == 3 or shape[1] is None or isinstance(shape[1], str)):
+        if len(shape) != 4 or ((isinstance(shape[1], int) or shape[3] == 3) and shape[1] != 3):
             raise InputError(f"{path} takes {shape}; one image [1, 3, H, W] is needed: export it again")
         if kind != "tensor(float)":
             raise InputError(f"{path} takes {kind}; export it with a float32 input (weights may be float16)")
@@ -91,7 +100,7 @@ class TeacherInference:
                 f"{self.teacher.settings}: a view takes {count:,} windows of {side[1]} x {side[0]}; {MAX_WINDOWS:,} of "
                 f"sides up to {MAX_SIDE} are possible: correct `base`, `size` or `multiple`"
             )
-        cells = self.run(_padded(_resized(image, scaled), side)[: side[0], : side[1]], "the first view")
+        cells = self.run(_padded(self._resized(image, scaled), side)[: side[0], : side[1]], "the first view")
         sides = []
         for n, m, window, count in zip(image.shape[:2], scaled, side, cells.shape[1:], strict=True):
             entry = max(window / count * n / m, downscale)
@@ -102,6 +111,21 @@ class TeacherInference:
                 )
             sides.append(math.ceil(n / entry - 1e-9))
         return (sides[0], sides[1]), cells.shape[0]
+
+    def judge(self, images: Stack | list[np.ndarray]) -> str:
+        """Tell from a few of the images what a segmenter's values are; all later maps are read so."""
+        few = images[:: -(-len(images) // JUDGED)]
+        self.scores = kind_of([self.run(self.middle(image), "a view") for image in few])
+        if self.scores != LOGITS:
+            log.info("%s gives values of %s, not logits: taken as such", self.teacher.path.name, self.scores)
+        return self.scores
+
+    def middle(self, image: np.ndarray) -> np.ndarray:
+        """The window in an image's middle, u8 [H, W, 3]."""
+        size = self.scaled_size(image, 1.0)
+        side, resized = self.window(size), self._resized(image, size)
+        top, left = (max(n - m, 0) // 2 for n, m in zip(size, side, strict=True))
+        return _padded(resized[top : top + side[0], left : left + side[1]], side)
 
     def features(
         self, image: np.ndarray, grid: tuple[int, int], scales: tuple[float, ...], flips: bool, name: str
@@ -114,13 +138,15 @@ class TeacherInference:
         total = np.zeros(0)
         for scale in scales:
             size = self.scaled_size(image, scale)
-            side, resized = self.window(size), _resized(image, size)
+            side, resized = self.window(size), self._resized(image, size)
             for flip in (False, True) if flips else (False,):
                 padded = _padded(resized[:, ::-1] if flip else resized, side)
 
                 def entries(top: int, left: int, padded: Any = padded, side: Any = side) -> np.ndarray:
                     output = self.run(padded[top : top + side[0], left : left + side[1]], name)
-                    return softmax(output) if self.teacher.output == "logits" else unit(output, 0)
+                    if self.teacher.output == "logits":
+                        return probabilities(output, self.scores)
+                    return unit(output, 0)
 
                 part = self._normal(blended(entries, size, side, grid))
                 part = part[:, ::-1] if flip else part
@@ -137,10 +163,17 @@ class TeacherInference:
         """
         teacher = self.teacher
         mean, std = (np.array(v, np.float32)[:, None, None] for v in (teacher.mean, teacher.std))
-        image = (window.transpose(2, 0, 1).astype(np.float32) / 255 - mean) / std
-        output = self.model.run({self.model.inputs[0].name: image[None]})[0]
+        fed = window[..., ::-1] if teacher.order == "BGR" else window
+        image = (fed.transpose(2, 0, 1).astype(np.float32) / 255 - mean) / std
+        outputs = self.model.run({self.model.inputs[0].name: image[None]})
+        if self._place is None:
+            self._place, self._last = self._place_of(outputs)
+        output = outputs[self._place]
+        if output.dtype.kind in "iu" and (output.ndim == 3 or output.shape[1:2] == (1,)):
+            raise InputError(f"{teacher.path} gives the likeliest class alone, {list(output.shape)}; export its logits")
         if output.ndim != 4 or output.shape[0] != 1 or not output.size:
             raise InputError(f"{teacher.path} gives {list(output.shape)}; [1, C, h, w] is needed: export it again")
+        output = np.moveaxis(output, 3, 1) if self._last else output
         if not np.isfinite(output).all():
             raise DataFailure(
                 f"{teacher.path} gives {np.sum(~np.isfinite(output))} non-finite values for {name}; check mean and std "
@@ -148,22 +181,50 @@ class TeacherInference:
             )
         return output[0].astype(np.float32)
 
+    def _resized(self, image: np.ndarray, size: tuple[int, int]) -> np.ndarray:
+        if image.shape[:2] == size:
+            return image
+        how = Image.Resampling[self.teacher.resample.upper()]
+        return np.asarray(Image.fromarray(image).resize((size[1], size[0]), how))
+
+    def _place_of(self, outputs: list[np.ndarray]) -> tuple[int, bool]:
+        """Which of the graph's outputs is the map, and whether its channels come last: the one that
+        the TOML names, or that fits the labels.
+
+        Raises: InputError listing them where none or several do.
+        """
+        teacher, names = self.teacher, [entry.name for entry in self.model.outputs]
+        listed = ", ".join(f"{name} {list(value.shape)}" for name, value in zip(names, outputs, strict=True))
+        asked = range(len(outputs))
+        if teacher.tensor is not None:
+            if teacher.tensor not in names:
+                why = f"no output is called {teacher.tensor}: there are {listed}"
+                raise InputError(f"{teacher.settings}: {why}; correct `tensor`")
+            asked = range(names.index(teacher.tensor), names.index(teacher.tensor) + 1)
+        maps = [k for k in asked if outputs[k].ndim == 4 and len(outputs[k]) == 1 and outputs[k].size]
+        found = [(k, False) for k in maps]
+        table, embeddings = ([], None) if teacher.labels is None else read_label_table(teacher.labels)
+        closed = teacher.output == "logits"
+        if closed or embeddings is not None:
+            wanted = len(table) if closed or embeddings is None else embeddings.shape[1]
+            first, last = ([k for k in maps if outputs[k].shape[axis] == wanted] for axis in (1, 3))
+            found = [(k, False) for k in first] or [(k, True) for k in last]
+        if len(found) == 1:
+            place, last_axis = found[0]
+            if last_axis:
+                log.info("%s gives %s: channels come last, and are taken so", teacher.path.name, listed)
+            elif len(asked) > 1:
+                log.info("%s gives %s: %s is taken", teacher.path.name, listed, names[place])
+            return found[0]
+        if len(asked) == 1:  # which whoever needs the channels refuses
+            return asked[0], False
+        fit = f"{'more than one' if found else 'none'} fits {teacher.labels or '[1, C, h, w]'}"
+        raise InputError(f"{teacher.path} gives {listed}: {fit}; name the right one as `tensor` in {teacher.settings}")
+
 
 def unit(values: np.ndarray, axis: int) -> np.ndarray:
     """Unit vectors along an axis; a vector of length 0 stays."""
     return values / np.linalg.norm(values, axis=axis, keepdims=True).clip(1e-6)
-
-
-def softmax(logits: np.ndarray) -> np.ndarray:
-    """Probabilities [C, h, w] of logits [C, h, w]."""
-    weights = np.exp(logits - logits.max(0))
-    return weights / weights.sum(0)
-
-
-def _resized(image: np.ndarray, size: tuple[int, int]) -> np.ndarray:
-    if image.shape[:2] == size:
-        return image
-    return np.asarray(Image.fromarray(image).resize((size[1], size[0]), Image.Resampling.BILINEAR))
 
 
 def _padded(image: np.ndarray, side: tuple[int, int]) -> np.ndarray:

@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from chebsplat.errors import InputError
-from chebsplat.formats.files import regular
+from chebsplat.formats.onnx_files import model_files
 
 if TYPE_CHECKING:
     import numpy as np
@@ -44,7 +44,7 @@ class Model:
         import onnxruntime
 
         self.path, self.remedy = Path(path), remedy
-        size = regular(self.path, remedy).st_size
+        model_files(self.path)  # which names what is missing
         self._options, self._providers = options or onnxruntime.SessionOptions(), providers(device)
         self._options.log_severity_level = 4  # what fails is raised, and reported once
         self._options.add_session_config_entry("session.use_env_allocators", "1")
@@ -63,7 +63,7 @@ class Model:
             declared = 4 * math.prod(side for side in entry.shape or () if isinstance(side, int))
             if declared > LARGEST:
                 raise InputError(f"{path} gives {entry.shape}, {declared:,} bytes; at most {LARGEST:,} are possible")
-        self.seconds = LOOPING if size and _loops(self.path) else SECONDS
+        self.seconds = LOOPING if _loops(self.path) else SECONDS
 
     def _open(self, memory: int) -> None:
         """A session whose runs may take so many bytes. The limit is of an arena that it is opened with, and the

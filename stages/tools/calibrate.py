@@ -14,8 +14,8 @@ import numpy as np
 
 import chebsplat
 from chebsplat.errors import ConfigError, DataFailure, InputError
-from chebsplat.formats.artifact import sha256_file
 from chebsplat.formats.calibration import TeacherCalibration
+from chebsplat.formats.onnx_files import model_sha256
 from chebsplat.formats.teacher_model import EMBEDDED, TeacherModel, read_teacher
 from chebsplat.labels.calibration import CUT, Calibration, evidence, fitted, frequent, presence, probable, strongest
 from chebsplat.stages.runtime.progress import Progress
@@ -86,7 +86,7 @@ def calibrate(model: Path, n_rooms: int, progress: Progress) -> TeacherCalibrati
         "on_rooms_left_out": figures(heard, apart, asked),
     }  # fmt: skip
     names = [vocabulary[row] for row in rows]
-    return TeacherCalibration(teacher.name, sha256_file(model), names, rounded(whole), made)
+    return TeacherCalibration(teacher.name, model_sha256(model), names, rounded(whole), made)
 
 
 def rounded(of: Calibration) -> dict[str, float]:

@@ -10,7 +10,8 @@ import os
 import re
 import shutil
 import time
-from pathlib import Path
+from collections.abc import Callable, Sequence
+from pathlib import Path, PurePosixPath
 from typing import Any, Literal
 from urllib.parse import urlsplit
 
@@ -19,8 +20,10 @@ import numpy as np
 from chebsplat.errors import ChebsplatError, ConfigError, InputError
 from chebsplat.formats.artifact import sha256_file
 from chebsplat.formats.files import parse_json
-from chebsplat.formats.images import read_rgb
-from chebsplat.formats.teacher_model import read_teacher
+from chebsplat.formats.images import images_below, read_rgb
+from chebsplat.formats.onnx_files import model_sha256, weight_files
+from chebsplat.formats.teacher_model import RESAMPLING, read_label_table, read_teacher
+from chebsplat.labels.scores import LOGITS, UNSURE, sureness
 from chebsplat.labels.tiling import window_starts
 from chebsplat.stages.runtime.command import n_threads
 from chebsplat.stages.settings import MAX_CHANNELS, TeacherSection
@@ -31,8 +34,12 @@ TEACHERS = {"segformer-b0-ade": "Xenova/segformer-b0-finetuned-ade-512-512"}  # 
 REPOSITORY = re.compile(r"hf:([\w.-]+/[\w.-]+?)(?:@([\w./-]+))?")
 GRAPH, CLASSES, PREPARATION = "onnx/model.onnx", "config.json", "preprocessor_config.json"
 WIDER = 4 / 3  # of a photo than of the square that a segmenter is trained on
+STEPS = (  # of an image processor: what keys of a TOML stand for, and what leaves a photo alone
+    "resize", "center_crop", "rescale", "normalize", "flip_channel_order", "convert_rgb", "reduce_labels", "pad",
+)  # fmt: skip
 AGAIN = "run the same command again"
 SHOWN = 8  # labels
+TRIED = 8  # photos
 
 
 def get_teacher(name: str, out: Path | None = None, graph: str = GRAPH) -> tuple[Path, list[tuple[str, str]]]:
@@ -53,16 +60,23 @@ def get_teacher(name: str, out: Path | None = None, graph: str = GRAPH) -> tuple
             raise ConfigError(f"{folder} exists and is not {origin}; remove it, or choose another --out")
         return model, check(model)
     held = {file: fetched(repository, file, revision) for file in (CLASSES, PREPARATION, graph)}
+    weights = {
+        name: fetched(repository, f"{PurePosixPath(graph).parent / name}", revision)
+        for name in weight_files(held[graph])
+    }
     part = folder.with_name(f".part-{folder.name}")
     shutil.rmtree(part, ignore_errors=True)
     part.mkdir(parents=True)
     try:
         made = part / model.name
         shutil.copyfile(held[graph], made)
+        for name, file in weights.items():
+            (part / name).parent.mkdir(parents=True, exist_ok=True)
+            shutil.copyfile(file, part / name)
         classes = class_names(held[CLASSES], repository)
         made.with_suffix(".txt").write_text("\n".join(classes) + "\n", encoding="utf-8")
         values = {"name": short, "output": "logits", "labels": f"{short}.txt", "origin": origin}
-        values |= {"sha256": sha256_file(made)} | preparation(held[PREPARATION], repository)
+        values |= {"sha256": model_sha256(made)} | preparation(held[PREPARATION], repository)
         lines = (f"{k} = {json.dumps(value, ensure_ascii=False)}\n" for k, value in values.items())
         made.with_suffix(".toml").write_text("".join(lines), encoding="utf-8")
         part.rename(folder)
@@ -178,36 +192,99 @@ def class_names(path: Path, repository: str) -> list[str]:
 
 
 def preparation(path: Path, repository: str) -> dict[str, Any]:
-    """mean, std, size and base of what the model is fed."""
-    values = document(path)
-    size = values.get("size")
-    if isinstance(size, dict):
-        size = [size.get("height", size.get("shortest_edge")), size.get("width", size.get("shortest_edge"))]
-    sides: list[Any] = list(size) if isinstance(size, list) else [size, size]
-    mean, std = values.get("image_mean"), values.get("image_std")
-    if len(sides) != 2 or not all(isinstance(side, int) for side in sides) or mean is None or std is None:
-        raise InputError(
-            f"hf:{repository}: {PREPARATION} has no size, image_mean or image_std as an image encoder needs; export "
-            "the model yourself (docs/teachers.md)"
-        )
-    return {"mean": mean, "std": std, "size": sides, "base": round(max(sides) * WIDER)}
+    """Keys of a teacher's TOML that feed a model as its image processor does.
+
+    Raises: InputError naming a step or a value that no key stands for.
+    Choices: what is cropped from a photo's middle is a window's size; a photo keeps its aspect ratio.
+    """
+    values = {key: value for key, value in document(path).items() if value is not None}
+
+    def refused(what: str) -> InputError:
+        where = f"hf:{repository}: {PREPARATION}"
+        return InputError(f"{where} {what}; export the model yourself (docs/teachers.md)")
+
+    def does(step: str, usual: bool) -> bool:
+        return bool(values.get(f"do_{step}", usual))
+
+    kind = values.get("image_processor_type", values.get("feature_extractor_type", ""))
+    flipped = does("flip_channel_order", "MobileViT" in str(kind))
+    others = [key for key, value in values.items() if (key.startswith("do_") or "offset" in key) and value]
+    if unknown := sorted({*others} - {f"do_{step}" for step in STEPS}):
+        raise refused(f"asks for {', '.join(unknown)}, which no key of a teacher stands for")
+    mean, std = [0.0] * 3, [1.0] * 3
+    if does("normalize", not flipped or "image_mean" in values):
+        mean, std = (three(values.get(key)) for key in ("image_mean", "image_std"))
+        if not mean or not std:
+            raise refused("has no image_mean or image_std of three numbers")
+    factor = values.get("rescale_factor", 1 / 255) if does("rescale", True) else 1
+    if not isinstance(factor, int | float) or not 0 < factor < 1e3:
+        raise refused(f"has a rescale_factor of {factor!r:.40}")
+    if flipped and len({*mean}) + len({*std}) > 2:
+        raise refused("turns the order of channels that are normalised apart (do_flip_channel_order)")
+    whole = 1 if np.isclose(255 * factor, 1, 1e-9) else 255 * factor  # what 255 becomes
+    if max(*mean, *std) > 1 and whole <= 1:
+        raise refused("has image_mean or image_std of colours in 0 to 255, and rescales to 0 to 1 before")
+    number = values.get("resample", 2)
+    if number not in range(len(RESAMPLING)):
+        raise refused(f"has a resample of {number!r:.40}")
+    found: dict[str, Any] = {"mean": [m / whole for m in mean], "std": [s / whole for s in std]}
+    found |= {"order": "BGR"} if flipped else {}
+    found |= {"resample": RESAMPLING[number]} if number != 2 else {}
+    return found | window_of(values, does("resize", True), does("center_crop", False), refused)
 
 
-def check(model: Path, photo: Path | None = None, labels: str | None = None) -> list[tuple[str, str]]:
+def three(value: Any) -> list[float]:
+    """Three numbers of a list or of one number; none of anything else."""
+    listed = value if isinstance(value, list) else [value] * 3
+    return listed if len(listed) == 3 and all(type(v) in (int, float) for v in listed) else []
+
+
+def window_of(
+    values: dict[str, Any], resized: bool, cropped: bool, refused: Callable[[str], InputError]
+) -> dict[str, Any]:
+    """`size` and `base` of a TOML: the sides of a window, and a photo's long side."""
+
+    def sides(key: str) -> tuple[list[int], int | None]:
+        of = values.get(key)
+        of = dict(zip(("height", "width"), of, strict=False)) if isinstance(of, list) else of
+        of = of if isinstance(of, dict) else {"shortest_edge": of}
+        longest = of.get("longest_edge")
+        short = of.get("shortest_edge", longest)
+        found = [side for side in (of.get("height", short), of.get("width", short)) if type(side) is int]
+        if len(found) < 2 or not isinstance(longest, int | None):
+            raise refused(f"has no {key} of whole numbers")
+        return found, longest
+
+    crop = {"size": sides("crop_size")[0]} if cropped else {}
+    if not resized:
+        return crop
+    size, longest = sides("size")
+    base = round(max(size) * WIDER)
+    return {"size": size, "base": base if longest is None else min(base, longest)} | crop
+
+
+def check(model: Path, photos: Path | Sequence[Path] = (), labels: str | None = None) -> list[tuple[str, str]]:
     """(what, finding) of a teacher. Raises what the teacher stage would.
 
-    Args: photo: None: a view of a generated room; labels: as teacher.labels, None: the teacher's own.
+    Args: photos: or folders of them, which tell the usual mistakes (`teacher_models/trials.py`);
+          none: a view of a generated room; labels: as teacher.labels, None: the teacher's own.
     """
     from chebsplat.stages.teacher_models.image_encoder import TeacherInference
+    from chebsplat.stages.teacher_models.trials import tried
 
     settings = TeacherSection()
     teacher = read_teacher(model)
     network = TeacherInference(teacher, n_threads())
-    name, image = shown(photo)
+    given = [photos] if isinstance(photos, Path) else photos
+    found = [images_below(path, "give another --photo") if path.is_dir() else [path] for path in given]
+    files = [file for of in found for file in of]
+    looked_at = [shown(file) for file in files[:: -(-len(files) // TRIED)]] if files else [shown(None)]
+    (name, image), images = looked_at[0], [image for _, image in looked_at]
     grid, n_channels = network.grid(image, settings.downscale)
     if teacher.output == "logits":
         asked = label_set(teacher, labels, None) if labels else None
         space = closed_set(teacher, asked, n_channels, settings.n_channels)
+        network.judge(images)
     else:
         space = open_vocabulary(teacher, label_set(teacher, labels, None), n_channels, None)
     began = time.perf_counter()
@@ -218,9 +295,19 @@ def check(model: Path, photo: Path | None = None, labels: str | None = None) -> 
     counts = np.bincount(pseudo_labels.ravel(), minlength=len(space.names))
     seen = [f"{space.names[k]} {counts[k] / pseudo_labels.size:.0%}" for k in np.argsort(-counts, kind="stable")[:SHOWN] if counts[k]]  # fmt: skip  # noqa: E501
     wide = teacher.output == "features" and n_channels > MAX_CHANNELS
+    by = "" if teacher.told else ", as its labels are names alone"
+    findings = []
+    if teacher.output == "logits":
+        taken = "" if network.scores == LOGITS else ", told by its values, and taken as such"
+        if sureness(float(confidence.mean()), len(space.names)) < UNSURE:
+            taken += "; unsure of everything, as of a softmax taken twice or of logits that were scaled down"
+        findings.append(("scores", network.scores + taken))
+    if files:
+        classes = read_label_table(teacher.labels)[0] if teacher.output == "logits" and teacher.labels else space.names
+        findings += tried(network, images, classes, space.embeddings)
     return [
         ("name", f"{teacher.name} ({model}, {model.stat().st_size / 2**20:.1f} MB)"),
-        ("output", f"{teacher.output}, {n_channels} channels" + (", reduced to fewer in a scene" if wide else "")),
+        ("output", f"{teacher.output}{by}, {n_channels} channels" + (", reduced to fewer in a scene" if wide else "")),
         ("image", f"{name}, {image.shape[1]} x {image.shape[0]}, seen at {size[1]} x {size[0]}"),
         (
             "windows",
@@ -230,6 +317,7 @@ def check(model: Path, photo: Path | None = None, labels: str | None = None) -> 
         ("labels", f"{len(space.names)}, from {labels or teacher.labels}"),
         ("seconds", f"{seconds:.2f} a view, on {n_threads()} threads"),
         ("sees", f"{', '.join(seen)} (mean confidence {confidence.mean():.2f})"),
+        *findings,
     ]
 
 

@@ -9,10 +9,11 @@ from pathlib import Path
 import numpy as np
 
 from chebsplat.errors import ConfigError, InputError
-from chebsplat.formats.artifact import read_manifest, sha256_file
+from chebsplat.formats.artifact import read_manifest
 from chebsplat.formats.calibration import calibration_of
 from chebsplat.formats.features import Features
 from chebsplat.formats.names import suggest
+from chebsplat.formats.onnx_files import model_sha256
 from chebsplat.formats.teacher_model import EMBEDDED, TeacherModel, read_label_table, read_teacher
 from chebsplat.labels.calibration import CUT, Calibration, presence, probability, relevancy
 from chebsplat.labels.names import folded
@@ -130,7 +131,7 @@ def understood(path: Path, text: str, phrases: list[str], calibrated: bool = Tru
 def teacher_of(features: Features, model: str | None) -> TeacherModel:
     """The ONNX teacher of a scene's features. Raises InputError if it is no longer the same."""
     teacher = read_teacher(Path(model) if model else EMBEDDED)
-    if sha256_file(teacher.path) != features.convention["sha256"]:
+    if model_sha256(teacher.path) != features.convention["sha256"]:
         raise InputError(f"{teacher.path} is not the model that this scene was trained from; run the scene again")
     return teacher
 

@@ -4,9 +4,11 @@ import json
 import os
 import shutil
 
+import numpy as np
+import onnx
 import pytest
 from source_folders import image, write_colmap
-from tiny_teachers import color_reference, color_teacher
+from tiny_teachers import COLORS, color_reference, color_teacher, moved_out, write_table
 
 from chebsplat.errors import InputError
 from chebsplat.formats import artifact
@@ -16,6 +18,7 @@ from chebsplat.pipelines.planning.raw import hashes, raw_files, unchanged
 from chebsplat.pipelines.running import job
 from chebsplat.pipelines.running.run import entry, write_plan
 from chebsplat.pipelines.work import store
+from chebsplat.stages.registry import STAGES
 
 pytestmark = pytest.mark.usefixtures("own_work")
 
@@ -110,6 +113,50 @@ def test_models_labels_and_weights_are_watched_too(tmp_path, stage, file):
     watched = {"model": model, "reference": images[0], "labels": labels, "weights": weights}[file]
     with pytest.raises(InputError, match=f"{watched} has changed"), unchanged(stage, step.sections, step.raw):
         same_size_and_time(watched, watched.read_bytes()[:-1] + b"?")
+
+
+def behind(*names):
+    """These stages, and all that read anything of them."""
+    found = set(names)
+    while more := {name for name, stage in STAGES.items() if found & {*stage.roles.values()}} - found:
+        found |= more
+    return found
+
+
+@pytest.mark.parametrize("weights", ["", "tiny.onnx.data", "tiny.onnx_data", "weights.bin"])
+def test_any_byte_that_a_teacher_reads_makes_it_and_what_follows_anew_and_nothing_else_does(tmp_path, weights):
+    """Its text encoder's, too; the files are those of the graph, not of a usual name."""
+    model = color_teacher(tmp_path, text="text.onnx", tokenizer="tokenizer.json")
+    (tmp_path / "tokenizer.json").write_text("{}")
+    shutil.copy(model, tmp_path / "text.onnx")
+    read = {name: tmp_path / name for name in ("tiny.onnx", "tiny.toml", "tokenizer.json", "text.onnx")}
+    if weights:
+        moved_out(model, weights)
+        moved_out(tmp_path / "text.onnx", "words.bin")
+        read |= {name: tmp_path / name for name in (weights, "words.bin")}
+
+    def keys():
+        plan = Planner().plan("toy", f"teacher.kind=onnx,teacher.model={model}")
+        return {step.stage: step.key for step in plan.steps}
+
+    before, follows = keys(), behind("channels", "teacher")
+    for name, path in read.items():
+        data = path.read_bytes()
+        path.write_bytes(data + b"\n" if name.endswith(("toml", "json")) else data[:-1] + bytes([data[-1] ^ 1]))
+        if name == "tiny.onnx" and weights:  # a graph that parses
+            path.write_bytes(data + onnx.ModelProto(doc_string="other").SerializeToString())
+        assert {stage for stage, key in keys().items() if key != before[stage]} == follows & {*before}, name
+        path.write_bytes(data)
+    write_table(tmp_path / "tiny.npz", embeddings=2 * np.array([*COLORS.values()]))
+    assert {stage for stage, key in keys().items() if key != before[stage]} == follows & {*before}
+    write_table(tmp_path / "tiny.npz")
+    for stray in {"tiny.onnx.data", "tiny.onnx_data", "weights.bin", "tiny.relevancy.json"} - {weights}:
+        (tmp_path / stray).write_bytes(b"of something else")
+    assert keys() == before
+    if weights:
+        (tmp_path / weights).unlink()
+        with pytest.raises(InputError, match=rf"{weights} is missing; .*tiny.onnx keeps weights there"):
+            keys()
 
 
 def test_files_that_were_not_touched_for_long_are_not_read_again(photos, monkeypatch):

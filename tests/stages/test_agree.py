@@ -10,6 +10,7 @@ from shared import published, run_stage
 from chebsplat.formats.artifact import read_manifest
 from chebsplat.formats.capture import Capture
 from chebsplat.formats.evaluation import ViewAgreement
+from chebsplat.formats.features import Features
 from chebsplat.formats.points import Points
 from chebsplat.labels.agreement import between, far_pairs, project, unhidden
 
@@ -97,6 +98,26 @@ def test_the_stage_warns_of_a_teacher_that_says_one_thing_and_records_it(tmp_pat
     assert len(told) == 1 and facts["doubt"] in told[0] and "docs/teachers.md" in told[0]
     assert run_stage("agree", tmp_path / "calm", inputs, {"agree": {"low": 0.0}}) == 0
     assert "doubt" not in read_manifest(tmp_path / "calm").facts
+
+
+@pytest.mark.parametrize(
+    ("confidence", "output", "warned"), [(0.4, "logits", True), (0.9, "logits", False), (0.4, "features", False)]
+)
+def test_a_segmenter_that_is_unsure_of_what_views_agree_on_is_warned_of(tmp_path, capsys, confidence, output, warned):
+    """Stripes of two labels agree better than chance."""
+    small = Features.read(artifacts() / "teacher")
+    stripes = np.arange(small.features.shape[2], dtype=np.int16) % 2
+    labels = np.broadcast_to(stripes, small.features.shape[:3]).copy()
+    features = np.asarray(small.label_embeddings)[labels].astype(np.float16)
+    sure = np.full(labels.shape, confidence, np.float16)
+    made = replace(
+        small, features=features, pseudo_labels=labels, confidence=sure,
+        convention={**small.convention, "kind": "onnx", "output": output},
+    )  # fmt: skip
+    inputs = {role: artifacts() / name for role, name in INPUTS.items()}
+    inputs["features"] = published(tmp_path / "features", made)
+    assert run_stage("agree", tmp_path / "out", inputs, {}) == 0
+    assert ("softmax taken twice" in capsys.readouterr().err) == warned
 
 
 def test_points_that_no_two_views_see_leave_the_figure_open(tmp_path, capsys):

@@ -20,6 +20,29 @@ def write_model(path, nodes, outputs=("features",), shape=(1, 3, "H", "W"), kind
     onnx.save(model, path)
 
 
+def ending(path, *nodes, outputs=None, constants=None):
+    """Put nodes that read `features` at the end of a model: (operator, its other inputs, attributes)."""
+    model = onnx.load(path)
+    name = "features"
+    for k, (operator, inputs, attributes) in enumerate(nodes):
+        result = f"features{k}"
+        model.graph.node.append(helper.make_node(operator, [name, *inputs], [result], **attributes))
+        name = result
+    held = [numpy_helper.from_array(np.asarray(value), of) for of, value in (constants or {}).items()]
+    model.graph.initializer.extend(held)
+    del model.graph.output[:]
+    kept = outputs or [name]
+    model.graph.output.extend(helper.make_tensor_value_info(of, TensorProto.FLOAT, None) for of in kept)
+    onnx.save(model, path)
+    return path
+
+
+def moved_out(path, location):
+    """Put a model's weights into a file beside it, as exporters do with many."""
+    model = onnx.load(path)
+    onnx.save(model, path, save_as_external_data=True, location=location, size_threshold=0, convert_attribute=True)
+
+
 def write_settings(path, **values):
     """The TOML beside a model, and the table of the three colours."""
     held = {"name": "tiny", "labels": "tiny.npz", "mean": [0.5] * 3, "std": [0.5] * 3} | values

@@ -1,12 +1,13 @@
 """Any ONNX teacher: windows, scales and flips, label sets, closed sets, and a clear error for what cannot be used."""
 
 import numpy as np
+import onnx
 import pytest
 from click.testing import CliRunner
 from onnx import helper
 from PIL import Image
 from shared import published, run_stage
-from tiny_teachers import COLORS, color_teacher, write_model, write_settings, write_table
+from tiny_teachers import COLORS, color_teacher, ending, write_model, write_settings, write_table
 
 from chebsplat.formats import artifact
 from chebsplat.formats.capture import Capture
@@ -188,6 +189,81 @@ def test_classes_of_a_segmenter_that_mean_one_label_become_it(tmp_path, capture)
     assert (code, found.label_names) == (0, ["red", "sea"])
     file.write_text("sea: blu\n")
     assert encoded(tmp_path / "other", capture, tmp_path / "tiny.onnx", labels=str(file))[0] == 3
+
+
+ENDS = {  # what exports put after the logits: operators, then what the outputs are
+    "logits": ([], "logits"),
+    "softmax": ([("Softmax", [], {"axis": 1})], "softmax"),
+    "softmax in float16": (
+        [("Softmax", [], {"axis": 1}), ("Cast", [], {"to": 10}), ("Cast", [], {"to": 1})], "softmax"
+    ),
+    "log-softmax": ([("LogSoftmax", [], {"axis": 1})], "logits"),
+    "sigmoid": ([("Sigmoid", [], {})], "sigmoid"),
+    "cosines": ([("LpNormalization", [], {"axis": 1})], "cosines"),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("end", ENDS)
+def test_a_segmenter_means_the_same_whatever_its_export_ends_with(tmp_path, capture, end, capsys):
+    nodes, scores = ENDS[end]
+    code, found = encoded(tmp_path, capture, ending(segmenter(tmp_path), *nodes))
+    assert code == 0 and found.convention["scores"] == scores
+    assert np.array_equal(found.pseudo_labels[:], Capture.read(capture).labels[:, ::4, ::4])
+    assert found.confidence[:].min() > 0.99
+    told = "not logits: taken as such" in capsys.readouterr().err
+    assert told == (scores != "logits")
+
+
+def test_of_a_segmenter_whose_toml_says_no_output_the_labels_tell(tmp_path, capture, capsys):
+    """Names alone are of channels; a table of embeddings, or an encoder of words, is of features."""
+    model = segmenter(tmp_path)
+    assert (read_teacher(model).output, read_teacher(model).told) == ("logits", True)
+    model.with_suffix(".toml").write_text('labels = "classes.txt"\nmultiple = 4\n')
+    assert (read_teacher(model).output, read_teacher(model).told) == ("logits", False)
+    code, found = encoded(tmp_path, capture, model)
+    assert code == 0 and np.array_equal(found.pseudo_labels[:], Capture.read(capture).labels[:, ::4, ::4])
+    assert "has no `output`: logits" in capsys.readouterr().err
+    model.with_suffix(".toml").write_text('labels = "tiny.npz"\n')
+    assert read_teacher(model).output == "features"
+    model.with_suffix(".toml").write_text('labels = "classes.txt"\ntext = "minilm"\n')
+    assert read_teacher(model).output == "features"
+
+
+OUTPUTS = {  # of the graph, in order, and which is taken; None: it cannot be told
+    "a small one first": (["mean", "features"], "features"),
+    "one of other channels first": (["twice", "features"], "features"),
+    "two alike": (["features", "same"], None),
+    "none that fits": (["twice", "four"], None),
+}
+
+
+@pytest.mark.parametrize("case", OUTPUTS)
+def test_of_several_outputs_the_one_that_fits_the_labels_is_taken_or_all_are_listed(tmp_path, capture, case, capsys):
+    outputs, taken = OUTPUTS[case]
+    model = segmenter(tmp_path)
+    graph = onnx.load(model)
+    for operator, inputs, name, how in (
+        ("GlobalAveragePool", ["features"], "mean", {}), ("Flatten", ["mean"], "flat", {}),
+        ("Identity", ["features"], "same", {}), ("Concat", ["features", "features"], "twice", {"axis": 1}),
+        ("Concat", ["twice", "twice"], "four", {"axis": 1}),
+    ):  # fmt: skip
+        graph.graph.node.append(helper.make_node(operator, inputs, [name], **how))
+    onnx.save(graph, model)
+    ending(model, outputs=["flat" if name == "mean" else name for name in outputs])
+    code, found = encoded(tmp_path, capture, model)
+    said = capsys.readouterr().err
+    if taken:
+        assert code == 0 and f": {taken} is taken" in said
+        assert np.array_equal(found.pseudo_labels[:], Capture.read(capture).labels[:, ::4, ::4])
+        return
+    assert code == 3 and all(name in said for name in outputs) and "12, 16]" in said and "`tensor`" in said
+    if case == "two alike":
+        with model.with_suffix(".toml").open("a") as toml:
+            toml.write('tensor = "same"\n')
+        assert encoded(tmp_path, capture, model)[0] == 0
+        model.with_suffix(".toml").write_text('output = "logits"\nlabels = "classes.txt"\ntensor = "sane"\n')
+        assert encoded(tmp_path / "other", capture, model)[0] == 3
+        assert "no output is called sane: there are features [1, 3" in capsys.readouterr().err
 
 
 # what check-teacher tells

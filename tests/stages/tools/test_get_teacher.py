@@ -13,11 +13,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 from onnx import helper
-from tiny_teachers import write_model
+from tiny_teachers import moved_out, write_model, write_settings
 
 from chebsplat.errors import ConfigError, InputError
 from chebsplat.formats.teacher_model import read_teacher
-from chebsplat.stages.tools.get_teacher import check, get_teacher, parsed, token_for
+from chebsplat.stages.teacher_models.image_encoder import TeacherInference
+from chebsplat.stages.tools.get_teacher import check, get_teacher, parsed, preparation, token_for
 
 REPOSITORY, COMMIT, CLASSES = "some/Segmenter-B0", "c" * 40, ["wall", "floor", "sofa: a seat", "wall"]
 NAME, SHORT = f"hf:{REPOSITORY}", "segmenter-b0"
@@ -118,6 +119,98 @@ def ask(constants, monkeypatch, address):
     template = constants.HUGGINGFACE_CO_URL_TEMPLATE.removeprefix(constants.ENDPOINT)
     monkeypatch.setattr(constants, "HUGGINGFACE_CO_URL_TEMPLATE", address + template)
     monkeypatch.setattr(constants, "ENDPOINT", address)
+
+
+NORM = {"image_mean": [0.485, 0.456, 0.406], "image_std": [0.229, 0.224, 0.225]}
+SIZED = {"size": {"height": 64, "width": 64}}
+FED = {  # of preprocessor_config.json: other keys, what the hub's processor makes of colours 0 to 255, keys of the TOML
+    "as usual": (NORM, lambda v, m, s: (v / 255 - m) / s, {"mean": [0.485, 0.456, 0.406]}),
+    "said in full": (
+        NORM | {"do_rescale": True, "rescale_factor": 0.00392156862745098, "do_normalize": True, "do_pad": True},
+        lambda v, m, s: (v / 255 - m) / s, {"mean": [0.485, 0.456, 0.406]},
+    ),
+    "not normalised": (NORM | {"do_normalize": False}, lambda v, m, s: v / 255, {"std": [1, 1, 1]}),
+    "not rescaled": (
+        {"do_rescale": False, "image_mean": [123.675, 116.28, 103.53], "image_std": [58.395, 57.12, 57.375]},
+        lambda v, m, s: (v - m) / s, {},
+    ),
+    "neither": ({"do_rescale": False, "do_normalize": False}, lambda v, m, s: v, {}),
+    "rescaled to 0 to 2": (NORM | {"rescale_factor": 1 / 127.5}, lambda v, m, s: (v / 127.5 - m) / s, {}),
+    "one number for three": ({"image_mean": 0.5, "image_std": 0.5}, lambda v, m, s: v / 127.5 - 1, {}),
+    "BGR": ({"do_flip_channel_order": True}, lambda v, m, s: v[::-1] / 255, {"order": "BGR"}),
+    "MobileViT, which is of BGR unless it says otherwise": (
+        {"image_processor_type": "MobileViTImageProcessor"}, lambda v, m, s: v[::-1] / 255, {"order": "BGR"},
+    ),
+    "bicubic": (NORM | {"resample": 3}, lambda v, m, s: (v / 255 - m) / s, {"resample": "bicubic"}),
+    "the shortest edge": (
+        NORM | {"size": {"shortest_edge": 96}}, lambda v, m, s: (v / 255 - m) / s, {"size": [96, 96], "base": 128}
+    ),
+    "the longest edge": (
+        NORM | {"size": {"shortest_edge": 96, "longest_edge": 100}}, lambda v, m, s: (v / 255 - m) / s, {"base": 100}
+    ),
+    "a crop": (
+        NORM | {"size": {"shortest_edge": 96}, "do_center_crop": True, "crop_size": 64},
+        lambda v, m, s: (v / 255 - m) / s, {"size": [64, 64], "base": 128},
+    ),
+}  # fmt: skip
+
+
+def written(tmp_path, values):
+    path = tmp_path / "preprocessor_config.json"
+    path.write_text(json.dumps(SIZED | values))
+    return preparation(path, REPOSITORY)
+
+
+@pytest.mark.parametrize("case", FED)
+def test_a_model_is_fed_what_the_hub_s_own_processor_would_feed_it(tmp_path, case):
+    values, processed, keys = FED[case]
+    found = written(tmp_path, values)
+    assert {key: found[key] for key in keys} == keys
+    write_model(tmp_path / "tiny.onnx", [helper.make_node("Identity", ["image"], ["features"])])
+    write_settings(tmp_path / "tiny.onnx", **found)
+    colors = np.arange(0, 256, 17, dtype=np.uint8)
+    window = np.stack([colors, colors[::-1], np.roll(colors, 5)], 1)[None]
+    fed = TeacherInference(read_teacher(tmp_path / "tiny.onnx"), 1).run(window, "view")
+    mean, std = (np.reshape(values.get(key, 0), (-1, 1, 1)) for key in ("image_mean", "image_std"))
+    wanted = processed(window.transpose(2, 0, 1).astype(float), mean, std)
+    assert np.allclose(fed, wanted, atol=1e-5 * np.abs(wanted).max())
+
+
+@pytest.mark.parametrize(
+    ("values", "word"),
+    [
+        (NORM | {"do_thumbnail": True}, "do_thumbnail"),
+        (NORM | {"do_grayscale": True, "rescale_offset": True}, "do_grayscale, rescale_offset"),
+        (NORM | {"do_flip_channel_order": True}, "do_flip_channel_order"),
+        (NORM | {"rescale_factor": "1/255"}, "rescale_factor of '1/255'"),
+        (NORM | {"resample": 9}, "resample of 9"),
+        (NORM | {"size": {"width": 64}}, "no size of whole numbers"),
+        (NORM | {"do_center_crop": True}, "no crop_size"),
+        ({"image_mean": [123.675, 116.28, 103.53], "image_std": [58.395, 57.12, 57.375]}, "of colours in 0 to 255"),
+        ({"image_mean": [0.5, 0.5], "image_std": [0.5, 0.5]}, "no image_mean or image_std of three numbers"),
+    ],
+)
+def test_what_no_key_of_a_teacher_stands_for_is_refused_by_name(tmp_path, values, word):
+    with pytest.raises(InputError, match=rf"{REPOSITORY}: preprocessor_config.json .*{word}.*; export"):
+        written(tmp_path, values)
+
+
+def test_weights_beside_a_graph_come_along_and_count_in_its_checksum(tmp_path, monkeypatch):
+    """Without the hub's client, which the other tests need."""
+    held = tmp_path / "hub"
+    (held / "onnx").mkdir(parents=True)
+    segmenter(held / "onnx/model.onnx")
+    moved_out(held / "onnx/model.onnx", "model.onnx_data")
+    (held / "config.json").write_text(json.dumps({"id2label": dict(enumerate(CLASSES))}))
+    (held / "preprocessor_config.json").write_text(json.dumps(PREPARATION))
+    monkeypatch.setattr("chebsplat.stages.tools.get_teacher.fetched", lambda repository, file, revision: held / file)
+    model, _ = get_teacher(NAME, tmp_path / "out")
+    assert (tmp_path / "out/model.onnx_data").is_file()
+    check(model)
+    with (tmp_path / "out/model.onnx_data").open("r+b") as weights:
+        weights.write(b"\1")
+    with pytest.raises(InputError, match="damaged or replaced"):
+        check(model)
 
 
 def test_a_repository_becomes_a_teacher_of_three_files(hub, tmp_path):
