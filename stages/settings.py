@@ -99,8 +99,8 @@ class SfmSection(Section):
     )
     dense: Literal["auto", "on", "off"] = setting(
         "auto",
-        "where no depth is given: points of a plane sweep, and far ones where none is found; auto: a sweep where a "
-        "fifth of the photos' cells hold no point",
+        "points of a plane sweep of the photos, and far ones where it finds none; auto: where a fifth of the photos' "
+        "cells hold no point, and no depth is given",
     )
     seed: int = seed("of the choice among points, and of the matches")
 

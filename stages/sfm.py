@@ -57,7 +57,7 @@ def run(job: Job) -> None:
         depths = more.pop("depths")
         cloud = filled(cloud, more, min(MOST, settings.max_points), name="n_swept")
     off = {} if "reprojection_error_px" in cloud["notes"] else missed(capture, cloud)
-    if capture.depth is None and settings.dense != "off":
+    if depths is not None:
         behind = backdrop(capture, cloud)
         cloud = joined(cloud, behind) | {"notes": cloud["notes"] | {"n_behind": len(behind["means"])}}
     means = cloud["means"]
