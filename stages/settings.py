@@ -99,8 +99,7 @@ class SfmSection(Section):
     )
     dense: Literal["auto", "on", "off"] = setting(
         "auto",
-        "points of a plane sweep of the photos, and far ones where it finds none; auto: where a fifth of the photos' "
-        "cells hold no point, and no depth is given",
+        "depth of a plane sweep of the photos; auto: where a fifth of their cells hold no point, and no depth is given",
     )
     seed: int = seed("of the choice among points, and of the matches")
 

@@ -12,7 +12,7 @@ import numpy as np
 import torch
 from PIL import Image
 
-from chebsplat.cameras import unproject
+from chebsplat.cameras import centers, unproject
 from chebsplat.formats.capture import Capture
 from chebsplat.photos.planar import completed
 from chebsplat.photos.plane_sweep import agreed, swept_depth
@@ -32,6 +32,7 @@ MOST_COST, AGREE = 0.5, 2  # what counts: cost, views that confirm a depth
 LEAST = 0.2  # of the points in the cube of a middling one, and three: what few pixels show is seldom there
 MOST = 12_000  # points in all: the first Gaussians, which growth needs room beside
 CELLS = 20  # cells along the longer side of a photo, of which it is asked how many hold a point
+FACING = 0.25  # of the pairs of cameras: of photos from all around something .35, of five other captures at most .2
 BEHIND = 1.5  # times the farthest point: how deep what no point is known of is supposed to lie
 COVERED = 0.8  # part of the cells under which matched points leave too much of the photos empty
 
@@ -157,16 +158,24 @@ def fused(means: np.ndarray, colors: np.ndarray, seen_from: np.ndarray) -> dict[
     return {"means": middle, "colors": color.round().astype(np.uint8), "seen_from": seen_from[first[is_dense]]}
 
 
+def facing(poses: np.ndarray) -> float:
+    """The share of pairs of cameras [V, 4, 4] that have one another before them and look more than 90° apart."""
+    eyes, forward = centers(poses), poses[:, 2, :3]
+    before = np.einsum("ijk,ik->ij", eyes - eyes[:, None], forward) > 0
+    return float((before & before.T & (forward @ forward.T < 0)).mean())
+
+
 def backdrop(capture: Capture, cloud: dict[str, Any]) -> dict[str, Any]:
     """means, colors and seen_from of points far behind all others, as a cloud has them: one in each cell of a training
     photo in which no point lies, of that cell's mean colour.
 
-    Choices: as deep as BEHIND times the farthest point in any photo (99th percentile). What such a cell shows is built
-      from what lies nearest otherwise, which looks right from there and stands before other cameras.
+    Choices: none unless FACING of the pairs of cameras face one another. What such a cell shows is built otherwise from
+      what lies nearest, which looks right from there, and stands before the cameras on the other side. As deep as
+      BEHIND times the farthest point in any photo (99th percentile).
     """
     row, (width, height) = {name: k for k, name in enumerate(capture.names)}, capture.size
-    used = [k for k, name in enumerate(cloud["names"]) if not capture.is_test[row[name]]]
     Ks, poses = cloud["Ks"], cloud["cam_from_world"]
+    used = [k for k, name in enumerate(cloud["names"]) if not capture.is_test[row[name]]] * (facing(poses) > FACING)
     depths = [in_photo(Ks[k], poses[k], cloud["means"], capture.size)[:, 2] for k in used]
     far = BEHIND * max((np.percentile(z, 99) for z in depths if len(z)), default=0.0)
     means, colors, seen = [np.zeros((0, 3))], [np.zeros((0, 3), np.uint8)], [np.zeros(0, np.int64)]

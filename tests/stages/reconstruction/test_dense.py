@@ -162,8 +162,10 @@ def test_points_are_added_where_most_cells_are_empty_and_never_beside_depth(wall
     assert dense.wants_more(job, capture_of(wall), full, SfmSection(dense="on"))
 
 
-def test_where_no_point_is_known_points_of_the_photos_colours_lie_far_behind_all_others(wall):
+def test_where_no_point_is_known_points_of_the_photos_colours_lie_far_behind_all_others(wall, monkeypatch):
     """All points but the last are in the middle; the last, five deep, is the farthest 99 of 100 times."""
+    assert len(dense.backdrop(capture_of(wall), cloud_of(wall))["means"]) == 0  # these cameras look one way
+    monkeypatch.setattr(dense, "FACING", -1.0)
     cloud, mask = cloud_of(wall), np.ones(wall[0].shape[:3], bool)
     cloud["means"] = np.concatenate([cloud["means"], np.tile([[0.0, 0.0, 5.0]], (20, 1))])
     mask[:, :, :24] = False
@@ -177,3 +179,20 @@ def test_where_no_point_is_known_points_of_the_photos_colours_lie_far_behind_all
     assert len(x) == (~held)[:, 3:].sum() and held.any()
     cells = wall[0][0].reshape(15, 8, 20, 8, 3).mean((1, 3))
     np.testing.assert_allclose(found["colors"][first], cells[(y / 8).astype(int), (x / 8).astype(int)], atol=1)
+
+
+def test_cameras_all_around_something_face_one_another_and_those_in_a_row_or_back_to_back_do_not():
+    turns = np.linspace(0, 2 * np.pi, 12, endpoint=False)
+
+    def ring(distance):
+        poses = np.tile(np.eye(4), (12, 1, 1))
+        poses[:, 0, :3] = np.stack([np.cos(turns), 0 * turns, -np.sin(turns)], 1)
+        poses[:, 2, :3] = np.stack([np.sin(turns), 0 * turns, np.cos(turns)], 1)
+        poses[:, 2, 3] = distance
+        return poses
+
+    assert dense.facing(ring(3.0)) > 0.4  # the middle lies before each
+    assert dense.facing(ring(-3.0)) == 0  # behind each
+    row = np.tile(np.eye(4), (12, 1, 1))
+    row[:, 0, 3] = np.arange(12)
+    assert dense.facing(row) == 0
