@@ -29,7 +29,7 @@ IDS, COLORS, SCORES, MASKS = "ids", "colours", "scores by class", "one mask a cl
 VOID = {"void", "ignore", "ignored", "ignoreregion", "unlabeled", "unlabelled", "notlabeled", "notlabelled", "nolabel",
         "unannotated", "notannotated", "unassigned", "unclassified", "undefined", "unknown", "invalid", "none", "null",
         "nan", "n/a", "noclass", "dontcare", "outlier"}  # fmt: skip
-BACKGROUND = "background"  # void where it has an id that stands for void, otherwise a class
+BACKGROUND = "background"  # void where it is 0 or one of CODES, otherwise a class
 CODES = (255, 65_535)  # the highest of 8 and 16 bits, which stand for void
 MAX_ID = 65_535  # what 16 bits hold
 NAMES = ("scene.json", "labels.json")  # documents that may name ids
@@ -49,20 +49,24 @@ def files_below(folder: Path) -> list[str]:
 
 
 def of_views(place: Path, names: Sequence[str]) -> dict[str, LabelFile]:
-    """The map of each view that has one: a file that is called like it; or a mask a class, as VIEW/CLASS.png or
-    CLASS/VIEW.png.
+    """The map of each view that has one: a file that is called like it; or a mask a class, as
+    VIEW/CLASS.png or CLASS/VIEW.png.
 
-    Raises: InputError where one view has two, or none of the files is called like a view.
+    Choices: a file lies no deeper than its view, for what is a folder deeper is a mask.
+    Raises:  InputError where one view has two, or none of the files is called like a view.
     """
     files = files_below(place)
     common.distinct(sorted((os.path.splitext(name)[0], place / name) for name in files))
-    if found := common.matched(names, files):
-        return {name: place / file for name, file in found.items()}
-    masks: dict[str, dict[str, Path]] = {}
-    folders = {os.path.dirname(file) for file in files} - {""}
-    for name, inner in common.matched(names, folders).items():
-        masks[name] = {_stem(file): place / file for file in files if os.path.dirname(file) == inner}
-    for label in {file.partition("/")[0] for file in files if "/" in file} if not masks else ():
+    found = common.matched(names, files).items()
+    if maps := {name: place / file for name, file in found if file.count("/") <= name.count("/")}:
+        return dict(maps)
+    held: dict[str, dict[str, Path]] = {}
+    for file in files:
+        folder, name = os.path.split(os.path.splitext(file)[0])
+        held.setdefault(folder, {})[name] = place / file
+    folders = common.matched(names, held.keys() - {""})
+    masks = {name: held[folder] for name, folder in folders.items()}
+    for label in () if masks else {file.partition("/")[0] for file in files if "/" in file}:
         own = [file.removeprefix(f"{label}/") for file in files if file.startswith(f"{label}/")]
         for name, file in common.matched(names, own).items():
             masks.setdefault(name, {})[label] = place / label / file
@@ -73,33 +77,33 @@ def of_views(place: Path, names: Sequence[str]) -> dict[str, LabelFile]:
     return dict(masks)
 
 
-def _stem(file: str) -> str:
-    return os.path.splitext(os.path.basename(file))[0]
-
-
 def files(folder: Path) -> list[Path]:
     """The maps of a source's folder."""
     return [folder / place / name for place in [place_in(folder)] if place for name in files_below(folder / place)]
 
 
-def give(listing: Listing, folder: Path) -> None:
-    """Give the frames of a listing the maps of a source's folder, where it holds any, and the listing their names."""
-    place = place_in(folder)
-    if place is None:
-        held = {place: os.listdir(folder / place) for place in LABELS if (folder / place).is_dir()}
-        listing.notes += [f"{place}/ holds no PNG or .npy: not read ({few(found)})." for place, found in held.items()]
-    if place is None or not listing.frames:
+def give(listing: Listing, folder: Path, places: Sequence[str] = LABELS) -> None:
+    """Give the frames of a listing the maps of a source's folder, where one of `places` in it holds
+    any, and the listing their names.
+    """
+    full = [place for place in places if any(files_below(folder / place))]
+    if not full or not listing.frames:
+        held = {place: os.listdir(folder / place) for place in places if (folder / place).is_dir()}
+        listing.notes += [
+            f"{place}/ holds no PNG or .npy: not read ({few(found)})."
+            for place, found in held.items()
+            if found and not full
+        ]
         return
+    listing.label_place = full[0]
     listing.label_names = names_in(folder)
-    maps = of_views(folder / place, [frame.name for frame in listing.frames])
+    maps = of_views(folder / full[0], [frame.name for frame in listing.frames])
     for frame in listing.frames:
         frame.labels = maps.get(frame.name)
-    listing.label_place = place
-    masks = [frame.labels for frame in listing.frames if isinstance(frame.labels, dict)]
-    if masks:
+    if masks := [file for file in maps.values() if isinstance(file, dict)]:
         listing.label_names = dict(enumerate(sorted(set().union(*masks)), 1))
-    if others := [other for other in LABELS if other != place and any(files_below(folder / other))]:
-        listing.notes.append(f"Labels are those of {place}/; not read: {', '.join(others)}.")
+    if full[1:]:
+        listing.notes.append(f"Labels are those of {full[0]}/; not read: {', '.join(full[1:])}.")
 
 
 def is_deep(path: Path) -> bool:
@@ -286,7 +290,8 @@ def indexed(
         known = names if names is not None else dict(enumerate(class_names or ()))
         if nameless := [v for v in present if v not in known]:
             notes.append(f"{what} ids without a name are ignored: {_told(nameless, shares, kind)}.")
-    if void := [v for v in present if v in known and is_void(known[v], v)]:
+    codes = (0, *CODES) if kind == IDS else (0,)
+    if void := [v for v in present if v in known and is_void(known[v], v in codes)]:
         of = ", ".join(dict.fromkeys(known[v] for v in void))
         notes.append(f"{what}s called {of} are void and ignored: {_told(void, shares, kind)}.")
     named = {v: known[v] for v in present if v in known and v not in void}
@@ -330,9 +335,9 @@ def void_code(present: Sequence[int]) -> int | None:
     return code if code in CODES and dense and max(others) < code - 1 else None
 
 
-def is_void(name: str, which: int) -> bool:
-    """Whether a name says that nobody labelled the pixels of that id."""
-    return joined(name) in VOID or (joined(name) == BACKGROUND and which in (0, *CODES))
+def is_void(name: str, coded: bool) -> bool:
+    """Whether a name says that nobody labelled its pixels; coded: their id usually says so."""
+    return joined(name) in VOID or (coded and joined(name) == BACKGROUND)
 
 
 def _shares(raw: np.ndarray) -> Counter[int]:

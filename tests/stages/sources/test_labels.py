@@ -21,14 +21,14 @@ CLASS = np.random.default_rng(0).integers(-1, 3, (3, 6, 8))
 CLASS[:, 0, :4] = [-1, 0, 1, 2]
 
 
-def source(folder, write, names=None):
+def source(folder, write, names=None, classes=CLASS):
     """Three views whose maps `write(path without an ending, class [6, 8])` writes; names of labels.json."""
     fields = tiny() | {"names": list("abc"), "labels": np.zeros((3, 6, 8), np.int16)}
     layouts.write_colmap(folder, fields)
     for path in (folder / "semantic").iterdir():
         path.unlink()
     (folder / "labels.json").unlink()
-    for name, of_view in zip("abc", CLASS, strict=True):
+    for name, of_view in zip("abc", classes, strict=True):
         write(folder / "semantic" / name, of_view)
     if names is not None:
         (folder / "labels.json").write_text(json.dumps(names))
@@ -77,11 +77,11 @@ def scores(axis, kind=np.float32):
 
 
 def masks(form, swapped=False):
-    """A writer of one mask a class: VIEW/CLASS, or CLASS/VIEW."""
+    """A writer of one mask a class that a view shows: VIEW/CLASS, or CLASS/VIEW."""
 
     def write(path, of_view):
-        for k, name in enumerate(NAMES):
-            place = path.parent / name / path.name if swapped else path / name
+        for k in set(of_view[of_view >= 0]):
+            place = path.parent / NAMES[k] / path.name if swapped else path / NAMES[k]
             place.parent.mkdir(parents=True, exist_ok=True)
             large = np.kron(of_view == k, np.ones((16, 16), bool))  # blocks of JPEG
             Image.fromarray((255 * large).astype(np.uint8)).save(f"{place}.{form}")
@@ -142,6 +142,16 @@ def test_a_pixel_s_class_is_the_one_that_was_written_and_a_line_says_what_maps_w
     assert {path for path in (tmp_path / "semantic").rglob("*") if path.is_file()} <= listed
 
 
+@pytest.mark.parametrize("shown", [("0", "0", "0"), ("0", "1", "2"), ("012", "0", "1")])
+def test_masks_in_folders_of_classes_are_told_from_ids_whatever_classes_a_view_shows(tmp_path, shown):
+    wanted = [
+        np.where(np.isin(of_view, [*map(int, of)]), of_view, -1) for of_view, of in zip(CLASS, shown, strict=True)
+    ]
+    fields = colmap.read(source(tmp_path, masks("png", swapped=True), classes=wanted), SETTINGS)
+    check(fields, NAMES, np.array(wanted))
+    assert "taken for one mask a class" in said(fields)
+
+
 @pytest.mark.parametrize(
     ("present", "code"),
     [([0, 1, 2, 255], 255), ([0, 1, 65_535], 65_535), ([1, 2, 4, 5, 255], 255), ([0, 2, 3, 40, 255], None),
@@ -156,13 +166,13 @@ def test_which_of_ids_without_names_is_void(present, code):
     ("name", "which", "void"),
     [(name, 5, True) for name in ("unannotated", "Unlabeled", "unlabelled", "ignore", "IGNORED ", "void", "un-defined",
                                   "none", "No Label", "not_labeled", "unknown")]
-    + [("background", 0, True), ("Background", 255, True), ("background", 7, False)]
+    + [("background", 0, True), ("Background", 255, True), ("background", 7, False), ("#background", 255, False)]
     + [(name, 0, False) for name in ("other", "others", "otherprop", "otherfurniture", "clutter", "wall", "void deck")],
 )  # fmt: skip
 def test_names_of_the_usual_sets_that_mean_nothing_are_void_and_classes_are_not(name, which, void):
-    assert labels.is_void(name, which) is void
-    raw = np.array([[[which, which, which, 9]]], np.int32)
-    found, classes, notes = labels.indexed(raw, {which: name, 9: "sofa"}, None)
+    kind, name = (labels.COLORS, name[1:]) if name[0] == "#" else (labels.IDS, name)
+    raw = np.array([[[which, which, which, 999]]], np.int32)
+    found, classes, notes = labels.indexed(raw, {which: name, 999: "sofa"}, None, kind)
     assert classes == (["sofa"] if void else [name, "sofa"])
     assert found.tolist() == ([[[-1, -1, -1, 0]]] if void else [[[0, 0, 0, 1]]])
     assert void == any(f"{which} (75.0% of the pixels)" in note for note in notes)
@@ -222,26 +232,35 @@ def test_colours_that_no_name_fits_are_an_error(tmp_path):
 # ScanNet as its own tools export it
 
 
-@pytest.mark.parametrize("how", ["raw ids, SG's table", "raw ids, ScanNet's table", "NYU's 40", "names beside"])
+@pytest.mark.parametrize(
+    "how",
+    ["raw ids, SG's table", "raw ids, ScanNet's table", "NYU's 40", "names beside", "semantics/", "masks"],
+)
 def test_scannets_own_export_needs_no_points_and_its_label_folder_is_read(tmp_path, how):
     fields = tiny() | {"class_names": NAMES, "labels": CLASS}
     fields["Ks"][:, 0, 2] += 0.5  # as written, half of these few pixels
     layouts.write_scannet(tmp_path, fields)
     raw = [layouts.SCANNET_IDS[name] for name in ("wall", "floor", "television")]
-    found = ["wall", "floor", "television"]
+    found, place = ["wall", "floor", "television"], "semantics" if how == "semantics/" else "label"
     for k, of_view in enumerate(CLASS):
-        stored = layouts.raw_labels(of_view, [1, 2, 25] if how in ("NYU's 40", "names beside") else raw)
-        save(tmp_path / f"label/{10 * k}.png", stored.astype(np.uint8) if how == "NYU's 40" else stored)
+        stored = layouts.raw_labels(of_view, raw if "raw" in how else [1, 2, 25])
+        if how == "masks":
+            masks("png")(tmp_path / f"label/{10 * k}", of_view)
+            found = NAMES
+        else:
+            save(tmp_path / f"{place}/{10 * k}.png", stored.astype(np.uint8) if how == "NYU's 40" else stored)
         save(tmp_path / f"depth/{10 * k}.png", layouts.stored_depth(fields["depth"][k]))
     if "SG" in how:
         layouts.write_table(tmp_path / scannet.MODIFIED, "cocomapid", layouts.COCO_IDS)
     elif "ScanNet's" in how:
         layouts.write_table(tmp_path / scannet.OWN, "nyu40id", layouts.NYU_IDS)
-    elif how == "names beside":
+    elif how not in ("NYU's 40", "masks"):
         (tmp_path / "labels.json").write_text(json.dumps({"1": "wall", "2": "floor", "25": "tv screen"}))
         found = NAMES
     got = scannet.read(tmp_path, SETTINGS)
     check(got, found)
     assert "points" not in got and "without points3d.ply" in said(got)
-    assert "Labels of label/ are taken for ids with names: 3 classes" in said(got)
-    assert scannet.probe(tmp_path)["labels"] and tmp_path / "label/10.png" in scannet.files(tmp_path)
+    kind = "one mask a class" if how == "masks" else "ids with names"
+    assert f"Labels of {place}/ are taken for {kind}: 3 classes" in said(got)
+    maps = {path for path in (tmp_path / place).rglob("*") if path.is_file()}
+    assert scannet.probe(tmp_path)["labels"] and maps <= set(scannet.files(tmp_path))

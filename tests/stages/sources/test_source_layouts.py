@@ -6,6 +6,7 @@ import shutil
 import layouts
 import numpy as np
 import pytest
+from PIL import Image
 from shared import data, published, run_stage
 from source_folders import SETTINGS, image, save, tiny
 
@@ -72,8 +73,14 @@ def test_replica_as_nice_slam_renders_it(scene, tmp_path):
     compare(read(tmp_path, "replica"), scene, labels=False)
 
 
-def test_replica_as_semantic_nerf_renders_it(scene, tmp_path):
+@pytest.mark.parametrize("ending", [".png", ".npy"])
+def test_replica_as_semantic_nerf_renders_it(scene, tmp_path, ending):
     layouts.write_semantic_nerf(tmp_path, scene)
+    for path in (tmp_path / "Sequence_1/semantic_class").iterdir():
+        ids = np.asarray(Image.open(path))
+        path.unlink()
+        np.save(path.with_suffix(".npy"), ids) if ending == ".npy" else save(path, ids)
+        assert path.with_suffix(ending) in replica.files(tmp_path)
     found = read(tmp_path, "replica")
     compare(found, scene, exact_Ks=False)  # the layout has no camera file: f is half the width
     assert np.allclose(found["Ks"], [[48, 0, 48], [0, 48, 36], [0, 0, 1]])
