@@ -11,7 +11,7 @@ from shared import data, published, run_stage
 from source_folders import SETTINGS, image, save, tiny
 
 from chebsplat.cameras import centers, unproject
-from chebsplat.errors import InputError
+from chebsplat.errors import DataFailure, InputError
 from chebsplat.evaluation.protocols import scannet_closed, scannet_open
 from chebsplat.formats import artifact
 from chebsplat.formats.capture import Capture
@@ -288,6 +288,14 @@ def test_a_sources_own_points_become_the_scenes_and_their_colours_where_these_te
     to_eyes = centers(scene["cam_from_world"])[None] - found.means[:, None]
     facing = (np.einsum("ni,nvi->nv", found.normals, to_eyes) > 0).mean()
     assert facing > 0.8  # most points of a convex room are turned towards most cameras
+
+
+def test_points_that_no_view_has_in_its_image_are_too_few_with_depth_too(scene, tmp_path, capfd):
+    fields = {key: scene[key] for key in ("names", "images", "Ks", "cam_from_world", "depth")}
+    record = Capture(**fields, is_test=np.arange(16) % 8 == 0, points=np.full((50, 3), 50, np.float32))
+    inputs = {"capture": published(tmp_path / "c", record)}
+    assert run_stage("sfm", tmp_path / "out", inputs, {"sfm": {"dense": "off"}}) == DataFailure.exit_code
+    assert "only 0 points were found" in capfd.readouterr().err
 
 
 @pytest.mark.data
