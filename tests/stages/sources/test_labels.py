@@ -6,6 +6,7 @@ import re
 import layouts
 import numpy as np
 import pytest
+from label_maps import arrays, masks, pictures
 from PIL import Image
 from source_folders import save, tiny
 
@@ -35,89 +36,43 @@ def source(folder, write, names=None, classes=CLASS):
     return folder
 
 
-def ids(table, kind=np.uint8, ending=".png"):
-    """A writer of ids, of classes 0, 1, 2 and of none."""
-
-    def write(path, of_view):
-        values = np.array(table)[of_view].astype(kind)
-        if ending == ".npy":
-            np.save(path.with_suffix(".npy"), values)
-        else:
-            Image.fromarray(values).save(path.with_suffix(ending), format="PNG")
-
-    return write
-
-
-def colors(path, of_view):
-    save(path.with_suffix(".png"), RGB[of_view])
-
-
-def transparent(path, of_view):
-    save(path.with_suffix(".png"), np.concatenate([RGB[of_view], 255 * (of_view >= 0)[..., None]], -1).astype(np.uint8))
-
-
-def grey_colors(path, of_view):
-    save(path.with_suffix(".png"), np.repeat((of_view + 1)[..., None], 3, -1).astype(np.uint8))
-
-
 def palette(path, of_view):
     image = Image.fromarray((of_view + 1).astype(np.uint8))
     image.putpalette([0, 0, 0, 200, 0, 0, 0, 200, 0, 0, 0, 200])
     image.save(path.with_suffix(".png"))
 
 
-def scores(axis, kind=np.float32):
-    """A writer of one-hot scores along an axis; all equal where there is no class."""
-
-    def write(path, of_view):
-        held = np.concatenate([np.eye(3), np.zeros((1, 3))])[of_view].astype(kind)
-        np.save(path.with_suffix(".npy"), np.moveaxis(held, -1, axis))
-
-    return write
-
-
-def masks(form, swapped=False):
-    """A writer of one mask a class that a view shows: VIEW/CLASS, or CLASS/VIEW."""
-
-    def write(path, of_view):
-        for k in set(of_view[of_view >= 0]):
-            place = path.parent / NAMES[k] / path.name if swapped else path / NAMES[k]
-            place.parent.mkdir(parents=True, exist_ok=True)
-            large = np.kron(of_view == k, np.ones((16, 16), bool))  # blocks of JPEG
-            Image.fromarray((255 * large).astype(np.uint8)).save(f"{place}.{form}")
-
-    return write
-
-
 BY_ID = {"1": "wall", "2": "floor", "3": "tv screen"}
 ONE, ZERO, CODE = [1, 2, 3, 0], [0, 1, 2, 255], [0, 1, 2, 65_535]
 UNNAMED = ["class_0", "class_1", "class_2"]
+GREY, CLEAR = np.stack([ONE] * 3, -1), np.concatenate([RGB, [[255]] * 3 + [[0]]], 1)
 HEX = ["#ff0000", "#00c800", "#0707c8"]
+SCORES, FIRST, BY_PLACE = np.eye(4, 3), (2, 0, 1), dict(enumerate(NAMES))
 # what: (writer, labels.json, the classes that are found in the order of NAMES, what is said)
 WAYS = {
-    "ids with names": (ids(ONE), BY_ID, NAMES, "taken for ids with names: 3 classes"),
-    "16 bits": (ids(ONE, np.uint16), BY_ID, NAMES, "taken for ids with names"),
+    "ids with names": (pictures(ONE), BY_ID, NAMES, "taken for ids with names: 3 classes"),
+    "16 bits": (pictures(ONE, np.uint16), BY_ID, NAMES, "taken for ids with names"),
     "a palette": (palette, BY_ID, NAMES, "taken for ids with names"),
-    "an ending in capitals": (ids(ONE, ending=".PNG"), BY_ID, NAMES, "taken for ids with names"),
-    "a PNG called .jpg": (ids(ONE, ending=".jpg"), BY_ID, NAMES, "taken for ids with names"),
-    "an array": (ids(ONE, ending=".npy"), BY_ID, NAMES, "taken for ids with names"),
-    "an array of floats": (ids(ONE, np.float32, ".npy"), BY_ID, NAMES, "taken for ids with names"),
-    "an array with -1": (ids([0, 1, 2, -1], np.int64, ".npy"), dict(enumerate(NAMES)), NAMES, "with names"),
-    "names spelt in two ways": (ids([1, 2, 3, 9]), BY_ID | {"9": " VOID "}, NAMES, "called VOID are void"),
-    "ids without names": (ids(ONE), None, ["class_1", "class_2", "class_3"], r"no names.*; 0 \(\d.*none of the cl"),
-    "255 for void": (ids(ZERO), None, UNNAMED, r"255 \(\d.* is taken for void, and 0 for a class"),
-    "65535 for void": (ids(CODE, np.uint16), None, UNNAMED, r"65535 \(\d.* is taken for void, and 0 for a class"),
-    "255 without a name": (ids(ZERO), dict(enumerate(NAMES)), NAMES, r"without a name are ignored: 255 \(\d"),
-    "colours": (colors, None, HEX, r"taken for colours without names.*#000000 \(\d"),
-    "colours with names": (colors, dict(zip(HEX, NAMES, strict=True)), NAMES, "taken for colours with names"),
-    "transparent colours": (transparent, None, HEX, "taken for colours without names"),
-    "grey colours": (grey_colors, BY_ID, NAMES, "taken for ids with names"),
-    "scores, classes last": (scores(-1), dict(enumerate(NAMES)), NAMES, "taken for scores by class with names"),
-    "scores, classes first": (scores(0), None, UNNAMED, "taken for scores by class without names"),
-    "one-hot": (scores(0, bool), dict(enumerate(NAMES)), NAMES, "taken for scores by class"),
-    "masks of a view": (masks("png"), None, NAMES, "taken for one mask a class"),
-    "masks of a view as JPEG": (masks("jpg"), None, NAMES, "taken for one mask a class"),
-    "masks of a class": (masks("png", swapped=True), None, NAMES, "taken for one mask a class"),
+    "an ending in capitals": (pictures(ONE, ending=".PNG"), BY_ID, NAMES, "taken for ids with names"),
+    "a PNG called .jpg": (pictures(ONE, ending=".jpg"), BY_ID, NAMES, "taken for ids with names"),
+    "an array": (arrays(ONE, np.uint8), BY_ID, NAMES, "taken for ids with names"),
+    "an array of floats": (arrays(ONE, np.float32), BY_ID, NAMES, "taken for ids with names"),
+    "an array with -1": (arrays([0, 1, 2, -1]), BY_PLACE, NAMES, "with names"),
+    "names spelt in two ways": (pictures([1, 2, 3, 9]), BY_ID | {"9": " VOID "}, NAMES, "called VOID are void"),
+    "ids without names": (pictures(ONE), None, ["class_1", "class_2", "class_3"], r"no names.*; 0 \(\d.*none of"),
+    "255 for void": (pictures(ZERO), None, UNNAMED, r"255 \(\d.* is taken for void, and 0 for a class"),
+    "65535 for void": (pictures(CODE, np.uint16), None, UNNAMED, r"65535 \(\d.* is taken for void, and 0 for a class"),
+    "255 without a name": (pictures(ZERO), BY_PLACE, NAMES, r"without a name are ignored: 255 \(\d"),
+    "colours": (pictures(RGB), None, HEX, r"taken for colours without names.*#000000 \(\d"),
+    "colours with names": (pictures(RGB), dict(zip(HEX, NAMES, strict=True)), NAMES, "taken for colours with names"),
+    "transparent colours": (pictures(CLEAR), None, HEX, "taken for colours without names"),
+    "grey colours": (pictures(GREY), BY_ID, NAMES, "taken for ids with names"),
+    "scores, classes last": (arrays(SCORES, np.float32), BY_PLACE, NAMES, "taken for scores by class with names"),
+    "scores, classes first": (arrays(SCORES, np.float32, FIRST), None, UNNAMED, "scores by class without names"),
+    "one-hot": (arrays(SCORES, bool, FIRST), BY_PLACE, NAMES, "taken for scores by class"),
+    "masks of a view": (masks(NAMES), None, NAMES, "taken for one mask a class"),
+    "masks of a view as JPEG": (masks(NAMES, "jpg"), None, NAMES, "taken for one mask a class"),
+    "masks of a class": (masks(NAMES, swapped=True), None, NAMES, "taken for one mask a class"),
 }  # fmt: skip
 
 
@@ -147,7 +102,7 @@ def test_masks_in_folders_of_classes_are_told_from_ids_whatever_classes_a_view_s
     wanted = [
         np.where(np.isin(of_view, [*map(int, of)]), of_view, -1) for of_view, of in zip(CLASS, shown, strict=True)
     ]
-    fields = colmap.read(source(tmp_path, masks("png", swapped=True), classes=wanted), SETTINGS)
+    fields = colmap.read(source(tmp_path, masks(NAMES, swapped=True), classes=wanted), SETTINGS)
     check(fields, NAMES, np.array(wanted))
     assert "taken for one mask a class" in said(fields)
 
@@ -181,7 +136,7 @@ def test_names_of_the_usual_sets_that_mean_nothing_are_void_and_classes_are_not(
 @pytest.mark.parametrize("place", ["semantics", "label", "labels", "segmentation"])
 @pytest.mark.parametrize("kind", ["colmap", "transforms"])
 def test_maps_lie_in_folders_of_other_names_and_beside_a_transforms_json(tmp_path, place, kind):
-    folder = source(tmp_path, ids(ONE), BY_ID)
+    folder = source(tmp_path, pictures(ONE), BY_ID)
     (folder / "semantic").rename(folder / place)
     if kind == "transforms":
         frames = [{"file_path": f"images/{name}.png", "transform_matrix": np.eye(4).tolist()} for name in "abc"]
@@ -192,7 +147,7 @@ def test_maps_lie_in_folders_of_other_names_and_beside_a_transforms_json(tmp_pat
 
 
 def test_views_without_a_map_are_unknown_and_counted(tmp_path):
-    folder = source(tmp_path, ids(ONE), BY_ID)
+    folder = source(tmp_path, pictures(ONE), BY_ID)
     (folder / "semantic/b.png").unlink()
     fields = colmap.read(folder, SETTINGS)
     check(fields, NAMES, np.where(np.arange(3)[:, None, None] == 1, -1, CLASS))
@@ -200,7 +155,7 @@ def test_views_without_a_map_are_unknown_and_counted(tmp_path):
 
 
 def test_maps_of_another_kind_are_named_and_not_passed_over(tmp_path):
-    folder = source(tmp_path, ids(ONE), BY_ID)
+    folder = source(tmp_path, pictures(ONE), BY_ID)
     for path in (folder / "semantic").iterdir():
         path.rename(path.with_suffix(".tif"))
     fields = colmap.read(folder, SETTINGS)
@@ -209,13 +164,13 @@ def test_maps_of_another_kind_are_named_and_not_passed_over(tmp_path):
 
 
 def test_a_name_given_twice_in_other_letters_is_one_class(tmp_path):
-    fields = colmap.read(source(tmp_path, ids(ONE), BY_ID | {"2": "Wall_"}), SETTINGS)
+    fields = colmap.read(source(tmp_path, pictures(ONE), BY_ID | {"2": "Wall_"}), SETTINGS)
     assert len(fields["class_names"]) == 2
     assert np.array_equal(fields["labels"] == 0, (CLASS == 0) | (CLASS == 1))
 
 
 def test_a_lossy_map_and_a_picture_of_many_colours_are_refused(tmp_path):
-    folder = source(tmp_path, ids(ONE), BY_ID)
+    folder = source(tmp_path, pictures(ONE), BY_ID)
     Image.fromarray(CLASS[1].astype(np.uint8)).save(folder / "semantic/b.png", format="JPEG", quality=100)
     with pytest.raises(InputError, match=r"semantic/b\.png is a JPEG picture.*write label maps as PNG"):
         colmap.read(folder, SETTINGS)
@@ -226,7 +181,7 @@ def test_a_lossy_map_and_a_picture_of_many_colours_are_refused(tmp_path):
 
 def test_colours_that_no_name_fits_are_an_error(tmp_path):
     with pytest.raises(DataFailure, match=r"no label has a name \(colours \[#000000, #00c800"):
-        colmap.read(source(tmp_path, colors, BY_ID), SETTINGS)
+        colmap.read(source(tmp_path, pictures(RGB), BY_ID), SETTINGS)
 
 
 # ScanNet as its own tools export it
@@ -245,7 +200,7 @@ def test_scannets_own_export_needs_no_points_and_its_label_folder_is_read(tmp_pa
     for k, of_view in enumerate(CLASS):
         stored = layouts.raw_labels(of_view, raw if "raw" in how else [1, 2, 25])
         if how == "masks":
-            masks("png")(tmp_path / f"label/{10 * k}", of_view)
+            masks(NAMES)(tmp_path / f"label/{10 * k}", of_view)
             found = NAMES
         else:
             save(tmp_path / f"{place}/{10 * k}.png", stored.astype(np.uint8) if how == "NYU's 40" else stored)
