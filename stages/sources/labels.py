@@ -52,14 +52,15 @@ def of_views(place: Path, names: Sequence[str]) -> dict[str, LabelFile]:
     """The map of each view that has one: a file that is called like it; or a mask a class, as
     VIEW/CLASS.png or CLASS/VIEW.png.
 
-    Choices: a file lies no deeper than its view, for what is a folder deeper is a mask.
+    Choices: a file lies in the folders of its view, or in fewer; what lies in another is a mask.
     Raises:  InputError where one view has two, or none of the files is called like a view.
     """
     files = files_below(place)
     common.distinct(sorted((os.path.splitext(name)[0], place / name) for name in files))
-    found = common.matched(names, files).items()
-    if maps := {name: place / file for name, file in found if file.count("/") <= name.count("/")}:
-        return dict(maps)
+    found = common.matched(names, files)
+    maps: dict[str, LabelFile] = {name: place / file for name, file in found.items() if _in_folders_of(name, file)}
+    if maps:
+        return maps
     held: dict[str, dict[str, Path]] = {}
     for file in files:
         folder, name = os.path.split(os.path.splitext(file)[0])
@@ -75,6 +76,12 @@ def of_views(place: Path, names: Sequence[str]) -> dict[str, LabelFile]:
             f"{place}/ holds {few(files)}, of which none is called like a photo ({few(names)}); rename the label maps"
         )
     return dict(masks)
+
+
+def _in_folders_of(name: str, file: str) -> bool:
+    """Whether a file lies in the folders of its view, or in the innermost of them."""
+    view, folders = (path.casefold().split("/")[:-1] for path in (name, file))
+    return folders == view[len(view) - len(folders) :]
 
 
 def files(folder: Path) -> list[Path]:

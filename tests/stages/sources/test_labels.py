@@ -2,6 +2,7 @@
 
 import json
 import re
+import shutil
 
 import layouts
 import numpy as np
@@ -22,12 +23,14 @@ CLASS = np.random.default_rng(0).integers(-1, 3, (3, 6, 8))
 CLASS[:, 0, :4] = [-1, 0, 1, 2]
 
 
-def source(folder, write, names=None, classes=CLASS):
-    """Three views whose maps `write(path without an ending, class [6, 8])` writes; names of labels.json."""
-    fields = tiny() | {"names": list("abc"), "labels": np.zeros((3, 6, 8), np.int16)}
+def source(folder, write, names=None, classes=CLASS, inner=""):
+    """Three views whose maps `write(path without an ending, class [6, 8])` writes; names of labels.json; `inner`: the
+    folder of the photos in images/.
+    """
+    fields = tiny() | {"names": [f"{inner}{name}" for name in "abc"], "labels": np.zeros((3, 6, 8), np.int16)}
     layouts.write_colmap(folder, fields)
-    for path in (folder / "semantic").iterdir():
-        path.unlink()
+    shutil.rmtree(folder / "semantic")
+    (folder / "semantic").mkdir()
     (folder / "labels.json").unlink()
     for name, of_view in zip("abc", classes, strict=True):
         write(folder / "semantic" / name, of_view)
@@ -97,12 +100,13 @@ def test_a_pixel_s_class_is_the_one_that_was_written_and_a_line_says_what_maps_w
     assert {path for path in (tmp_path / "semantic").rglob("*") if path.is_file()} <= listed
 
 
+@pytest.mark.parametrize("inner", ["", "left/"])
 @pytest.mark.parametrize("shown", [("0", "0", "0"), ("0", "1", "2"), ("012", "0", "1")])
-def test_masks_in_folders_of_classes_are_told_from_ids_whatever_classes_a_view_shows(tmp_path, shown):
+def test_masks_in_folders_of_classes_are_told_from_ids_whatever_classes_a_view_shows(tmp_path, shown, inner):
     wanted = [
         np.where(np.isin(of_view, [*map(int, of)]), of_view, -1) for of_view, of in zip(CLASS, shown, strict=True)
     ]
-    fields = colmap.read(source(tmp_path, masks(NAMES, swapped=True), classes=wanted), SETTINGS)
+    fields = colmap.read(source(tmp_path, masks(NAMES, swapped=True), classes=wanted, inner=inner), SETTINGS)
     check(fields, NAMES, np.array(wanted))
     assert "taken for one mask a class" in said(fields)
 
@@ -144,6 +148,13 @@ def test_maps_lie_in_folders_of_other_names_and_beside_a_transforms_json(tmp_pat
     module = {"colmap": colmap, "transforms": transforms}[kind]
     assert module.probe(folder)["labels"] and folder / place / "a.png" in module.files(folder)
     check(module.read(folder, SETTINGS), NAMES)
+
+
+@pytest.mark.parametrize("place", ["", "left/", "Left/"])
+def test_maps_lie_in_the_folders_of_their_photos_or_in_fewer(tmp_path, place):
+    folder = source(tmp_path, lambda path, classes: pictures(ONE)(path.parent / place / path.name, classes), BY_ID,
+                    inner="left/")  # fmt: skip
+    check(colmap.read(folder, SETTINGS), NAMES)
 
 
 def test_views_without_a_map_are_unknown_and_counted(tmp_path):
