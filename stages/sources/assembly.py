@@ -90,24 +90,24 @@ def assemble(listing: Listing, settings: IngestSection, class_names: tuple[str, 
         notes.append(f"Images are undistorted ({', '.join(models)}), and figures are of these where they do not say.")
     source = {"kind": listing.kind, "notes": notes} | told | ({"undistorted": models} if models else {})
     fields |= {"source": source, "variance_kept": float(np.mean(shares))}
-    return fields | {"as_taken": lambda names: as_taken(bent(frames, listing, names), settings)}
+    return fields | {"bent": lambda wanted: bent(frames, listing, wanted)}
 
 
-def bent(frames: list[Frame], listing: Listing, names: set[str]) -> Iterator[tuple[str, Camera, Any]]:
-    """Those of the views `names` whose photo a lens bends: name, camera, photo; none that is a face of its photo."""
+def bent(frames: list[Frame], listing: Listing, wanted: set[str]) -> Iterator[tuple[str, Camera, Any]]:
+    """Name, camera and photo of the `wanted` views whose photo a lens bends; faces of a photo are left out."""
     for frame in frames:
-        if frame.name in names and frame.camera.model in DISTORTED and frame.camera.model != EQUIRECTANGULAR:
+        if frame.name in wanted and frame.camera.model in DISTORTED and frame.camera.model != EQUIRECTANGULAR:
             with open_photo(frame.image, (frame.camera.width, frame.camera.height), listing.upright) as (image, _):
                 yield frame.name, frame.camera, image
 
 
-def as_taken(photos: Iterable[tuple[str, Camera, Any]], settings: IngestSection) -> dict[str, Any]:
+def as_taken(photos: Iterable[tuple[str, Camera, Any]], max_side: int) -> dict[str, Any]:
     """Fields `taken` u8 [T, H, W, 3] and `lenses` of a capture: photos reduced to `max_side` as they are, each with its
     name and camera; smaller ones are padded at the right and the bottom.
     """
     small, lenses = [], []
     for name, camera, image in photos:
-        factor = min(1.0, settings.max_side / max(image.size))
+        factor = min(1.0, max_side / max(image.size))
         width, height = (max(round(side * factor), 1) for side in image.size)
         small.append(np.asarray(image.resize((width, height), Image.Resampling.BOX)))
         held = camera.colmap
