@@ -114,9 +114,7 @@ def give(listing: Listing, folder: Path, places: Sequence[str] = LABELS) -> None
 
 
 def is_deep(path: Path) -> bool:
-    """Whether a map's ids have 16 bits."""
-    if path.suffix == ".npy":
-        return read_npy(path, REMEDY).dtype.itemsize > 1
+    """Whether the ids of a map, a picture, have 16 bits."""
     with opened(path, REMEDY) as image:
         return image.mode in DEEP
 
@@ -222,7 +220,8 @@ def _of_array(path: Path, size: tuple[int, int]) -> tuple[str, np.ndarray]:
         if (values != np.floor(values)).any() or values.max() > MAX_ID:
             raise InputError(f"{path} holds numbers that are no ids of 0...{MAX_ID}; write ids, or scores by class")
         return IDS, np.maximum(values.astype(np.int64), -1).astype(np.int32)
-    axis = next((k for k in (0, 2) if fits((values.shape[2 - k // 2], values.shape[1 - k // 2]), size)), None)
+    sides = {0: values.shape[1:], 2: values.shape[:2]}  # by the axis that is of classes
+    axis = next((k for k, (height, width) in sides.items() if fits((width, height), size)), None)
     if axis is None:
         raise InputError(f"{path} is {values.shape}, which has not the shape of its photo {size[::-1]}; write it again")
     if axis == 2 and values.shape[2] == 3 and values.dtype == np.uint8 and values.max() > 1:
@@ -251,12 +250,12 @@ def resolved(listing: Listing, raw: np.ndarray) -> tuple[str, np.ndarray]:
 
     Raises: InputError where they are of two kinds, or of more colours than labels have.
     """
-    kinds = Counter(listing.label_kinds.values())
+    kinds = set(listing.label_kinds.values())
     if len(kinds) > 1:
         views = {kind: [view for view, of in listing.label_kinds.items() if of == kind] for kind in sorted(kinds)}
         told = ", ".join(f"{kind} ({few(some)})" for kind, some in views.items())
         raise InputError(f"{listing.label_place}/ holds label maps of several kinds: {told}; write them alike")
-    kind = next(iter(kinds))
+    (kind,) = kinds
     if kind == COLORS and all((view[view >= 0] % packed(np.ones(3, int)) == 0).all() for view in raw):
         return IDS, np.where(raw < 0, -1, raw & 255)
     if kind == COLORS and (n := len(_shares(raw))) > MAX_COLORS:

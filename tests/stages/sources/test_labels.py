@@ -200,7 +200,15 @@ def test_colours_that_no_name_fits_are_an_error(tmp_path):
 
 @pytest.mark.parametrize(
     "how",
-    ["raw ids, SG's table", "raw ids, ScanNet's table", "NYU's 40", "names beside", "semantics/", "masks"],
+    [
+        "raw ids, SG's table",
+        "raw ids, ScanNet's table",
+        "NYU's 40",
+        "names beside",
+        "semantics/",
+        "masks",
+        "arrays, ScanNet's table",
+    ],
 )
 def test_scannets_own_export_needs_no_points_and_its_label_folder_is_read(tmp_path, how):
     fields = tiny() | {"class_names": NAMES, "labels": CLASS}
@@ -213,6 +221,10 @@ def test_scannets_own_export_needs_no_points_and_its_label_folder_is_read(tmp_pa
         if how == "masks":
             masks(NAMES)(tmp_path / f"label/{10 * k}", of_view)
             found = NAMES
+        elif "arrays" in how:
+            (tmp_path / "label").mkdir(exist_ok=True)
+            arrays([1, 2, 25, 0])(tmp_path / f"label/{10 * k}", of_view)
+            found = ["class_1", "class_2", "class_25"]
         else:
             save(tmp_path / f"{place}/{10 * k}.png", stored.astype(np.uint8) if how == "NYU's 40" else stored)
         save(tmp_path / f"depth/{10 * k}.png", layouts.stored_depth(fields["depth"][k]))
@@ -226,7 +238,7 @@ def test_scannets_own_export_needs_no_points_and_its_label_folder_is_read(tmp_pa
     got = scannet.read(tmp_path, SETTINGS)
     check(got, found)
     assert "points" not in got and "without points3d.ply" in said(got)
-    kind = "one mask a class" if how == "masks" else "ids with names"
+    kind = {"masks": "one mask a class", "arrays": "ids without names"}.get(how.partition(",")[0], "ids with names")
     assert f"Labels of {place}/ are taken for {kind}: 3 classes" in said(got)
     maps = {path for path in (tmp_path / place).rglob("*") if path.is_file()}
     assert scannet.probe(tmp_path)["labels"] and maps <= set(scannet.files(tmp_path))
