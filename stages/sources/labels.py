@@ -113,10 +113,12 @@ def give(listing: Listing, folder: Path, places: Sequence[str] = LABELS) -> None
         listing.notes.append(f"Labels are those of {full[0]}/; not read: {', '.join(full[1:])}.")
 
 
-def is_deep(path: Path) -> bool:
-    """Whether the ids of a map, a picture, have 16 bits."""
+def bits_of_ids(path: Path) -> int | None:
+    """8 or 16, of a map that is a picture of ids in one channel; None of any other."""
+    if path.suffix == ".npy":
+        return None
     with opened(path, REMEDY) as image:
-        return image.mode in DEEP
+        return None if image.mode not in GREY else 16 if image.mode in DEEP else 8
 
 
 def names_in(folder: Path) -> dict[int, str] | None:

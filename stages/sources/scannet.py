@@ -118,7 +118,7 @@ def _give_labels(listing: Listing, folder: Path) -> None:
 
     Choices: PL's have its names; otherwise those of labels.json go first. In label/ and the like
       ids of 16 bits are ScanNet's own, those of 8 bits NYU's 40, as the set of 25,000 frames has them.
-      What is in an .npy nobody can tell: labels.json alone names it.
+      Colours and what is in an .npy labels.json alone names.
     """
     labels.give(listing, folder, _label_places(folder))
     place = listing.label_place
@@ -133,9 +133,9 @@ def _give_labels(listing: Listing, folder: Path) -> None:
             frame.objects = folder / f"instance/{frame.name}.png" if frame.labels else None
         if listing.corrections:
             listing.notes.append(f"{len(listing.corrections)} objects take the hand-corrected labels of this scene.")
-    elif not maps or listing.label_names is not None or maps[0].suffix == ".npy":
+    elif listing.label_names is not None or (bits := labels.bits_of_ids(maps[0])) is None:
         listing.class_names = None
-    elif place != "label-filt" and not labels.is_deep(maps[0]):
+    elif place != "label-filt" and bits == 8:
         listing.label_names = dict(enumerate(("void", *NYU)))
         listing.class_names = None
         listing.notes.append(f"Ids of {place}/ have 8 bits and are taken for NYU's 40 classes.")

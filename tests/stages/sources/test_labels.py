@@ -197,48 +197,42 @@ def test_colours_that_no_name_fits_are_an_error(tmp_path):
 
 # ScanNet as its own tools export it
 
+OWN_NAMES = ["wall", "floor", "television"]
+OWN_IDS, NYU_IDS = [*(layouts.SCANNET_IDS[name] for name in OWN_NAMES), 0], [1, 2, 25, 0]
+UNTOLD = ["class_1", "class_2", "class_25"]
+
 
 @pytest.mark.parametrize(
-    "how",
+    ("write", "beside", "found", "kind"),
     [
-        "raw ids, SG's table",
-        "raw ids, ScanNet's table",
-        "NYU's 40",
-        "names beside",
-        "semantics/",
-        "masks",
-        "arrays, ScanNet's table",
+        (pictures(OWN_IDS, np.uint16), "SG's table", OWN_NAMES, "ids with names"),
+        (pictures(OWN_IDS, np.uint16), "ScanNet's table", OWN_NAMES, "ids with names"),
+        (pictures(NYU_IDS), "ScanNet's table", OWN_NAMES, "ids with names"),
+        (pictures(NYU_IDS), "names", NAMES, "ids with names"),
+        (pictures(NYU_IDS, np.uint16), "names", NAMES, "ids with names"),
+        (pictures(RGB), "ScanNet's table", HEX, "colours without names"),
+        (arrays(NYU_IDS), "ScanNet's table", UNTOLD, "ids without names"),
+        (masks(NAMES), "ScanNet's table", NAMES, "one mask a class"),
     ],
 )
-def test_scannets_own_export_needs_no_points_and_its_label_folder_is_read(tmp_path, how):
+@pytest.mark.parametrize("place", ["label", "semantics"])
+def test_scannets_own_export_needs_no_points_and_its_label_folder_is_read(tmp_path, write, beside, found, kind, place):
     fields = tiny() | {"class_names": NAMES, "labels": CLASS}
     fields["Ks"][:, 0, 2] += 0.5  # as written, half of these few pixels
     layouts.write_scannet(tmp_path, fields)
-    raw = [layouts.SCANNET_IDS[name] for name in ("wall", "floor", "television")]
-    found, place = ["wall", "floor", "television"], "semantics" if how == "semantics/" else "label"
+    (tmp_path / place).mkdir()
     for k, of_view in enumerate(CLASS):
-        stored = layouts.raw_labels(of_view, raw if "raw" in how else [1, 2, 25])
-        if how == "masks":
-            masks(NAMES)(tmp_path / f"label/{10 * k}", of_view)
-            found = NAMES
-        elif "arrays" in how:
-            (tmp_path / "label").mkdir(exist_ok=True)
-            arrays([1, 2, 25, 0])(tmp_path / f"label/{10 * k}", of_view)
-            found = ["class_1", "class_2", "class_25"]
-        else:
-            save(tmp_path / f"{place}/{10 * k}.png", stored.astype(np.uint8) if how == "NYU's 40" else stored)
+        write(tmp_path / f"{place}/{10 * k}", of_view)
         save(tmp_path / f"depth/{10 * k}.png", layouts.stored_depth(fields["depth"][k]))
-    if "SG" in how:
+    if beside == "SG's table":
         layouts.write_table(tmp_path / scannet.MODIFIED, "cocomapid", layouts.COCO_IDS)
-    elif "ScanNet's" in how:
+    elif beside == "ScanNet's table":
         layouts.write_table(tmp_path / scannet.OWN, "nyu40id", layouts.NYU_IDS)
-    elif how not in ("NYU's 40", "masks"):
-        (tmp_path / "labels.json").write_text(json.dumps({"1": "wall", "2": "floor", "25": "tv screen"}))
-        found = NAMES
+    else:
+        (tmp_path / "labels.json").write_text(json.dumps(dict(zip(NYU_IDS, NAMES, strict=False))))
     got = scannet.read(tmp_path, SETTINGS)
     check(got, found)
     assert "points" not in got and "without points3d.ply" in said(got)
-    kind = {"masks": "one mask a class", "arrays": "ids without names"}.get(how.partition(",")[0], "ids with names")
     assert f"Labels of {place}/ are taken for {kind}: 3 classes" in said(got)
     maps = {path for path in (tmp_path / place).rglob("*") if path.is_file()}
     assert scannet.probe(tmp_path)["labels"] and maps <= set(scannet.files(tmp_path))
