@@ -32,7 +32,7 @@ VOID = {"void", "ignore", "ignored", "ignoreregion", "unlabeled", "unlabelled", 
 BACKGROUND = "background"  # void where it is 0 or one of CODES, otherwise a class
 CODES = (255, 65_535)  # the highest of 8 and 16 bits, which stand for void
 MAX_ID = 65_535  # what 16 bits hold
-NAMES = ("scene.json", "labels.json")  # documents that may name ids
+DOCUMENTS = ("scene.json", "labels.json")  # that may name ids
 MAX_COLORS = 1024  # a picture with more is no map of labels
 REMEDY = "add it, or take its folder away to do without"
 
@@ -84,9 +84,10 @@ def _in_folders_of(name: str, file: str) -> bool:
     return folders == view[len(view) - len(folders) :]
 
 
-def files(folder: Path) -> list[Path]:
-    """The maps of a source's folder."""
-    return [folder / place / name for place in [place_in(folder)] if place for name in files_below(folder / place)]
+def files(folder: Path, places: Sequence[str] = LABELS) -> list[Path]:
+    """The maps of a source's folder, in the first of `places` that holds any."""
+    place = place_in(folder, places)
+    return [] if place is None else [folder / place / name for name in files_below(folder / place)]
 
 
 def give(listing: Listing, folder: Path, places: Sequence[str] = LABELS) -> None:
@@ -94,13 +95,10 @@ def give(listing: Listing, folder: Path, places: Sequence[str] = LABELS) -> None
     any, and the listing their names.
     """
     full = [place for place in places if any(files_below(folder / place))]
+    for place in places if not full else ():
+        if (folder / place).is_dir() and (found := os.listdir(folder / place)):
+            listing.notes.append(f"{place}/ holds no PNG or .npy: not read ({few(found)}).")
     if not full or not listing.frames:
-        held = {place: os.listdir(folder / place) for place in places if (folder / place).is_dir()}
-        listing.notes += [
-            f"{place}/ holds no PNG or .npy: not read ({few(found)})."
-            for place, found in held.items()
-            if found and not full
-        ]
         return
     listing.label_place = full[0]
     listing.label_names = names_in(folder)
@@ -123,7 +121,7 @@ def bits_of_ids(path: Path) -> int | None:
 
 def names_in(folder: Path) -> dict[int, str] | None:
     """Class names by id, of scene.json's "labels" or of labels.json: {"id": name}, or {"#rrggbb": name} of colours."""
-    scene, plain = NAMES
+    scene, plain = DOCUMENTS
     path = folder / scene
     table = texts.read_json(path).get("labels") if common.present(path) else None
     if table is None and common.present(path := folder / plain):

@@ -29,7 +29,7 @@ def probe(folder: Path) -> dict[str, bool]:
         depth = any(name.startswith("depth") for name in common.names_below(folder / "results"))
         return {"poses": True, "depth": depth, "labels": False}
     depth = any(common.names_below(folder / SEQUENCE / "depth"))
-    return {"poses": True, "depth": depth, "labels": any(labels.files_below(folder / SEQUENCE / CLASSES))}
+    return {"poses": True, "depth": depth, "labels": bool(labels.files(folder / SEQUENCE, (CLASSES,)))}
 
 
 def files(folder: Path) -> list[Path]:
@@ -37,7 +37,7 @@ def files(folder: Path) -> list[Path]:
     tables = [folder / "traj.txt", folder / SEQUENCE / "traj_w_c.txt", *_parameter_files(folder), *_class_files(folder)]
     places = [folder / "results", *(folder / SEQUENCE / part for part in ("rgb", "depth"))]
     data = [place / name for place in places for name in common.names_below(place)]
-    data += [folder / SEQUENCE / CLASSES / name for name in labels.files_below(folder / SEQUENCE / CLASSES)]
+    data += labels.files(folder / SEQUENCE, (CLASSES,))
     return sorted([*(path for path in tables if common.present(path)), *data])
 
 

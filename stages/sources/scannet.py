@@ -74,15 +74,16 @@ def probe(folder: Path) -> dict[str, bool]:
 
 def files(folder: Path) -> list[Path]:
     """Poses, intrinsics, points, split, label table, and every image, depth, label and object image."""
-    place, table = _labels_folder(folder), _table(folder)
-    places = ["color", "depth", *(["instance"] if place == PL_IDS and _is_reduced(folder) else [])]
+    table = _table(folder)
+    with_objects = _is_reduced(folder) and _labels_folder(folder) == PL_IDS
+    places = ["color", "depth", *(["instance"] if with_objects else [])]
     data = [folder / of / name for of in places for name in common.names_below(folder / of)]
-    data += [folder / place / name for name in labels.files_below(folder / place)] if place else []
+    data += labels.files(folder, _label_places(folder))
     texts = [path for place in ("pose", "intrinsic") for path in (folder / place).glob("*.txt")]
     if _has_pseudo_labels(folder):
         data += [folder / PSEUDO / name for name in common.names_below(folder / PSEUDO)]
         texts += list((folder / CONFIDENCE).glob("*.npz"))
-    single = [folder / name for name in (POINTS, "splits.json", *labels.NAMES) if common.present(folder / name)]
+    single = [folder / name for name in (POINTS, "splits.json", *labels.DOCUMENTS) if common.present(folder / name)]
     return sorted([*data, *texts, *single, *([table] if table is not None and common.present(table) else [])])
 
 

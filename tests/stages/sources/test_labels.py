@@ -169,9 +169,11 @@ def test_maps_of_another_kind_are_named_and_not_passed_over(tmp_path):
     folder = source(tmp_path, pictures(ONE), BY_ID)
     for path in (folder / "semantic").iterdir():
         path.rename(path.with_suffix(".tif"))
+    (folder / "labels").mkdir()
     fields = colmap.read(folder, SETTINGS)
     assert "labels" not in fields
-    assert "semantic/ holds no PNG or .npy: not read (a.tif, b.tif, c.tif)." in fields["source"]["notes"]
+    of_labels = [note for note in fields["source"]["notes"] if "holds no PNG" in note]
+    assert of_labels == ["semantic/ holds no PNG or .npy: not read (a.tif, b.tif, c.tif)."]
 
 
 def test_a_name_given_twice_in_other_letters_is_one_class(tmp_path):
