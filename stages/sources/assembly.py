@@ -60,18 +60,18 @@ def assemble(listing: Listing, settings: IngestSection, class_names: tuple[str, 
         shares = list(pool.map(share_kept, compared))
     if not stacks["loss_mask"].any():
         raise DataFailure(f"{frames[0].mask or frames[0].image}: no pixel of any view counts; correct the masks")
-    fields: dict[str, Any] = {"names": [frame.name for frame in frames], "images": stacks["images"]}
+    source: dict[str, Any] = {"kind": listing.kind, "notes": notes}
+    fields: dict[str, Any] = {"source": source, "names": [frame.name for frame in frames], "images": stacks["images"]}
     fields["Ks"] = np.stack([shape.K for shape in shapes])
     fields["cam_from_world"] = np.stack([frame.pose for frame in frames]) if listing.has("pose") else None  # type: ignore[misc]
     if "depth" in stacks:
         fields["depth"] = stacks["depth"]
-    told = {}
     if "labels" in stacks:
         wanted = class_names or listing.class_names
         kind, raw = labels.resolved(listing, stacks.pop("labels"))
         fields["labels"], fields["class_names"], remarks = labels.indexed(raw, listing.label_names, wanted, kind)
         notes += remarks
-        told = {"labels": labels.line(listing, kind, fields["labels"])}
+        source["labels"] = labels.line(listing, kind, fields["labels"])
     if "pseudo_labels" in stacks:
         wanted = fields.get("class_names") or class_names or listing.class_names
         own = listing.pseudo_names, wanted and tuple(wanted)
@@ -88,8 +88,8 @@ def assemble(listing: Listing, settings: IngestSection, class_names: tuple[str, 
         notes.append(f"Images are reduced by {least:.3f} (ingest.max_side).")
     if models := sorted({frame.camera.model for frame in frames} & set(DISTORTED)):
         notes.append(f"Images are undistorted ({', '.join(models)}), and figures are of these where they do not say.")
-    source = {"kind": listing.kind, "notes": notes} | told | ({"undistorted": models} if models else {})
-    fields |= {"source": source, "variance_kept": float(np.mean(shares))}
+        source["undistorted"] = models
+    fields["variance_kept"] = float(np.mean(shares))
     return fields | {"bent": lambda wanted: bent(frames, listing, wanted)}
 
 
