@@ -122,10 +122,10 @@ def segmented(
 
 
 def too_little(rests: dict[str, int]) -> str:
-    """Why there is no mIoU of a truth of so many `classes` and `pixels`."""
+    """Why there is no mIoU of a truth of so many `classes`, of pixels or of points."""
     if not rests["classes"]:
         return "no pixel of the evaluated views has a label; label some of them, or choose others (ingest.test_every)"
-    return f"the evaluated views show one class alone ({rests['pixels']:,} pixels): a mean over classes needs two"
+    return "what the evaluated views show is of one class alone: a mean over classes needs two"
 
 
 def unmatched(names: list[str], classes: list[str]) -> dict[str, list[str]]:

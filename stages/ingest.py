@@ -33,6 +33,7 @@ from chebsplat.stages.sources import (
     transforms,
     video,
 )
+from chebsplat.stages.sources.assembly import as_taken
 from chebsplat.stages.sources.common import resolve_source
 
 log = logging.getLogger("chebsplat")
@@ -176,8 +177,9 @@ def run(job: Job) -> None:
     n_views = len(fields["names"])
     fields["is_test"], protocol = split(fields["names"], fields.pop("is_test", None), settings)
     fields |= thinned(fields, settings.max_train_views)
-    if as_taken := fields.pop("as_taken", None):
-        fields |= as_taken({fields["names"][row] for row in np.flatnonzero(fields["is_test"])})
+    if bent := fields.pop("bent", None):
+        tests = {fields["names"][row] for row in np.flatnonzero(fields["is_test"])}
+        fields |= as_taken(bent(tests), settings.max_side)
     strengths = settings.disturb_colors, settings.disturb_degrees, settings.disturb_shift
     if any(strengths):
         if fields.get("cam_from_world") is None and any(strengths[1:]):

@@ -135,7 +135,7 @@ def psnr_of_one_color(evaluation: Evaluation) -> float:
 
 
 def clock_rows(training: Manifest) -> list[list[str]]:
-    """(figure, scene, teacher) of a training that its clock has ended: how far that came depends on the machine."""
+    """(figure, scene, teacher) of a training that the clock limits: how far it came depends on the machine."""
     seconds = training.config.get("train", {}).get("seconds")
     if seconds is None:
         return []

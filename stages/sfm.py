@@ -56,13 +56,13 @@ def run(job: Job) -> None:
         more = swept(job, capture, cloud)
         depths = more.pop("depths")
         cloud = filled(cloud, more, min(MOST, settings.max_points), name="n_swept")
+    if (n := len(cloud["means"])) < 16:
+        raise DataFailure(f"only {n} points were found, at least 16 are needed; add views with more overlap")
     off = {} if "reprojection_error_px" in cloud["notes"] else missed(capture, cloud)
     if depths is not None:
         behind = backdrop(capture, cloud)
         cloud = joined(cloud, behind) | {"notes": cloud["notes"] | {"n_behind": len(behind["means"])}}
     means = cloud["means"]
-    if len(means) < 16:
-        raise DataFailure(f"only {len(means)} points were found, at least 16 are needed; add views with more overlap")
     covariances, normals = local_shape(means, N_NEIGHBORS)
     eye = centers(cloud["cam_from_world"])[cloud["seen_from"]]
     away = np.einsum("ni,ni->n", normals, eye - means) < 0

@@ -102,7 +102,7 @@ def streams(tell: Callable[[str], object]) -> Iterator[None]:
             setattr(sys, name, open(os.devnull, "w"))  # noqa: SIM115
     output = _Output(sys.stdout)
     try:
-        with explained(Path.cwd()), redirect_stdout(cast(TextIO, output)):
+        with explained(Path()), redirect_stdout(cast(TextIO, output)):
             try:
                 yield
             except SystemExit as stop:

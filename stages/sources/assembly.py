@@ -39,35 +39,39 @@ def assemble(listing: Listing, settings: IngestSection, class_names: tuple[str, 
     frames, notes = chosen(listing, settings)
     shapes = [geometry(frame.camera, settings.max_side) for frame in frames]
     full = (len(frames), max(shape.height for shape in shapes), max(shape.width for shape in shapes))
-    stacks = room(listing, frames, full, notes)
+    stacks = empty_stacks(listing, frames, full, notes)
     lookup = functools.lru_cache(8)(positions)  # frames of one camera share it
-    compared = set(np.linspace(0, len(frames) - 1, min(COMPARED, len(frames))).astype(int).tolist())
-    kept: list[float] = []
+    compared = np.linspace(0, len(frames) - 1, min(COMPARED, len(frames))).astype(int)
 
     def fill(k: int) -> None:
-        at = lookup(frames[k].camera, shapes[k])
-        view = read_view(frames[k], listing, shapes[k], at, set(stacks), kept if k in compared else None)
+        view = read_view(frames[k], listing, shapes[k], lookup(frames[k].camera, shapes[k]), set(stacks))
         if not view["opaque"].all():
             listing.empty[frames[k].name] = ~view["opaque"]
         for name in stacks.keys() & view.keys():
             stacks[name][k, : shapes[k].height, : shapes[k].width] = view[name]
 
+    def share_kept(k: int) -> float:
+        camera, pixels = frames[k].camera, stacks["images"][k, : shapes[k].height, : shapes[k].width]
+        with open_photo(frames[k].image, (camera.width, camera.height), listing.upright) as (image, _):
+            return variance_kept(image, pixels, lookup(camera, shapes[k]))
+
     with ThreadPoolExecutor(WORKERS) as pool:
         list(pool.map(fill, range(len(frames))))
+        shares = list(pool.map(share_kept, compared))
     if not stacks["loss_mask"].any():
         raise DataFailure(f"{frames[0].mask or frames[0].image}: no pixel of any view counts; correct the masks")
-    fields: dict[str, Any] = {"names": [frame.name for frame in frames], "images": stacks["images"]}
+    source: dict[str, Any] = {"kind": listing.kind, "notes": notes}
+    fields: dict[str, Any] = {"source": source, "names": [frame.name for frame in frames], "images": stacks["images"]}
     fields["Ks"] = np.stack([shape.K for shape in shapes])
     fields["cam_from_world"] = np.stack([frame.pose for frame in frames]) if listing.has("pose") else None  # type: ignore[misc]
     if "depth" in stacks:
         fields["depth"] = stacks["depth"]
-    told = {}
     if "labels" in stacks:
         wanted = class_names or listing.class_names
         kind, raw = labels.resolved(listing, stacks.pop("labels"))
         fields["labels"], fields["class_names"], remarks = labels.indexed(raw, listing.label_names, wanted, kind)
         notes += remarks
-        told = {"labels": labels.line(listing, kind, fields["labels"])}
+        source["labels"] = labels.line(listing, kind, fields["labels"])
     if "pseudo_labels" in stacks:
         wanted = fields.get("class_names") or class_names or listing.class_names
         own = listing.pseudo_names, wanted and tuple(wanted)
@@ -84,26 +88,26 @@ def assemble(listing: Listing, settings: IngestSection, class_names: tuple[str, 
         notes.append(f"Images are reduced by {least:.3f} (ingest.max_side).")
     if models := sorted({frame.camera.model for frame in frames} & set(DISTORTED)):
         notes.append(f"Images are undistorted ({', '.join(models)}), and figures are of these where they do not say.")
-    source = {"kind": listing.kind, "notes": notes} | told | ({"undistorted": models} if models else {})
-    fields |= {"source": source, "variance_kept": float(np.mean(kept))}
-    return fields | {"as_taken": lambda names: as_taken(bent(frames, listing, names), settings)}
+        source["undistorted"] = models
+    fields["variance_kept"] = float(np.mean(shares))
+    return fields | {"bent": lambda wanted: bent(frames, listing, wanted)}
 
 
-def bent(frames: list[Frame], listing: Listing, names: set[str]) -> Iterator[tuple[str, Camera, Any]]:
-    """Those of the views `names` whose photo a lens bends: name, camera, photo; none that is a face of its photo."""
+def bent(frames: list[Frame], listing: Listing, wanted: set[str]) -> Iterator[tuple[str, Camera, Any]]:
+    """Name, camera and photo of the `wanted` views whose photo a lens bends; faces of a photo are left out."""
     for frame in frames:
-        if frame.name in names and frame.camera.model in DISTORTED and frame.camera.model != EQUIRECTANGULAR:
+        if frame.name in wanted and frame.camera.model in DISTORTED and frame.camera.model != EQUIRECTANGULAR:
             with open_photo(frame.image, (frame.camera.width, frame.camera.height), listing.upright) as (image, _):
                 yield frame.name, frame.camera, image
 
 
-def as_taken(photos: Iterable[tuple[str, Camera, Any]], settings: IngestSection) -> dict[str, Any]:
+def as_taken(photos: Iterable[tuple[str, Camera, Any]], max_side: int) -> dict[str, Any]:
     """Fields `taken` u8 [T, H, W, 3] and `lenses` of a capture: photos reduced to `max_side` as they are, each with its
     name and camera; smaller ones are padded at the right and the bottom.
     """
     small, lenses = [], []
     for name, camera, image in photos:
-        factor = min(1.0, settings.max_side / max(image.size))
+        factor = min(1.0, max_side / max(image.size))
         width, height = (max(round(side * factor), 1) for side in image.size)
         small.append(np.asarray(image.resize((width, height), Image.Resampling.BOX)))
         held = camera.colmap
@@ -117,12 +121,15 @@ def as_taken(photos: Iterable[tuple[str, Camera, Any]], settings: IngestSection)
     return {"taken": taken, "lenses": lenses}
 
 
-def room(listing: Listing, frames: list[Frame], full: tuple[int, int, int], notes: list[str]) -> dict[str, np.ndarray]:
-    """Empty stacks of what the views will have, by name; notes on what only some of them have."""
+def empty_stacks(
+    listing: Listing, frames: list[Frame], full: tuple[int, int, int], notes: list[str]
+) -> dict[str, np.ndarray]:
+    """Empty stacks of what the views will have, by name; notes on what only some of them have are added."""
     stacks = {"images": np.zeros((*full, 3), np.uint8), "loss_mask": np.zeros(full, bool)}
     empties = {"depth": np.float32(np.nan), "labels": np.int32(-1), "pseudo_labels": np.int32(0)}
     for name, empty in (empties | {"confidence": np.float16(0)}).items():
-        n, of = sum(getattr(frame, name) is not None for frame in listing.frames), len(listing.frames)
+        n = sum(getattr(frame, name) is not None for frame in listing.frames)
+        of = len(listing.frames)
         if n == of or (name == "labels" and any(frame.labels for frame in frames)):
             stacks[name] = np.full(full, empty)
             if n < of:
@@ -254,19 +261,14 @@ def positions(camera: Camera, view: Geometry) -> np.ndarray:
 
 
 def read_view(
-    frame: Frame,
-    listing: Listing,
-    view: Geometry,
-    at: np.ndarray,
-    wanted: set[str],
-    kept: list[float] | None = None,
+    frame: Frame, listing: Listing, view: Geometry, at: np.ndarray, wanted: set[str]
 ) -> dict[str, np.ndarray]:
     """images u8 [H, W, 3], loss_mask, opaque bool [H, W]; where `wanted`, depth, labels, pseudo_labels, confidence
-    [H, W]. kept: of `photo`.
+    [H, W].
     """
     camera, size = frame.camera, (frame.camera.width, frame.camera.height)
     inside = within(at, size)
-    pixels, opaque = photo(frame, listing, view, at, kept)
+    pixels, opaque = photo(frame, listing, view, at)
     counts = inside & opaque.any()
     fields = {"images": pixels, "loss_mask": counts, "opaque": opaque}
     inside &= opaque  # of empty space there is no depth, nor a label
@@ -291,20 +293,12 @@ def read_view(
     return fields
 
 
-def photo(
-    frame: Frame, listing: Listing, view: Geometry, at: np.ndarray, kept: list[float] | None = None
-) -> tuple[np.ndarray, np.ndarray]:
-    """The view's pixels u8 [H, W, 3] and where they are opaque, bool [H, W]; the whole photo is gone on return.
-
-    Args: kept: where the share of the photo's variance that the view keeps is added, if it is wanted.
-    """
+def photo(frame: Frame, listing: Listing, view: Geometry, at: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """The view's pixels u8 [H, W, 3] and where they are opaque, bool [H, W]; the whole photo is gone on return."""
     size = (frame.camera.width, frame.camera.height)
     with open_photo(frame.image, size, listing.upright) as (image, opaque):
         seen = np.ones(at.shape[1:], bool) if opaque is None else nearest(opaque, at, size)
-        pixels = resampled(image, frame.camera, view, at)
-        if kept is not None:
-            kept.append(variance_kept(image, pixels, at))
-        return pixels, seen
+        return resampled(image, frame.camera, view, at), seen
 
 
 def variance_kept(image: Any, pixels: np.ndarray, at: np.ndarray) -> float:

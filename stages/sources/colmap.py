@@ -55,7 +55,7 @@ def probe(folder: Path) -> dict[str, bool]:
 def files(folder: Path) -> list[Path]:
     """The model, scene.json, labels.json, and every image, depth, label map and mask."""
     model = [path for place in _models(folder) for path in place.iterdir() if path.suffix in (".bin", ".txt")]
-    documents = [folder / name for name in labels.NAMES if common.present(folder / name)]
+    documents = [folder / name for name in labels.DOCUMENTS if common.present(folder / name)]
     places = [common.photo_folder(folder), *(folder / name for name in ("depth", "masks", "confidence"))]
     data = [place / name for place in places for name in common.names_below(place)]
     return sorted([*model, *documents, *data, *labels.files(folder)])

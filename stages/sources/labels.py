@@ -29,10 +29,10 @@ IDS, COLORS, SCORES, MASKS = "ids", "colours", "scores by class", "one mask a cl
 VOID = {"void", "ignore", "ignored", "ignoreregion", "unlabeled", "unlabelled", "notlabeled", "notlabelled", "nolabel",
         "unannotated", "notannotated", "unassigned", "unclassified", "undefined", "unknown", "invalid", "none", "null",
         "nan", "n/a", "noclass", "dontcare", "outlier"}  # fmt: skip
-BACKGROUND = "background"  # void where it has an id that stands for void, otherwise a class
+BACKGROUND = "background"  # void where it is 0 or one of CODES, otherwise a class
 CODES = (255, 65_535)  # the highest of 8 and 16 bits, which stand for void
 MAX_ID = 65_535  # what 16 bits hold
-NAMES = ("scene.json", "labels.json")  # documents that may name ids
+DOCUMENTS = ("scene.json", "labels.json")  # that may name ids
 MAX_COLORS = 1024  # a picture with more is no map of labels
 REMEDY = "add it, or take its folder away to do without"
 
@@ -49,20 +49,25 @@ def files_below(folder: Path) -> list[str]:
 
 
 def of_views(place: Path, names: Sequence[str]) -> dict[str, LabelFile]:
-    """The map of each view that has one: a file that is called like it; or a mask a class, as VIEW/CLASS.png or
-    CLASS/VIEW.png.
+    """The map of each view that has one: a file that is called like it; or a mask a class, as
+    VIEW/CLASS.png or CLASS/VIEW.png.
 
-    Raises: InputError where one view has two, or none of the files is called like a view.
+    Choices: a file lies in the folders of its view, or in fewer; what lies in another is a mask.
+    Raises:  InputError where one view has two, or none of the files is called like a view.
     """
     files = files_below(place)
     common.distinct(sorted((os.path.splitext(name)[0], place / name) for name in files))
-    if found := common.matched(names, files):
-        return {name: place / file for name, file in found.items()}
-    masks: dict[str, dict[str, Path]] = {}
-    folders = {os.path.dirname(file) for file in files} - {""}
-    for name, inner in common.matched(names, folders).items():
-        masks[name] = {_stem(file): place / file for file in files if os.path.dirname(file) == inner}
-    for label in {file.partition("/")[0] for file in files if "/" in file} if not masks else ():
+    found = common.matched(names, files)
+    maps: dict[str, LabelFile] = {name: place / file for name, file in found.items() if _in_folders_of(name, file)}
+    if maps:
+        return maps
+    held: dict[str, dict[str, Path]] = {}
+    for file in files:
+        folder, name = os.path.split(os.path.splitext(file)[0])
+        held.setdefault(folder, {})[name] = place / file
+    folders = common.matched(names, held.keys() - {""})
+    masks = {name: held[folder] for name, folder in folders.items()}
+    for label in () if masks else {file.partition("/")[0] for file in files if "/" in file}:
         own = [file.removeprefix(f"{label}/") for file in files if file.startswith(f"{label}/")]
         for name, file in common.matched(names, own).items():
             masks.setdefault(name, {})[label] = place / label / file
@@ -73,46 +78,50 @@ def of_views(place: Path, names: Sequence[str]) -> dict[str, LabelFile]:
     return dict(masks)
 
 
-def _stem(file: str) -> str:
-    return os.path.splitext(os.path.basename(file))[0]
+def _in_folders_of(name: str, file: str) -> bool:
+    """Whether a file lies in the folders of its view, or in the innermost of them."""
+    view, folders = (path.casefold().split("/")[:-1] for path in (name, file))
+    return folders == view[len(view) - len(folders) :]
 
 
-def files(folder: Path) -> list[Path]:
-    """The maps of a source's folder."""
-    return [folder / place / name for place in [place_in(folder)] if place for name in files_below(folder / place)]
+def files(folder: Path, places: Sequence[str] = LABELS) -> list[Path]:
+    """The maps of a source's folder, in the first of `places` that holds any."""
+    place = place_in(folder, places)
+    return [] if place is None else [folder / place / name for name in files_below(folder / place)]
 
 
-def give(listing: Listing, folder: Path) -> None:
-    """Give the frames of a listing the maps of a source's folder, where it holds any, and the listing their names."""
-    place = place_in(folder)
-    if place is None:
-        held = {place: os.listdir(folder / place) for place in LABELS if (folder / place).is_dir()}
-        listing.notes += [f"{place}/ holds no PNG or .npy: not read ({few(found)})." for place, found in held.items()]
-    if place is None or not listing.frames:
+def give(listing: Listing, folder: Path, places: Sequence[str] = LABELS) -> None:
+    """Give the frames of a listing the maps of a source's folder, where one of `places` in it holds
+    any, and the listing their names.
+    """
+    full = [place for place in places if any(files_below(folder / place))]
+    for place in places if not full else ():
+        if (folder / place).is_dir() and (found := os.listdir(folder / place)):
+            listing.notes.append(f"{place}/ holds no PNG or .npy: not read ({few(found)}).")
+    if not full or not listing.frames:
         return
+    listing.label_place = full[0]
     listing.label_names = names_in(folder)
-    maps = of_views(folder / place, [frame.name for frame in listing.frames])
+    maps = of_views(folder / full[0], [frame.name for frame in listing.frames])
     for frame in listing.frames:
         frame.labels = maps.get(frame.name)
-    listing.label_place = place
-    masks = [frame.labels for frame in listing.frames if isinstance(frame.labels, dict)]
-    if masks:
+    if masks := [file for file in maps.values() if isinstance(file, dict)]:
         listing.label_names = dict(enumerate(sorted(set().union(*masks)), 1))
-    if others := [other for other in LABELS if other != place and any(files_below(folder / other))]:
-        listing.notes.append(f"Labels are those of {place}/; not read: {', '.join(others)}.")
+    if full[1:]:
+        listing.notes.append(f"Labels are those of {full[0]}/; not read: {', '.join(full[1:])}.")
 
 
-def is_deep(path: Path) -> bool:
-    """Whether a map's ids have 16 bits."""
+def bits_of_ids(path: Path) -> int | None:
+    """8 or 16, of a map that is a picture of ids in one channel; None of any other."""
     if path.suffix == ".npy":
-        return read_npy(path, REMEDY).dtype.itemsize > 1
+        return None
     with opened(path, REMEDY) as image:
-        return image.mode in DEEP
+        return None if image.mode not in GREY else 16 if image.mode in DEEP else 8
 
 
 def names_in(folder: Path) -> dict[int, str] | None:
     """Class names by id, of scene.json's "labels" or of labels.json: {"id": name}, or {"#rrggbb": name} of colours."""
-    scene, plain = NAMES
+    scene, plain = DOCUMENTS
     path = folder / scene
     table = texts.read_json(path).get("labels") if common.present(path) else None
     if table is None and common.present(path := folder / plain):
@@ -211,7 +220,8 @@ def _of_array(path: Path, size: tuple[int, int]) -> tuple[str, np.ndarray]:
         if (values != np.floor(values)).any() or values.max() > MAX_ID:
             raise InputError(f"{path} holds numbers that are no ids of 0...{MAX_ID}; write ids, or scores by class")
         return IDS, np.maximum(values.astype(np.int64), -1).astype(np.int32)
-    axis = next((k for k in (0, 2) if fits((values.shape[2 - k // 2], values.shape[1 - k // 2]), size)), None)
+    sides = {0: values.shape[1:], 2: values.shape[:2]}  # by the axis that is of classes
+    axis = next((k for k, (height, width) in sides.items() if fits((width, height), size)), None)
     if axis is None:
         raise InputError(f"{path} is {values.shape}, which has not the shape of its photo {size[::-1]}; write it again")
     if axis == 2 and values.shape[2] == 3 and values.dtype == np.uint8 and values.max() > 1:
@@ -240,12 +250,12 @@ def resolved(listing: Listing, raw: np.ndarray) -> tuple[str, np.ndarray]:
 
     Raises: InputError where they are of two kinds, or of more colours than labels have.
     """
-    kinds = Counter(listing.label_kinds.values())
+    kinds = set(listing.label_kinds.values())
     if len(kinds) > 1:
         views = {kind: [view for view, of in listing.label_kinds.items() if of == kind] for kind in sorted(kinds)}
         told = ", ".join(f"{kind} ({few(some)})" for kind, some in views.items())
         raise InputError(f"{listing.label_place}/ holds label maps of several kinds: {told}; write them alike")
-    kind = next(iter(kinds))
+    (kind,) = kinds
     if kind == COLORS and all((view[view >= 0] % packed(np.ones(3, int)) == 0).all() for view in raw):
         return IDS, np.where(raw < 0, -1, raw & 255)
     if kind == COLORS and (n := len(_shares(raw))) > MAX_COLORS:
@@ -286,7 +296,8 @@ def indexed(
         known = names if names is not None else dict(enumerate(class_names or ()))
         if nameless := [v for v in present if v not in known]:
             notes.append(f"{what} ids without a name are ignored: {_told(nameless, shares, kind)}.")
-    if void := [v for v in present if v in known and is_void(known[v], v)]:
+    codes = (0, *CODES) if kind == IDS else (0,)
+    if void := [v for v in present if v in known and is_void(known[v], v in codes)]:
         of = ", ".join(dict.fromkeys(known[v] for v in void))
         notes.append(f"{what}s called {of} are void and ignored: {_told(void, shares, kind)}.")
     named = {v: known[v] for v in present if v in known and v not in void}
@@ -330,9 +341,9 @@ def void_code(present: Sequence[int]) -> int | None:
     return code if code in CODES and dense and max(others) < code - 1 else None
 
 
-def is_void(name: str, which: int) -> bool:
-    """Whether a name says that nobody labelled the pixels of that id."""
-    return joined(name) in VOID or (joined(name) == BACKGROUND and which in (0, *CODES))
+def is_void(name: str, coded: bool) -> bool:
+    """Whether a name says that nobody labelled its pixels; coded: their id usually says so."""
+    return joined(name) in VOID or (coded and joined(name) == BACKGROUND)
 
 
 def _shares(raw: np.ndarray) -> Counter[int]:

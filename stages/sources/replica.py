@@ -28,15 +28,16 @@ def probe(folder: Path) -> dict[str, bool]:
     if (folder / "results").is_dir():
         depth = any(name.startswith("depth") for name in common.names_below(folder / "results"))
         return {"poses": True, "depth": depth, "labels": False}
-    depth, labelled = (any(common.names_below(folder / SEQUENCE / part)) for part in ("depth", CLASSES))
-    return {"poses": True, "depth": depth, "labels": labelled}
+    depth = any(common.names_below(folder / SEQUENCE / "depth"))
+    return {"poses": True, "depth": depth, "labels": bool(labels.files(folder / SEQUENCE, (CLASSES,)))}
 
 
 def files(folder: Path) -> list[Path]:
     """Trajectory, camera, class names, and every image, depth and label."""
     tables = [folder / "traj.txt", folder / SEQUENCE / "traj_w_c.txt", *_parameter_files(folder), *_class_files(folder)]
-    places = [folder / "results", *(folder / SEQUENCE / part for part in ("rgb", "depth", CLASSES))]
+    places = [folder / "results", *(folder / SEQUENCE / part for part in ("rgb", "depth"))]
     data = [place / name for place in places for name in common.names_below(place)]
+    data += labels.files(folder / SEQUENCE, (CLASSES,))
     return sorted([*(path for path in tables if common.present(path)), *data])
 
 

@@ -22,6 +22,7 @@ SENSOR = 1296  # width of the colour sensor, which intrinsics refer to even wher
 OFF_CENTRE = 0.1  # of the width, by which a principal point may lie off the middle
 POINTS = "points3d.ply"
 PSEUDO, CONFIDENCE = "m2f_semantics", "m2f_probabilities"  # of Mask2Former with test-time augmentation
+PL_IDS = "semantics"  # where PL has ScanNet's own ids
 OF_PL = ("splits.json", "segmentation_data.pkl", "rs_semantics", "m2f_semantics")  # never in an SG folder
 MODIFIED, COMBINED = "scannetv2-labels.modified.tsv", "scannet-labels.combined.tsv"
 OWN = "scannetv2-labels.combined.tsv"  # ScanNet's, of which COMBINED is PL's copy
@@ -73,15 +74,16 @@ def probe(folder: Path) -> dict[str, bool]:
 
 def files(folder: Path) -> list[Path]:
     """Poses, intrinsics, points, split, label table, and every image, depth, label and object image."""
-    place, table = _labels_folder(folder), _table(folder)
-    places = ["color", "depth", *(["instance"] if place == "semantics" else [])]
+    table = _table(folder)
+    with_objects = _is_reduced(folder) and _labels_folder(folder) == PL_IDS
+    places = ["color", "depth", *(["instance"] if with_objects else [])]
     data = [folder / of / name for of in places for name in common.names_below(folder / of)]
-    data += [folder / place / name for name in labels.files_below(folder / place)] if place else []
+    data += labels.files(folder, _label_places(folder))
     texts = [path for place in ("pose", "intrinsic") for path in (folder / place).glob("*.txt")]
     if _has_pseudo_labels(folder):
         data += [folder / PSEUDO / name for name in common.names_below(folder / PSEUDO)]
         texts += list((folder / CONFIDENCE).glob("*.npz"))
-    single = [folder / name for name in (POINTS, "splits.json", *labels.NAMES) if common.present(folder / name)]
+    single = [folder / name for name in (POINTS, "splits.json", *labels.DOCUMENTS) if common.present(folder / name)]
     return sorted([*data, *texts, *single, *([table] if table is not None and common.present(table) else [])])
 
 
@@ -94,44 +96,54 @@ def _is_reduced(folder: Path) -> bool:
     return any((folder / name).exists() for name in OF_PL)
 
 
+def _label_places(folder: Path) -> tuple[str, ...]:
+    """Where labels may lie, the best first."""
+    return ("rs_semantics", PL_IDS) if _is_reduced(folder) else ("label-filt", *common.LABELS)
+
+
 def _labels_folder(folder: Path) -> str | None:
-    wanted = ("rs_semantics", "semantics") if _is_reduced(folder) else ("label-filt", *common.LABELS)
-    return labels.place_in(folder, wanted)
+    return labels.place_in(folder, _label_places(folder))
 
 
 def _table(folder: Path) -> Path | None:
     """The nearest table that ScanNet's ids may be looked up in; where there is none, the place where it should be."""
-    wanted = (COMBINED,) if _labels_folder(folder) == "semantics" else (MODIFIED, OWN, COMBINED)
-    if _labels_folder(folder) in (None, "rs_semantics"):
+    place, reduced = _labels_folder(folder), _is_reduced(folder)
+    if place in (None, "rs_semantics"):
         return None
+    wanted = (COMBINED,) if reduced else (MODIFIED, OWN, COMBINED)
     return next(filter(None, (common.nearest_file(folder, name) for name in wanted)), folder / wanted[0])
 
 
-def _give_names(listing: Listing, folder: Path, place: str) -> None:
-    """Name the ids of a label folder.
+def _give_labels(listing: Listing, folder: Path) -> None:
+    """Give the frames their label maps, and the listing the names of their ids.
 
-    Choices: those of labels.json go first. In label/ and the like ids of 16 bits are ScanNet's own, those of 8 bits
-      NYU's 40, as the set of 25,000 frames has them.
+    Choices: PL's have its names; otherwise those of labels.json go first. In label/ and the like
+      ids of 16 bits are ScanNet's own, those of 8 bits NYU's 40, as the set of 25,000 frames has them.
+      Colours and what is in an .npy labels.json alone names.
     """
+    labels.give(listing, folder, _label_places(folder))
+    place = listing.label_place
+    if not place:
+        return
     maps = [frame.labels for frame in listing.frames if isinstance(frame.labels, Path)]
-    own = labels.names_in(folder)
-    if place == "rs_semantics":
+    if place == "rs_semantics" and maps:
         listing.label_names = dict(enumerate(("void", *scannet_closed.CLASSES)))
-    elif place == "semantics":
+    elif place == PL_IDS and maps and _is_reduced(folder):
         listing.label_names, listing.corrections = reduced_names(_table(folder), folder.resolve().name)
+        for frame in listing.frames:
+            frame.objects = folder / f"instance/{frame.name}.png" if frame.labels else None
         if listing.corrections:
             listing.notes.append(f"{len(listing.corrections)} objects take the hand-corrected labels of this scene.")
-    elif own is not None:
-        listing.label_names, listing.class_names = own, None
-    elif place != "label-filt" and maps and not labels.is_deep(maps[0]):
-        listing.label_names, listing.class_names = dict(enumerate(("void", *NYU))), None
+    elif listing.label_names is not None or (bits := labels.bits_of_ids(maps[0])) is None:
+        listing.class_names = None
+    elif place != "label-filt" and bits == 8:
+        listing.label_names = dict(enumerate(("void", *NYU)))
+        listing.class_names = None
         listing.notes.append(f"Ids of {place}/ have 8 bits and are taken for NYU's 40 classes.")
     elif (table := _table(folder)) is not None and table.name != MODIFIED:
         nyu = _column(table, OWN, "nyu40id", 41, empty=40)
-        listing.label_names, listing.class_names = (
-            {raw: ("void", *NYU)[k] for raw, k in nyu.items()} | {0: "void"},
-            None,
-        )
+        listing.label_names = {raw: ("void", *NYU)[k] for raw, k in nyu.items()} | {0: "void"}
+        listing.class_names = None
         listing.notes.append(f"Classes are NYU's 40, of {table.name}; scannet-open has 20, of {MODIFIED}.")
     else:
         listing.label_names = mapped(table)
@@ -174,8 +186,7 @@ def _listing(folder: Path) -> Listing:
     poses = cameras.cam_from_world(folder / "pose", matrices, names)
     size, _ = header(folder / "color" / images[0])
     camera = _camera(folder, "color", size, SENSOR)
-    has, place = probe(folder), _labels_folder(folder)
-    maps = labels.of_views(folder / place, names) if place else {}
+    has = probe(folder)
     pseudo = has["pseudo_labels"]
     frames = [
         Frame(
@@ -184,8 +195,6 @@ def _listing(folder: Path) -> Listing:
             camera,
             pose,
             folder / f"depth/{name}.png" if has["depth"] else None,
-            maps.get(name),
-            objects=folder / f"instance/{name}.png" if place == "semantics" and name in maps else None,
             pseudo_labels=folder / f"{PSEUDO}/{name}.png" if pseudo else None,
             confidence=folder / f"{CONFIDENCE}/{name}.npz" if pseudo else None,
         )
@@ -193,7 +202,7 @@ def _listing(folder: Path) -> Listing:
     ]
     reduced = _is_reduced(folder)
     protocol = scannet_closed if reduced else scannet_open
-    listing = Listing("scannet", frames, class_names=protocol.CLASSES if place or pseudo else None)
+    listing = Listing("scannet", frames, class_names=protocol.CLASSES if has["labels"] or pseudo else None)
     listing.pseudo_names = dict(enumerate(("void", *scannet_closed.CLASSES))) if pseudo else None
     intrinsics = folder / "intrinsic/intrinsic_color.txt"
     listing.notes += texts.skew_note(intrinsics, texts.read_matrix(intrinsics))
@@ -205,9 +214,7 @@ def _listing(folder: Path) -> Listing:
     if has["depth"] and common.present(folder / "intrinsic/intrinsic_depth.txt"):
         depth_size, _ = header(folder / f"depth/{names[0]}.png")
         listing.depth_camera = _camera(folder, "depth", depth_size, depth_size[0])
-    if place:
-        listing.label_place = place
-        _give_names(listing, folder, place)
+    _give_labels(listing, folder)
     others = ("segmentation_data.pkl", "m2f_invalid", *(() if pseudo else (PSEUDO, CONFIDENCE)))
     if unused := [name for name in others if (folder / name).exists()]:
         listing.notes.append(f"Not read: {', '.join(unused)}.")

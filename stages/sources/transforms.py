@@ -82,7 +82,7 @@ def files(folder: Path) -> list[Path]:
     beside = [path for entry, _ in present for part in PARTS[1:] if (path := _part(folder, entry, part))]
     beside += [sure for path in beside if (sure := common.sureness(path))]
     cloud = _cloud(folder, entries[0])
-    beside += [*labels.files(folder), *(folder / name for name in labels.NAMES if common.present(folder / name))]
+    beside += [*labels.files(folder), *(folder / name for name in labels.DOCUMENTS if common.present(folder / name))]
     return sorted([*_documents(folder), *(Path(image) for _, image in present), *beside, *([cloud] if cloud else [])])
 
 

@@ -83,10 +83,9 @@ def read(path: Path, settings: IngestSection, model: PhotoModel) -> dict[str, An
         if k % step == 0:
             kept.append(assembly.variance_kept(image, images[-1], at))
 
-    def as_taken(names: set[str]) -> dict[str, Any]:
-        wanted = {frame for frame, name in named.items() if name in names and camera.model in cameras.DISTORTED}
-        photos = ((named[frame], camera, image) for frame, image in _taken(file, wanted))
-        return assembly.as_taken(photos, settings)
+    def bent(wanted: set[str]) -> Iterator[tuple[str, cameras.Camera, Any]]:
+        numbers = {frame for frame, name in named.items() if name in wanted and camera.model in cameras.DISTORTED}
+        return ((named[frame], camera, image) for frame, image in _taken(file, numbers))
 
     fields = {
         "names": list(named.values()),
@@ -94,7 +93,7 @@ def read(path: Path, settings: IngestSection, model: PhotoModel) -> dict[str, An
         "Ks": np.tile(view.K, (len(images), 1, 1)),
         "cam_from_world": model.cam_from_world[rows],
         "source": {"kind": "video", "notes": notes},
-        "as_taken": as_taken,
+        "bent": bent,
         "variance_kept": float(np.mean(kept)),
     }
     return fields | points_of(Cloud(model.points, model.colors, model.errors, model.tracks), model.names, fields)

@@ -63,11 +63,13 @@ def test_a_home_folder_that_takes_nothing_stops_no_run(tmp_path, monkeypatch):
     assert done.returncode == 0, done.stderr
 
 
-def in_a_shell(folder, words, buffered=""):
-    """A `chebsplat` command in a shell, whose streams `words` may redirect; its work folder is `folder`."""
+def in_a_shell(folder, words, buffered="", before=""):
+    """A `chebsplat` command in a shell, whose streams `words` may redirect; its work folder is `folder`; `before`:
+    what the shell does first.
+    """
     env = os.environ | {"CHEBSPLAT_WORK": str(folder), "PYTHONUNBUFFERED": buffered, "PYTHONPATH": str(ROOT)}
     command = f"{sys.executable} -P -m chebsplat.pipelines.cli {words}"
-    return subprocess.run(["sh", "-c", command], cwd=folder, env=env, capture_output=True, text=True)
+    return subprocess.run(["sh", "-c", before + command], cwd=folder, env=env, capture_output=True, text=True)
 
 
 @pytest.mark.parametrize(
@@ -91,6 +93,11 @@ def test_closed_streams_keep_nothing_from_being_made_and_no_file_takes_their_pla
     assert (done.returncode, done.stdout) == (0, printed.format(tmp_path))
     artifact.verify(tmp_path / "made", Capture.SCHEMA)
     assert in_a_shell(tmp_path, f"settings nonsense {closed}").returncode == 2
+
+
+def test_help_is_shown_in_a_folder_that_is_gone(tmp_path):
+    done = in_a_shell(tmp_path, "--help", before="mkdir gone && cd gone && rmdir ../gone && ")
+    assert done.returncode == 0 and "Usage" in done.stdout, done.stderr
 
 
 def test_a_full_disk_is_recognised_behind_a_library_s_own_error(tmp_path):

@@ -6,9 +6,8 @@ import re
 
 import numpy as np
 import pytest
-from PIL import Image
+from label_maps import arrays, masks, pictures
 from shared import run_stage
-from source_folders import save
 
 from chebsplat.errors import ChebsplatError
 from chebsplat.formats.evaluation import Evaluation
@@ -29,7 +28,7 @@ __all__ = ["scene"]  # the fixture
 def made(scene, tmp_path_factory):
     """A scene that was trained from labels by name, and what it says of the test views, names [2, H, W]."""
     folder = tmp_path_factory.mktemp("made")
-    write(folder / "scene", scene, png(IDS))
+    write(folder / "scene", scene, pictures(IDS))
     inputs = {}
     given = {
         "ingest": (), "sfm": ("capture",), "teacher": ("capture",), "train": ("capture", "points", "features"),
@@ -67,42 +66,12 @@ def miou(said, truth, lost):
     return 100 * float(np.mean(ious)) if ious else None
 
 
-# writers: of a map, by its path without an ending and classes [H, W], -1 none
-
 IDS = [*range(1, len(NAMES) + 1), 0]
 ZERO = [*range(len(NAMES)), 255]
 COLORS = np.random.default_rng(4).integers(1, 256, (len(NAMES) + 1, 3)).astype(np.uint8)
 COLORS[-1] = 0
 HEX = {"#" + bytes(color).hex(): name for color, name in zip(COLORS, NAMES, strict=False)}
-
-
-def png(table, kind=np.uint8, ending=".png", form="PNG"):
-    def write_map(path, labels):
-        Image.fromarray(np.array(table)[labels].astype(kind)).save(f"{path}{ending}", format=form)
-
-    return write_map
-
-
-def npy(table, kind=np.int64, turned=False):
-    def write_map(path, labels):
-        values = np.array(table)[labels].astype(kind)
-        np.save(f"{path}.npy", values.T if turned else values)
-
-    return write_map
-
-
-def scores(axis, kind=np.float32):
-    n = len(NAMES)
-    held = np.concatenate([np.full((n, n), 0.1) + np.eye(n), np.zeros((1, n))])
-    return lambda path, labels: np.save(f"{path}.npy", np.moveaxis(held[labels].astype(kind), -1, axis))
-
-
-def masks(ending):
-    def write_map(path, labels):
-        for k, name in enumerate(NAMES):
-            save(path / f"{name}.{ending}", (255 * (labels == k)).astype(np.uint8))
-
-    return write_map
+SCORES = 0.1 + np.eye(len(NAMES) + 1, len(NAMES))
 
 
 def write(folder, scene, of_map, names=None, place="semantic", views=range(16), half=False):
@@ -121,7 +90,7 @@ def renamed(change, **others):
 
 
 def ids(**how):
-    return {"of_map": png(IDS)} | how
+    return {"of_map": pictures(IDS)} | how
 
 
 UNMATCHED = "no label of the scene is called like"
@@ -129,21 +98,12 @@ UNMATCHED = "no label of the scene is called like"
 # none)
 WAYS = {
     "8 bits": (ids(), (), ""),
-    "16 bits": ({"of_map": png(IDS, np.uint16)}, (), ""),
-    "grey as colours": ({"of_map": png(np.stack([IDS] * 3, -1))}, (), ""),
-    "endings in capitals": ({"of_map": png(IDS, ending=".PNG")}, (), ""),
-    "PNG called .jpg": ({"of_map": png(IDS, ending=".jpg")}, (), ""),
-    "JPEG": ({"of_map": png(IDS, ending=".jpg", form="JPEG")}, (), "is a JPEG picture"),
-    "arrays": ({"of_map": npy(IDS)}, (), ""),
-    "arrays of floats": ({"of_map": npy(IDS, np.float32)}, (), ""),
-    "arrays turned": ({"of_map": npy(IDS, turned=True)}, (), "its photo 96x72"),
+    "JPEG": ({"of_map": pictures(IDS, ending=".jpg", form="JPEG")}, (), "is a JPEG picture"),
+    "arrays": ({"of_map": arrays(IDS)}, (), ""),
+    "arrays turned": ({"of_map": arrays(IDS, axes=(1, 0))}, (), "its photo 96x72"),
     "half as large": (ids(half=True), (), ""),
-    "semantics/": (ids(place="semantics"), (), ""),
-    "label/": (ids(place="label"), (), ""),
-    "labels/": (ids(place="labels"), (), ""),
     "segmentation/": (ids(place="segmentation"), (), ""),
     "capitals": (ids(names=renamed(str.upper)), (), ""),
-    "blanks about names": (ids(names=renamed(" {} ".format)), (), ""),
     "names in other words": (ids(names=renamed("mi {}".format)), (), UNMATCHED),
     "one name in other words": (ids(names=renamed(str, wall="zyx")), (), f"{UNMATCHED}.*: zyx"),
     "a class that is unannotated": (ids(names=renamed(str, wall="unannotated")), ("wall",), ""),
@@ -151,15 +111,13 @@ WAYS = {
     "a class without a name": (ids(names=dict(list(enumerate(NAMES, 1))[1:])), (NAMES[0],), ""),
     "a class alone": (ids(names={1: NAMES[0]}), NAMES[1:], "one class alone"),
     "background of id 0": (ids(names=renamed(str) | {0: "background"}), (), ""),
-    "from 0 with 255, with names": ({"of_map": png(ZERO), "names": dict(enumerate(NAMES))}, (), ""),
-    "from 0 with 255, without names": ({"of_map": png(ZERO), "names": ""}, (), UNMATCHED),
+    "from 0 with 255, with names": ({"of_map": pictures(ZERO), "names": dict(enumerate(NAMES))}, (), ""),
+    "from 0 with 255, without names": ({"of_map": pictures(ZERO), "names": ""}, (), UNMATCHED),
     "ids without names": (ids(names=""), (), "have no names"),
-    "colours": ({"of_map": png(COLORS), "names": HEX}, (), ""),
-    "colours without names": ({"of_map": png(COLORS), "names": ""}, (), "colours without names"),
-    "scores": ({"of_map": scores(0), "names": dict(enumerate(NAMES))}, (), ""),
-    "scores, classes last": ({"of_map": scores(-1, np.float16), "names": dict(enumerate(NAMES))}, (), ""),
-    "masks": ({"of_map": masks("png"), "names": ""}, (), ""),
-    "masks as JPEG": ({"of_map": masks("jpg"), "names": ""}, (), "one mask a class"),
+    "colours": ({"of_map": pictures(COLORS), "names": HEX}, (), ""),
+    "colours without names": ({"of_map": pictures(COLORS), "names": ""}, (), "colours without names"),
+    "scores": ({"of_map": arrays(SCORES, np.float32, (2, 0, 1)), "names": dict(enumerate(NAMES))}, (), ""),
+    "masks": ({"of_map": masks(NAMES), "names": ""}, (), ""),
     "test views alone": (ids(views=(0, 8)), (), ""),
     "one test view": (ids(views=range(8)), (), ""),
     "no test view": (ids(views=range(1, 8)), (), "no pixel of the evaluated views"),

@@ -18,10 +18,10 @@ import numpy as np
 
 from chebsplat.evaluation.metrics import confusion
 from chebsplat.evaluation.protocols.task import (
-    LEAST,
     EvaluatedView,
     Task,
     counted,
+    mean_over,
     predicted,
     required,
     resized,
@@ -64,7 +64,7 @@ def figures(matrix: np.ndarray) -> dict[str, Any]:
     kept = np.maximum(n_true, n_predicted) >= RARE * max(matrix.sum(), 1)
     iou = {name: float(r / (t + f - r)) if k else None
            for name, r, t, f, k in zip((VOID, *CLASSES), n_right, n_true, n_predicted, kept, strict=True)}  # fmt: skip
-    miou = averaged(list(iou.values())) if counted(n_true)["classes"] >= LEAST else None
+    miou = mean_over(np.array(list(iou.values()), float), n_true)
     return {"miou": miou, "macc": None, "oa": None, "boundary_miou": None, "iou": iou}
 
 
@@ -74,6 +74,6 @@ def over_scenes(scenes: list[dict[str, Any]]) -> dict[str, Any]:
 
 
 def averaged(values: list[float | None]) -> float | None:
-    """Plain mean of what was measured: of classes, and of the scenes' mIoU."""
+    """Plain mean of the scenes' mIoU that were measured."""
     known = [value for value in values if value is not None]
     return float(np.mean(known)) if known else None

@@ -12,8 +12,6 @@ from chebsplat.errors import DataFailure
 from chebsplat.evaluation.metrics import IGNORE
 from chebsplat.labels.names import lacking, rows_of
 
-LEAST = 2  # classes that a mean over classes needs
-
 
 @dataclass
 class EvaluatedView:
@@ -73,9 +71,9 @@ def counted(pixels: np.ndarray) -> dict[str, int]:
 
 def mean_over(values: np.ndarray, pixels: np.ndarray) -> float | None:
     """Mean of the figures of classes that are defined, not nan; None where the truth, of so many `pixels` by class,
-    has fewer than LEAST: of one class alone any scene that knows no other has 100 %.
+    has fewer than two: of one class alone any scene that knows no other has 100 %.
     """
-    if counted(pixels)["classes"] < LEAST or np.isnan(values).all():
+    if counted(pixels)["classes"] < 2 or np.isnan(values).all():
         return None
     return float(np.nanmean(values))
 

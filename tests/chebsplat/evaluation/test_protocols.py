@@ -148,11 +148,8 @@ def test_one_class_alone_has_no_miou_and_every_miou_says_what_it_rests_on(protoc
         assert found["scene"]["miou"] == (None if classes == 1 else 1)
 
 
-SPELLINGS = ["Wall", "WALL", " wall ", "wall"], ["TV_Screen", "tv-screen", "tv  screen", "\ttv screen\n", "TVScreen"]
-
-
-@pytest.mark.parametrize("wall", SPELLINGS[0])
-@pytest.mark.parametrize("screen", SPELLINGS[1])
+@pytest.mark.parametrize("wall", ["WALL", " Wall "])
+@pytest.mark.parametrize("screen", ["TV_Screen", "tv-screen", "tv  screen", "\ttv screen\n", "TVScreen"])
 def test_a_name_is_the_same_however_it_is_spelt_on_either_side(wall, screen):
     truth, seen = np.array([[0, 0, 1, 1]]), [[0, 1, 1, 1]]
     for names, classes in ((["wall", "tv screen"], [wall, screen]), ([wall, screen], ["wall", "tv screen"])):

@@ -2,10 +2,12 @@
 
 import json
 import re
+import shutil
 
 import layouts
 import numpy as np
 import pytest
+from label_maps import arrays, masks, pictures
 from PIL import Image
 from source_folders import save, tiny
 
@@ -21,43 +23,20 @@ CLASS = np.random.default_rng(0).integers(-1, 3, (3, 6, 8))
 CLASS[:, 0, :4] = [-1, 0, 1, 2]
 
 
-def source(folder, write, names=None):
-    """Three views whose maps `write(path without an ending, class [6, 8])` writes; names of labels.json."""
-    fields = tiny() | {"names": list("abc"), "labels": np.zeros((3, 6, 8), np.int16)}
+def source(folder, write, names=None, classes=CLASS, inner=""):
+    """Three views whose maps `write(path without an ending, class [6, 8])` writes; names of labels.json; `inner`: the
+    folder of the photos in images/.
+    """
+    fields = tiny() | {"names": [f"{inner}{name}" for name in "abc"], "labels": np.zeros((3, 6, 8), np.int16)}
     layouts.write_colmap(folder, fields)
-    for path in (folder / "semantic").iterdir():
-        path.unlink()
+    shutil.rmtree(folder / "semantic")
+    (folder / "semantic").mkdir()
     (folder / "labels.json").unlink()
-    for name, of_view in zip("abc", CLASS, strict=True):
+    for name, of_view in zip("abc", classes, strict=True):
         write(folder / "semantic" / name, of_view)
     if names is not None:
         (folder / "labels.json").write_text(json.dumps(names))
     return folder
-
-
-def ids(table, kind=np.uint8, ending=".png"):
-    """A writer of ids, of classes 0, 1, 2 and of none."""
-
-    def write(path, of_view):
-        values = np.array(table)[of_view].astype(kind)
-        if ending == ".npy":
-            np.save(path.with_suffix(".npy"), values)
-        else:
-            Image.fromarray(values).save(path.with_suffix(ending), format="PNG")
-
-    return write
-
-
-def colors(path, of_view):
-    save(path.with_suffix(".png"), RGB[of_view])
-
-
-def transparent(path, of_view):
-    save(path.with_suffix(".png"), np.concatenate([RGB[of_view], 255 * (of_view >= 0)[..., None]], -1).astype(np.uint8))
-
-
-def grey_colors(path, of_view):
-    save(path.with_suffix(".png"), np.repeat((of_view + 1)[..., None], 3, -1).astype(np.uint8))
 
 
 def palette(path, of_view):
@@ -66,58 +45,37 @@ def palette(path, of_view):
     image.save(path.with_suffix(".png"))
 
 
-def scores(axis, kind=np.float32):
-    """A writer of one-hot scores along an axis; all equal where there is no class."""
-
-    def write(path, of_view):
-        held = np.concatenate([np.eye(3), np.zeros((1, 3))])[of_view].astype(kind)
-        np.save(path.with_suffix(".npy"), np.moveaxis(held, -1, axis))
-
-    return write
-
-
-def masks(form, swapped=False):
-    """A writer of one mask a class: VIEW/CLASS, or CLASS/VIEW."""
-
-    def write(path, of_view):
-        for k, name in enumerate(NAMES):
-            place = path.parent / name / path.name if swapped else path / name
-            place.parent.mkdir(parents=True, exist_ok=True)
-            large = np.kron(of_view == k, np.ones((16, 16), bool))  # blocks of JPEG
-            Image.fromarray((255 * large).astype(np.uint8)).save(f"{place}.{form}")
-
-    return write
-
-
 BY_ID = {"1": "wall", "2": "floor", "3": "tv screen"}
 ONE, ZERO, CODE = [1, 2, 3, 0], [0, 1, 2, 255], [0, 1, 2, 65_535]
 UNNAMED = ["class_0", "class_1", "class_2"]
+GREY, CLEAR = np.stack([ONE] * 3, -1), np.concatenate([RGB, [[255]] * 3 + [[0]]], 1)
 HEX = ["#ff0000", "#00c800", "#0707c8"]
+SCORES, FIRST, BY_PLACE = np.eye(4, 3), (2, 0, 1), dict(enumerate(NAMES))
 # what: (writer, labels.json, the classes that are found in the order of NAMES, what is said)
 WAYS = {
-    "ids with names": (ids(ONE), BY_ID, NAMES, "taken for ids with names: 3 classes"),
-    "16 bits": (ids(ONE, np.uint16), BY_ID, NAMES, "taken for ids with names"),
+    "ids with names": (pictures(ONE), BY_ID, NAMES, "taken for ids with names: 3 classes"),
+    "16 bits": (pictures(ONE, np.uint16), BY_ID, NAMES, "taken for ids with names"),
     "a palette": (palette, BY_ID, NAMES, "taken for ids with names"),
-    "an ending in capitals": (ids(ONE, ending=".PNG"), BY_ID, NAMES, "taken for ids with names"),
-    "a PNG called .jpg": (ids(ONE, ending=".jpg"), BY_ID, NAMES, "taken for ids with names"),
-    "an array": (ids(ONE, ending=".npy"), BY_ID, NAMES, "taken for ids with names"),
-    "an array of floats": (ids(ONE, np.float32, ".npy"), BY_ID, NAMES, "taken for ids with names"),
-    "an array with -1": (ids([0, 1, 2, -1], np.int64, ".npy"), dict(enumerate(NAMES)), NAMES, "with names"),
-    "names spelt in two ways": (ids([1, 2, 3, 9]), BY_ID | {"9": " VOID "}, NAMES, "called VOID are void"),
-    "ids without names": (ids(ONE), None, ["class_1", "class_2", "class_3"], r"no names.*; 0 \(\d.*none of the cl"),
-    "255 for void": (ids(ZERO), None, UNNAMED, r"255 \(\d.* is taken for void, and 0 for a class"),
-    "65535 for void": (ids(CODE, np.uint16), None, UNNAMED, r"65535 \(\d.* is taken for void, and 0 for a class"),
-    "255 without a name": (ids(ZERO), dict(enumerate(NAMES)), NAMES, r"without a name are ignored: 255 \(\d"),
-    "colours": (colors, None, HEX, r"taken for colours without names.*#000000 \(\d"),
-    "colours with names": (colors, dict(zip(HEX, NAMES, strict=True)), NAMES, "taken for colours with names"),
-    "transparent colours": (transparent, None, HEX, "taken for colours without names"),
-    "grey colours": (grey_colors, BY_ID, NAMES, "taken for ids with names"),
-    "scores, classes last": (scores(-1), dict(enumerate(NAMES)), NAMES, "taken for scores by class with names"),
-    "scores, classes first": (scores(0), None, UNNAMED, "taken for scores by class without names"),
-    "one-hot": (scores(0, bool), dict(enumerate(NAMES)), NAMES, "taken for scores by class"),
-    "masks of a view": (masks("png"), None, NAMES, "taken for one mask a class"),
-    "masks of a view as JPEG": (masks("jpg"), None, NAMES, "taken for one mask a class"),
-    "masks of a class": (masks("png", swapped=True), None, NAMES, "taken for one mask a class"),
+    "an ending in capitals": (pictures(ONE, ending=".PNG"), BY_ID, NAMES, "taken for ids with names"),
+    "a PNG called .jpg": (pictures(ONE, ending=".jpg"), BY_ID, NAMES, "taken for ids with names"),
+    "an array": (arrays(ONE, np.uint8), BY_ID, NAMES, "taken for ids with names"),
+    "an array of floats": (arrays(ONE, np.float32), BY_ID, NAMES, "taken for ids with names"),
+    "an array with -1": (arrays([0, 1, 2, -1]), BY_PLACE, NAMES, "with names"),
+    "names spelt in two ways": (pictures([1, 2, 3, 9]), BY_ID | {"9": " VOID "}, NAMES, "called VOID are void"),
+    "ids without names": (pictures(ONE), None, ["class_1", "class_2", "class_3"], r"no names.*; 0 \(\d.*none of"),
+    "255 for void": (pictures(ZERO), None, UNNAMED, r"255 \(\d.* is taken for void, and 0 for a class"),
+    "65535 for void": (pictures(CODE, np.uint16), None, UNNAMED, r"65535 \(\d.* is taken for void, and 0 for a class"),
+    "255 without a name": (pictures(ZERO), BY_PLACE, NAMES, r"without a name are ignored: 255 \(\d"),
+    "colours": (pictures(RGB), None, HEX, r"taken for colours without names.*#000000 \(\d"),
+    "colours with names": (pictures(RGB), dict(zip(HEX, NAMES, strict=True)), NAMES, "taken for colours with names"),
+    "transparent colours": (pictures(CLEAR), None, HEX, "taken for colours without names"),
+    "grey colours": (pictures(GREY), BY_ID, NAMES, "taken for ids with names"),
+    "scores, classes last": (arrays(SCORES, np.float32), BY_PLACE, NAMES, "taken for scores by class with names"),
+    "scores, classes first": (arrays(SCORES, np.float32, FIRST), None, UNNAMED, "scores by class without names"),
+    "one-hot": (arrays(SCORES, bool, FIRST), BY_PLACE, NAMES, "taken for scores by class"),
+    "masks of a view": (masks(NAMES), None, NAMES, "taken for one mask a class"),
+    "masks of a view as JPEG": (masks(NAMES, "jpg"), None, NAMES, "taken for one mask a class"),
+    "masks of a class": (masks(NAMES, swapped=True), None, NAMES, "taken for one mask a class"),
 }  # fmt: skip
 
 
@@ -142,6 +100,17 @@ def test_a_pixel_s_class_is_the_one_that_was_written_and_a_line_says_what_maps_w
     assert {path for path in (tmp_path / "semantic").rglob("*") if path.is_file()} <= listed
 
 
+@pytest.mark.parametrize("inner", ["", "left/"])
+@pytest.mark.parametrize("shown", [("0", "0", "0"), ("0", "1", "2"), ("012", "0", "1")])
+def test_masks_in_folders_of_classes_are_told_from_ids_whatever_classes_a_view_shows(tmp_path, shown, inner):
+    wanted = [
+        np.where(np.isin(of_view, [*map(int, of)]), of_view, -1) for of_view, of in zip(CLASS, shown, strict=True)
+    ]
+    fields = colmap.read(source(tmp_path, masks(NAMES, swapped=True), classes=wanted, inner=inner), SETTINGS)
+    check(fields, NAMES, np.array(wanted))
+    assert "taken for one mask a class" in said(fields)
+
+
 @pytest.mark.parametrize(
     ("present", "code"),
     [([0, 1, 2, 255], 255), ([0, 1, 65_535], 65_535), ([1, 2, 4, 5, 255], 255), ([0, 2, 3, 40, 255], None),
@@ -156,13 +125,13 @@ def test_which_of_ids_without_names_is_void(present, code):
     ("name", "which", "void"),
     [(name, 5, True) for name in ("unannotated", "Unlabeled", "unlabelled", "ignore", "IGNORED ", "void", "un-defined",
                                   "none", "No Label", "not_labeled", "unknown")]
-    + [("background", 0, True), ("Background", 255, True), ("background", 7, False)]
+    + [("background", 0, True), ("Background", 255, True), ("background", 7, False), ("#background", 255, False)]
     + [(name, 0, False) for name in ("other", "others", "otherprop", "otherfurniture", "clutter", "wall", "void deck")],
 )  # fmt: skip
 def test_names_of_the_usual_sets_that_mean_nothing_are_void_and_classes_are_not(name, which, void):
-    assert labels.is_void(name, which) is void
-    raw = np.array([[[which, which, which, 9]]], np.int32)
-    found, classes, notes = labels.indexed(raw, {which: name, 9: "sofa"}, None)
+    kind, name = (labels.COLORS, name[1:]) if name[0] == "#" else (labels.IDS, name)
+    raw = np.array([[[which, which, which, 999]]], np.int32)
+    found, classes, notes = labels.indexed(raw, {which: name, 999: "sofa"}, None, kind)
     assert classes == (["sofa"] if void else [name, "sofa"])
     assert found.tolist() == ([[[-1, -1, -1, 0]]] if void else [[[0, 0, 0, 1]]])
     assert void == any(f"{which} (75.0% of the pixels)" in note for note in notes)
@@ -171,7 +140,7 @@ def test_names_of_the_usual_sets_that_mean_nothing_are_void_and_classes_are_not(
 @pytest.mark.parametrize("place", ["semantics", "label", "labels", "segmentation"])
 @pytest.mark.parametrize("kind", ["colmap", "transforms"])
 def test_maps_lie_in_folders_of_other_names_and_beside_a_transforms_json(tmp_path, place, kind):
-    folder = source(tmp_path, ids(ONE), BY_ID)
+    folder = source(tmp_path, pictures(ONE), BY_ID)
     (folder / "semantic").rename(folder / place)
     if kind == "transforms":
         frames = [{"file_path": f"images/{name}.png", "transform_matrix": np.eye(4).tolist()} for name in "abc"]
@@ -181,8 +150,15 @@ def test_maps_lie_in_folders_of_other_names_and_beside_a_transforms_json(tmp_pat
     check(module.read(folder, SETTINGS), NAMES)
 
 
+@pytest.mark.parametrize("place", ["", "left/", "Left/"])
+def test_maps_lie_in_the_folders_of_their_photos_or_in_fewer(tmp_path, place):
+    folder = source(tmp_path, lambda path, classes: pictures(ONE)(path.parent / place / path.name, classes), BY_ID,
+                    inner="left/")  # fmt: skip
+    check(colmap.read(folder, SETTINGS), NAMES)
+
+
 def test_views_without_a_map_are_unknown_and_counted(tmp_path):
-    folder = source(tmp_path, ids(ONE), BY_ID)
+    folder = source(tmp_path, pictures(ONE), BY_ID)
     (folder / "semantic/b.png").unlink()
     fields = colmap.read(folder, SETTINGS)
     check(fields, NAMES, np.where(np.arange(3)[:, None, None] == 1, -1, CLASS))
@@ -190,22 +166,24 @@ def test_views_without_a_map_are_unknown_and_counted(tmp_path):
 
 
 def test_maps_of_another_kind_are_named_and_not_passed_over(tmp_path):
-    folder = source(tmp_path, ids(ONE), BY_ID)
+    folder = source(tmp_path, pictures(ONE), BY_ID)
     for path in (folder / "semantic").iterdir():
         path.rename(path.with_suffix(".tif"))
+    (folder / "labels").mkdir()
     fields = colmap.read(folder, SETTINGS)
     assert "labels" not in fields
-    assert "semantic/ holds no PNG or .npy: not read (a.tif, b.tif, c.tif)." in fields["source"]["notes"]
+    of_labels = [note for note in fields["source"]["notes"] if "holds no PNG" in note]
+    assert of_labels == ["semantic/ holds no PNG or .npy: not read (a.tif, b.tif, c.tif)."]
 
 
 def test_a_name_given_twice_in_other_letters_is_one_class(tmp_path):
-    fields = colmap.read(source(tmp_path, ids(ONE), BY_ID | {"2": "Wall_"}), SETTINGS)
+    fields = colmap.read(source(tmp_path, pictures(ONE), BY_ID | {"2": "Wall_"}), SETTINGS)
     assert len(fields["class_names"]) == 2
     assert np.array_equal(fields["labels"] == 0, (CLASS == 0) | (CLASS == 1))
 
 
 def test_a_lossy_map_and_a_picture_of_many_colours_are_refused(tmp_path):
-    folder = source(tmp_path, ids(ONE), BY_ID)
+    folder = source(tmp_path, pictures(ONE), BY_ID)
     Image.fromarray(CLASS[1].astype(np.uint8)).save(folder / "semantic/b.png", format="JPEG", quality=100)
     with pytest.raises(InputError, match=r"semantic/b\.png is a JPEG picture.*write label maps as PNG"):
         colmap.read(folder, SETTINGS)
@@ -216,32 +194,47 @@ def test_a_lossy_map_and_a_picture_of_many_colours_are_refused(tmp_path):
 
 def test_colours_that_no_name_fits_are_an_error(tmp_path):
     with pytest.raises(DataFailure, match=r"no label has a name \(colours \[#000000, #00c800"):
-        colmap.read(source(tmp_path, colors, BY_ID), SETTINGS)
+        colmap.read(source(tmp_path, pictures(RGB), BY_ID), SETTINGS)
 
 
 # ScanNet as its own tools export it
 
+OWN_NAMES = ["wall", "floor", "television"]
+OWN_IDS, NYU_IDS = [*(layouts.SCANNET_IDS[name] for name in OWN_NAMES), 0], [1, 2, 25, 0]
+UNTOLD = ["class_1", "class_2", "class_25"]
 
-@pytest.mark.parametrize("how", ["raw ids, SG's table", "raw ids, ScanNet's table", "NYU's 40", "names beside"])
-def test_scannets_own_export_needs_no_points_and_its_label_folder_is_read(tmp_path, how):
+
+@pytest.mark.parametrize(
+    ("write", "beside", "found", "kind"),
+    [
+        (pictures(OWN_IDS, np.uint16), "SG's table", OWN_NAMES, "ids with names"),
+        (pictures(OWN_IDS, np.uint16), "ScanNet's table", OWN_NAMES, "ids with names"),
+        (pictures(NYU_IDS), "ScanNet's table", OWN_NAMES, "ids with names"),
+        (pictures(NYU_IDS), "names", NAMES, "ids with names"),
+        (pictures(NYU_IDS, np.uint16), "names", NAMES, "ids with names"),
+        (pictures(RGB), "ScanNet's table", HEX, "colours without names"),
+        (arrays(NYU_IDS), "ScanNet's table", UNTOLD, "ids without names"),
+        (masks(NAMES), "ScanNet's table", NAMES, "one mask a class"),
+    ],
+)
+@pytest.mark.parametrize("place", ["label", "semantics"])
+def test_scannets_own_export_needs_no_points_and_its_label_folder_is_read(tmp_path, write, beside, found, kind, place):
     fields = tiny() | {"class_names": NAMES, "labels": CLASS}
     fields["Ks"][:, 0, 2] += 0.5  # as written, half of these few pixels
     layouts.write_scannet(tmp_path, fields)
-    raw = [layouts.SCANNET_IDS[name] for name in ("wall", "floor", "television")]
-    found = ["wall", "floor", "television"]
+    (tmp_path / place).mkdir()
     for k, of_view in enumerate(CLASS):
-        stored = layouts.raw_labels(of_view, [1, 2, 25] if how in ("NYU's 40", "names beside") else raw)
-        save(tmp_path / f"label/{10 * k}.png", stored.astype(np.uint8) if how == "NYU's 40" else stored)
+        write(tmp_path / f"{place}/{10 * k}", of_view)
         save(tmp_path / f"depth/{10 * k}.png", layouts.stored_depth(fields["depth"][k]))
-    if "SG" in how:
+    if beside == "SG's table":
         layouts.write_table(tmp_path / scannet.MODIFIED, "cocomapid", layouts.COCO_IDS)
-    elif "ScanNet's" in how:
+    elif beside == "ScanNet's table":
         layouts.write_table(tmp_path / scannet.OWN, "nyu40id", layouts.NYU_IDS)
-    elif how == "names beside":
-        (tmp_path / "labels.json").write_text(json.dumps({"1": "wall", "2": "floor", "25": "tv screen"}))
-        found = NAMES
+    else:
+        (tmp_path / "labels.json").write_text(json.dumps(dict(zip(NYU_IDS, NAMES, strict=False))))
     got = scannet.read(tmp_path, SETTINGS)
     check(got, found)
     assert "points" not in got and "without points3d.ply" in said(got)
-    assert "Labels of label/ are taken for ids with names: 3 classes" in said(got)
-    assert scannet.probe(tmp_path)["labels"] and tmp_path / "label/10.png" in scannet.files(tmp_path)
+    assert f"Labels of {place}/ are taken for {kind}: 3 classes" in said(got)
+    maps = {path for path in (tmp_path / place).rglob("*") if path.is_file()}
+    assert scannet.probe(tmp_path)["labels"] and maps <= set(scannet.files(tmp_path))

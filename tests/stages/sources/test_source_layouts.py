@@ -6,11 +6,12 @@ import shutil
 import layouts
 import numpy as np
 import pytest
+from PIL import Image
 from shared import data, published, run_stage
 from source_folders import SETTINGS, image, save, tiny
 
 from chebsplat.cameras import centers, unproject
-from chebsplat.errors import InputError
+from chebsplat.errors import DataFailure, InputError
 from chebsplat.evaluation.protocols import scannet_closed, scannet_open
 from chebsplat.formats import artifact
 from chebsplat.formats.capture import Capture
@@ -72,8 +73,14 @@ def test_replica_as_nice_slam_renders_it(scene, tmp_path):
     compare(read(tmp_path, "replica"), scene, labels=False)
 
 
-def test_replica_as_semantic_nerf_renders_it(scene, tmp_path):
+@pytest.mark.parametrize("ending", [".png", ".npy"])
+def test_replica_as_semantic_nerf_renders_it(scene, tmp_path, ending):
     layouts.write_semantic_nerf(tmp_path, scene)
+    for path in (tmp_path / "Sequence_1/semantic_class").iterdir():
+        ids = np.asarray(Image.open(path))
+        path.unlink()
+        np.save(path.with_suffix(".npy"), ids) if ending == ".npy" else save(path, ids)
+        assert path.with_suffix(ending) in replica.files(tmp_path)
     found = read(tmp_path, "replica")
     compare(found, scene, exact_Ks=False)  # the layout has no camera file: f is half the width
     assert np.allclose(found["Ks"], [[48, 0, 48], [0, 48, 36], [0, 0, 1]])
@@ -281,6 +288,14 @@ def test_a_sources_own_points_become_the_scenes_and_their_colours_where_these_te
     to_eyes = centers(scene["cam_from_world"])[None] - found.means[:, None]
     facing = (np.einsum("ni,nvi->nv", found.normals, to_eyes) > 0).mean()
     assert facing > 0.8  # most points of a convex room are turned towards most cameras
+
+
+def test_points_that_no_view_has_in_its_image_are_too_few_with_depth_too(scene, tmp_path, capfd):
+    fields = {key: scene[key] for key in ("names", "images", "Ks", "cam_from_world", "depth")}
+    record = Capture(**fields, is_test=np.arange(16) % 8 == 0, points=np.full((50, 3), 50, np.float32))
+    inputs = {"capture": published(tmp_path / "c", record)}
+    assert run_stage("sfm", tmp_path / "out", inputs, {"sfm": {"dense": "off"}}) == DataFailure.exit_code
+    assert "only 0 points were found" in capfd.readouterr().err
 
 
 @pytest.mark.data
