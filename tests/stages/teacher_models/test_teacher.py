@@ -318,7 +318,8 @@ def test_few_views_are_not_looked_at_mirrored(tmp_path, capture):
 
 
 def test_views_that_a_stopped_run_finished_are_not_encoded_again(tmp_path, capture, monkeypatch):
-    model, seen, encode = color_teacher(tmp_path), [], TeacherInference.features
+    model, seen, encode = sidelong_teacher(tmp_path), [], TeacherInference.features
+    monkeypatch.setattr(teacher, "MIRRORED", 2)
 
     def counted(self, image, grid, scales, flips, name):
         if name == "view_002" and "view_002" not in seen:
@@ -331,10 +332,12 @@ def test_views_that_a_stopped_run_finished_are_not_encoded_again(tmp_path, captu
     assert encoded(tmp_path, capture, model)[0] == 1
     assert not (tmp_path / "out").exists()
     assert encoded(tmp_path, capture, model)[0] == 0
-    assert seen == ["view_000", "view_001", "view_002", "view_002", "view_003"]
+    assert seen == [f"view_{k:03d}" for k in (0, 1, 2, 2, 3, 1, 3)]  # the last two are mirrored
     whole = run_stage("teacher", tmp_path / "whole", {"capture": capture}, {"teacher": {"model": str(model)}})
     assert whole == 0
     assert values_of(tmp_path / "whole") == values_of(tmp_path / "out")
+    facts = [artifact.read_manifest(tmp_path / name).facts for name in ("whole", "out")]
+    assert facts[0] == facts[1] and 0.2 < facts[0]["mirrored_alike"] < 0.9
 
 
 def test_another_teacher_starts_anew(tmp_path, capture, monkeypatch):
