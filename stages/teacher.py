@@ -55,7 +55,7 @@ def from_onnx(job: Job, capture: Capture, settings: TeacherSection) -> None:
     network = TeacherInference(teacher, n_threads(), job.device)
     if job.device == "cuda" and CUDA not in providers(job.device):
         job.left_out("the teacher on the GPU", f"onnxruntime here has no CUDA ({GPU_REMEDY})")
-    if not teacher.told:
+    if teacher.guessed:
         log.info("%s has no `output`: logits, as %s holds names alone", teacher.settings, teacher.labels)
     grid, n_channels = network.grid(capture.images[0], settings.downscale)
     channels = None
@@ -107,12 +107,12 @@ def from_onnx(job: Job, capture: Capture, settings: TeacherSection) -> None:
     assert made.pseudo_labels is not None  # `split` gives them
     alike = []
     for view in range(MIRRORED // 2, len(capture.names), MIRRORED):
-        image, labels = capture.images[view], np.asarray(made.pseudo_labels[view])
+        image, upright = capture.images[view], np.asarray(made.pseudo_labels[view])
         once = (grid, settings.scales, False, capture.names[view])
         if settings.flips:
-            labels = space.split(network.features(image, *once))[1]
+            upright = space.split(network.features(image, *once))[1]
         mirrored = space.split(network.features(image[:, ::-1], *once))[1]
-        alike.append(float((labels == mirrored[:, ::-1]).mean()))
+        alike.append(float((upright == mirrored[:, ::-1]).mean()))
     job.facts |= {"kind": "onnx", "n_labels": len(space.names), "convention": convention}
     job.facts |= {"mirrored_alike": float(np.mean(alike)) if alike else None, "right": pixels_right(capture, made)}
 

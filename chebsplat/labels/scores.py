@@ -55,4 +55,4 @@ def probabilities(values: np.ndarray, kind: str) -> np.ndarray:
 
 def sureness(confidence: float, n_classes: int) -> float:
     """How sure a mean confidence is: 0 where all classes are alike, 1 where one is certain."""
-    return (confidence * n_classes - 1) / max(n_classes - 1, 1)
+    return (confidence * n_classes - 1) / (n_classes - 1) if n_classes > 1 else 1.0

@@ -295,7 +295,7 @@ def check(model: Path, photos: Path | Sequence[Path] = (), labels: str | None = 
     counts = np.bincount(pseudo_labels.ravel(), minlength=len(space.names))
     seen = [f"{space.names[k]} {counts[k] / pseudo_labels.size:.0%}" for k in np.argsort(-counts, kind="stable")[:SHOWN] if counts[k]]  # fmt: skip  # noqa: E501
     wide = teacher.output == "features" and n_channels > MAX_CHANNELS
-    by = "" if teacher.told else ", as its labels are names alone"
+    by = ", as its labels are names alone" if teacher.guessed else ""
     findings = []
     if teacher.output == "logits":
         taken = "" if network.scores == LOGITS else ", told by its values, and taken as such"

@@ -54,7 +54,7 @@ def pixels_right(capture: Capture, teacher: Features) -> float | None:
     if capture.labels is None or teacher.pseudo_labels is None:
         return None
     right = counted = 0
-    for view in np.flatnonzero(~capture.is_test):
+    for view in np.flatnonzero(~capture.is_test).tolist():
         labels = np.asarray(teacher.pseudo_labels[view])
         truth = resized(true_labels(capture, view, teacher.label_names), labels.shape, centred=True)
         right += int(((labels == truth) & (truth >= 0)).sum())

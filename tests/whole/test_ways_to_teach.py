@@ -116,6 +116,10 @@ WAYS = {  # how it is brought, and a word of what is said, "" where nothing need
         "write mean = [0.485, 0.456, 0.406], std = [0.229, 0.224, 0.225]",
     ),
     "a mean of 0 to 255": (lambda f: segmenter(f, IMAGENET, mean=[123.675, 116.28, 103.53]), "of colours in 0 to 255"),
+    "Caffe's mean and std": (
+        lambda f: segmenter(f, CAFFE, mean=[104.0, 117.0, 123.0], std=[1, 1, 1]),
+        "write mean = [0.4078, 0.4588, 0.4824], std = [0.003922, 0.003922, 0.003922]",
+    ),
     "a name too many": (
         lambda f: (segmenter(f, SIGNED), (f / "classes.txt").write_text("background\nred\ngreen\nblue\n")),
         "names 4 classes",

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from chebsplat.labels.scores import kind_of, probabilities
+from chebsplat.labels.scores import kind_of, probabilities, sureness
 
 
 def softmax(logits):
@@ -49,6 +49,11 @@ def test_values_tell_what_they_are_and_keep_the_order_of_classes(form):
         assert np.array_equal(found.argmax(0), values.argmax(0))
     if kind == "sigmoid" or form in ("log-softmax", "softmax", "logits without negative ones"):
         assert np.allclose(found, softmax(logits), atol=1e-3)
+
+
+@pytest.mark.parametrize(("confidence", "n", "sure"), [(0.25, 4, 0), (1, 4, 1), (0.625, 4, 0.5), (1, 1, 1)])
+def test_a_segmenter_is_as_sure_as_it_is_above_chance(confidence, n, sure):
+    assert sureness(confidence, n) == sure
 
 
 def test_windows_that_differ_are_judged_together():

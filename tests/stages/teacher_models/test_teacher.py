@@ -217,9 +217,9 @@ def test_a_segmenter_means_the_same_whatever_its_export_ends_with(tmp_path, capt
 def test_of_a_segmenter_whose_toml_says_no_output_the_labels_tell(tmp_path, capture, capsys):
     """Names alone are of channels; a table of embeddings, or an encoder of words, is of features."""
     model = segmenter(tmp_path)
-    assert (read_teacher(model).output, read_teacher(model).told) == ("logits", True)
+    assert (read_teacher(model).output, read_teacher(model).guessed) == ("logits", False)
     model.with_suffix(".toml").write_text('labels = "classes.txt"\nmultiple = 4\n')
-    assert (read_teacher(model).output, read_teacher(model).told) == ("logits", False)
+    assert (read_teacher(model).output, read_teacher(model).guessed) == ("logits", True)
     code, found = encoded(tmp_path, capture, model)
     assert code == 0 and np.array_equal(found.pseudo_labels[:], Capture.read(capture).labels[:, ::4, ::4])
     assert "has no `output`: logits" in capsys.readouterr().err

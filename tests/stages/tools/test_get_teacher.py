@@ -136,6 +136,7 @@ FED = {  # of preprocessor_config.json: other keys, what the hub's processor mak
     ),
     "neither": ({"do_rescale": False, "do_normalize": False}, lambda v, m, s: v, {}),
     "rescaled to 0 to 2": (NORM | {"rescale_factor": 1 / 127.5}, lambda v, m, s: (v / 127.5 - m) / s, {}),
+    "rescaled to less than 1": ({"rescale_factor": 1 / 256, "do_normalize": False}, lambda v, m, s: v / 256, {}),
     "one number for three": ({"image_mean": 0.5, "image_std": 0.5}, lambda v, m, s: v / 127.5 - 1, {}),
     "BGR": ({"do_flip_channel_order": True}, lambda v, m, s: v[::-1] / 255, {"order": "BGR"}),
     "MobileViT, which is of BGR unless it says otherwise": (
