@@ -191,42 +191,17 @@ def test_classes_of_a_segmenter_that_mean_one_label_become_it(tmp_path, capture)
     assert encoded(tmp_path / "other", capture, tmp_path / "tiny.onnx", labels=str(file))[0] == 3
 
 
-ENDS = {  # what exports put after the logits: operators, then what the outputs are
-    "logits": ([], "logits"),
-    "softmax": ([("Softmax", [], {"axis": 1})], "softmax"),
-    "softmax in float16": (
-        [("Softmax", [], {"axis": 1}), ("Cast", [], {"to": 10}), ("Cast", [], {"to": 1})], "softmax"
-    ),
-    "log-softmax": ([("LogSoftmax", [], {"axis": 1})], "logits"),
-    "sigmoid": ([("Sigmoid", [], {})], "sigmoid"),
-    "cosines": ([("LpNormalization", [], {"axis": 1})], "cosines"),
-}  # fmt: skip
-
-
-@pytest.mark.parametrize("end", ENDS)
-def test_a_segmenter_means_the_same_whatever_its_export_ends_with(tmp_path, capture, end, capsys):
-    nodes, scores = ENDS[end]
-    code, found = encoded(tmp_path, capture, ending(segmenter(tmp_path), *nodes))
-    assert code == 0 and found.convention["scores"] == scores
-    assert np.array_equal(found.pseudo_labels[:], Capture.read(capture).labels[:, ::4, ::4])
-    assert found.confidence[:].min() > 0.99
-    told = "not logits: taken as such" in capsys.readouterr().err
-    assert told == (scores != "logits")
-
-
-def test_of_a_segmenter_whose_toml_says_no_output_the_labels_tell(tmp_path, capture, capsys):
+def test_of_a_segmenter_whose_toml_says_no_output_the_labels_tell(tmp_path):
     """Names alone are of channels; a table of embeddings, or an encoder of words, is of features."""
     model = segmenter(tmp_path)
-    assert (read_teacher(model).output, read_teacher(model).guessed) == ("logits", False)
-    model.with_suffix(".toml").write_text('labels = "classes.txt"\nmultiple = 4\n')
-    assert (read_teacher(model).output, read_teacher(model).guessed) == ("logits", True)
-    code, found = encoded(tmp_path, capture, model)
-    assert code == 0 and np.array_equal(found.pseudo_labels[:], Capture.read(capture).labels[:, ::4, ::4])
-    assert "has no `output`: logits" in capsys.readouterr().err
-    model.with_suffix(".toml").write_text('labels = "tiny.npz"\n')
-    assert read_teacher(model).output == "features"
-    model.with_suffix(".toml").write_text('labels = "classes.txt"\ntext = "minilm"\n')
-    assert read_teacher(model).output == "features"
+    for toml, output, guessed in (
+        ('labels = "classes.txt"\noutput = "logits"\n', "logits", False),
+        ('labels = "classes.txt"\n', "logits", True),
+        ('labels = "tiny.npz"\n', "features", False),
+        ('labels = "classes.txt"\ntext = "minilm"\n', "features", False),
+    ):
+        model.with_suffix(".toml").write_text(toml)
+        assert (read_teacher(model).output, read_teacher(model).guessed) == (output, guessed)
 
 
 OUTPUTS = {  # of the graph, in order, and which is taken; None: it cannot be told
@@ -307,11 +282,6 @@ def test_one_view_in_25_is_looked_at_mirrored_and_labels_are_held_against_the_tr
         assert len(seen) == calls and len(set(seen)) == 26
         assert name == "sidelong" or facts["right"] == pytest.approx(18 / 19)
     assert alike["upright"] == 1 and 0.2 < alike["sidelong"] < 0.9
-
-
-def test_few_views_are_not_looked_at_mirrored(tmp_path, capture):
-    assert encoded(tmp_path, capture, color_teacher(tmp_path))[0] == 0
-    assert artifact.read_manifest(tmp_path / "out").facts["mirrored_alike"] is None
 
 
 # a run that is killed
