@@ -112,13 +112,12 @@ class TeacherInference:
             sides.append(math.ceil(n / entry - 1e-9))
         return (sides[0], sides[1]), cells.shape[0]
 
-    def judge(self, images: Stack | list[np.ndarray]) -> str:
+    def judge(self, images: Stack | list[np.ndarray]) -> None:
         """Tell from a few of the images what a segmenter's values are; all later maps are read so."""
         few = images[:: -(-len(images) // JUDGED)]
         self.scores = kind_of([self.run(self.middle(image), "a view") for image in few])
         if self.scores != LOGITS:
             log.info("%s gives values of %s, not logits: taken as such", self.teacher.path.name, self.scores)
-        return self.scores
 
     def middle(self, image: np.ndarray, side: tuple[int, int] | None = None) -> np.ndarray:
         """The window in an image's middle, u8 [H, W, 3]. Args: side: its (H, W); None: as large as the image allows."""

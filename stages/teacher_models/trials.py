@@ -39,13 +39,10 @@ UNTOLD = "cannot be told from these photos"
 
 
 class Trials:
-    """What a teacher gives of the middle windows of photos, fed in one way or another.
+    """What a teacher gives of the middle windows of photos, fed in one way or another."""
 
-    Args: values: of a window's output [C, h, w] what is compared of labels, [L, h, w].
-    """
-
-    def __init__(self, network: TeacherInference, images: list[np.ndarray], values: Callable[[np.ndarray], np.ndarray]):
-        self.network, self.values, self.own = network, values, network.teacher
+    def __init__(self, network: TeacherInference, images: list[np.ndarray], embeddings: np.ndarray):
+        self.network, self.own, self.embeddings = network, network.teacher, embeddings
         heights, widths = zip(*(network.window(network.scaled_size(image, 1.0)) for image in images), strict=True)
         self.windows = [network.middle(image, (min(heights), min(widths))) for image in images]
         self.turned = False
@@ -56,11 +53,14 @@ class Trials:
         self.network.teacher = teacher
         try:
             windows = [window if change is None else change(window) for window in self.windows]
-            found = [self.values(self.network.run(window, "a photo")) for window in windows]
+            outputs = [self.network.run(window, "a photo") for window in windows]
         finally:
             self.network.teacher = self.own
-        stacked = np.stack(found)
-        return stacked.swapaxes(2, 3) if self.turned else stacked
+        if self.own.output == "logits":
+            values = np.stack([logits_of(output, self.network.scores) for output in outputs])
+        else:
+            values = np.stack([np.tensordot(self.embeddings, unit(output, 0), 1) for output in outputs])
+        return values.swapaxes(2, 3) if self.turned else values
 
     def informed(self, teacher: TeacherModel) -> tuple[float, np.ndarray]:
         """Information that photos share with their own middles, mirrored and darkened; the plain
@@ -82,21 +82,13 @@ def tried(
 
     Args: names: of the channels of a segmenter, or of the rows of `embeddings` of other teachers.
     """
-    teacher = network.teacher
-    closed = teacher.output == "logits"
-
-    def values(output: np.ndarray) -> np.ndarray:
-        if closed:
-            return logits_of(output, network.scores)
-        return np.tensordot(embeddings, unit(output, 0), 1)
-
-    trials = Trials(network, images, values)
+    trials = Trials(network, images, embeddings)
     found = [("layout", layout_of(trials))]
     if len(images) < ENOUGH:
         return [*found, ("more", "with eight photos, or a folder, range and order of colours and names are tried, too")]
     told, best, plain = range_of(trials)
     found += [("range", told), ("order", order_of(trials, best, plain))]
-    return [*found, ("names", names_of(plain, names))] if closed else found
+    return [*found, ("names", names_of(plain, names))] if trials.own.output == "logits" else found
 
 
 def layout_of(trials: Trials) -> str:
