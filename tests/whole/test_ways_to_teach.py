@@ -61,6 +61,20 @@ def beside(folder, location):
     moved_out(segmenter(folder, SIGNED), location)
 
 
+def of_outputs(folder, *outputs, **toml):
+    """A graph that gives these: its map, the same again, twice or four times the channels, or no map (flat)."""
+    path = segmenter(folder, SIGNED, **toml)
+    model = onnx.load(path)
+    model.graph.node.extend([
+        helper.make_node("Identity", ["features"], ["same"]),
+        helper.make_node("Concat", ["features", "features"], ["twice"], axis=1),
+        helper.make_node("Concat", ["twice", "twice"], ["four"], axis=1),
+        helper.make_node("Flatten", ["features"], ["flat"]),
+    ])  # fmt: skip
+    onnx.save(model, path)
+    ending(path, outputs=outputs)
+
+
 def likeliest(folder):
     path = segmenter(folder, SIGNED, node("ArgMax", axis=1, keepdims=0))
     model = onnx.load(path)
@@ -95,6 +109,16 @@ WAYS = {  # how it is brought, and a word of what is said, "" where nothing need
     "sigmoid": (lambda f: segmenter(f, SIGNED, node("Sigmoid")), "values of sigmoid"),
     "cosines": (lambda f: segmenter(f, SIGNED, node("LpNormalization", axis=1)), "values of cosines"),
     "no output in the TOML": (lambda f: segmenter(f, SIGNED, output=None), "has no `output`: logits"),
+    "no map first": (lambda f: of_outputs(f, "flat", "features"), ": features is taken"),
+    "a map of other channels first": (lambda f: of_outputs(f, "twice", "features"), ": features is taken"),
+    "two maps alike": (
+        lambda f: of_outputs(f, "features", "same"), "same [1, 3, 12, 16]: more than one fits"
+    ),
+    "two maps alike, one named": (lambda f: of_outputs(f, "features", "same", tensor="same"), ""),
+    "two maps alike, none of that name": (
+        lambda f: of_outputs(f, "features", "same", tensor="sane"), "no output is called sane: there are features [1, 3"
+    ),
+    "no map that fits": (lambda f: of_outputs(f, "twice", "four"), "none fits"),
     "channels last": (lambda f: segmenter(f, SIGNED, node("Transpose", perm=[0, 2, 3, 1])), "channels come last"),
     "the likeliest class alone": (likeliest, "the likeliest class alone"),
     "and as numbers": (lambda f: segmenter(f, SIGNED, node("ArgMax", axis=1), FLOAT), "names 3 classes"),

@@ -1,13 +1,12 @@
 """Any ONNX teacher: windows, scales and flips, label sets, closed sets, and a clear error for what cannot be used."""
 
 import numpy as np
-import onnx
 import pytest
 from click.testing import CliRunner
 from onnx import helper
 from PIL import Image
 from shared import published, run_stage
-from tiny_teachers import COLORS, color_teacher, ending, write_model, write_settings, write_table
+from tiny_teachers import COLORS, color_teacher, write_model, write_settings, write_table
 
 from chebsplat.formats import artifact
 from chebsplat.formats.capture import Capture
@@ -202,43 +201,6 @@ def test_of_a_segmenter_whose_toml_says_no_output_the_labels_tell(tmp_path):
     ):
         model.with_suffix(".toml").write_text(toml)
         assert (read_teacher(model).output, read_teacher(model).guessed) == (output, guessed)
-
-
-OUTPUTS = {  # of the graph, in order, and which is taken; None: it cannot be told
-    "a small one first": (["mean", "features"], "features"),
-    "one of other channels first": (["twice", "features"], "features"),
-    "two alike": (["features", "same"], None),
-    "none that fits": (["twice", "four"], None),
-}
-
-
-@pytest.mark.parametrize("case", OUTPUTS)
-def test_of_several_outputs_the_one_that_fits_the_labels_is_taken_or_all_are_listed(tmp_path, capture, case, capsys):
-    outputs, taken = OUTPUTS[case]
-    model = segmenter(tmp_path)
-    graph = onnx.load(model)
-    for operator, inputs, name, how in (
-        ("GlobalAveragePool", ["features"], "mean", {}), ("Flatten", ["mean"], "flat", {}),
-        ("Identity", ["features"], "same", {}), ("Concat", ["features", "features"], "twice", {"axis": 1}),
-        ("Concat", ["twice", "twice"], "four", {"axis": 1}),
-    ):  # fmt: skip
-        graph.graph.node.append(helper.make_node(operator, inputs, [name], **how))
-    onnx.save(graph, model)
-    ending(model, outputs=["flat" if name == "mean" else name for name in outputs])
-    code, found = encoded(tmp_path, capture, model)
-    said = capsys.readouterr().err
-    if taken:
-        assert code == 0 and f": {taken} is taken" in said
-        assert np.array_equal(found.pseudo_labels[:], Capture.read(capture).labels[:, ::4, ::4])
-        return
-    assert code == 3 and all(name in said for name in outputs) and "12, 16]" in said and "`tensor`" in said
-    if case == "two alike":
-        with model.with_suffix(".toml").open("a") as toml:
-            toml.write('tensor = "same"\n')
-        assert encoded(tmp_path, capture, model)[0] == 0
-        model.with_suffix(".toml").write_text('output = "logits"\nlabels = "classes.txt"\ntensor = "sane"\n')
-        assert encoded(tmp_path / "other", capture, model)[0] == 3
-        assert "no output is called sane: there are features [1, 3" in capsys.readouterr().err
 
 
 # what check-teacher tells
