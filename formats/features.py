@@ -117,7 +117,8 @@ class FeatureWriter:
         convention: dict[str, Any],
         channels: ChannelMap | None = None,
     ) -> Features:
-        """Fill the directory that `artifact.publish` yields, and give what it holds; the writer's own folder stays.
+        """Fill the directory that `artifact.publish` yields, and return what it holds; the writer's own
+        folder stays as it is.
 
         Raises: ValueError naming a view that was not added, or was added without its labels or confidence.
         """

@@ -104,9 +104,10 @@ def row_of(stage: str, manifest: Manifest, facts: Mapping[str, dict[str, Any]]) 
 class Course(NamedTuple):
     """How a scene came to what it is. Seconds count from the start, stage after stage.
 
-    spans: (stage, begin, end) in order; training: begin and end of one; plain: PSNR of photos of one colour, which is
-    what there is before; colors: (seconds, PSNR) of the scene as it would have been left then, as often as it was
-    measured; meanings: (stage, seconds, value) after each stage that made features; words: what these values are.
+    spans:    (stage, begin, end) in order; training: begin and end of this one.
+    plain:    PSNR of photos of one colour, which is what there is before training.
+    colors:   (seconds, PSNR) of the scene, had it been left then, as often as it was measured.
+    meanings: (stage, seconds, value) after each stage that made features; words: what these are.
     """
 
     spans: list[tuple[str, float, float]]
@@ -145,8 +146,11 @@ def stops(course: Course) -> list[tuple[str, float, float, float | None]]:
     """
     begin, end = course.training
     seconds, values = zip(*course.colors, strict=True)
-    within = [("a quarter of the training", begin + (end - begin) / 4), ("half of the training", (begin + end) / 2)]
-    ends = [("before training", begin), *((words, when) for words, when in within if when >= seconds[0])]
+    ends = [("before training", begin)]
+    for words, share in (("a quarter of the training", 0.25), ("half of the training", 0.5)):
+        when = begin + share * (end - begin)
+        if when >= seconds[0]:
+            ends.append((words, when))
     ends += [(stage, end) for stage, _, end in course.spans if stage in ("train", "lift", "refine")]
     found = []
     for words, when in ends:

@@ -120,7 +120,7 @@ class TeacherInference:
             log.info("%s gives values of %s, not logits: taken as such", self.teacher.path.name, self.scores)
 
     def middle(self, image: np.ndarray, side: tuple[int, int] | None = None) -> np.ndarray:
-        """The window in an image's middle, u8 [H, W, 3]. Args: side: its (H, W); None: as large as the image allows."""
+        """The window in an image's middle, u8 [H, W, 3]. Args: side: its (H, W); None: the usual."""
         size = self.scaled_size(image, 1.0)
         side = side or self.window(size)
         resized = self._resized(image, size)

@@ -62,7 +62,7 @@ def beside(folder, location):
 
 
 def of_outputs(folder, *outputs, **toml):
-    """A graph that gives these: its map, the same again, twice or four times the channels, or no map (flat)."""
+    """A graph that gives these: its map, the same again, more channels, or no map (flat)."""
     path = segmenter(folder, SIGNED, **toml)
     model = onnx.load(path)
     model.graph.node.extend([
