@@ -93,11 +93,15 @@ def figures_of(stage: str, facts: Mapping[str, dict[str, Any]]) -> list[str]:
 
 def row_of(stage: str, manifest: Manifest, facts: Mapping[str, dict[str, Any]]) -> Row:
     """The row of a stage whose artifact this is."""
-    of, loads = manifest.processes, [value for process in manifest.processes for value in process["load"]]
-    cores = " and ".join(dict.fromkeys(str(process["cores"]) for process in of))
-    machine = measured_on(manifest) + (f" of {cores} cores" if of else "")
-    machine += f", in {len(of)} processes" if len(of) > 1 else ""
-    load = f"{min(loads):.1f} to {max(loads):.1f}" if loads else ""
+    processes = manifest.processes
+    machine, load = measured_on(manifest), ""
+    if processes:
+        cores = dict.fromkeys(str(process["cores"]) for process in processes)
+        loads = [value for process in processes for value in process["load"]]
+        machine += f" of {' and '.join(cores)} cores"
+        load = f"{min(loads):.1f} to {max(loads):.1f}"
+    if len(processes) > 1:
+        machine += f", in {len(processes)} processes"
     return Row(stage, manifest.seconds, manifest.key, figures_of(stage, facts), machine, load)
 
 

@@ -56,7 +56,8 @@ class Stopwatch:
     earlier: list[dict[str, Any]] = field(default_factory=list)
 
     def __post_init__(self) -> None:
-        self.began, self.load = time.perf_counter(), load()
+        self.began = time.perf_counter()
+        self.load = load()
 
     def processes(self) -> list[dict[str, Any]]:
         """Of each process, in their order: processor, gpu, cores, threads, load at start and now, seconds."""

@@ -193,7 +193,8 @@ class TeacherInference:
 
         Raises: InputError listing them where none or several do.
         """
-        teacher, names = self.teacher, [entry.name for entry in self.model.outputs]
+        teacher = self.teacher
+        names = [entry.name for entry in self.model.outputs]
         listed = ", ".join(f"{name} {list(value.shape)}" for name, value in zip(names, outputs, strict=True))
         asked = [k for k, name in enumerate(names) if teacher.tensor in (None, name)]
         if not asked:
