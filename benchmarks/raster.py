@@ -166,19 +166,20 @@ def main(arguments: Sequence[str]) -> int:
     base, colors = times["cpu, 4 threads"], times["training step, 3 colors"]
     bars: list[tuple[str, float, str, float]] = [
         ("torch over cpu, four threads", times["torch, 4 threads"] / base, ">=", 20),
-        ("one thread over four", times["cpu, 1 thread"] / base, ">=", 2.5),
         ("19 channels over 3", base / times["cpu, 3 channels"], "<=", 2.0),
         ("100k Gaussians over 20k", times["cpu, 100k"] / base, "<=", 1.9),
         ("32 features by cell over none", times["training step, 32 features by cell"] / colors, "<=", 1.5),
     ]
+    if shared.cores() >= 4:
+        bars.append(("one thread over four", times["cpu, 1 thread"] / base, ">=", 2.5))
+    else:
+        print(f"one thread over four: not asked on {shared.cores()} cores")
     print(shared.machine())
     print(f"{N} Gaussians, {SIZE[0]}x{SIZE[1]}, {CHANNELS} channels; fastest of {options.rounds} rounds")
     rows: list[dict[str, Any]] = []
     for name, ms in times.items():
         print(f"  {name:<36} {ms:9.2f} ms")
         rows.append({"what": name, "value": ms, "unit": "ms"})
-    if shared.cores() < 4:
-        print(f"{bars.pop(1)[0]}: not asked on {shared.cores()} cores")
     missed = 0
     for what, value, relation, bar in bars:
         within = value >= bar if relation == ">=" else value <= bar

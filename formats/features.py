@@ -116,8 +116,9 @@ class FeatureWriter:
         label_embeddings: np.ndarray,
         convention: dict[str, Any],
         channels: ChannelMap | None = None,
-    ) -> None:
-        """Fill the directory that `artifact.publish` yields; the writer's own folder stays as it is.
+    ) -> Features:
+        """Fill the directory that `artifact.publish` yields, and return what it holds; the writer's own
+        folder stays as it is.
 
         Raises: ValueError naming a view that was not added, or was added without its labels or confidence.
         """
@@ -135,9 +136,9 @@ class FeatureWriter:
             _link(self.folder / name / METADATA, out / name / METADATA)
         check_names(label_names, "label names", "features", "correct the labels")
         fixed = (label_names, label_embeddings)
-        Features(self.names, stored.pop("features"), *fixed, **stored, convention=convention, channels=channels).write(
-            out
-        )
+        made = Features(self.names, stored.pop("features"), *fixed, **stored, convention=convention, channels=channels)
+        made.write(out)
+        return made
 
     def _array(self, name: str) -> Any:
         """The open array. Metadata are written anew, always the same; what chunks there are stay."""

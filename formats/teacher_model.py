@@ -22,6 +22,7 @@ if TYPE_CHECKING:
 EMBEDDED = Path(__file__).parents[1] / "teachers/embedded.onnx"  # ships with the package
 MAX_LABELS = 2**15 - 1  # what maps of int16 can number
 MAX_SIDE = 4096  # pixels of what a model is fed
+LARGEST = 4  # mean or std of colours in 0 to 1, where a model is fed less than they are, too
 RESAMPLING = ("nearest", "lanczos", "bilinear", "bicubic", "box", "hamming")  # by Pillow's numbers
 FILES = ("labels", "text", "tokenizer")
 TEXT_PACKAGE = "minilm"  # `text` may name the optional extra instead of a file
@@ -33,8 +34,8 @@ class TeacherModel:
 
     path:      the image encoder, `[1, 3, H, W]` float32 -> `[1, C, h, w]`.
     output:    "features", or "logits" of a closed-set segmenter: channel = index into the label list.
-    told:      whether the TOML says so; else labels that are names alone, without `text`, are a
-               segmenter's.
+    guessed:   whether the TOML leaves that out, and labels that are names alone, without `text`,
+               are taken for a segmenter's.
     tensor:    the graph's output, or None: the one that fits.
     mean, std: of colours in [0, 1], in the order that the model is fed, `order`: "RGB" or "BGR".
     resample:  how photos are resized, of RESAMPLING.
@@ -61,7 +62,7 @@ class TeacherModel:
     origin: str | None = None
     sha256: str | None = None
     tensor: str | None = None
-    told: bool = True
+    guessed: bool = False
 
     @property
     def settings(self) -> Path:
@@ -121,7 +122,7 @@ def read_teacher(path: Path) -> TeacherModel:
     if "output" not in values and teacher.labels is not None and teacher.text is None:
         with suppress(InputError):  # which whoever needs the table raises
             if read_label_table(teacher.labels)[1] is None:
-                teacher = replace(teacher, output="logits", told=False)
+                teacher = replace(teacher, output="logits", guessed=True)
     if teacher.output == "features" and teacher.labels is None and teacher.text is None:
         raise InputError(f"{settings} has neither `labels` nor `text`: no label could be told; add one of them")
     if teacher.output == "logits" and teacher.labels is None:
@@ -177,12 +178,15 @@ def _check(settings: Path, key: str, value: Any) -> None:
 
 
 def _check_range(settings: Path, values: dict[str, Any]) -> None:
-    """Mean and std are of colours in 0 to 1: with those of 0 to 255 all photos would look alike."""
-    given = {key: values[key] for key in ("mean", "std") if key in values}
-    large = [key for key, value in given.items() if max(value) > 1]
+    """Mean and std are of colours in 0 to 1: with those of 0 to 255 all photos would look alike.
+
+    Choices: a std of 1 beside such a mean is of colours in 0 to 255, too, as Caffe's models have it.
+    """
+    large = [key for key in ("mean", "std") if max(values.get(key, [0])) > LARGEST]
+    if large == ["mean"] and {*values.get("std", ())} == {1}:
+        large = ["mean", "std"]
     if large:
-        right = {key: [float(f"{v / 255:.4g}") for v in given[key]] for key in large}
-        advice = ", ".join(f"{key} = {value}" for key, value in right.items())
+        advice = ", ".join(f"{key} = {[float(f'{v / 255:.4g}') for v in values[key]]}" for key in large)
         what = f"{' and '.join(large)} of colours in 0 to 255, where those of 0 to 1 are needed"
         raise InputError(f"{settings}: {what}; write {advice}")
 

@@ -40,9 +40,7 @@ def run(job: Job) -> None:
         make = from_labels if settings.kind == "labels" else from_pseudo_labels
         features = make(job, capture, settings)
         job.facts |= {"kind": settings.kind, "n_labels": len(features.label_names), "convention": features.convention}
-        if features.pseudo_labels is not None:
-            said = dict(enumerate(np.asarray(features.pseudo_labels)))
-            job.facts["right"] = pixels_right(capture, features.label_names, said)
+        job.facts["right"] = pixels_right(capture, features)
         features.write(job.out)
     else:
         from_onnx(job, capture, settings)
@@ -57,7 +55,7 @@ def from_onnx(job: Job, capture: Capture, settings: TeacherSection) -> None:
     network = TeacherInference(teacher, n_threads(), job.device)
     if job.device == "cuda" and CUDA not in providers(job.device):
         job.left_out("the teacher on the GPU", f"onnxruntime here has no CUDA ({GPU_REMEDY})")
-    if not teacher.told:
+    if teacher.guessed:
         log.info("%s has no `output`: logits, as %s holds names alone", teacher.settings, teacher.labels)
     grid, n_channels = network.grid(capture.images[0], settings.downscale)
     channels = None
@@ -100,23 +98,23 @@ def from_onnx(job: Job, capture: Capture, settings: TeacherSection) -> None:
     if writer.done:
         job.watch.go_on(job.scratch)
         log.info("%d of %d views are there from a run that was stopped", len(writer.done), len(capture.names))
-    said: dict[int, np.ndarray] = {}
-    turned, alike = set(waiting[MIRRORED // 2 :: MIRRORED]), []
     for view, _ in job.progress.track(waiting, len(capture.names), "teacher", len(writer.done)):
         name = capture.names[view]
         features = network.features(capture.images[view], grid, settings.scales, settings.flips, name)
-        kept, said[view], confidence = space.split(features)
-        writer.add(view, kept, said[view], confidence)
+        writer.add(view, *space.split(features))
         job.watch.keep(job.scratch)
-        if view in turned:
-            image, scales = capture.images[view], settings.scales
-            there = features if not settings.flips else network.features(image, grid, scales, False, name)
-            back = network.features(image[:, ::-1], grid, scales, False, name)[:, ::-1]
-            alike.append(float((space.split(there)[1] == space.split(back)[1]).mean()))
-    writer.finish(job.out, space.names, space.embeddings, convention, channels)
+    made = writer.finish(job.out, space.names, space.embeddings, convention, channels)
+    assert made.pseudo_labels is not None  # `split` gives them
+    alike = []
+    for view in range(MIRRORED // 2, len(capture.names), MIRRORED):
+        image, upright = capture.images[view], np.asarray(made.pseudo_labels[view])
+        once = (grid, settings.scales, False, capture.names[view])
+        if settings.flips:
+            upright = space.split(network.features(image, *once))[1]
+        mirrored = space.split(network.features(image[:, ::-1], *once))[1]
+        alike.append(float((upright == mirrored[:, ::-1]).mean()))
     job.facts |= {"kind": "onnx", "n_labels": len(space.names), "convention": convention}
-    job.facts |= {"mirrored_alike": float(np.mean(alike)) if alike else None}
-    job.facts |= {"right": pixels_right(capture, space.names, said)}
+    job.facts |= {"mirrored_alike": float(np.mean(alike)) if alike else None, "right": pixels_right(capture, made)}
 
 
 def from_labels(job: Job, capture: Capture, settings: TeacherSection) -> Features:

@@ -22,7 +22,6 @@ from chebsplat.formats.scene import Scene
 from chebsplat.formats.teacher_model import EMBEDDED
 from chebsplat.labels.calibration import relevancy
 from chebsplat.pipelines.work import store
-from chebsplat.stages.runtime.machine import processor
 from chebsplat.stages.tools.query import CANONICAL, understood
 from chebsplat.synthetic import CLASS_NAMES
 
@@ -102,5 +101,5 @@ def main(arguments: Sequence[str]) -> int:
     for line in table:
         cells = (f"{key} {value:.3f}" if isinstance(value, float) else str(value) for key, value in line.items())
         print("  ".join(cells))
-    print(f"{len(folders)} rooms, {len(absent)} absent words, {processor()}; bars: {BARS}")
+    print(f"{len(folders)} rooms, {len(absent)} absent words, {shared.processor()}; bars: {BARS}")
     return int(any(total[0][name] < bar for name, bar in BARS.items()))

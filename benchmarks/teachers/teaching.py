@@ -36,7 +36,6 @@ from chebsplat.shape import point_encoder
 from chebsplat.shape.lessons import RIDGE, combined, solved
 from chebsplat.shape.point_encoder import PointEncoder
 from chebsplat.shape.point_inputs import PointInputs
-from chebsplat.stages.runtime.machine import processor
 from chebsplat.stages.settings import TeachSection
 from chebsplat.stages.shape_models.surfaces import in_scene
 from chebsplat.stages.shape_models.teaching_rooms import Room, held, prepare
@@ -91,7 +90,7 @@ def main(arguments: Sequence[str]) -> None:
     tested = {name: [room[kind] for room in rooms[options.rooms :]] for name, kind in KINDS.items()}
     tested |= {name: [scene_room(name)] for name in options.scenes}
     print(f"{options.steps} steps, seeds {options.seeds}, {options.rooms} rooms, {options.held_out} held out, "
-          f"{torch.get_num_threads()} threads, {processor()}")  # fmt: skip
+          f"{torch.get_num_threads()} threads, {shared.processor()}")  # fmt: skip
     rows: list[dict[str, Any]] = []
 
     def add(variant: str, measure: str, seed: int, seconds: float, values: Sequence[float]) -> None:

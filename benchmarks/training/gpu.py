@@ -31,7 +31,6 @@ from chebsplat.settings import TrainSection
 from chebsplat.stages.measuring.image_quality import timing
 from chebsplat.stages.runtime.config import Config
 from chebsplat.stages.runtime.device import resolve
-from chebsplat.stages.runtime.machine import processor
 from chebsplat.views import View
 
 DEVICE, SCENE, SETTINGS, REPEATS = "cuda", "office0", "train.steps=3000", 5
@@ -51,7 +50,7 @@ def main(arguments: Sequence[str]) -> int:
     rows: list[dict[str, Any]] = []
     plans = {name: trained(ablation, device) for name, (ablation, device) in RUNS.items()}
     for name, (_, device) in RUNS.items():
-        rows.append({"what": name, "device": processor() if device == "cpu" else torch.cuda.get_device_name()})
+        rows.append({"what": name, "device": shared.processor() if device == "cpu" else torch.cuda.get_device_name()})
         rows[-1] |= measured(plans[name])
     rows += [step(n, packed) for n in SIZES for packed in (None, False, True)]
     rows.append(again(plans["GPU"]))

@@ -5,6 +5,7 @@ change of a photo, where in the map such a change is seen, and whether what lies
 from __future__ import annotations
 
 import numpy as np
+from scipy.special import entr, rel_entr, softmax
 
 SHARPNESS = 2.0  # of a softmax of values whose standard deviation is 1
 ABOVE = frozenset(("ceiling", "sky"))
@@ -23,9 +24,7 @@ def spread(values: np.ndarray) -> float:
 
 def soft(values: np.ndarray, deviation: float) -> np.ndarray:
     """Shares [V, L, h, w] of labels: a softmax of values whose size does not matter."""
-    scaled = values * (SHARPNESS / max(deviation, 1e-9))
-    weights = np.exp(scaled - scaled.max(1, keepdims=True))
-    shares: np.ndarray = weights / weights.sum(1, keepdims=True)
+    shares: np.ndarray = softmax(values * (SHARPNESS / max(deviation, 1e-9)), axis=1)
     return shares
 
 
@@ -36,13 +35,12 @@ def information(first: np.ndarray, second: np.ndarray) -> float:
     a, b = (np.moveaxis(shares, 1, 0).reshape(shares.shape[1], -1).astype(np.float64) for shares in (first, second))
     joint = a @ b.T / a.shape[1]
     chance = joint.sum(1, keepdims=True) * joint.sum(0, keepdims=True)
-    there = joint > 1e-12
-    return float((joint[there] * np.log(joint[there] / chance[there])).sum())
+    return float(rel_entr(joint, chance).sum())
 
 
 def entropy(shares: np.ndarray) -> float:
     """Mean entropy, nats, of shares [V, L, h, w] in a pixel."""
-    return float(-(shares * np.log(shares.clip(1e-12))).sum(1).mean())
+    return float(entr(shares).sum(1).mean())
 
 
 def changes(before: np.ndarray, after: np.ndarray) -> np.ndarray:

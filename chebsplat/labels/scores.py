@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import numpy as np
+from scipy.special import logit, softmax
 
 SUM = 0.004  # that sums of probabilities may be off 1: those of bfloat16
 RANGE = 1e-3  # that values may lie beyond what they cannot
@@ -36,23 +37,22 @@ def logits_of(values: np.ndarray, kind: str) -> np.ndarray:
 
     Choices: those of sigmoids are the logits that they were taken of.
     """
-    logits: np.ndarray = values * SCALE if kind == COSINES else values
+    logits: np.ndarray = values
     if kind == SOFTMAX:
         logits = np.log(values.clip(NONE))
     elif kind == SIGMOID:
-        shares = values.clip(LEAST, 1 - LEAST)
-        logits = np.log(shares / (1 - shares))
+        logits = logit(values.clip(LEAST, 1 - LEAST))
+    elif kind == COSINES:
+        logits = SCALE * values
     return logits
 
 
 def probabilities(values: np.ndarray, kind: str) -> np.ndarray:
     """Of the classes, [C, h, w], of sum 1. Args: kind: as `kind_of` tells it."""
-    logits = logits_of(values, kind)
-    weights = np.exp(logits - logits.max(0))
-    shares: np.ndarray = weights / weights.sum(0)
+    shares: np.ndarray = softmax(logits_of(values, kind), axis=0)
     return shares
 
 
 def sureness(confidence: float, n_classes: int) -> float:
     """How sure a mean confidence is: 0 where all classes are alike, 1 where one is certain."""
-    return (confidence * n_classes - 1) / max(n_classes - 1, 1)
+    return (confidence * n_classes - 1) / (n_classes - 1) if n_classes > 1 else 1.0

@@ -16,7 +16,7 @@ from chebsplat.formats import artifact
 from chebsplat.formats.manifest import measured_on
 from chebsplat.pipelines.studies import figures
 from chebsplat.pipelines.studies.pictures import gallery
-from chebsplat.pipelines.studies.results import COLUMNS, Row, compare, elsewhere, on_one_machine, traces
+from chebsplat.pipelines.studies.results import COLUMNS, Row, compare, on_one_machine, traces
 from chebsplat.pipelines.studies.study import Run, Study
 from chebsplat.pipelines.studies.tables import (
     Section,
@@ -50,7 +50,9 @@ def write(
         writer = csv.DictWriter(handle, COLUMNS, extrasaction="ignore")
         writer.writeheader()
         writer.writerows(rows)
-    named, rows = facts(runs, rows, command), on_one_machine(rows)
+    named = facts(runs, rows, command)
+    rows, elsewhere = on_one_machine(rows)
+    named += [("beware", words) for words in elsewhere]
     settings = settings_of(study) if study.against else None
     figures.draw(out / PICTURE, rows, traces(runs, rows), settings, study.against)
     lines = compare(rows, study.baseline)
@@ -114,7 +116,7 @@ def facts(runs: list[Run], rows: list[Row], command: str) -> list[tuple[str, str
         for m in manifests
         if "commit" in m.code
     }
-    lines = [
+    return [
         ("command", command),
         ("protocol", ", ".join(sorted({row["protocol"] for row in rows}))),
         ("runs", f"{len(done)} of {len(rows)} done; {len({m.key for m in manifests})} different trainings"),
@@ -124,7 +126,6 @@ def facts(runs: list[Run], rows: list[Row], command: str) -> list[tuple[str, str
         ("versions", ", ".join(sorted(versions))),
         ("commit", ", ".join(sorted(commits)) or "not in a checkout"),
     ]
-    return lines + [("beware", words) for words in elsewhere(rows)]
 
 
 def inert(text: str) -> str:

@@ -50,9 +50,8 @@ FIGURES = (
     Figure("frames_per_second", "frames/s", 1, 1, True, "rendered_on"),
     Figure("train_seconds", "training, s", 1, 1, True, "trained_on"),
 )
-OTHERS = ("miou_teacher", "classes", "pixels", "protocol", "held_in_psnr", "steps", "clock", "device", "trained_on",
-          "rendered_on",
-          "train_key", "evaluate_key")  # fmt: skip
+OTHERS = ("miou_teacher", "classes", "pixels", "protocol", "held_in_psnr", "steps", "clock", "device",
+          "trained_on", "rendered_on", "train_key", "evaluate_key")  # fmt: skip
 IDENTITY = ("condition", "variant", "budget", "scene", "seed", "state")
 POOLED = ("miou", "miou_gain", "macc", "oa")  # what a protocol may work out over all scenes together
 COLUMNS = (*IDENTITY, *(figure.key for figure in FIGURES), *OTHERS)
@@ -107,40 +106,29 @@ def row_of(run: Run, failed: dict[str, tuple[int, str, Path]]) -> Row:
     }
 
 
-def machine_of(rows: list[Row], column: str) -> str:
-    """The machine that most of these rows name; of equally many, the first."""
-    return Counter(row[column] for row in rows).most_common(1)[0][0] if rows else ""
+def on_one_machine(rows: list[Row]) -> tuple[list[Row], list[str]]:
+    """The rows with the seconds and frames/s of one machine alone, that of most finished runs, None
+    elsewhere; and what is left out, in sentences.
 
-
-def on_one_machine(rows: list[Row]) -> list[Row]:
-    """The rows with the seconds and frames/s of one machine alone, that of most finished runs;
-    None elsewhere.
-
-    Choices: a training that ended by the clock of another machine (`clock`) has other figures
-      altogether: it has no part in the comparison, and its `state` says why.
+    Choices: of equally many, the first. A training that ended by the clock of another machine
+      (`clock`) has other figures altogether: it has no part in the comparison, and its `state`
+      says why.
     """
-    done = [row for row in rows if row["state"] == "done"]
-    machines = {figure.key: (figure.timed, machine_of(done, figure.timed)) for figure in FIGURES if figure.timed}
-    kept = []
-    for row in rows:
-        here = row | {key: None for key, (column, machine) in machines.items() if row[column] != machine}
-        if row["state"] == "done" and row["clock"] and here["train_seconds"] is None:
-            here["state"] = f"its {row['clock']:g} s are of another machine ({row['trained_on']}): not compared"
-        kept.append(here)
-    return kept
-
-
-def elsewhere(rows: list[Row]) -> list[str]:
-    """Which seconds and frames/s a study leaves out, as `on_one_machine` does, in sentences."""
-    done, said = [row for row in rows if row["state"] == "done"], []
+    kept, said = [dict(row) for row in rows], []
+    done = [row for row in kept if row["state"] == "done"]
     for figure in FIGURES:
-        if figure.timed and (others := Counter(row[figure.timed] for row in done)):
-            machine = machine_of(done, figure.timed)
-            n_here = others.pop(machine)
+        if figure.timed and done:
+            (machine, n_here), *others = Counter(row[figure.timed] for row in done).most_common()
             if others:
-                left = "; ".join(f"{n} on {name}" for name, n in others.items())
+                left = "; ".join(f"{n} on {name}" for name, n in others)
                 said.append(f"'{figure.heading}' is of the {n_here} runs on {machine} alone; not compared: {left}")
-    return said
+            for row in done:
+                if row[figure.timed] != machine:
+                    row[figure.key] = None
+    for row in done:
+        if row["clock"] and row["train_seconds"] is None:
+            row["state"] = f"its {row['clock']:g} s are of another machine ({row['trained_on']}): not compared"
+    return kept, said
 
 
 def segmented(scene: dict[str, Any], teacher: dict[str, Any]) -> Row:

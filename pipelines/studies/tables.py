@@ -149,7 +149,7 @@ def reach(points: Sequence[tuple[float, float]], target: float) -> Reach:
 def sections(study: Study, rows: list[Row]) -> list[Section]:
     """One section; none without two budgets, or before a scene has the baseline's last one."""
     budgets = list(study.budgets.settings())
-    timed = [row for row in on_one_machine(rows) if row["train_seconds"] is not None]
+    timed = [row for row in on_one_machine(rows)[0] if row["train_seconds"] is not None]
     done = [row for row in timed if row["state"] == "done"]
     table = []
     for (condition, scene), some in groups(done, "condition", "scene").items():

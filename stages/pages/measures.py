@@ -93,23 +93,29 @@ def figures_of(stage: str, facts: Mapping[str, dict[str, Any]]) -> list[str]:
 
 def row_of(stage: str, manifest: Manifest, facts: Mapping[str, dict[str, Any]]) -> Row:
     """The row of a stage whose artifact this is."""
-    of, loads = manifest.processes, [value for process in manifest.processes for value in process["load"]]
-    cores = " and ".join(dict.fromkeys(str(process["cores"]) for process in of))
-    machine = measured_on(manifest) + (f" of {cores} cores" if of else "")
-    machine += f", in {len(of)} processes" if len(of) > 1 else ""
-    load = f"{min(loads):.1f} to {max(loads):.1f}" if loads else ""
+    processes = manifest.processes
+    machine, load = measured_on(manifest), ""
+    if processes:
+        cores = dict.fromkeys(str(process["cores"]) for process in processes)
+        loads = [value for process in processes for value in process["load"]]
+        machine += f" of {' and '.join(cores)} cores"
+        load = f"{min(loads):.1f} to {max(loads):.1f}"
+    if len(processes) > 1:
+        machine += f", in {len(processes)} processes"
     return Row(stage, manifest.seconds, manifest.key, figures_of(stage, facts), machine, load)
 
 
 class Course(NamedTuple):
     """How a scene came to what it is. Seconds count from the start, stage after stage.
 
-    spans: (stage, begin, end) in order; plain: PSNR of photos of one colour, which is what there is before training;
-    colors: (seconds, PSNR) of the scene as it would have been left then, as often as it was measured; meanings:
-    (stage, seconds, value) after each stage that made features, and what the values are, in words.
+    spans:    (stage, begin, end) in order; training: begin and end of this one.
+    plain:    PSNR of photos of one colour, which is what there is before training.
+    colors:   (seconds, PSNR) of the scene, had it been left then, as often as it was measured.
+    meanings: (stage, seconds, value) after each stage that made features; words: what these are.
     """
 
     spans: list[tuple[str, float, float]]
+    training: tuple[float, float]
     plain: float
     colors: list[tuple[float, float]]
     meanings: list[tuple[str, float, float]]
@@ -131,25 +137,28 @@ def course_of(
     colors = [(begin + factor * entry["seconds"], entry["psnr"]) for entry in trace]
     colors.append((ends[-1], trace[-1]["psnr"]))
     for fact, words in (("right", RIGHT), ("halves_agree", HALVES)):
-        measured = {stage: m.role for stage, of in MEASURES.items() for m in of if m.fact == fact}
-        values = [(stage, end, facts.get(measured.get(stage, ""), {}).get(fact)) for stage, _, end in spans]
+        asked = [(stage, end, of.role) for stage, _, end in spans for of in MEASURES[stage] if of.fact == fact]
+        values = [(stage, end, facts.get(role, {}).get(fact)) for stage, end, role in asked]
         if meanings := [(stage, end, value) for stage, end, value in values if value is not None]:
-            return Course(spans, plain, colors, meanings, words)
-    return Course(spans, plain, colors, [], "")
-
-
-STOPS = (("a quarter of the training", 0.25), ("half of the training", 0.5))
+            return Course(spans, (begin, end), plain, colors, meanings, words)
+    return Course(spans, (begin, end), plain, colors, [], "")
 
 
 def stops(course: Course) -> list[tuple[str, float, float, float | None]]:
     """(stopped after, seconds, PSNR, meaning by then), of earlier ends and, last, of the whole; of a training that was
     not measured so early, none within.
     """
-    seconds, values = map(np.array, zip(*course.colors, strict=True))
-    begin, end = next((begin, end) for stage, begin, end in course.spans if stage == "train")
-    at = [(words, begin + share * (end - begin)) for words, share in STOPS]
-    at = [(words, when) for words, when in at if when >= seconds[0]]
-    at += [(stage, end) for stage, _, end in course.spans if stage in ("train", "lift", "refine")]
-    found = [("before training", begin, course.plain), *((*of, float(np.interp(of[1], seconds, values))) for of in at)]
-    by_then = [[value for _, second, value in course.meanings if second <= when + 1e-9] for _, when, _ in found]
-    return [(*of, values[-1] if values else None) for of, values in zip(found, by_then, strict=True)]
+    begin, end = course.training
+    seconds, values = zip(*course.colors, strict=True)
+    ends = [("before training", begin)]
+    for words, share in (("a quarter of the training", 0.25), ("half of the training", 0.5)):
+        when = begin + share * (end - begin)
+        if when >= seconds[0]:
+            ends.append((words, when))
+    ends += [(stage, end) for stage, _, end in course.spans if stage in ("train", "lift", "refine")]
+    found = []
+    for words, when in ends:
+        color = float(np.interp(when, seconds, values)) if when > begin else course.plain
+        meanings = [value for _, second, value in course.meanings if second <= when + 1e-9]
+        found.append((words, when, color, meanings[-1] if meanings else None))
+    return found

@@ -130,8 +130,7 @@ def course(of: Course, test_psnr: float) -> str:
             if end - begin > 0.035 * last:
                 top = panels[0, 0].get_xaxis_transform()
                 panels[0, 0].text((begin + end) / 2, 1.02, stage, transform=top, ha="center", fontsize=8)
-        begin = next(begin for stage, begin, _ in of.spans if stage == "train")
-        panels[0, 0].plot([0, begin], [of.plain] * 2, ":", color="#1f6feb", label="photos of one colour")
+        panels[0, 0].plot([0, of.training[0]], [of.plain] * 2, ":", color="#1f6feb", label="photos of one colour")
         panels[0, 0].plot(*zip(*of.colors, strict=True), color="#1f6feb", marker=".", markersize=4,
                           label="training views")  # fmt: skip
         panels[0, 0].plot([last], [test_psnr], "*", color="#e36209", markersize=11, label="test views", clip_on=False)

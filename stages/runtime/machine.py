@@ -5,7 +5,6 @@ from __future__ import annotations
 import json
 import logging
 import os
-import platform
 import time
 from dataclasses import dataclass, field
 from functools import cache
@@ -16,15 +15,20 @@ from chebsplat.errors import InputError
 from chebsplat.formats.files import atomic_write, parse_json
 
 log = logging.getLogger("chebsplat")
+CPUS = Path("/proc/cpuinfo")  # which has no names on ARM
 KEPT = "processes.json"  # in the scratch folder of a stage that resumes
 
 
 @cache
 def processor() -> str:
-    """The processor's name, where the system tells it, otherwise its architecture."""
-    path = Path("/proc/cpuinfo")
-    lines = path.read_text().splitlines() if path.exists() else []
-    return next((line.split(":", 1)[1].strip() for line in lines if line.startswith("model name")), platform.machine())
+    """The processor's name where Linux tells it, otherwise its kind as LLVM calls it."""
+    lines = CPUS.read_text().splitlines() if CPUS.exists() else []
+    named = (line.split(":", 1)[1].strip() for line in lines if line.startswith("model name"))
+    if name := next(named, ""):
+        return name
+    from llvmlite.binding import get_host_cpu_name
+
+    return str(get_host_cpu_name())
 
 
 def cores() -> int:
@@ -52,7 +56,8 @@ class Stopwatch:
     earlier: list[dict[str, Any]] = field(default_factory=list)
 
     def __post_init__(self) -> None:
-        self.began, self.load = time.perf_counter(), load()
+        self.began = time.perf_counter()
+        self.load = load()
 
     def processes(self) -> list[dict[str, Any]]:
         """Of each process, in their order: processor, gpu, cores, threads, load at start and now, seconds."""

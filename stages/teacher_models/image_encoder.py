@@ -112,18 +112,18 @@ class TeacherInference:
             sides.append(math.ceil(n / entry - 1e-9))
         return (sides[0], sides[1]), cells.shape[0]
 
-    def judge(self, images: Stack | list[np.ndarray]) -> str:
+    def judge(self, images: Stack | list[np.ndarray]) -> None:
         """Tell from a few of the images what a segmenter's values are; all later maps are read so."""
         few = images[:: -(-len(images) // JUDGED)]
         self.scores = kind_of([self.run(self.middle(image), "a view") for image in few])
         if self.scores != LOGITS:
             log.info("%s gives values of %s, not logits: taken as such", self.teacher.path.name, self.scores)
-        return self.scores
 
-    def middle(self, image: np.ndarray) -> np.ndarray:
-        """The window in an image's middle, u8 [H, W, 3]."""
+    def middle(self, image: np.ndarray, side: tuple[int, int] | None = None) -> np.ndarray:
+        """The window in an image's middle, u8 [H, W, 3]. Args: side: its (H, W); None: the usual."""
         size = self.scaled_size(image, 1.0)
-        side, resized = self.window(size), self._resized(image, size)
+        side = side or self.window(size)
+        resized = self._resized(image, size)
         top, left = (max(n - m, 0) // 2 for n, m in zip(size, side, strict=True))
         return _padded(resized[top : top + side[0], left : left + side[1]], side)
 
@@ -193,29 +193,26 @@ class TeacherInference:
 
         Raises: InputError listing them where none or several do.
         """
-        teacher, names = self.teacher, [entry.name for entry in self.model.outputs]
+        teacher = self.teacher
+        names = [entry.name for entry in self.model.outputs]
         listed = ", ".join(f"{name} {list(value.shape)}" for name, value in zip(names, outputs, strict=True))
-        asked = range(len(outputs))
-        if teacher.tensor is not None:
-            if teacher.tensor not in names:
-                why = f"no output is called {teacher.tensor}: there are {listed}"
-                raise InputError(f"{teacher.settings}: {why}; correct `tensor`")
-            asked = range(names.index(teacher.tensor), names.index(teacher.tensor) + 1)
+        asked = [k for k, name in enumerate(names) if teacher.tensor in (None, name)]
+        if not asked:
+            why = f"no output is called {teacher.tensor}: there are {listed}"
+            raise InputError(f"{teacher.settings}: {why}; correct `tensor`")
         maps = [k for k in asked if outputs[k].ndim == 4 and len(outputs[k]) == 1 and outputs[k].size]
-        found = [(k, False) for k in maps]
         table, embeddings = ([], None) if teacher.labels is None else read_label_table(teacher.labels)
-        closed = teacher.output == "logits"
-        if closed or embeddings is not None:
-            wanted = len(table) if closed or embeddings is None else embeddings.shape[1]
-            first, last = ([k for k in maps if outputs[k].shape[axis] == wanted] for axis in (1, 3))
-            found = [(k, False) for k in first] or [(k, True) for k in last]
+        n_channels = None if embeddings is None else embeddings.shape[1]
+        if teacher.output == "logits":
+            n_channels = len(table)
+        first, last = ([k for k in maps if n_channels in (None, outputs[k].shape[axis])] for axis in (1, 3))
+        found = first or last
         if len(found) == 1:
-            place, last_axis = found[0]
-            if last_axis:
+            if not first:
                 log.info("%s gives %s: channels come last, and are taken so", teacher.path.name, listed)
             elif len(asked) > 1:
-                log.info("%s gives %s: %s is taken", teacher.path.name, listed, names[place])
-            return found[0]
+                log.info("%s gives %s: %s is taken", teacher.path.name, listed, names[found[0]])
+            return found[0], not first
         if len(asked) == 1:  # which whoever needs the channels refuses
             return asked[0], False
         fit = f"{'more than one' if found else 'none'} fits {teacher.labels or '[1, C, h, w]'}"

@@ -12,7 +12,7 @@ import numpy as np
 from chebsplat.errors import ConfigError, InputError
 from chebsplat.formats.teacher_model import read_label_set, read_label_table
 from chebsplat.labels.decode import class_codes, decode
-from chebsplat.labels.names import folded, joined
+from chebsplat.labels.names import joined, lacking
 from chebsplat.stages.teacher_models.text_encoder import text_embeddings
 
 if TYPE_CHECKING:
@@ -55,8 +55,8 @@ def label_set(teacher: TeacherModel, file: str | None, class_names: list[str] | 
             "give teacher.labels, a text file with one name a line"
         )
     table = read_label_table(teacher.labels)[0]
-    known = {folded(name) for name in table}
-    common = [name for name in IN_ROOMS if folded(name) in known]
+    absent = lacking(IN_ROOMS, table)
+    common = [name for name in IN_ROOMS if name not in absent]
     return {name: [name] for name in (common if len(common) >= LEAST else table)}
 
 

@@ -55,8 +55,8 @@ def text_embeddings(names: list[str], teacher: TeacherModel) -> np.ndarray:
 def found(names: list[str], known: list[str], last_word: bool = True) -> list[int]:
     """Where each name stands among those known, -1 where it does not; looked up as in a table of labels."""
     row = {folded(name): k for k, name in reversed(list(enumerate(known)))}  # the first of equal ones
-    tight = zip(names, rows_of(names, known), strict=True)
-    return [next((row[form] for form in forms(name, last_word) if form in row), place) for name, place in tight]
+    otherwise = dict(zip(names, rows_of(names, known), strict=True))
+    return [next((row[form] for form in forms(name, last_word) if form in row), otherwise[name]) for name in names]
 
 
 def forms(name: str, last_word: bool = True) -> Iterator[str]:

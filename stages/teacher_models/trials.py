@@ -11,11 +11,11 @@ from PIL import Image
 
 from chebsplat.errors import DataFailure
 from chebsplat.formats.teacher_model import TeacherModel
+from chebsplat.labels.names import folded
 from chebsplat.labels.plausible import QUARTERS, changes, entropy, information, sense, soft, spread
 from chebsplat.labels.scores import LOGITS, logits_of, probabilities
 from chebsplat.stages.teacher_models.image_encoder import TeacherInference, unit
 from chebsplat.stages.teacher_models.label_space import IN_ROOMS
-from chebsplat.stages.teacher_models.text_encoder import folded
 
 IMAGENET = (0.485, 0.456, 0.406), (0.229, 0.224, 0.225)
 BYTE = (1 / 255,) * 3
@@ -39,16 +39,12 @@ UNTOLD = "cannot be told from these photos"
 
 
 class Trials:
-    """What a teacher gives of the middle windows of photos, fed in one way or another.
+    """What a teacher gives of the middle windows of photos, fed in one way or another."""
 
-    Args: values: of a window's output [C, h, w] what is compared of labels, [L, h, w].
-    """
-
-    def __init__(self, network: TeacherInference, images: list[np.ndarray], values: Callable[[np.ndarray], np.ndarray]):
-        self.network, self.values = network, values
-        self.own, windows = network.teacher, [network.middle(image) for image in images]
-        sides = [min(window.shape[k] for window in windows) for k in (0, 1)]  # models of any size see photos of any
-        self.windows = [window[middle(window, sides)] for window in windows]
+    def __init__(self, network: TeacherInference, images: list[np.ndarray], embeddings: np.ndarray):
+        self.network, self.own, self.embeddings = network, network.teacher, embeddings
+        heights, widths = zip(*(network.window(network.scaled_size(image, 1.0)) for image in images), strict=True)
+        self.windows = [network.middle(image, (min(heights), min(widths))) for image in images]
         self.turned = False
         self.plain = self.fed(self.own)
 
@@ -57,11 +53,14 @@ class Trials:
         self.network.teacher = teacher
         try:
             windows = [window if change is None else change(window) for window in self.windows]
-            found = [self.values(self.network.run(window, "a photo")) for window in windows]
+            outputs = [self.network.run(window, "a photo") for window in windows]
         finally:
             self.network.teacher = self.own
-        stacked = np.stack(found)
-        return stacked.swapaxes(2, 3) if self.turned else stacked
+        if self.own.output == "logits":
+            values = np.stack([logits_of(output, self.network.scores) for output in outputs])
+        else:
+            values = np.stack([np.tensordot(self.embeddings, unit(output, 0), 1) for output in outputs])
+        return values.swapaxes(2, 3) if self.turned else values
 
     def informed(self, teacher: TeacherModel) -> tuple[float, np.ndarray]:
         """Information that photos share with their own middles, mirrored and darkened; the plain
@@ -83,50 +82,43 @@ def tried(
 
     Args: names: of the channels of a segmenter, or of the rows of `embeddings` of other teachers.
     """
-    teacher = network.teacher
-    closed = teacher.output == "logits"
-
-    def values(output: np.ndarray) -> np.ndarray:
-        if closed:
-            return logits_of(output, network.scores)
-        return np.tensordot(embeddings, unit(output, 0), 1)
-
-    trials = Trials(network, images, values)
-    found = [layout(trials)]
+    trials = Trials(network, images, embeddings)
+    found = [("layout", layout_of(trials))]
     if len(images) < ENOUGH:
         return [*found, ("more", "with eight photos, or a folder, range and order of colours and names are tried, too")]
-    told, best, plain = range_of(trials, teacher)
+    told, best, plain = range_of(trials)
     found += [("range", told), ("order", order_of(trials, best, plain))]
-    return [*found, ("names", names_of(plain, names))] if closed else found
+    return [*found, ("names", names_of(plain, names))] if trials.own.output == "logits" else found
 
 
-def layout(trials: Trials) -> tuple[str, str]:
+def layout_of(trials: Trials) -> str:
     """Where in the map a change of the photos' top right is seen. A transposed map is turned."""
     before, after = trials.plain, trials.fed(trials.own, top_right_inverted)
     deviation = spread(before)
     moved = changes(soft(before, deviation), soft(after, deviation))
     second, first = np.argsort(moved)[-2:]
     if moved[first] < CLEARLY * moved[second]:
-        return "layout", UNTOLD
+        return UNTOLD
     how = ("mirrored", "as the photos", "transposed", "upside down")[first]
-    if first == 1:
-        return "layout", how
-    if first == 2:
-        trials.turned, trials.plain = True, before.swapaxes(2, 3)
-    return "layout", f"{how}: a change of the photos' top right is seen at the {QUARTERS[first]}; export it again"
+    if how == "as the photos":
+        return how
+    if how == "transposed":
+        trials.turned = True
+        trials.plain = before.swapaxes(2, 3)
+    return f"{how}: a change of the photos' top right is seen at the {QUARTERS[first]}; export it again"
 
 
-def range_of(trials: Trials, teacher: TeacherModel) -> tuple[str, TeacherModel, np.ndarray]:
+def range_of(trials: Trials) -> tuple[str, TeacherModel, np.ndarray]:
     """What is said of mean and std; the teacher as it tells most; its values."""
+    teacher = trials.own
     own, plain = trials.informed(teacher)
-    most, name, best, values = 0.0, "", teacher, plain
-    for other, (mean, std) in RANGES.items():
+    found = []
+    for name, (mean, std) in RANGES.items():
         if not np.allclose((mean, std), (teacher.mean, teacher.std), rtol=0.05):
             fed = replace(teacher, mean=mean, std=std)
             with suppress(DataFailure):  # a range that makes it overflow
-                told, there = trials.informed(fed)
-                if told > most:
-                    most, name, best, values = told, other, fed, there
+                found.append((*trials.informed(fed), name, fed))
+    most, values, name, best = max(found, key=lambda of: of[0], default=(0.0, plain, "", teacher))
     kept = "nats outlive a change of the photos"
     if most > max(MORE * own, LEAST):
         said = f"{name} tells more: {most:.2f} {kept}, {own:.2f} as given"
@@ -154,11 +146,12 @@ def order_of(trials: Trials, teacher: TeacherModel, plain: np.ndarray) -> str:
 
 def names_of(plain: np.ndarray, names: list[str]) -> str:
     """What is said of the names of classes: of one class more or less in front, nothing else."""
-    shares, words = soft(plain, spread(plain)), [folded(name.replace(",", " ").replace(";", " ")) for name in names]
+    shares = soft(plain, spread(plain))
+    words = [folded(name.replace(",", " ").replace(";", " ")) for name in names]
     indoors = frozenset(word for name in IN_ROOMS for word in name.split())
     off = {by: sense(shares, list(np.roll(words, by)), indoors) for by in (-1, 0, 1)}
     second, by = sorted(off, key=lambda of: off[of])[1:]
-    if off[by] < SENSIBLE or off[by] < off[0 if by else second] + BETTER:
+    if off[by] < max(SENSIBLE, off[0 if by else second] + BETTER):
         return f"{UNTOLD}: too little is seen of floors, ceilings, and what rooms hold and others do not"
     if by == 0:
         return f"make sense of a room ({off[0]:.2f} of 2)"
@@ -166,12 +159,6 @@ def names_of(plain: np.ndarray, names: list[str]) -> str:
     said = f"one class off, if these are rooms: each makes more sense with the name {which} its own"
     asked = "is a background named that the model has not, or the other way round?"
     return f"{said} ({off[by]:.2f} of 2, {off[0]:.2f} as given); {asked}"
-
-
-def middle(window: np.ndarray, sides: list[int]) -> tuple[slice, ...]:
-    """Where a window's middle of these sides lies."""
-    starts = [(n - side) // 2 for n, side in zip(window.shape, sides, strict=False)]
-    return tuple(slice(start, start + side) for start, side in zip(starts, sides, strict=True))
 
 
 def closer(window: np.ndarray) -> np.ndarray:

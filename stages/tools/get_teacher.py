@@ -10,7 +10,7 @@ import os
 import re
 import shutil
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from pathlib import Path, PurePosixPath
 from typing import Any, Literal
 from urllib.parse import urlsplit
@@ -195,13 +195,19 @@ def preparation(path: Path, repository: str) -> dict[str, Any]:
     """Keys of a teacher's TOML that feed a model as its image processor does.
 
     Raises: InputError naming a step or a value that no key stands for.
+    """
+    try:
+        return feeding({key: value for key, value in document(path).items() if value is not None})
+    except ValueError as error:
+        why = f"hf:{repository}: {PREPARATION} {error}"
+        raise InputError(f"{why}; export the model yourself (docs/teachers.md)") from None
+
+
+def feeding(values: dict[str, Any]) -> dict[str, Any]:
+    """These keys, of an image processor's values. Raises: ValueError.
+
     Choices: what is cropped from a photo's middle is a window's size; a photo keeps its aspect ratio.
     """
-    values = {key: value for key, value in document(path).items() if value is not None}
-
-    def refused(what: str) -> InputError:
-        where = f"hf:{repository}: {PREPARATION}"
-        return InputError(f"{where} {what}; export the model yourself (docs/teachers.md)")
 
     def does(step: str, usual: bool) -> bool:
         return bool(values.get(f"do_{step}", usual))
@@ -210,27 +216,27 @@ def preparation(path: Path, repository: str) -> dict[str, Any]:
     flipped = does("flip_channel_order", "MobileViT" in str(kind))
     others = [key for key, value in values.items() if (key.startswith("do_") or "offset" in key) and value]
     if unknown := sorted({*others} - {f"do_{step}" for step in STEPS}):
-        raise refused(f"asks for {', '.join(unknown)}, which no key of a teacher stands for")
+        raise ValueError(f"asks for {', '.join(unknown)}, which no key of a teacher stands for")
     mean, std = [0.0] * 3, [1.0] * 3
     if does("normalize", not flipped or "image_mean" in values):
         mean, std = (three(values.get(key)) for key in ("image_mean", "image_std"))
         if not mean or not std:
-            raise refused("has no image_mean or image_std of three numbers")
+            raise ValueError("has no image_mean or image_std of three numbers")
     factor = values.get("rescale_factor", 1 / 255) if does("rescale", True) else 1
     if not isinstance(factor, int | float) or not 0 < factor < 1e3:
-        raise refused(f"has a rescale_factor of {factor!r:.40}")
+        raise ValueError(f"has a rescale_factor of {factor!r:.40}")
     if flipped and len({*mean}) + len({*std}) > 2:
-        raise refused("turns the order of channels that are normalised apart (do_flip_channel_order)")
+        raise ValueError("turns the order of channels that are normalised apart (do_flip_channel_order)")
     whole = 1 if np.isclose(255 * factor, 1, 1e-9) else 255 * factor  # what 255 becomes
     if max(*mean, *std) > 1 and whole <= 1:
-        raise refused("has image_mean or image_std of colours in 0 to 255, and rescales to 0 to 1 before")
+        raise ValueError("has image_mean or image_std of colours in 0 to 255, and rescales to 0 to 1 before")
     number = values.get("resample", 2)
     if number not in range(len(RESAMPLING)):
-        raise refused(f"has a resample of {number!r:.40}")
+        raise ValueError(f"has a resample of {number!r:.40}")
     found: dict[str, Any] = {"mean": [m / whole for m in mean], "std": [s / whole for s in std]}
     found |= {"order": "BGR"} if flipped else {}
     found |= {"resample": RESAMPLING[number]} if number != 2 else {}
-    return found | window_of(values, does("resize", True), does("center_crop", False), refused)
+    return found | window_of(values, does("resize", True), does("center_crop", False))
 
 
 def three(value: Any) -> list[float]:
@@ -239,10 +245,8 @@ def three(value: Any) -> list[float]:
     return listed if len(listed) == 3 and all(type(v) in (int, float) for v in listed) else []
 
 
-def window_of(
-    values: dict[str, Any], resized: bool, cropped: bool, refused: Callable[[str], InputError]
-) -> dict[str, Any]:
-    """`size` and `base` of a TOML: the sides of a window, and a photo's long side."""
+def window_of(values: dict[str, Any], resized: bool, cropped: bool) -> dict[str, Any]:
+    """`size` and `base` of a TOML: the sides of a window, and a photo's long side. Raises: ValueError."""
 
     def sides(key: str) -> tuple[list[int], int | None]:
         of = values.get(key)
@@ -252,7 +256,7 @@ def window_of(
         short = of.get("shortest_edge", longest)
         found = [side for side in (of.get("height", short), of.get("width", short)) if type(side) is int]
         if len(found) < 2 or not isinstance(longest, int | None):
-            raise refused(f"has no {key} of whole numbers")
+            raise ValueError(f"has no {key} of whole numbers")
         return found, longest
 
     crop = {"size": sides("crop_size")[0]} if cropped else {}
@@ -263,7 +267,7 @@ def window_of(
     return {"size": size, "base": base if longest is None else min(base, longest)} | crop
 
 
-def check(model: Path, photos: Path | Sequence[Path] = (), labels: str | None = None) -> list[tuple[str, str]]:
+def check(model: Path, photos: Sequence[Path] = (), labels: str | None = None) -> list[tuple[str, str]]:
     """(what, finding) of a teacher. Raises what the teacher stage would.
 
     Args: photos: or folders of them, which tell the usual mistakes (`teacher_models/trials.py`);
@@ -275,8 +279,7 @@ def check(model: Path, photos: Path | Sequence[Path] = (), labels: str | None = 
     settings = TeacherSection()
     teacher = read_teacher(model)
     network = TeacherInference(teacher, n_threads())
-    given = [photos] if isinstance(photos, Path) else photos
-    found = [images_below(path, "give another --photo") if path.is_dir() else [path] for path in given]
+    found = [images_below(path, "give another --photo") if path.is_dir() else [path] for path in photos]
     files = [file for of in found for file in of]
     looked_at = [shown(file) for file in files[:: -(-len(files) // TRIED)]] if files else [shown(None)]
     (name, image), images = looked_at[0], [image for _, image in looked_at]
@@ -295,7 +298,7 @@ def check(model: Path, photos: Path | Sequence[Path] = (), labels: str | None = 
     counts = np.bincount(pseudo_labels.ravel(), minlength=len(space.names))
     seen = [f"{space.names[k]} {counts[k] / pseudo_labels.size:.0%}" for k in np.argsort(-counts, kind="stable")[:SHOWN] if counts[k]]  # fmt: skip  # noqa: E501
     wide = teacher.output == "features" and n_channels > MAX_CHANNELS
-    by = "" if teacher.told else ", as its labels are names alone"
+    by = ", as its labels are names alone" if teacher.guessed else ""
     findings = []
     if teacher.output == "logits":
         taken = "" if network.scores == LOGITS else ", told by its values, and taken as such"

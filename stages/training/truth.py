@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-
 import numpy as np
 from scipy.spatial import cKDTree
 
@@ -49,19 +47,18 @@ def labels_right(
     return float((said == np.concatenate(truth)).mean())
 
 
-def pixels_right(capture: Capture, label_names: list[str], said: Mapping[int, np.ndarray]) -> float | None:
-    """Share of the pixels of training views that have the true label; None where the capture has no labels.
-
-    Args: said: by view, labels [h, w] among `label_names`, -1 none, which is as wrong as any other.
+def pixels_right(capture: Capture, teacher: Features) -> float | None:
+    """Share of the pixels of training views that a teacher's pseudo labels name rightly, where -1 is
+    as wrong as any other; None where the capture has no labels.
     """
-    if capture.labels is None:
+    if capture.labels is None or teacher.pseudo_labels is None:
         return None
     right = counted = 0
-    for view, labels in said.items():
-        if not capture.is_test[view]:
-            truth = resized(true_labels(capture, view, label_names), labels.shape, centred=True)
-            right += int(((labels == truth) & (truth >= 0)).sum())
-            counted += int((truth >= 0).sum())
+    for view in np.flatnonzero(~capture.is_test).tolist():
+        labels = np.asarray(teacher.pseudo_labels[view])
+        truth = resized(true_labels(capture, view, teacher.label_names), labels.shape, centred=True)
+        right += int(((labels == truth) & (truth >= 0)).sum())
+        counted += int((truth >= 0).sum())
     return right / counted if counted else None
 
 

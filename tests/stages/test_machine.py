@@ -47,6 +47,15 @@ def test_machines_are_the_same_where_their_names_and_threads_are(processes, word
     assert measured_on(Manifest("s/1", KEY, "train", processes=processes)) == words
 
 
+@pytest.mark.parametrize("lines", [None, "CPU part\t: 0xd0c\n", "model name\t:\n"])
+def test_a_processor_without_a_name_is_told_from_others_of_its_architecture(tmp_path, monkeypatch, lines):
+    monkeypatch.setattr(machine, "CPUS", tmp_path / "cpuinfo")
+    monkeypatch.setattr("llvmlite.binding.get_host_cpu_name", lambda: "neoverse-n1")
+    if lines is not None:
+        machine.CPUS.write_text(lines)
+    assert machine.processor.__wrapped__() == "neoverse-n1"
+
+
 def stopped_after(monkeypatch, cls, method, calls):
     """Let a stage be stopped as it calls a method for the `calls`-th time, after what that does."""
     original, count = getattr(cls, method), []

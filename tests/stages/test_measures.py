@@ -1,5 +1,7 @@
 """Every stage has an error beside its seconds, of one table, and the course of a scene is that of its stages."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from scipy.special import logit
@@ -113,12 +115,13 @@ def test_labels_of_gaussians_are_held_against_the_surface_of_training_views(wall
 
 
 def test_labels_of_pixels_are_held_against_those_of_training_views(wall):
-    said = {view: np.zeros((4, 4), np.int16) for view in range(3)}
-    said[2][:] = -1  # of the test view
-    assert pixels_right(wall, ["a", "b"], said) == 0.5
-    said[1][:] = -1
-    assert pixels_right(wall, ["b", "a"], said) == 0.25
-    assert pixels_right(wall, ["x"], said) is None
+    said = np.zeros((3, 4, 4), np.int16)
+    teacher = Features(wall.names, np.zeros((3, 4, 4, 2), np.float16), ["a", "b"], np.eye(2, dtype=np.float32), said)
+    said[2] = -1  # of the test view
+    assert pixels_right(wall, teacher) == 0.5
+    said[1] = -1
+    assert pixels_right(wall, replace(teacher, label_names=["b", "a"])) == 0.25
+    assert pixels_right(wall, replace(teacher, label_names=["x", "y"])) is None
 
 
 def test_points_are_held_against_the_depth_of_training_views_and_without_it_cells_are_counted(wall):

@@ -5,14 +5,13 @@ import json
 import numpy as np
 import onnx
 import pytest
-from onnx import TensorProto, helper, numpy_helper
+from onnx import TensorProto, helper
 from shared import published, run_stage
 from tiny_teachers import COLORS, ending, moved_out, write_model
 
 from chebsplat.formats.capture import Capture
 from chebsplat.formats.features import Features
 
-pytestmark = pytest.mark.slow
 IMAGENET = {"mean": [0.485, 0.456, 0.406], "std": [0.229, 0.224, 0.225]}
 SIGNED, RAW = {"mean": [0.5] * 3, "std": [0.5] * 3}, {"mean": [0.0] * 3, "std": [1.0] * 3}
 BYTES = {"mean": [0.0] * 3, "std": [1 / 255] * 3}
@@ -62,14 +61,18 @@ def beside(folder, location):
     moved_out(segmenter(folder, SIGNED), location)
 
 
-def with_another_output(folder):
-    """What trainings add: a map of fewer classes, before the right one."""
-    path = segmenter(folder, SIGNED)
+def of_outputs(folder, *outputs, **toml):
+    """A graph that gives these: its map, the same again, more channels, or no map (flat)."""
+    path = segmenter(folder, SIGNED, **toml)
     model = onnx.load(path)
-    model.graph.initializer.append(numpy_helper.from_array(np.array([0, 1]), "two"))
-    model.graph.node.append(helper.make_node("Gather", ["features", "two"], ["auxiliary"], axis=1))
+    model.graph.node.extend([
+        helper.make_node("Identity", ["features"], ["same"]),
+        helper.make_node("Concat", ["features", "features"], ["twice"], axis=1),
+        helper.make_node("Concat", ["twice", "twice"], ["four"], axis=1),
+        helper.make_node("Flatten", ["features"], ["flat"]),
+    ])  # fmt: skip
     onnx.save(model, path)
-    ending(path, outputs=["auxiliary", "features"])
+    ending(path, outputs=outputs)
 
 
 def likeliest(folder):
@@ -106,7 +109,16 @@ WAYS = {  # how it is brought, and a word of what is said, "" where nothing need
     "sigmoid": (lambda f: segmenter(f, SIGNED, node("Sigmoid")), "values of sigmoid"),
     "cosines": (lambda f: segmenter(f, SIGNED, node("LpNormalization", axis=1)), "values of cosines"),
     "no output in the TOML": (lambda f: segmenter(f, SIGNED, output=None), "has no `output`: logits"),
-    "an output of fewer classes first": (with_another_output, "features is taken"),
+    "no map first": (lambda f: of_outputs(f, "flat", "features"), ": features is taken"),
+    "a map of other channels first": (lambda f: of_outputs(f, "twice", "features"), ": features is taken"),
+    "two maps alike": (
+        lambda f: of_outputs(f, "features", "same"), "same [1, 3, 12, 16]: more than one fits"
+    ),
+    "two maps alike, one named": (lambda f: of_outputs(f, "features", "same", tensor="same"), ""),
+    "two maps alike, none of that name": (
+        lambda f: of_outputs(f, "features", "same", tensor="sane"), "no output is called sane: there are features [1, 3"
+    ),
+    "no map that fits": (lambda f: of_outputs(f, "twice", "four"), "none fits"),
     "channels last": (lambda f: segmenter(f, SIGNED, node("Transpose", perm=[0, 2, 3, 1])), "channels come last"),
     "the likeliest class alone": (likeliest, "the likeliest class alone"),
     "and as numbers": (lambda f: segmenter(f, SIGNED, node("ArgMax", axis=1), FLOAT), "names 3 classes"),
@@ -115,7 +127,10 @@ WAYS = {  # how it is brought, and a word of what is said, "" where nothing need
         lambda f: segmenter(f, IMAGENET, mean=[123.675, 116.28, 103.53], std=[58.395, 57.12, 57.375]),
         "write mean = [0.485, 0.456, 0.406], std = [0.229, 0.224, 0.225]",
     ),
-    "a mean of 0 to 255": (lambda f: segmenter(f, IMAGENET, mean=[123.675, 116.28, 103.53]), "of colours in 0 to 255"),
+    "Caffe's mean and std": (
+        lambda f: segmenter(f, CAFFE, mean=[104.0, 117.0, 123.0], std=[1, 1, 1]),
+        "write mean = [0.4078, 0.4588, 0.4824], std = [0.003922, 0.003922, 0.003922]",
+    ),
     "a name too many": (
         lambda f: (segmenter(f, SIGNED), (f / "classes.txt").write_text("background\nred\ngreen\nblue\n")),
         "names 4 classes",
@@ -143,6 +158,7 @@ def test_a_segmenter_says_the_same_however_it_is_brought_or_a_line_says_why_not(
     if code:
         assert code == 3 and word
         return
-    assert (
-        miou(Features.read(tmp_path / "out").pseudo_labels[:], Capture.read(capture).labels[:, ::4, ::4]) > 100 - POINTS
-    )
+    found = Features.read(tmp_path / "out")
+    assert miou(found.pseudo_labels[:], Capture.read(capture).labels[:, ::4, ::4]) > 100 - POINTS
+    scores = next((kind for kind in ("softmax", "sigmoid", "cosines") if kind in word), "logits")
+    assert found.convention["scores"] == scores

@@ -123,11 +123,17 @@ def ask(constants, monkeypatch, address):
 
 NORM = {"image_mean": [0.485, 0.456, 0.406], "image_std": [0.229, 0.224, 0.225]}
 SIZED = {"size": {"height": 64, "width": 64}}
+
+
+def usual(v, m, s):
+    return (v / 255 - m) / s
+
+
 FED = {  # of preprocessor_config.json: other keys, what the hub's processor makes of colours 0 to 255, keys of the TOML
-    "as usual": (NORM, lambda v, m, s: (v / 255 - m) / s, {"mean": [0.485, 0.456, 0.406]}),
+    "as usual": (NORM, usual, {"mean": [0.485, 0.456, 0.406]}),
     "said in full": (
         NORM | {"do_rescale": True, "rescale_factor": 0.00392156862745098, "do_normalize": True, "do_pad": True},
-        lambda v, m, s: (v / 255 - m) / s, {"mean": [0.485, 0.456, 0.406]},
+        usual, {},
     ),
     "not normalised": (NORM | {"do_normalize": False}, lambda v, m, s: v / 255, {"std": [1, 1, 1]}),
     "not rescaled": (
@@ -136,21 +142,18 @@ FED = {  # of preprocessor_config.json: other keys, what the hub's processor mak
     ),
     "neither": ({"do_rescale": False, "do_normalize": False}, lambda v, m, s: v, {}),
     "rescaled to 0 to 2": (NORM | {"rescale_factor": 1 / 127.5}, lambda v, m, s: (v / 127.5 - m) / s, {}),
+    "rescaled to less than 1": ({"rescale_factor": 1 / 256, "do_normalize": False}, lambda v, m, s: v / 256, {}),
     "one number for three": ({"image_mean": 0.5, "image_std": 0.5}, lambda v, m, s: v / 127.5 - 1, {}),
     "BGR": ({"do_flip_channel_order": True}, lambda v, m, s: v[::-1] / 255, {"order": "BGR"}),
     "MobileViT, which is of BGR unless it says otherwise": (
         {"image_processor_type": "MobileViTImageProcessor"}, lambda v, m, s: v[::-1] / 255, {"order": "BGR"},
     ),
-    "bicubic": (NORM | {"resample": 3}, lambda v, m, s: (v / 255 - m) / s, {"resample": "bicubic"}),
-    "the shortest edge": (
-        NORM | {"size": {"shortest_edge": 96}}, lambda v, m, s: (v / 255 - m) / s, {"size": [96, 96], "base": 128}
-    ),
-    "the longest edge": (
-        NORM | {"size": {"shortest_edge": 96, "longest_edge": 100}}, lambda v, m, s: (v / 255 - m) / s, {"base": 100}
-    ),
+    "bicubic": (NORM | {"resample": 3}, usual, {"resample": "bicubic"}),
+    "the shortest edge": (NORM | {"size": {"shortest_edge": 96}}, usual, {"size": [96, 96], "base": 128}),
+    "the longest edge": (NORM | {"size": {"shortest_edge": 96, "longest_edge": 100}}, usual, {"base": 100}),
     "a crop": (
         NORM | {"size": {"shortest_edge": 96}, "do_center_crop": True, "crop_size": 64},
-        lambda v, m, s: (v / 255 - m) / s, {"size": [64, 64], "base": 128},
+        usual, {"size": [64, 64], "base": 128},
     ),
 }  # fmt: skip
 
