@@ -131,7 +131,7 @@ def test_an_export_script_of_the_document_makes_a_teacher(name, tmp_path, monkey
     (tmp_path / f"{name}.toml").write_text("\n".join(line for line in lines if not line.startswith(drop or "-")))
     pixels = np.random.default_rng(0).integers(0, 255, (240, 320, 3), np.uint8)
     Image.fromarray(pixels).save(tmp_path / "photo.png")
-    found = dict(check(tmp_path / f"{name}.onnx", tmp_path / "photo.png"))
+    found = dict(check(tmp_path / f"{name}.onnx", [tmp_path / "photo.png"]))
     for told, expected in zip(("output", "image", "windows"), EXPECTED[name], strict=True):
         assert expected in found[told]
     assert found["labels"].startswith("3, from ")
