@@ -17,9 +17,6 @@ LEAST = 30  # verified matches of a pair that counts
 SOUND = 0.6  # of the pairs
 DENIED = 0.05  # of a pair's matches: where fewer are, the pair contradicts it
 CONTRADICTED = 0.5  # of a photo's pairs: where more contradict its place, it is left out; of right photos .44 did
-FEWEST = 3  # pairs that contradict a photo's place: two did a right photo's
-ASIDE, NEARER = 20.0, 1.5  # degrees, times: two photos that see a point less apart than this match it
-MARGIN = 0.03  # of a picture's sides, in which no point is expected
 DISPUTED = 0.3  # of a photo's pairs: where more contradict its place, it speaks for no costlier model
 CONFIRMED = 0.3  # of a pair's matches: where so many are points of the model, the pair agrees with it
 AGREE = 0.8  # of the pairs: of six real captures all that are right have .88 and more, a repetitive board .5
@@ -34,22 +31,20 @@ REMEDY = "photograph from more places, a step to the side between photos, with t
 
 
 class Pairs(NamedTuple):
-    """What pairs of a model's photos say of one another's places.
+    """The pairs of a model's photos that have LEAST verified matches.
 
-    images: ids [N] of the photos; rows: [P, 2] into them, of pairs with LEAST verified matches; confirmed: [P] the
-    share of a pair's matches that are points of the model; level: the share of these pairs whose matches one
-    homography explains; blind: bool [N, N], where the first photo should see the second one's points and does not.
+    images: ids [N] of the photos; rows: [P, 2] into them; confirmed: [P] the share of a pair's matches that are points
+    of the model; level: the share of the pairs whose matches one homography explains.
     """
 
     images: list[int]
     rows: np.ndarray
     confirmed: np.ndarray
-    level: float
-    blind: np.ndarray
+    level: float = 0.0
 
 
 def pairs(model: pycolmap.Reconstruction, database: Path) -> Pairs:
-    """Pairs of a model's photos, the share of each one's matches that the model confirms, and who sees nothing."""
+    """Pairs of a model's photos, and the share of each one's matches that the model confirms."""
     points = {
         image.image_id: np.array([p.point3D_id if p.has_point3D() else -1 for p in image.points2D], np.int64)
         for image in model.images.values()
@@ -65,44 +60,16 @@ def pairs(model: pycolmap.Reconstruction, database: Path) -> Pairs:
                 rows.append([images.index(first), images.index(second)])
                 confirmed.append(float(((a == b) & (a >= 0)).mean()))
                 level.append(geometry.config in HOMOGRAPHIES)
-    seen = [np.unique(points[image][points[image] >= 0]) for image in images]
-    flat = float(np.mean(level or [False]))
-    return Pairs(images, np.array(rows, int).reshape(-1, 2), np.array(confirmed), flat, blind(model, images, seen))
-
-
-def blind(model: pycolmap.Reconstruction, images: list[int], seen: list[np.ndarray]) -> np.ndarray:
-    """Whether the first photo has under DENIED of those points of the second, LEAST or more, that the model has in its
-    picture and that both look at alike, bool [N, N].
-
-    Args: seen: ids of each photo's points.
-    """
-    found = np.zeros((len(images), len(images)), bool)
-    eyes = np.array([model.images[image].projection_center() for image in images])
-    for second, ids in enumerate(seen):
-        rays = (np.array([model.points3D[k].xyz for k in ids]).reshape(-1, 1, 3) - eyes).swapaxes(0, 1)  # [N, P, 3]
-        away = np.linalg.norm(rays, axis=2)
-        alike = (rays * rays[second]).sum(2) > math.cos(math.radians(ASIDE)) * away * away[second]
-        alike &= np.abs(np.log(away / away[second])) < math.log(NEARER)
-        for first in set(np.flatnonzero(alike.sum(1) >= LEAST)) - {second}:
-            image = model.images[images[first]]
-            camera = model.cameras[image.camera_id]
-            local = rays[first][alike[first]] @ image.cam_from_world().rotation.matrix().T
-            size = np.array([camera.width, camera.height])
-            places = np.where(local[:, 2:] > 0, camera.img_from_cam(local), -1.0)
-            inside = (np.abs(places / size - 0.5) < 0.5 - MARGIN).all(1)
-            shared = np.isin(ids[alike[first]][inside], seen[first])
-            found[first, second] = len(shared) >= LEAST and shared.mean() < DENIED
-    return found
+    return Pairs(images, np.array(rows, int).reshape(-1, 2), np.array(confirmed), float(np.mean(level or [False])))
 
 
 def misplaced(found: Pairs, most: float = CONTRADICTED) -> list[int]:
     """Ids of photos that many of their pairs contradict, for they were put beside something that only looks alike.
 
     Args:    most: of a photo's pairs, that may contradict its place.
-    Choices: the photo with the largest share of contradicting pairs goes first, and its pairs no longer count. A pair
-      contradicts by matches that the model denies, or where a photo does not see what it should; fewer than FEWEST
-      tell nothing, for something may stand between. Of groups then linked by no agreeing pair the largest stays; photos
-      without pairs stay, too. Where less than SOUND of all pairs agree, matches are no witnesses, and all stay.
+    Choices: the photo with the largest share of contradicting pairs goes first, and its pairs no longer count. One pair
+      alone tells nothing. Of groups then linked by no agreeing pair the largest stays; photos without pairs stay, too.
+      Where less than SOUND of all pairs agree, matches are no witnesses, and all stay.
     """
     if not len(found.confirmed) or np.mean(found.confirmed >= CONFIRMED) < SOUND:
         return []
@@ -111,11 +78,10 @@ def misplaced(found: Pairs, most: float = CONTRADICTED) -> list[int]:
     for matrix, chosen in ((agree, found.confirmed >= CONFIRMED), (deny, found.confirmed < DENIED)):
         i, j = found.rows[chosen].T
         matrix[i, j] = matrix[j, i] = 1
-    deny = np.maximum(deny, found.blind & (agree == 0))
     kept = np.ones(n, bool)
     while True:
         against = deny @ kept
-        share = np.where(kept & (against >= FEWEST), against / np.maximum(against + agree @ kept, 1), 0)
+        share = np.where(kept & (against > 1), against / np.maximum(against + agree @ kept, 1), 0)
         worst = np.lexsort((against, share))[-1]
         if share[worst] <= most:
             break

@@ -1,7 +1,6 @@
 """Every layout on disk becomes the same capture, and a bad one is named with its remedy."""
 
 import json
-import time
 
 import numpy as np
 import pytest
@@ -136,7 +135,7 @@ def test_a_folder_without_photos_is_no_source(tmp_path):
         common.detect(tmp_path)
 
 
-def test_probes_take_under_20_ms_for_a_thousand_frames(tmp_path):
+def test_probes_of_a_thousand_frames_open_no_picture(tmp_path, monkeypatch):
     folders = {n: tmp_path / n for n in ("slam", "nerf", "colmap", "transforms", "photos", "scannet", "seven")}
     pixels = image(tmp_path / "x.png").read_bytes()
     (tmp_path / "x.png").unlink()
@@ -153,10 +152,6 @@ def test_probes_take_under_20_ms_for_a_thousand_frames(tmp_path):
     (folders["transforms"] / "transforms.json").write_text(json.dumps({"fl_x": 1.0, "frames": frames}))
     modules = {"slam": replica, "nerf": replica, "colmap": colmap, "transforms": transforms, "photos": photos,
                "scannet": scannet, "seven": seven_scenes}  # fmt: skip
+    monkeypatch.setattr("PIL.Image.open", lambda *_, **__: pytest.fail("a probe opened a picture"))
     for kind, module in modules.items():
-        seconds = []
-        for _ in range(5):
-            start = time.perf_counter()
-            module.probe(folders[kind])
-            seconds.append(time.perf_counter() - start)
-        assert min(seconds) < 0.02, (kind, seconds)
+        assert module.probe(folders[kind])
