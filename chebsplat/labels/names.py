@@ -16,7 +16,7 @@ def joined(name: str) -> str:
 
 
 def rows_of(names: Iterable[str], known: Iterable[str]) -> list[int]:
-    """Where each name stands among those known, the first of equal ones; -1 where it does not."""
+    """Index of each name among those known, the first of equal ones; -1 of a name that is not known."""
     row: dict[str, int] = {}
     for place, name in enumerate(known):
         row.setdefault(joined(name), place)

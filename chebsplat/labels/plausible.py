@@ -1,4 +1,4 @@
-"""Whether what a teacher says of photos makes sense, without true labels: how much of it outlives a
+"""Evidence, without true labels, that what a teacher says of photos makes sense: how much of it outlives a
 change of a photo, where in the map such a change is seen, and whether what lies above is called so.
 """
 
@@ -44,14 +44,14 @@ def entropy(shares: np.ndarray) -> float:
 
 
 def changes(before: np.ndarray, after: np.ndarray) -> np.ndarray:
-    """How much shares [V, L, h, w] differ in each of QUARTERS."""
+    """Mean change of shares [V, L, h, w] in each of QUARTERS."""
     moved = np.abs(after - before).sum(1).mean(0)
     rows, columns = (np.array_split(np.arange(n), 2) for n in moved.shape)
     return np.array([moved[np.ix_(r, c)].mean() for r in rows for c in columns])
 
 
 def sense(shares: np.ndarray, names: list[str], indoors: frozenset[str]) -> float:
-    """How much sense the names make of shares [V, L, h, w] in photos of rooms, at most 2: what is
+    """Sense that the names make of shares [V, L, h, w] in photos of rooms, at most 2: what is
     called a floor lies below the middle and a ceiling above it (at most 1), and rooms hold what is
     seen rather than outdoors (at most 1).
 

@@ -1,4 +1,4 @@
-"""What a segmenter's outputs are, told by their values, and what probabilities they stand for."""
+"""Kinds of a segmenter's outputs, told by their values, and the probabilities that they stand for."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ LOGITS, SOFTMAX, SIGMOID, COSINES = "logits", "softmax", "sigmoid", "cosines"
 
 
 def kind_of(maps: Sequence[np.ndarray]) -> str:
-    """What values [C, h, w] of windows are: logits, or what a softmax, sigmoids or cosines give.
+    """Kind of values [C, h, w] of windows: logits, or what a softmax, sigmoids or cosines give.
 
     Choices: sums of 1 over the classes are a softmax, whatever a resize made of its range; values
       of 0 to 1 are sigmoids if some class is surer than SURE; what else stays within -1 to 1 is
@@ -33,7 +33,7 @@ def kind_of(maps: Sequence[np.ndarray]) -> str:
 
 
 def logits_of(values: np.ndarray, kind: str) -> np.ndarray:
-    """What a softmax takes [C, h, w] of values. Args: kind: as `kind_of` tells it.
+    """Logits [C, h, w] of values, which a softmax takes. Args: kind: as `kind_of` tells it.
 
     Choices: those of sigmoids are the logits that they were taken of.
     """

@@ -91,7 +91,7 @@ def truncation(
     unit: float = 1.0,
     describe: DescribeSection | None = None,
 ) -> float | None:
-    """What cutting off the Chebyshev series costs: 1 - r, of the distances between the descriptors of
+    """Cost of cutting off the Chebyshev series: 1 - r, of the distances between the descriptors of
     N_TRIED points, and between these points' descriptors of twice as many degrees.
 
     Args: as for `point_inputs`. Returns: in [0, 2]; None where fewer than 3 points, or only points of
