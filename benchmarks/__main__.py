@@ -47,7 +47,9 @@ BENCHMARKS = {
     "lessons": Benchmark("teachers.lessons", "what lessons of scenes, and labelled points, are worth in other scenes"),
     "unposed": Benchmark("scenes.unposed", "poses of photos that come alone, beside pycolmap's defaults; args=FOLDERS"),
     "query": Benchmark("scenes.query", "asking at the suggested cut: precision, recall, absent words; trains 5 rooms"),
-    "gpu": Benchmark("training.gpu", "office0 on a GPU beside the CPU: seconds, PSNR, mIoU, frames/s, memory"),
+    "gpu": Benchmark(
+        "training.gpu", "a GPU beside the CPU: seconds, PSNR, mIoU, frames/s, launches, memory", ("sfm", "teacher")
+    ),
     "stability": Benchmark("stability.main", "every extreme case of the maths; fails if one does"),
 }
 

@@ -7,14 +7,16 @@ from __future__ import annotations
 
 import math
 import time
+from typing import Any
 
 import numpy as np
 import torch
 from torch import Tensor
 
 from chebsplat.rasterize import binning, ellipses, rasterize, tiles
+from chebsplat.rasterize.cuda import made_harmless
 from chebsplat.rasterize.depths import depths
-from chebsplat.splats.gaussians import activated, surface_of
+from chebsplat.splats.gaussians import activated, surface_of, take
 from chebsplat.splats.planes import inverse_depths
 from chebsplat.splats.sh import eval_sh
 from chebsplat.views import View, in_frustum
@@ -47,26 +49,36 @@ class SceneRenderer:
 
     def __init__(self, parameters: dict[str, np.ndarray], device: str = "cpu"):
         raw = {name: torch.from_numpy(np.ascontiguousarray(values)).to(device) for name, values in parameters.items()}
-        self.means, self.quats, self.scales, self.opacities = activated(raw)
+        self.on_gpu = raw["means"].device.type == "cuda"
+        means, quats, scales, opacities = activated(raw)
+        if self.on_gpu:
+            lights = {name: raw[name] for name in ("sh0", "shN", "features") if name in raw}
+            flat = torch.cat([part.flatten(1) for part in lights.values()], 1)
+            means, quats, scales, opacities, flat = made_harmless(means, quats, scales, opacities, flat)
+            parts = flat.split([part[0].numel() for part in lights.values()], 1)
+            raw |= {name: part.reshape(lights[name].shape) for name, part in zip(lights, parts, strict=True)}
+        self.means, self.quats, self.scales, self.opacities = means, quats, scales, opacities
         self.raw, self.reach = raw, 3 * self.scales.amax(1)
         self.normals = torch.from_numpy(surface_of(parameters)[0])
 
-    def colors(self, view: View, index: Tensor) -> Tensor:
-        """Colours [V, 3] of these Gaussians as the view's camera sees them."""
-        eye, raw = -view.viewmat[:3, :3].T @ view.viewmat[:3, 3], self.raw
-        return colors_by_degree(raw["sh0"][index], raw["shN"][index], self.means[index] - eye, raw["degrees"][index])
+    def colors(self, view: View, index: Tensor | None) -> Tensor:
+        """Colours [V, 3] of these Gaussians (None: of all) as the view's camera sees them."""
+        eye = -view.viewmat[:3, :3].T @ view.viewmat[:3, 3]
+        sh0, shN, degrees = (take(self.raw[name], index) for name in ("sh0", "shN", "degrees"))
+        return colors_by_degree(sh0, shN, take(self.means, index) - eye, degrees)
 
     @torch.no_grad()
     def render(self, view: View, with_features: bool = False) -> tuple[np.ndarray, np.ndarray | None]:
         """Image u8 [H, W, 3], and features f32 [H, W, C] where asked for and present."""
         view = view.to(self.means.device)
-        index = in_frustum(self.means, view, self.reach)
-        raw, channels = self.raw, self.colors(view, index)
-        if with_features and "features" in raw:
-            channels = torch.cat([channels, raw["features"][index]], 1)
-        gaussians = (self.means[index], self.quats[index], self.scales[index], self.opacities[index])
+        index = None if self.on_gpu else in_frustum(self.means, view, self.reach)  # nothing waits for their number
+        channels = self.colors(view, index)
+        if with_features and "features" in self.raw:
+            channels = torch.cat([channels, take(self.raw["features"], index)], 1)
+        gaussians = (take(part, index) for part in (self.means, self.quats, self.scales, self.opacities))
         camera = (view.viewmat[None], view.K[None], view.width, view.height)
-        render, _, _ = rasterize(*gaussians, channels, *camera)
+        options: dict[str, Any] = {"harmless": True} if self.on_gpu else {}
+        render, _, _ = rasterize(*gaussians, channels, *camera, **options)
         image = (render[0, ..., :3].clamp(0, 1) * 255).round().byte().cpu().numpy()
         return image, render[0, ..., 3:].cpu().numpy() if channels.shape[1] > 3 else None
 

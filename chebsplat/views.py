@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import NamedTuple
 
 import torch
@@ -24,8 +24,13 @@ class View:
         return View(self.K.to(device), self.viewmat.to(device), self.width, self.height)
 
 
-def in_frustum(means: Tensor, view: View, reach: Tensor, margin: float = 0.15) -> Tensor:
-    """Indices of points whose sphere of radius `reach` [N] may touch the image; NaN never does."""
+def in_frustum(means: Tensor, view: View, reach: Tensor) -> Tensor:
+    """Indices of the points of which `may_be_seen` is true."""
+    return may_be_seen(means, view, reach).nonzero()[:, 0]
+
+
+def may_be_seen(means: Tensor, view: View, reach: Tensor, margin: float = 0.15) -> Tensor:
+    """Whether points' spheres of radius `reach` [N] may touch the image, bool [N]; those of NaN never do."""
     camera = means @ view.viewmat[:3, :3].T + view.viewmat[:3, 3]
     x, y, z = camera.unbind(-1)
     half_x, half_y = 0.5 * view.width * (1 + margin), 0.5 * view.height * (1 + margin)
@@ -36,7 +41,7 @@ def in_frustum(means: Tensor, view: View, reach: Tensor, margin: float = 0.15) -
     inside = (u.abs() <= half_x * z.clamp_min(0) + (fx + half_x) * reach) & (
         v.abs() <= half_y * z.clamp_min(0) + (fy + half_y) * reach
     )
-    return (near & inside).nonzero()[:, 0]
+    return near & inside
 
 
 def remembered(read: Callable[[int], Tensor], budget: int) -> Callable[[int], Tensor]:
@@ -112,6 +117,7 @@ class Views:
     features: Callable[[int], Tensor] | None = None
     labels: Callable[[int], TaughtLabels] | None = None
     depth: Callable[[int, int], Tensor] | None = None
+    scaled_Ks: dict[int, Tensor] = field(default_factory=dict)  # by factor, once asked for
 
     def to(self, device: str | torch.device) -> Views:
         """The same views on a device: photos, masks and cameras for good, the rest as each step reads it."""
@@ -136,15 +142,26 @@ class Views:
     def camera(self, index: int, factor: int) -> View:
         """The view's camera at 1/factor of its resolution."""
         height, width = self.images.shape[1] // factor, self.images.shape[2] // factor
-        scale = self.Ks.new_tensor([[width / self.images.shape[2]], [height / self.images.shape[1]], [1.0]])
-        return View(self.Ks[index] * scale, self.viewmats[index], width, height)
+        return View(self._Ks_at(factor)[index], self.viewmats[index], width, height)
 
-    def target(self, index: int, factor: int) -> tuple[Tensor, Tensor | None]:
-        """Colours [H, W, 3] in [0, 1] and mask [H, W] at 1/factor; a reduced pixel counts if all of it does."""
-        image = self.images[index].float() / 255
-        mask = None if self.masks is None else self.masks[index]
-        if factor > 1:
-            image = torch.nn.functional.avg_pool2d(image.permute(2, 0, 1), factor).permute(1, 2, 0).contiguous()
-            if mask is not None:
-                mask = -torch.nn.functional.max_pool2d(-mask[None].float(), factor)[0] > 0.5
-        return image, mask
+    def _Ks_at(self, factor: int) -> Tensor:
+        """Intrinsics [V, 3, 3] at 1/factor."""
+        if factor not in self.scaled_Ks:
+            height, width = self.images.shape[1:3]
+            sizes = width // factor / width, height // factor / height, 1.0
+            self.scaled_Ks[factor] = self.Ks * self.Ks.new_tensor(sizes)[:, None]
+        return self.scaled_Ks[factor]
+
+    def photo(self, index: int) -> tuple[Tensor, Tensor | None]:
+        """The photo u8 [H, W, 3] of a view and its mask bool [H, W], None where all pixels count."""
+        return self.images[index], None if self.masks is None else self.masks[index]
+
+
+def reduced(photo: Tensor, mask: Tensor | None, factor: int) -> tuple[Tensor, Tensor | None]:
+    """Colours [H, W, 3] in [0, 1] and mask [H, W] of a photo u8 at 1/factor; a pixel counts if all of it does."""
+    image = photo.float() / 255
+    if factor > 1:
+        image = torch.nn.functional.avg_pool2d(image.permute(2, 0, 1), factor).permute(1, 2, 0).contiguous()
+        if mask is not None:
+            mask = -torch.nn.functional.max_pool2d(-mask[None].float(), factor)[0] > 0.5
+    return image, mask

@@ -35,9 +35,11 @@ def rasterize(
     backgrounds: Tensor | None = None,
     absgrad: bool = False,
     cell_colors: Tensor | None = None,
+    harmless: bool = False,
 ) -> tuple[Tensor, Tensor, dict[str, Any]]:
     """As `reference.rasterize`, of float32 tensors on a GPU.
 
+    Args: harmless: the Gaussians are those that `made_harmless` returns.
     Raises: ValueError unless the Gaussians are float32 on a GPU, for a `max_alpha` above 0.999, or beyond 512 channels;
       ImportError, with the remedy, without gsplat.
     Choices: gsplat fixes the ceiling of alpha at 0.999; a lower one is kept by what a Gaussian's opacity is at most,
@@ -62,7 +64,9 @@ def rasterize(
         return reference.rasterize(*empty, backgrounds=backgrounds, absgrad=absgrad, cell_colors=cell_colors)
     if backgrounds is not None:
         backgrounds = torch.nn.functional.pad(backgrounds, (0, colors.shape[-1] - n_colors))
-    gaussians = _without_broken(means, quats, scales, _at_most(opacities, max_alpha), colors)
+    gaussians = (means, quats, scales, opacities, colors)
+    if not harmless:
+        gaussians = made_harmless(*gaussians, max_alpha)
     nearest = float(np.nextafter(np.float32(near_plane), np.float32(np.inf)))
     renders, alphas, gsplat_meta = rasterization(
         *gaussians, viewmats, Ks, width, height,
@@ -76,17 +80,16 @@ def rasterize(
     return renders[..., :n_colors], alphas, meta
 
 
-def _at_most(opacities: Tensor, ceiling: float) -> Tensor:
-    """Opacities [N] no higher than the ceiling, with a gradient as if they were as given."""
-    return opacities + (opacities.clamp_max(ceiling) - opacities).detach()
-
-
-def _without_broken(means: Tensor, quats: Tensor, scales: Tensor, opacities: Tensor, colors: Tensor) -> list[Tensor]:
-    """Gaussians with harmless values and opacity 0 where one is not finite or has no rotation; quaternions scaled.
+def made_harmless(
+    means: Tensor, quats: Tensor, scales: Tensor, opacities: Tensor, colors: Tensor, max_alpha: float = 0.99
+) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
+    """Gaussians that gsplat draws as the other backends do: opacities at most `max_alpha`, with a gradient as if there
+    were no ceiling, and 0 where a value is not finite or there is no rotation; quaternions scaled.
 
     Choices: a Gaussian's values are looked at together, by their sum, which is finite where each of them is (or takes
       one for broken whose values are beyond all measure): each question to a GPU takes as long as a sum.
     """
+    opacities = opacities + (opacities.clamp_max(max_alpha) - opacities).detach()
     by_camera = colors.ndim == 3
     columns = [means, quats, scales, opacities[:, None], colors.movedim(0, 1).flatten(1) if by_camera else colors]
     values = torch.cat(columns, 1)
@@ -96,7 +99,8 @@ def _without_broken(means: Tensor, quats: Tensor, scales: Tensor, opacities: Ten
     means, quats, scales, alone, flat = values.split([part.shape[1] for part in columns], 1)
     quats = quats / torch.where(whole, longest, 1)[:, None] + ~whole[:, None]
     colors = flat.unflatten(1, (colors.shape[0], -1)).movedim(1, 0) if by_camera else flat
-    return [part.contiguous() for part in (means, quats, scales, alone[:, 0], colors)]
+    means, quats, scales, colors = (part.contiguous() for part in (means, quats, scales, colors))
+    return means, quats, scales, alone[:, 0].contiguous(), colors
 
 
 def own_meta(gsplat_meta: dict[str, Any]) -> dict[str, Any]:

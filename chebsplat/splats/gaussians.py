@@ -112,7 +112,9 @@ class _Take(torch.autograd.Function):
         return grad.new_zeros(ctx.shape).index_copy_(0, index, grad), None
 
 
-def take(values: Tensor, index: Tensor) -> Tensor:
-    """values[index] for an index [V] that holds no row twice."""
+def take(values: Tensor, index: Tensor | None) -> Tensor:
+    """values[index] for an index [V] that holds no row twice; None: all values."""
+    if index is None:
+        return values
     rows: Tensor = _Take.apply(values, index)
     return rows

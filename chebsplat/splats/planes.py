@@ -17,9 +17,17 @@ def inverse_depths(means: Tensor, normals: Tensor, K: Tensor, nearest: float) ->
     Choices: a plane that is seen at a grazing angle is taken to face the camera; its depth would be without bound.
     """
     along, grazing = _along(means, normals, nearest)
-    planes = normals @ torch.linalg.inv(K) / torch.where(grazing, 1, along)[:, None]
+    planes = normals @ inverse_of(K) / torch.where(grazing, 1, along)[:, None]
     facing = torch.nn.functional.pad(1 / means[:, 2:].clamp_min(nearest), (2, 0))
     return torch.where(grazing[:, None], facing, planes)
+
+
+def inverse_of(K: Tensor) -> Tensor:
+    """K⁻¹ [3, 3] of a camera's K, whose last row is (0, 0, 1), without the check for which a GPU would be waited."""
+    (fx, skew, cx), (_, fy, cy), (_, _, one) = K
+    zero = torch.zeros_like(one)
+    rows = [one / fx, -skew / (fx * fy), (skew * cy - cx * fy) / (fx * fy), zero, one / fy, -cy / fy, zero, zero, one]
+    return torch.stack(rows).reshape(3, 3)
 
 
 def _along(means: Tensor, normals: Tensor, nearest: float) -> tuple[Tensor, Tensor]:
@@ -49,7 +57,7 @@ class _Planes(torch.autograd.Function):
     def backward(ctx: Any, grad: Tensor) -> tuple[Tensor | None, ...]:
         where, across, normals, w, r, lengths, viewmat, K = ctx.saved_tensors
         along, grazing = _along(where, across, ctx.nearest)
-        slope = grad @ torch.linalg.inv(K).T / torch.where(grazing, 1, along)[:, None]
+        slope = grad @ inverse_of(K).T / torch.where(grazing, 1, along)[:, None]
         pull = (slope * across).sum(-1, True) / torch.where(grazing, 1, along)[:, None]
         z = where[:, 2:]
         facing = torch.nn.functional.pad(torch.where(z > ctx.nearest, -grad[:, 2:] / z.square(), 0), (2, 0))

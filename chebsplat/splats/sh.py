@@ -109,13 +109,13 @@ def eval_sh(sh0: Tensor, shN: Tensor, directions: Tensor, degree: int) -> Tensor
 def colors_in_view(
     bands: Sequence[Tensor],
     masks: Tensor | None,
-    index: Tensor,
+    index: Tensor | None,
     means: Tensor,
     eye: Tensor,
     degree: int,
     backend: str = "auto",
 ) -> Tensor:
-    """Colours [V, 3], at least 0, of the Gaussians `index` i64 [V] (no row twice) as seen from `eye` [3].
+    """Colours [V, 3], at least 0, of the Gaussians `index` i64 [V] (no row twice; None: all) as seen from `eye` [3].
 
     Args: bands: coefficients [N_l, 2 l + 1, 3] of bands 0 to 3 or fewer: the first N_l Gaussians have band l,
       N = N_0 ≥ N_1 ≥ ...; masks [V, 3] nested, of bands 1 to 3, None for all open; means [N, 3]; degree: the highest
@@ -128,13 +128,14 @@ def colors_in_view(
     if not 0 <= degree <= 3:
         raise ValueError(f"degree {degree} is not within 0 and 3")
     if is_compiled(bands[0], backend):
+        index = torch.arange(len(means)) if index is None else index
         return sh_kernels.colors_in_view(bands, masks, index, means, eye, degree)
     coefficients = _coefficients(bands[: degree + 1], masks, index)
-    directions = means.detach().index_select(0, index) - eye
+    directions = take(means.detach(), index) - eye
     return _floored(light(coefficients, directions, min(degree, len(bands) - 1), backend) + 0.5)
 
 
-def _coefficients(bands: Sequence[Tensor], masks: Tensor | None, index: Tensor) -> Tensor:
+def _coefficients(bands: Sequence[Tensor], masks: Tensor | None, index: Tensor | None) -> Tensor:
     """Masked coefficients [V, K, 3] of all bands. Choices: a band that only the first Gaussians have is filled up with
     zeros, rather than cut to those in view that have it: a cut has to wait for their number.
     """

@@ -2,29 +2,45 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any
+from functools import partial
+from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor, nn
+from torch.func import functional_call
 
 from chebsplat.rasterize import CELL, rasterize
+from chebsplat.rasterize.cuda import made_harmless
 from chebsplat.settings import DescribeSection, TrainSection
 from chebsplat.splats.gaussians import take
 from chebsplat.splats.planes import at_pixels, planes_in_view
 from chebsplat.splats.sh import colors_in_view
 from chebsplat.training import prune, sh_prune
-from chebsplat.views import View, in_frustum
+from chebsplat.training.replay import Replay
+from chebsplat.views import View, in_frustum, may_be_seen
 
+BANDS = ("sh0", "sh1", "sh2", "sh3")
 NEAREST = 0.01  # scene units, of a plane's depth: the rasterizer's near plane
+
+
+class Wanted(NamedTuple):
+    """What a picture is to show, as `SceneModel.render` is asked for it; size: (width, height)."""
+
+    degree: int
+    masked: bool
+    semantic: bool
+    depth: bool
+    size: tuple[int, int]
 
 
 @dataclass
 class Auxiliary:
     """What losses need beside the picture; None where it was not wanted or does not exist.
 
-    soft_mask: m̂ [V] of the pruning gates; band_masks [V, 3]. Of the printed method: soft_mask [N] and delta [N, 4] of
-    all Gaussians, fused features [V, C], and L_reg [] (`knowledge`).
+    soft_mask: m̂ [V] of the pruning gates; band_masks [V, 3]; in_view bool [V], None: all are. Of the printed method:
+    soft_mask [N] and delta [N, 4] of all Gaussians, fused features [V, C], and L_reg [] (`knowledge`).
     """
 
     soft_mask: Tensor | None = None
@@ -32,22 +48,28 @@ class Auxiliary:
     delta: Tensor | None = None
     fused: Tensor | None = None
     knowledge: Tensor | None = None
+    in_view: Tensor | None = None
 
 
 @dataclass
 class Rendered:
     """rgb [H, W, 3], alpha [H, W, 1], features [H, W, C], [h, w, C] by cell of the rasterizer, or None; `index` [V]
-    the Gaussians in the frustum, with `means2d` [1, V, 2] and `radii` [1, V, 2] in `meta`; inverse_depth [H, W] of the
-    Gaussians' planes, Σ w_i / z_i, 1 / scene unit, or None.
+    the Gaussians in the frustum, None: all, with `means2d` [1, V, 2] and `radii` [1, V] in `meta`; planes [H, W, 3],
+    Σ w_i q_i of `planes_in_view`, 1 / scene unit, or None.
     """
 
     rgb: Tensor
     alpha: Tensor
     features: Tensor | None
     meta: dict[str, Any]
-    index: Tensor
+    index: Tensor | None
     auxiliary: Auxiliary
-    inverse_depth: Tensor | None = None
+    planes: Tensor | None = None
+
+    @property
+    def inverse_depth(self) -> Tensor | None:
+        """[H, W] of the Gaussians' planes, Σ w_i / z_i, 1 / scene unit."""
+        return None if self.planes is None else at_pixels(self.planes)
 
 
 class SceneModel:
@@ -82,6 +104,7 @@ class SceneModel:
             self.raw["sh_logits"] = torch.zeros(n, 3, device=device)
         for value in self.raw.values():
             value.requires_grad_(True)
+        self.replay = Replay(device.type == "cuda")
         self.semantic_gate: prune.SemanticGate | None = None
         if n_channels and train.prune and train.prune_semantic:
             self.semantic_gate = prune.SemanticGate(n_channels).to(device)
@@ -106,7 +129,7 @@ class SceneModel:
 
     def bands(self) -> list[Tensor]:
         """Coefficients [N_l, 2 l + 1, 3] of the SH bands, from 0 to the highest that any Gaussian has."""
-        return [self.raw[name] for name in ("sh0", "sh1", "sh2", "sh3") if name in self.raw]
+        return [self.raw[name] for name in BANDS if name in self.raw]
 
     def sh_kept(self) -> float:
         """Part of all SH coefficients up to degree 3 that the Gaussians keep; until the freeze, would keep."""
@@ -125,14 +148,24 @@ class SceneModel:
         """Highest open band u8 [N] of each Gaussian, which keeps it for good."""
         return sh_prune.degrees(self.open_bands())
 
-    def soft_mask(self, index: Tensor, features: Tensor | None) -> Tensor | None:
+    @property
+    def learned(self) -> dict[str, Tensor]:
+        """The raw parameters, and the weights of the modules as `<module>.<weight>`."""
+        weights = {f"{name}.{k}": w for name, module in self.modules.items() for k, w in module.named_parameters()}
+        return self.raw | weights
+
+    def soft_mask(self, index: Tensor | None, features: Tensor | None) -> Tensor | None:
         """m̂ [V] in (0, 1) of the pruning gates, None where pruning is off."""
-        if "prune_logits" not in self.raw:
+        return self._soft_mask(self.learned, index, features)
+
+    def _soft_mask(self, learned: Mapping[str, Tensor], index: Tensor | None, features: Tensor | None) -> Tensor | None:
+        if "prune_logits" not in learned:
             return None
-        logits, gate = take(self.raw["prune_logits"], index), self.semantic_gate
-        if gate is None or features is None:
-            return prune.soft_mask(logits, None)
-        return prune.soft_mask(logits, gate(features.detach()))
+        semantic, prefix = None, "semantic_gate."
+        if self.semantic_gate is not None and features is not None:
+            weights = {name.removeprefix(prefix): w for name, w in learned.items() if name.startswith(prefix)}
+            semantic = functional_call(self.semantic_gate, weights, (features.detach(),))
+        return prune.soft_mask(take(learned["prune_logits"], index), semantic)
 
     def render(
         self,
@@ -149,42 +182,74 @@ class SceneModel:
         degree: SH bands in use; masked: apply the pruning masks; semantic: render features too; grid: features are
         only wanted as means over h × w cells, and rendered so where these are the rasterizer's; depth: render it too,
         three channels beside the colours.
+        Choices: on a GPU all Gaussians are rendered, since to choose those in view is to wait for their number.
         """
-        raw = self.raw
-        with torch.no_grad():
-            reach = 3 * raw["log_scales"].amax(1).exp()
-            index = in_frustum(raw["means"], view, reach)
+        index = None
+        if self.device.type != "cuda" or self.backend == "reference":
+            with torch.no_grad():
+                index = in_frustum(self.raw["means"], view, _reach(self.raw))
+        wanted, learned = Wanted(degree, masked, semantic, depth, (view.width, view.height)), self.learned
+        seen = self.replay(
+            wanted,
+            partial(self._seen, wanted, tuple(learned), index),
+            list(learned.values()),
+            [view.viewmat, view.K],
+        )
+        gaussians: list[Any] = [seen[name] for name in ("means", "quats", "scales", "opacities", "colors")]
+        auxiliary = Auxiliary(seen.get("soft_mask"), seen.get("band_masks"), in_view=seen.get("in_view"))
+        camera = (view.viewmat[None], view.K[None], view.width, view.height)
+        features, cells = seen.get("features"), None
+        if index is None:
+            render, alpha, meta = rasterize(*gaussians, *camera, backend="cuda", harmless=True)
+        elif features is None or (grid is not None and wanted.size == (CELL * grid[1], CELL * grid[0])):
+            render, alpha, meta = rasterize(*gaussians, *camera, cell_colors=features, backend=self.backend)
+            cells = None if features is None else meta["cells"][0]
+        else:
+            gaussians[4] = torch.cat([gaussians[4], features], -1)
+            render, alpha, meta = rasterize(*gaussians, *camera, backend=self.backend)
+        sizes = [3, 3 * depth, render.shape[-1] - 3 - 3 * depth]
+        rgb, planes, rest = render.squeeze(0).split(sizes, -1)  # one gradient, where slices would make one each
+        shown = rest if rest.shape[-1] else None
+        return Rendered(
+            rgb, alpha.squeeze(0), shown if cells is None else cells, meta, index, auxiliary, planes if depth else None
+        )
+
+    def _seen(
+        self, wanted: Wanted, names: tuple[str, ...], index: Tensor | None, *tensors: Tensor
+    ) -> dict[str, Tensor]:
+        """What the rasterizer is given of the Gaussians `index`, and their masks, by name.
+
+        Args: tensors: what is `learned`, by names; then the view's viewmat and K.
+        """
+        raw, (viewmat, K) = dict(zip(names, tensors, strict=False)), tensors[-2:]
         means, quats = take(raw["means"], index), take(raw["quats"], index)
         scales, opacities = take(raw["log_scales"], index).exp(), take(raw["logit_opacities"], index).sigmoid()
-        auxiliary = Auxiliary()
         features = take(raw["features"], index) if "features" in raw else None
-        if masked and (soft := self.soft_mask(index, features)) is not None:
-            auxiliary.soft_mask = soft
+        seen = {}
+        if wanted.masked and (soft := self._soft_mask(raw, index, features)) is not None:
+            seen["soft_mask"] = soft
             scales, opacities = prune.apply_mask(prune.hard_mask(soft), scales, opacities)
-        eye = -view.viewmat[:3, :3].T @ view.viewmat[:3, 3]
         masks = None
-        if masked and degree > 0 and "sh_logits" in raw:
-            masks = auxiliary.band_masks = sh_prune.band_mask(take(raw["sh_logits"], index))
-        if not semantic:  # the masks have seen them
-            features = None
-        colors = colors_in_view(self.bands(), masks, index, raw["means"], eye, degree, self.backend)
-        if depth:
-            colors = torch.cat([colors, planes_in_view(means, quats, scales, view.viewmat, view.K, NEAREST)], -1)
-        n_colors = colors.shape[1]
-        gaussians, camera = (means, quats, scales, opacities), (view.viewmat[None], view.K[None])
-        size = view.width, view.height
-        if features is None or (grid is not None and size == (CELL * grid[1], CELL * grid[0])):
-            render, alpha, meta = rasterize(
-                *gaussians, colors, *camera, *size, cell_colors=features, backend=self.backend
-            )
-            cells = None if features is None else meta["cells"][0]
-            image, planes = render[0].split([3, 3], -1) if depth else (render[0], None)
-            return Rendered(
-                image, alpha[0], cells, meta, index, auxiliary, None if planes is None else at_pixels(planes)
-            )
-        channels = torch.cat([colors, features], -1)
-        render, alpha, meta = rasterize(*gaussians, channels, *camera, *size, backend=self.backend)
-        sizes = [3, n_colors - 3, channels.shape[1] - n_colors]
-        parts = render[0].split(sizes, -1)  # one gradient, where slices would make one each
-        inverse_depth = at_pixels(parts[1]) if depth else None
-        return Rendered(parts[0], alpha[0], parts[2], meta, index, auxiliary, inverse_depth)
+        if wanted.masked and wanted.degree > 0 and "sh_logits" in raw:
+            masks = seen["band_masks"] = sh_prune.band_mask(take(raw["sh_logits"], index))
+        eye = -viewmat[:3, :3].T @ viewmat[:3, 3]
+        bands = [raw[name] for name in BANDS if name in raw]
+        channels = [colors_in_view(bands, masks, index, raw["means"], eye, wanted.degree, self.backend)]
+        if wanted.depth:
+            channels.append(planes_in_view(means, quats, scales, viewmat, K, NEAREST))
+        if wanted.semantic and features is not None:  # the masks have seen them in any case
+            if index is None:
+                channels.append(features)
+            else:
+                seen["features"] = features
+        colors = channels[0] if len(channels) == 1 else torch.cat(channels, -1)
+        gaussians = (means, quats, scales, opacities, colors)
+        if index is None:
+            gaussians = made_harmless(*gaussians)
+            seen["in_view"] = may_be_seen(raw["means"].detach(), View(K, viewmat, *wanted.size), _reach(raw))
+        return seen | dict(zip(("means", "quats", "scales", "opacities", "colors"), gaussians, strict=True))
+
+
+def _reach(raw: Mapping[str, Tensor]) -> Tensor:
+    """Three standard deviations [N] of each Gaussian's longest axis, scene units."""
+    return 3 * raw["log_scales"].detach().amax(1).exp()

@@ -63,10 +63,15 @@ class Population:
         if gradient is None:
             return
         height, width = rendered.rgb.shape[:2]
-        length = (gradient[0] * gradient.new_tensor([0.5 * width, 0.5 * height])).norm(dim=-1)
+        length = torch.hypot(gradient[0, :, 0] * (0.5 * width), gradient[0, :, 1] * (0.5 * height))
         visible = rendered.meta["radii"][0] > 0
-        self.gradient_sum.index_add_(0, rendered.index, torch.where(visible, length, 0))  # nothing waits for a count
-        self.gradient_count.index_add_(0, rendered.index, visible.to(length))
+        length = torch.where(visible, length, 0)  # nothing waits for a count
+        if rendered.index is None:
+            self.gradient_sum += length
+            self.gradient_count += visible
+        else:
+            self.gradient_sum.index_add_(0, rendered.index, length)
+            self.gradient_count.index_add_(0, rendered.index, visible.to(length))
 
     def note_distances(self) -> None:
         """How large each Gaussian may be where it is now: see `bound_scales`."""

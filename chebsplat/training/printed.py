@@ -218,11 +218,11 @@ class PrintedScene(SceneModel):
         return self.encoded(self.rows, self.n_regions)
 
     @torch.no_grad()
-    def soft_mask(self, index: Tensor, features: Tensor | None) -> Tensor | None:
+    def soft_mask(self, index: Tensor | None, features: Tensor | None) -> Tensor | None:
         """Soft mask [V] by fused features of the whole scene."""
         whole = self.whole()
         soft = self.masks(whole.fused, self.rows, whole.regions)[0]
-        return None if soft is None else soft[index]
+        return soft if soft is None or index is None else soft[index]
 
     @torch.no_grad()
     def open_bands(self) -> Tensor:

@@ -12,8 +12,13 @@ BANDS = ((0, 3), (3, 8), (8, 15))  # columns of shN by band 1, 2, 3
 
 
 def band_mask(logits: Tensor) -> Tensor:
-    """Masks [N, 3] in {0, 1} of bands 1 to 3, nested by a cumulative product, with a straight-through gradient."""
-    return hard_mask(logits.clamp(-MAX_LOGIT, MAX_LOGIT).sigmoid().cumprod(-1))
+    """Masks [N, 3] in {0, 1} of bands 1 to 3, nested by products, with a straight-through gradient.
+
+    Choices: products written out; the gradient of `cumprod` asks a GPU for zeros, and waits.
+    """
+    first, second, third = logits.clamp(-MAX_LOGIT, MAX_LOGIT).sigmoid().unbind(-1)
+    both = first * second
+    return hard_mask(torch.stack([first, both, both * third], -1))
 
 
 def masked_sh(shN: Tensor, mask: Tensor) -> Tensor:
@@ -130,9 +135,17 @@ def region_guidance(shN: Tensor, members: Tensor, n: int, n_bins: int = 8) -> Te
     return shN.new_ones(n, 3).index_copy_(0, used, weight / times)
 
 
-def sh_loss(mask: Tensor, guidance: Tensor | None = None) -> Tensor:
-    """Mean over Gaussians of Σ_l (2l + 1) m_l, each band weighted by `guidance` [N, 3] where given; 0 for none."""
-    if len(mask) == 0:
-        return mask.sum()
-    cost = mask * mask.new_tensor([3.0, 5.0, 7.0])
-    return (cost if guidance is None else cost * guidance).sum(-1).mean()
+def sh_loss(mask: Tensor, guidance: Tensor | None = None, counted: Tensor | None = None) -> Tensor:
+    """Mean over Gaussians of Σ_l (2l + 1) m_l, each band weighted by `guidance` [N, 3] where given; 0 for none.
+
+    Args: counted bool [N]: the Gaussians that the mean is of; None: all.
+    """
+    cost = mask * torch.arange(3, 9, 2, dtype=mask.dtype, device=mask.device)
+    return mean_of((cost if guidance is None else cost * guidance).sum(-1), counted)
+
+
+def mean_of(values: Tensor, counted: Tensor | None) -> Tensor:
+    """Mean of values [N], of those that are counted, bool [N] (None: of all); 0 of none."""
+    if counted is None:
+        return values.sum() / max(len(values), 1)
+    return torch.where(counted, values, 0).sum() / counted.sum().clamp_min(1)

@@ -4,8 +4,10 @@ files. `Laps` are its seconds by part.
 
 from __future__ import annotations
 
+import math
 import time
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -18,13 +20,15 @@ from chebsplat.evaluation.metrics import psnr
 from chebsplat.printed.losses import auxiliary_losses
 from chebsplat.settings import TrainSection
 from chebsplat.shape.regions import regions_of
+from chebsplat.splats.planes import at_pixels
 from chebsplat.training import sh_prune
 from chebsplat.training.losses import depth_distance, photometric, semantic_loss
 from chebsplat.training.model import Rendered, SceneModel
 from chebsplat.training.population import Population, broken
 from chebsplat.training.printed import PrintedScene
+from chebsplat.training.replay import Replay
 from chebsplat.training.schedule import Schedule, adam
-from chebsplat.views import Views
+from chebsplat.views import TaughtLabels, Views, reduced
 
 WEIGHT_SSIM = 0.2  # share of SSIM in the colour loss, 3DGS's λ
 READ_EVERY = 10  # steps on a GPU from one that waits for its figures to the next
@@ -37,7 +41,7 @@ class Trainer:
       settings: resolved, nothing left open (`stages.training.defaults`).
       extent:   scene units, scales the means' learning rate.
     The model's Gaussians say which device computes; views and cameras are to be there, too. On a GPU a step waits for
-    no number but that of the Gaussians in view: a loss that is not finite is found within READ_EVERY steps.
+    no number: a loss that is not finite is found within READ_EVERY steps.
     `state_dict()` between two steps holds all that the steps to come depend on: a trainer that loads it takes them as
     this one does, to the bit, with as many threads.
     """
@@ -52,6 +56,8 @@ class Trainer:
         self.optimizer = adam(self.model, self.settings, self.extent)
         self.order_generator = np.random.default_rng(settings.seed)
         self.generator = torch.Generator().manual_seed(settings.seed)
+        records = model.replay.records and settings.densify_semantic and not isinstance(model, PrintedScene)
+        self.replay, model.replay = Replay(records), Replay(records)  # one pass backward, as recorded
         if isinstance(model, PrintedScene):
             model.draws = self.generator
         self.order: list[int] = []  # views still to be seen before any is seen again
@@ -167,7 +173,7 @@ class Trainer:
         self.population.note_distances()
         self.laps.mark("refresh")
 
-    def _guided(self, index: Tensor) -> Tensor | None:
+    def _guided(self, index: Tensor | None) -> Tensor | None:
         """Weights [V, 3] of the bands' penalty, computed when first wanted after a refresh; None: all alike."""
         if not self.settings.sh_guided:
             return None
@@ -176,11 +182,38 @@ class Trainer:
             shN = sh_prune.dense([band.detach() for band in self.model.bands()[1:]], len(self.model))
             self.guidance = sh_prune.region_guidance(shN, self.members, len(self.model))
             self.laps.mark("refresh")
-        return self.guidance[index]
+        return self.guidance if index is None else self.guidance[index]
 
     def _step(self, index: int, share: float) -> dict[str, float | Tensor]:
+        settings = self.settings
+        rendered, losses = self.losses_of(index, share)
+        loss, values = losses["loss"], torch.stack([value.detach() for value in losses.values()])
+        figures = dict(zip(losses, values.tolist() if self.reads else values.unbind(), strict=True))
+        if self.reads and not math.isfinite(figures["loss"]):
+            bad = [name.removeprefix("loss_") for name, value in figures.items() if not math.isfinite(value)][1:]
+            where = f"step {self.step}, view {self.views.names[index]}: loss {', '.join(bad)} is not finite"
+            raise DataFailure(f"{where}; {broken(self.model) or 'all parameters are finite: look at the view itself'}")
+        self.laps.mark("losses")
+        self.optimizer.zero_grad(set_to_none=True)
+        if settings.densify_semantic:
+            loss.backward()
+            self.population.note_gradients(rendered)
+        else:
+            losses["loss_color"].backward(retain_graph=True)
+            self.population.note_gradients(rendered)
+            (loss - losses["loss_color"]).backward()
+        self.laps.mark("backward")
+        self.optimizer.step()
+        self.population.bound_scales()
+        self.laps.mark("optimizer")
+        return figures
+
+    def losses_of(self, index: int, share: float) -> tuple[Rendered, dict[str, Tensor]]:
+        """A view as this step looks at it, and its losses: `loss`, their sum, and each, weighted, as `loss_<name>`.
+
+        Args: index: of the view; share: of the budget that is spent.
+        """
         settings, factor = self.settings, self.schedule.factor(share)
-        target, mask = self.views.target(index, factor)
         pruning, taught = self.schedule.prunes(share), self.step % self.feature_every == 0
         wanted = None if self.views.features is None or not taught else self.views.features(index)
         placed = self.views.depth if self.step % settings.depth_every == 0 else None
@@ -194,52 +227,49 @@ class Trainer:
             depth=surface is not None,
         )
         self.laps.mark("render")
-        losses = self._losses(rendered, target, mask, wanted, index)
-        if surface is not None and rendered.inverse_depth is not None:
-            distance = depth_distance(rendered.inverse_depth, rendered.alpha, surface, mask)
+        auxiliary, (photo, mask) = rendered.auxiliary, self.views.photo(index)
+        labels = None if wanted is None or self.views.labels is None else self.views.labels(index)
+        guidance = None if auxiliary.band_masks is None else self._guided(rendered.index)
+        known = {
+            "photo": photo, "mask": mask, "rgb": rendered.rgb, "wanted": wanted,
+            "features": None if wanted is None else rendered.features, "surface": surface, "planes": rendered.planes,
+            "alpha": None if rendered.planes is None else rendered.alpha,
+            "classes": labels and labels.classes, "confidence": labels and labels.confidence,
+            "class_codes": labels and labels.class_codes, "guidance": guidance, "soft_mask": auxiliary.soft_mask,
+            "band_masks": auxiliary.band_masks, "in_view": auxiliary.in_view,
+        }  # fmt: skip
+        if isinstance(self.model, PrintedScene):
+            known |= {"delta": auxiliary.delta, "knowledge": auxiliary.knowledge}
+        given = {name: value for name, value in known.items() if value is not None}
+        key = factor, tuple(given), labels is not None and labels.complete
+        return rendered, self.replay(key, partial(self._losses, *key), [], list(given.values()))
+
+    def _losses(self, factor: int, names: Sequence[str], complete: bool, *tensors: Tensor) -> dict[str, Tensor]:
+        """As `losses_of`, of tensors by their names there (docs/method.md, section 8)."""
+        settings, backend, given = self.settings, self.model.backend, dict(zip(names, tensors, strict=True))
+        target, mask = reduced(given["photo"], given.get("mask"), factor)
+        losses = {"color": photometric(given["rgb"], target, mask, WEIGHT_SSIM, backend)}
+        if "features" in given:
+            labels = None
+            if "classes" in given:
+                labels = TaughtLabels(given["classes"], given["confidence"], given["class_codes"], complete)
+            losses["features"] = semantic_loss(given["features"], given["wanted"], labels, mask, settings, backend)
+        if isinstance(self.model, PrintedScene):
+            parts = given.get("soft_mask"), given.get("delta"), given.get("knowledge")
+            losses |= auxiliary_losses(parts, (settings.weight_mask, settings.weight_sh))
+        else:
+            if "soft_mask" in given:
+                losses["mask"] = settings.weight_mask * sh_prune.mean_of(given["soft_mask"], given.get("in_view"))
+            if "band_masks" in given:
+                cost = sh_prune.sh_loss(given["band_masks"], given.get("guidance"), given.get("in_view"))
+                losses["sh"] = settings.weight_sh * cost
+        if "planes" in given:
+            distance = depth_distance(at_pixels(given["planes"]), given["alpha"], given["surface"], mask)
             losses["depth"] = self.weight_depth * distance
         loss = torch.stack(list(losses.values())).sum()
-        if self.reads and not torch.isfinite(loss):
-            bad = [name for name, value in losses.items() if not torch.isfinite(value)]
-            where = f"step {self.step}, view {self.views.names[index]}: loss {', '.join(bad)} is not finite"
-            raise DataFailure(f"{where}; {broken(self.model) or 'all parameters are finite: look at the view itself'}")
-        self.laps.mark("losses")
-        self.optimizer.zero_grad(set_to_none=True)
-        if settings.densify_semantic:
-            loss.backward()
-            self.population.note_gradients(rendered)
-        else:
-            losses["color"].backward(retain_graph=True)
-            self.population.note_gradients(rendered)
-            (loss - losses["color"]).backward()
-        self.laps.mark("backward")
-        self.optimizer.step()
-        self.population.bound_scales()
-        self.laps.mark("optimizer")
-        figures = {"loss": loss.detach()} | {f"loss_{k}": v.detach() for k, v in losses.items()}
-        if not self.reads:
-            return dict(figures)
-        return dict(zip(figures, torch.stack(list(figures.values())).tolist(), strict=True))
-
-    def _losses(
-        self, rendered: Rendered, target: Tensor, mask: Tensor | None, wanted: Tensor | None, view: int
-    ) -> dict[str, Tensor]:
-        """Weighted losses by name (docs/method.md, section 8), those that this training and step have."""
-        settings, auxiliary, backend = self.settings, rendered.auxiliary, self.model.backend
-        losses = {"color": photometric(rendered.rgb, target, mask, WEIGHT_SSIM, backend)}
-        if rendered.features is not None and wanted is not None:
-            labels = None if self.views.labels is None else self.views.labels(view)
-            losses["features"] = semantic_loss(rendered.features, wanted, labels, mask, settings, backend)
-        if isinstance(self.model, PrintedScene):
-            parts = auxiliary.soft_mask, auxiliary.delta, auxiliary.knowledge
-            weights = settings.weight_mask, settings.weight_sh
-            return losses | auxiliary_losses(parts, weights)
-        if auxiliary.soft_mask is not None:
-            soft = auxiliary.soft_mask
-            losses["mask"] = settings.weight_mask * soft.sum() / max(len(soft), 1)
-        if auxiliary.band_masks is not None:
-            losses["sh"] = settings.weight_sh * sh_prune.sh_loss(auxiliary.band_masks, self._guided(rendered.index))
-        return losses
+        if settings.densify_semantic:  # nobody asks for the gradient of one alone
+            losses = {name: value.detach() for name, value in losses.items()}
+        return {"loss": loss} | {f"loss_{name}": value for name, value in losses.items()}
 
     @torch.no_grad()
     def held_in_psnr(self, indices: list[int]) -> float:

@@ -38,6 +38,6 @@ def test_photos_that_do_not_fit_are_read_when_they_are_looked_at(budget):
     cameras = torch.eye(3).repeat(5, 1, 1), torch.eye(4).repeat(5, 1, 1)
     whole, stored = (Views(list("abcde"), images, *cameras) for images in (photos, held))
     for index, factor in ((3, 1), (0, 2), (3, 2)):
-        assert torch.equal(whole.target(index, factor)[0], stored.to("cpu").target(index, factor)[0])
+        assert torch.equal(whole.photo(index)[0], stored.to("cpu").photo(index)[0])
         assert stored.camera(index, factor).width == 6 // factor
     assert bool(reads) == (budget < photos.nbytes)

@@ -28,6 +28,11 @@ INDEXING = {aten.index.Tensor, aten.index_put_.default, aten.index_put.default, 
 INDEXING |= {aten.index_fill_.int_Scalar}  # `x[i] = 0` in torch 2.15; with i elsewhere, a GPU's takes index_put_
 WAITING = {aten.nonzero.default, aten._unique2.default, aten.masked_select.default, aten.unique_consecutive.default}
 PURGE_EVERY = 5000  # operations
+VIEWS = {aten.view.default, aten.detach.default, aten.t.default, aten.alias.default, aten.expand.default}
+VIEWS |= {aten._unsafe_view.default, aten.permute.default, aten.transpose.int, aten.unsqueeze.default}
+VIEWS |= {aten.select.int, aten.slice.Tensor, aten.unbind.int, aten.as_strided.default, aten._reshape_alias.default}
+VIEWS |= {aten.split.Tensor, aten.split_with_sizes.default, aten.squeeze.dim, aten.squeeze.default}
+VIEWS |= {aten.empty.memory_format, aten.empty_like.default, aten.new_empty_strided.default, aten.lift_fresh.default}
 
 
 class Moved(NamedTuple):
@@ -39,7 +44,8 @@ class Moved(NamedTuple):
 
 
 class SimulatedGpu:
-    """While `active()`, "cuda" is a device; `moved` records what was copied between it and the CPU.
+    """While `active()`, "cuda" is a device; `moved` records what was copied between it and the CPU, and `launches`
+    counts the operations that a GPU computes, a CUDA graph for one.
 
     Choices: where a tensor lies is kept by storage, so that views and operations in place lie where their base does;
       on the CPU, where nothing is kept. What autograd makes of nothing lies nowhere, and fits everything.
@@ -47,14 +53,64 @@ class SimulatedGpu:
 
     def __init__(self) -> None:
         self.moved: list[Moved] = []
+        self.launches = 0
         self.counting = True
         self.places: dict[int, tuple[Any, torch.device | None]] = {}
         self.n_operations = 0
 
     @contextmanager
     def active(self) -> Iterator[SimulatedGpu]:
-        with _Functions(self), _Operations(self):
-            yield self
+        graphed, torch.cuda.make_graphed_callables = torch.cuda.make_graphed_callables, self.graphed
+        try:
+            with _Functions(self), _Operations(self):
+                yield self
+        finally:
+            torch.cuda.make_graphed_callables = graphed
+
+    def graphed(self, function: Any, samples: Any, warm_ups: int = 3, allow_unused_input: bool = False) -> Any:
+        """As `torch.cuda.make_graphed_callables`: what it is given is copied, what it returns is overwritten."""
+        kept: dict[str, Tensor] = {}
+
+        def replayed(*arguments: Tensor) -> dict[str, Tensor]:
+            for sample, argument in zip(samples, arguments, strict=True):
+                if sample.data_ptr() != argument.data_ptr():
+                    sample.data.copy_(argument.detach())
+            values = self.apart(function, samples, arguments)
+            self.launches += 1
+            with self.uncounted(), torch.no_grad():
+                for name, value in values.items():
+                    if name in kept:
+                        kept[name].copy_(value)
+                        value.data = kept[name]
+                    kept[name] = value.detach()
+            return values
+
+        return replayed
+
+    def apart(self, function: Any, samples: Any, arguments: Any) -> dict[str, Tensor]:
+        """function(*samples), a dictionary, as if of the arguments; what is computed in it and back is not counted."""
+        gpu, names, inner = self, [], []
+
+        class Apart(torch.autograd.Function):
+            @staticmethod
+            def forward(ctx: Any, *given: Tensor) -> tuple[Tensor, ...]:
+                with gpu.uncounted(), torch.enable_grad():
+                    values = function(*samples)
+                names.extend(values)
+                inner.extend(values.values())
+                return tuple(value.detach() for value in inner)
+
+            @staticmethod
+            def backward(ctx: Any, *grads: Tensor) -> tuple[Tensor | None, ...]:
+                gpu.launches += 1
+                learning = [k for k, value in enumerate(inner) if value.requires_grad]
+                values, slopes = ([many[k] for k in learning] for many in (inner, grads))
+                leaves = [sample for sample in samples if sample.requires_grad]
+                with gpu.uncounted():
+                    found = torch.autograd.grad(values, leaves, slopes, allow_unused=True)
+                return tuple(dict(zip(map(id, leaves), found, strict=True)).get(id(sample)) for sample in samples)
+
+        return dict(zip(names, Apart.apply(*arguments), strict=True))
 
     @contextmanager
     def uncounted(self) -> Iterator[None]:
@@ -104,6 +160,7 @@ class _Operations(TorchDispatchMode):
         inputs = [leaf for leaf in tree_leaves((args, kwargs)) if isinstance(leaf, Tensor)]
         places = [gpu.place(tensor) for tensor in inputs]
         on_gpu = GPU in places
+        gpu.launches += gpu.counting and on_gpu and func not in VIEWS
         if on_gpu and CPU in places:
             self._check(func, args, inputs, places)
         if on_gpu and func in (aten._local_scalar_dense.default, aten.equal.default):

@@ -83,12 +83,18 @@ def rasterization(
         assert not absgrad or chunk == D, "a second chunk would overwrite the absolute gradient"
     asked.clear()
     asked.update(channel_chunk=channel_chunk, packed=packed, absgrad=absgrad, rasterize_mode=rasterize_mode)
-    with within[-1]() if within else nullcontext():
-        image, alpha, meta = reference.rasterize(
-            means, quats, scales, opacities, colors, viewmats, Ks, width, height,
+    meta: dict[str, Any] = {}
+
+    def render(*gaussians: Tensor) -> tuple[Tensor, Tensor]:
+        image, alpha, found = reference.rasterize(
+            *gaussians, viewmats, Ks, width, height,
             near_plane=near_plane, far_plane=far_plane, eps2d=eps2d, max_alpha=CEILING, rasterize_mode=rasterize_mode,
             backgrounds=backgrounds, absgrad=absgrad,
         )  # fmt: skip
+        meta.update(found)
+        return image, alpha
+
+    image, alpha = _Kernel.apply(render, means, quats, scales, opacities, colors)
     return image, alpha, meta | {"radii": meta["radii"][..., None].expand(-1, -1, 2).int()}
 
 
@@ -97,6 +103,33 @@ def spherical_harmonics(degrees_to_use: int, dirs: Tensor, coeffs: Tensor, masks
     assert (degrees_to_use + 1) ** 2 <= coeffs.shape[-2], coeffs.shape
     assert dirs.shape == (len(coeffs), 3) and coeffs.shape[-1] == 3
     assert dirs.dtype == coeffs.dtype == torch.float32 and dirs.device.type == coeffs.device.type == "cuda"
-    with within[-1]() if within else nullcontext():
+
+    def shine(coefficients: Tensor) -> tuple[Tensor]:
         values = basis(torch.nn.functional.normalize(dirs, dim=-1), degrees_to_use)
-        return torch.einsum("nk,nkc->nc", values, coeffs[:, : (degrees_to_use + 1) ** 2])
+        return (torch.einsum("nk,nkc->nc", values, coefficients[:, : (degrees_to_use + 1) ** 2]),)
+
+    (light,) = _Kernel.apply(shine, coeffs)
+    return light
+
+
+class _Kernel(torch.autograd.Function):
+    """A function of tensors with all its operations, forward and backward, within what `within` says."""
+
+    @staticmethod
+    def forward(ctx: Any, function: Callable[..., tuple[Tensor, ...]], *inputs: Tensor) -> tuple[Tensor, ...]:
+        ctx.inputs = [tensor.detach().requires_grad_(tensor.requires_grad) for tensor in inputs]
+        with _aside(), torch.set_grad_enabled(any(tensor.requires_grad for tensor in inputs)):
+            ctx.outputs = function(*ctx.inputs)
+        return tuple(tensor.detach() for tensor in ctx.outputs)
+
+    @staticmethod
+    def backward(ctx: Any, *grads: Tensor) -> tuple[Tensor | None, ...]:
+        for tensor in ctx.inputs:
+            tensor.grad = None
+        with _aside():
+            torch.autograd.backward(ctx.outputs, grads, retain_graph=True)
+        return None, *(tensor.grad for tensor in ctx.inputs)
+
+
+def _aside() -> AbstractContextManager[None]:
+    return within[-1]() if within else nullcontext()

@@ -102,7 +102,7 @@ def test_growth_pruning_refresh_freeze_and_finish_mix_no_devices(settings, gpu, 
 
 def test_a_step_moves_no_array_of_gaussians_and_reads_figures_every_tenth_time(gpu, trainer_on):
     settings = {"densify": "off", "refresh_every": 1000, "remove_every": 1000, "report_every": 1000, "sh_freeze": 1.0}
-    waits, largest, n_read = set(), 0, 0
+    largest, n_read = 0, 0
     with gpu.active():
         made = trainer_on("cuda", **settings)
         gpu.moved.clear()
@@ -113,16 +113,44 @@ def test_a_step_moves_no_array_of_gaussians_and_reads_figures_every_tenth_time(g
             if frozen or [one for one in moved if "region_guidance" in one.what]:  # once after a refresh
                 continue
             down = [one for one in moved if one.kind == "down"]
-            assert [len(one.shape) for one in down] == ([0, 1] if made.step % READ_EVERY == 0 else []), down
+            assert [len(one.shape) for one in down] == ([1] if made.step % READ_EVERY == 0 else []), down
             n_read += len(down) > 0
-            waits |= {one.what.rpartition(" in ")[2] for one in moved if one.kind == "wait"}
+            assert not [one for one in moved if one.kind == "wait"]
             up = [one.shape for one in moved if one.kind == "up"]
             assert not [shape for shape in up if len(made.model) in shape]
             largest = max([largest, *(int(np.prod(shape)) for shape in up)])
         views = made.views  # no more than what the teacher says of a view, or its measured depth
         assert largest == max(views.features(0).numel(), views.depth(0, 1).numel())
     assert n_read == WHOLE["steps"] // READ_EVERY - 1
-    assert waits == {"in_frustum"}
+
+
+def test_a_step_launches_at_most_60_operations_beside_those_of_gsplat(gpu, trainer_on):
+    settings = {"densify": "off", "refresh_every": 1000, "remove_every": 1000, "report_every": 1000, "sh_freeze": 1.0}
+    counts = {}
+    with gpu.active():
+        made = trainer_on("cuda", **settings)
+        for _ in made.steps():
+            both = made.replay.recordings, made.model.replay.recordings
+            recorded = [recording.graph is not None for recordings in both for recording in recordings.values()]
+            counts[made.step] = gpu.launches, (len(recorded), sum(recorded))
+            gpu.launches = 0
+    assert made.model.raw["features"].shape[1] >= 3 and "sh_logits" in made.model.raw
+    replayed = [n for step, (n, recorded) in counts.items() if recorded == counts.get(step - 1, (0, 0))[1]]
+    assert len(replayed) > WHOLE["steps"] / 2 and 10 < max(replayed) <= 60, counts
+
+
+def test_a_step_that_cannot_be_recorded_is_launched_as_it_is(gpu, trainer_on, caplog):
+    def refuse(function, samples, warm_ups, allow_unused_input):
+        raise RuntimeError("CUDA error: operation not permitted when stream is capturing\nand more")
+
+    gpu.graphed = refuse
+    with gpu.active():
+        made = trainer_on("cuda", densify="off")
+        for _ in made.steps():
+            pass
+        assert np.isfinite(made.finish()["means"]).all()
+    said = [record.message for record in caplog.records if "CUDA graph" in record.message]
+    assert len(said) == 2 and said[0].endswith("capturing")  # of what is rendered, and of its losses
 
 
 def test_a_training_on_the_simulated_gpu_is_the_one_in_plain_torch(gpu, trainer_on):
@@ -208,7 +236,7 @@ def test_a_finished_scene_renders_there_as_on_the_cpu(gpu):
         found, there = renderer.render(view, True), renderer.render_depth(view)
     assert np.abs(found[0].astype(int) - wanted[0]).max() <= 1  # grey levels
     np.testing.assert_allclose(found[1], wanted[1], atol=1e-5)
-    np.testing.assert_array_equal(there[0], depth[0])
+    np.testing.assert_allclose(there[0], depth[0], rtol=1e-5)  # its quaternions were scaled
 
 
 @pytest.mark.xdist_group("toy")

@@ -23,6 +23,7 @@ from chebsplat.stages.training.defaults import DEPTH_WEIGHT, evidence_of, resolv
 from chebsplat.stages.training.photos import own_exposures
 from chebsplat.stages.training.views import training_views
 from chebsplat.training.losses import depth_distance
+from chebsplat.views import reduced
 
 K = torch.tensor([[40.0, 0, 24], [0, 40, 20], [0, 0, 1]])
 
@@ -224,7 +225,7 @@ def test_depth_of_a_view_is_thinned_like_its_picture():
     capture.depth = np.arange(3 * 40 * 48, dtype=np.float32).reshape(3, 40, 48)
     views = training_views(capture, points, None, with_depth=True)
     for factor in (1, 2, 3):
-        target, _ = views.target(2, factor)
+        target, _ = reduced(*views.photo(2), factor)
         assert views.depth(2, factor).shape == target.shape[:2]
     assert views.depth(2, 2)[1, 3] == capture.depth[2, 2, 6]
     assert training_views(capture, points, None).depth is None
