@@ -2,7 +2,7 @@
 SHELL := /bin/bash
 
 # What the user names reaches commands by the environment, as it is: never as text of a recipe, never as make's own.
-NAMES := scene sequence study bench set stage ablation knowledge newer device on cores threads \
+NAMES := scene sequence study bench set stage quality ablation knowledge newer device on cores threads \
   args teacher out dir yes
 define as_it_is
 override $(1) := $$(value $(1))
@@ -27,7 +27,7 @@ unexport PYTHONDONTWRITEBYTECODE
 
 CHEBSPLAT := .venv/bin/chebsplat
 CHOICE := $(if $(scene),--scene="$$scene") $(if $(sequence),--sequence="$$sequence") $(if $(set),--set="$$set") \
-  $(if $(ablation),--ablation="$$ablation") $(if $(knowledge),--knowledge="$$knowledge") $(if $(newer),--newer)
+  $(if $(quality),--quality="$$quality") $(if $(ablation),--ablation="$$ablation") $(if $(knowledge),--knowledge="$$knowledge") $(if $(newer),--newer)
 MACHINE := $(if $(cores),--cores="$$cores") $(if $(device),--device="$$device") $(if $(on),--on="$$on")
 
 CLUSTER := $(if $(filter-out local,$(on)),slurm)
@@ -36,7 +36,7 @@ CLUSTER := $(if $(filter-out local,$(on)),slurm)
 .DEFAULT_GOAL := $(if $(study),study,$(if $(bench),bench,$(if $(scene)$(sequence),run,help)))
 .PHONY: help run study slurm cluster-test view plan verify status clean-stale setup test test-all test-lowest gpu soak stability bench text-model nouns knowledge calibration teacher teacher-quality lint lock
 
-run: $(READY) $(CLUSTER)  ## make scene=NAME|FOLDER [stage=] [set=a.b=c,...] [ablation=] [cores=] [knowledge=] [newer=1] [device=] [on=slurm]; or sequence=NAME
+run: $(READY) $(CLUSTER)  ## make scene=NAME|FOLDER [stage=] [set=a.b=c,...] [quality=] [ablation=] [cores=] [knowledge=] [newer=1] [device=] [on=slurm]; or sequence=NAME
 	@$(CHEBSPLAT) run $(CHOICE) $(if $(stage),--stage="$$stage") $(MACHINE)
 
 study: $(READY) $(CLUSTER)  ## make study=NAME [cores=] [threads=] [on=slurm] [args=--no-run]: its runs, then table, figure, page in build/studies

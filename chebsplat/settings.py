@@ -136,6 +136,9 @@ class TrainSection(Section):
     depth_every: int = number(4, "steps from one that places the surface by measured depth to the next", 1, 1_000_000)
     # schedule, as fractions of the budget
     coarse_until: float = number(0.1, "fraction of the training at half resolution", 0, 1)
+    fine_from: float = number(
+        0.6, "fraction after which windows of larger photos are seen at their own resolution", 0, 1
+    )
     densify_from: float = number(0.1, "fraction after which Gaussians grow", 0, 1)
     densify_until: float = number(0.6, "fraction after which they no longer do", 0, 1)
     n_densify: int = number(12, "how often they grow between the two", 0, 1000)

@@ -102,6 +102,19 @@ class TaughtLabels(NamedTuple):
     complete: bool = False
 
 
+class Window(NamedTuple):
+    """A part of a photo, in its pixels."""
+
+    top: int
+    left: int
+    height: int
+    width: int
+
+    def of(self, image: Tensor) -> Tensor:
+        """The part of an image [H, W, ...]."""
+        return image[self.top : self.top + self.height, self.left : self.left + self.width]
+
+
 @dataclass
 class Views:
     """Training views. images [V, H, W, 3] u8; masks [V, H, W] bool or None, both as tensors or stored; features: view
@@ -139,10 +152,14 @@ class Views:
             None if depth is None else lambda index, factor: depth(index, factor).to(device),
         )
 
-    def camera(self, index: int, factor: int) -> View:
-        """The view's camera at 1/factor of its resolution."""
+    def camera(self, index: int, factor: int, window: Window | None = None) -> View:
+        """The view's camera at 1/factor of its resolution, or of a window of the whole photo."""
         height, width = self.images.shape[1] // factor, self.images.shape[2] // factor
-        return View(self._Ks_at(factor)[index], self.viewmats[index], width, height)
+        K = self._Ks_at(factor)[index]
+        if window is not None:
+            width, height = window.width, window.height
+            K = torch.cat([K[:, :2], K[:, 2:] - K.new_tensor([window.left, window.top, 0])[:, None]], 1)
+        return View(K, self.viewmats[index], width, height)
 
     def _Ks_at(self, factor: int) -> Tensor:
         """Intrinsics [V, 3, 3] at 1/factor."""
@@ -152,9 +169,12 @@ class Views:
             self.scaled_Ks[factor] = self.Ks * self.Ks.new_tensor(sizes)[:, None]
         return self.scaled_Ks[factor]
 
-    def photo(self, index: int) -> tuple[Tensor, Tensor | None]:
-        """The photo u8 [H, W, 3] of a view and its mask bool [H, W], None where all pixels count."""
-        return self.images[index], None if self.masks is None else self.masks[index]
+    def photo(self, index: int, window: Window | None = None) -> tuple[Tensor, Tensor | None]:
+        """The photo u8 [H, W, 3] of a view, or a window of it, and its mask bool [H, W], None where all pixels count."""
+        image, mask = self.images[index], None if self.masks is None else self.masks[index]
+        if window is None:
+            return image, mask
+        return window.of(image), None if mask is None else window.of(mask)
 
 
 def reduced(photo: Tensor, mask: Tensor | None, factor: int) -> tuple[Tensor, Tensor | None]:

@@ -18,13 +18,17 @@ def plans(
     device: str = "cpu",
     knowledge: str = "",
     newer: bool = False,
+    quality: str = "",
 ) -> list[Plan]:
-    """The plan of a scene, or the plans of a sequence. knowledge: `knowledge.start`, if any; newer: as of `Planner`."""
+    """The plan of a scene, or the plans of a sequence.
+
+    knowledge: `knowledge.start`, if any; newer, quality: as of `Planner`.
+    """
     if (scene is None) == (sequence is None):
         raise ConfigError("name one of scene= and sequence=")
     if knowledge:
         settings = merged(overrides(settings), {"knowledge": {"start": knowledge}})
-    planner = Planner(running=running, device=device, newer=newer)
+    planner = Planner(running=running, device=device, newer=newer, quality=quality)
     try:
         if sequence is not None:
             return sequences.chain(planner, sequence, settings, ablation)

@@ -28,7 +28,7 @@ from chebsplat.formats.world import World
 from chebsplat.labels.decode import decode_labels
 from chebsplat.labels.names import lacking
 from chebsplat.render import SceneRenderer
-from chebsplat.stages.measuring.image_quality import frame_split, image_figures, perceptual, psnr_as_taken, timing
+from chebsplat.stages.measuring.image_quality import figures_as_taken, frame_split, image_figures, perceptual, timing
 from chebsplat.stages.runtime.command import Job
 from chebsplat.views import View
 
@@ -82,10 +82,9 @@ def run(job: Job) -> None:
         job.left_out("LPIPS", "evaluate.lpips_weights names no file: not measured")
     else:
         figures["lpips_net"] = {"net": NET, "normalize": NORMALIZE}
-    Ks = {name: scene.cameras.Ks[k] for name, k in zip(names, places, strict=True)}
-    as_taken = psnr_as_taken(capture, dict(zip(names, pictures["renders"], strict=True)), Ks)
+    as_taken = figures_as_taken(capture, renderer, dict(zip(names, cameras, strict=True)))
     if as_taken is not None:
-        figures["image"]["psnr_as_taken"] = as_taken
+        figures["image"]["as_taken"] = as_taken
     if segmentation is not None:
         figures["segmentation"] = segmentation
     figures["left_out"] = scene.summary.get("left_out", {}) | job.facts.get("left_out", {})

@@ -177,9 +177,8 @@ def run(job: Job) -> None:
     n_views = len(fields["names"])
     fields["is_test"], protocol = split(fields["names"], fields.pop("is_test", None), settings)
     fields |= thinned(fields, settings.max_train_views)
-    if bent := fields.pop("bent", None):
-        tests = {fields["names"][row] for row in np.flatnonzero(fields["is_test"])}
-        fields |= as_taken(bent(tests), settings.max_side)
+    if altered := fields.pop("altered", None):
+        fields |= as_taken(altered({fields["names"][row] for row in np.flatnonzero(fields["is_test"])}))
     strengths = settings.disturb_colors, settings.disturb_degrees, settings.disturb_shift
     if any(strengths):
         if fields.get("cam_from_world") is None and any(strengths[1:]):

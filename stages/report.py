@@ -203,7 +203,7 @@ def summary_rows(
         ["figure", "scene", "2D teacher"],
         [f"PSNR, dB (8-bit, mean over views{of})", f"{image['psnr']:.2f}", ""],
         ["PSNR after a colour fit by view, dB", shown(image.get("psnr_fit"), "{:.2f}"), ""],
-        *([["PSNR on the photos as taken, dB", f"{taken:.2f}", ""]] if (taken := image.get("psnr_as_taken")) else []),
+        *taken_rows(image.get("as_taken")),
         ["SSIM (window 11, σ 1.5)", f"{image['ssim']:.4f}", ""],
         ["LPIPS (vgg, images in [0, 1])", shown(figures["lpips"], "{:.3f}"), ""],
     ]
@@ -235,6 +235,17 @@ def summary_rows(
     if peak := trained.get("peak_device_bytes"):
         rows.append(["bytes of the GPU's memory in training, at most", f"{peak:,}", ""])
     return rows
+
+
+def taken_rows(taken: dict[str, Any] | None) -> list[list[str]]:
+    """Figures on the test photos as they were taken; none where these are what was trained on."""
+    if taken is None:
+        return []
+    size = "{}×{}".format(*taken["size"])
+    return [
+        [f"PSNR on the photos as taken, {size} pixels, dB", f"{taken['psnr']:.2f}", ""],
+        ["SSIM on them", f"{taken['ssim']:.4f}", ""],
+    ]
 
 
 def refined_rows(facts: dict[str, Any] | None) -> list[list[str]]:

@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+import math
+
 import torch
 
 from chebsplat.settings import MOST_STEPS, TrainSection
 from chebsplat.splats.sh import MAX_DEGREE
 from chebsplat.training.model import SceneModel
 
+STEP_SIDE = 640  # pixels of the longer side of what a step looks at
 LR_OPACITIES = 5e-2  # of opacities before the sigmoid, 3DGS's
 LR_MODULES = 3e-3  # of the semantic gate
 FASTER = {"means": 0.01, "features": 0.01, "modules": 0.01}  # what a rate has fallen to at the end; 0.1 elsewhere
@@ -54,14 +57,15 @@ def adam(model: SceneModel, settings: TrainSection, extent: float) -> torch.opti
 
 
 class Schedule:
-    """Of a resolved train section. A budget is a number of steps, or seconds of training: then the pace is
+    """Of a resolved train section, and photos whose longer side has `side` pixels. A budget is a number of steps, or seconds of training: then the pace is
     the machine's, and two runs are not the same.
     """
 
-    def __init__(self, settings: TrainSection):
+    def __init__(self, settings: TrainSection, side: int = STEP_SIDE):
         require_resolved(settings)
         assert settings.steps is not None
         self.settings, self.steps = settings, settings.steps
+        self.reduction = max(math.ceil(side / STEP_SIDE - 0.1), 1)
         self.seconds: float | None = settings.seconds
         self.growth = [] if settings.densify == "off" else self._while_growing(settings.n_densify)
         self.resets = self._while_growing(settings.opacity_resets)
@@ -97,8 +101,12 @@ class Schedule:
         return min(int(share * 10 + 1e-9), self.settings.sh_degree, MAX_DEGREE)
 
     def factor(self, share: float) -> int:
-        """What images are reduced by."""
-        return 2 if share <= self.settings.coarse_until else 1
+        """Reduction of a whole photo that a step looks at."""
+        return self.reduction * (2 if share <= self.settings.coarse_until else 1)
+
+    def in_full(self, share: float) -> bool:
+        """Do steps look at windows of the photos as they are? Not at photos that a step can take whole."""
+        return self.reduction > 1 and share > self.settings.fine_from
 
     def grown(self, share: float) -> int:
         """How many times Gaussians were to be added until now."""

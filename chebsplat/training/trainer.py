@@ -28,9 +28,10 @@ from chebsplat.training.population import Population, broken
 from chebsplat.training.printed import PrintedScene
 from chebsplat.training.replay import Replay
 from chebsplat.training.schedule import Schedule, adam
-from chebsplat.views import TaughtLabels, Views, reduced
+from chebsplat.views import TaughtLabels, Views, Window, reduced
 
 WEIGHT_SSIM = 0.2  # share of SSIM in the colour loss, 3DGS's λ
+WHOLE = 4  # steps from one that looks at a whole photo to the next, while the others look at windows
 READ_EVERY = 10  # steps on a GPU from one that waits for its figures to the next
 
 
@@ -48,7 +49,7 @@ class Trainer:
 
     def __init__(self, model: SceneModel, views: Views, settings: TrainSection, extent: float):
         self.model, self.views, self.settings, self.extent = model, views, settings, extent
-        self.schedule = Schedule(settings)
+        self.schedule = Schedule(settings, max(views.images.shape[1:3]))
         assert settings.feature_every is not None and settings.weight_depth is not None
         self.feature_every, self.weight_depth = settings.feature_every, settings.weight_depth
         self.members = torch.zeros(0, 0, dtype=torch.int64)
@@ -186,7 +187,7 @@ class Trainer:
 
     def _step(self, index: int, share: float) -> dict[str, float | Tensor]:
         settings = self.settings
-        rendered, losses = self.losses_of(index, share)
+        rendered, losses = self.losses_of(index, share, self._window(share))
         loss, values = losses["loss"], torch.stack([value.detach() for value in losses.values()])
         figures = dict(zip(losses, values.tolist() if self.reads else values.unbind(), strict=True))
         if self.reads and not math.isfinite(figures["loss"]):
@@ -208,18 +209,33 @@ class Trainer:
         self.laps.mark("optimizer")
         return figures
 
-    def losses_of(self, index: int, share: float) -> tuple[Rendered, dict[str, Tensor]]:
+    def _teaches(self, share: float) -> bool:
+        """Does this step teach features? It then looks at a whole photo: of windows, at most one step in WHOLE does."""
+        every = max(self.feature_every, WHOLE) if self.schedule.in_full(share) else self.feature_every
+        return self.views.features is not None and self.step % every == 0
+
+    def _window(self, share: float) -> Window | None:
+        """The part of a photo, drawn at random, that this step sees at the photo's own resolution; None: all, reduced."""
+        if not self.schedule.in_full(share) or self._teaches(share):
+            return None
+        (height, width), by = self.views.images.shape[1:3], self.schedule.reduction
+        top, left = self.order_generator.integers(0, [height - height // by + 1, width - width // by + 1]).tolist()
+        return Window(top, left, height // by, width // by)
+
+    def losses_of(self, index: int, share: float, window: Window | None = None) -> tuple[Rendered, dict[str, Tensor]]:
         """A view as this step looks at it, and its losses: `loss`, their sum, and each, weighted, as `loss_<name>`.
 
-        Args: index: of the view; share: of the budget that is spent.
+        Args: index: of the view; share: of the budget that is spent; window: of the photo, None: all of it, reduced.
         """
-        settings, factor = self.settings, self.schedule.factor(share)
-        pruning, taught = self.schedule.prunes(share), self.step % self.feature_every == 0
-        wanted = None if self.views.features is None or not taught else self.views.features(index)
+        settings, factor = self.settings, 1 if window else self.schedule.factor(share)
+        pruning, taught = self.schedule.prunes(share), self._teaches(share)
+        wanted = self.views.features(index) if taught and self.views.features is not None else None
         placed = self.views.depth if self.step % settings.depth_every == 0 else None
         surface = None if placed is None else placed(index, factor)
+        if surface is not None and window is not None:
+            surface = window.of(surface)
         rendered = self.model.render(
-            self.views.camera(index, factor),
+            self.views.camera(index, factor, window),
             self.schedule.degree(share),
             masked=pruning,
             semantic=taught,
@@ -227,7 +243,7 @@ class Trainer:
             depth=surface is not None,
         )
         self.laps.mark("render")
-        auxiliary, (photo, mask) = rendered.auxiliary, self.views.photo(index)
+        auxiliary, (photo, mask) = rendered.auxiliary, self.views.photo(index, window)
         labels = None if wanted is None or self.views.labels is None else self.views.labels(index)
         guidance = None if auxiliary.band_masks is None else self._guided(rendered.index)
         known = {

@@ -16,6 +16,9 @@ OPTIONS = [
     click.option("--scene", help="a name from `chebsplat scenes`, a folder, or a video"),
     click.option("--sequence", help="scenes in order, each with what those before it taught"),
     click.option("--set", "settings", default="", help="section.key=value,..."),
+    click.option(
+        "--quality", default="", help="of photos: draft (640 pixels, as by default), standard (1000), high (1600)"
+    ),
     click.option("--ablation", default="", help="a named set of settings"),
     click.option("--knowledge", default="", help="what it starts from: none, shipped, a set of lessons, a folder/"),
     click.option("--newer", is_flag=True, help="start from the lessons that there are now, and stay with these"),

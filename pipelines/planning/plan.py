@@ -171,10 +171,12 @@ class Planner:
           lessons that there are now.
     """
 
-    def __init__(self, code: Path = PACKAGE, running: bool = False, device: str = "cpu", newer: bool = False):
+    def __init__(
+        self, code: Path = PACKAGE, running: bool = False, device: str = "cpu", newer: bool = False, quality: str = ""
+    ):
         self.code_memo, self.file_memo = store.Memo("code"), store.Memo("files")
         self.code, self.running = Code(code, self.code_memo.values), running
-        self.device, self.newer = device, newer
+        self.device, self.newer, self.quality = device, newer, quality
 
     def save(self) -> None:
         self.code_memo.save()
@@ -199,12 +201,15 @@ class Planner:
         """
         name, own = scene_values(scene)
         values, title = merged(own, values or {}), ""
+        if self.quality:
+            values = merged(values, read_toml("qualities", self.quality))
+            title += f"@{self.quality}"
         if ablation:
             values = merged(values, read_toml("ablations", ablation))
-            title += f"@{ablation}"
+            title += f"{'+' if title else '@'}{ablation}"
         if settings:
             values = merged(values, overrides(settings))
-            title += f"{'+' if ablation else '@'}{name_part}" if (name_part := suffix(settings)) else ""
+            title += f"{'+' if title else '@'}{name_part}" if (name_part := suffix(settings)) else ""
         config = placed(configs.build(values, f"scene {shown(scene)}"))
         asked = config.source
         source = located(resolve_source(name, asked))

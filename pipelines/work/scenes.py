@@ -16,7 +16,9 @@ from chebsplat.pipelines.work.store import is_name
 from chebsplat.stages.sources.common import detect
 
 CONFIGS = Path(__file__).parents[1] / "configs"
-ONE = {"scenes": "scene", "ablations": "ablation", "sequences": "sequence", "studies": "study"}
+ONE = {
+    "scenes": "scene", "qualities": "quality", "ablations": "ablation", "sequences": "sequence", "studies": "study",
+}  # fmt: skip
 VARIABLE = re.compile(r"\$\{(\w+):-([^}]*)\}")  # ${NAME:-default}
 
 

@@ -64,7 +64,7 @@ def table(evaluation: Path) -> list[tuple[str, str, str]]:
         miou, beside = "none", [measured["left_out"].get("mIoU", "")]
     rows = [
         ("test PSNR", psnr, text("SSIM {:.3f}", number(measured, "image", "ssim"))),
-        ("as taken", text("{:.1f} dB", number(measured, "image", "psnr_as_taken")), "on photos before undistortion"),
+        ("as taken", text("{:.1f} dB", number(measured, "image", "as_taken", "psnr")), as_taken(measured)),
         ("mIoU", miou, "; ".join(filter(None, beside))),
         *((what, str(len(names)), few(names)) for what, names in strangers(segmentation)),
         ("Gaussians", text("{:,}", number(measured, "n_gaussians")), ""),
@@ -72,6 +72,12 @@ def table(evaluation: Path) -> list[tuple[str, str, str]]:
         ("frames/s", text("{:.0f}", number(measured, "frames_per_second", "color")), f"colour alone{where}"),
     ]
     return [row for row in rows if row[1]]
+
+
+def as_taken(figures: Any) -> str:
+    """SSIM and size of test photos as they were taken; empty where these are what was trained on."""
+    found = (figures or {}).get("image", {}).get("as_taken")
+    return "SSIM {:.3f}, {}×{} pixels".format(found["ssim"], *found["size"]) if found else ""
 
 
 def strangers(segmentation: Any) -> list[tuple[str, list[str]]]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import pickle
 import time
 from pathlib import Path
@@ -48,12 +49,13 @@ def image_figures(
     return {"lpips": None} | means | {"per_view": per_view}
 
 
-def psnr_as_taken(capture: Capture, renders: dict[str, np.ndarray], Ks: dict[str, np.ndarray]) -> float | None:
-    """PSNR of renders u8 [H, W, 3] on the test photos as they were taken, dB; None where no lens bends one.
+def figures_as_taken(capture: Capture, renderer: SceneRenderer, cameras: dict[str, View]) -> dict[str, Any] | None:
+    """PSNR, dB, and SSIM on the test photos as they were taken, at their own resolution, at most 1600 pixels, and that;
+    None where photos were neither undistorted nor reduced.
 
-    Args:    Ks: [3, 3] of each render.
-    Choices: a render is interpolated, by cubic splines, where the photo's pixels lie in it. What a photo has beyond its
-      undistorted view, or is masked there, does not count.
+    Args:    cameras: of the capture's views, by name.
+    Choices: the scene is rendered as fine as the photo is, and interpolated, by cubic splines, where its pixels lie.
+      What a photo has beyond its undistorted view, or is masked there, does not count; for SSIM it is as in the photo.
     """
     if capture.taken is None:
         return None
@@ -61,21 +63,37 @@ def psnr_as_taken(capture: Capture, renders: dict[str, np.ndarray], Ks: dict[str
 
     figures = []
     for photo, (name, model, params, width, height) in zip(capture.taken[:], capture.lenses, strict=True):
-        if name not in renders:
+        if name not in cameras:
             continue
+        lens, truth = pycolmap.Camera(model=model, params=params, width=width, height=height), photo[:height, :width]
+        finer = lens.mean_focal_length() / float(cameras[name].K[[0, 1], [0, 1]].mean())
+        view = enlarged(cameras[name], finer)
+        K, render = view.K.double().numpy(), renderer.render(view)[0]
         pixels = np.stack(np.meshgrid(np.arange(width) + 0.5, np.arange(height) + 0.5), -1).reshape(-1, 2)
-        lens = pycolmap.Camera(model=model, params=params, width=width, height=height)
-        places = (lens.cam_from_img(pixels) @ Ks[name][:2, :2].T + Ks[name][:2, 2] - 0.5).T[::-1]
-        rows, columns = renders[name].shape[:2]
-        inside = ((places >= 0) & (places <= [[rows - 1], [columns - 1]])).all(0)
+        places = (lens.cam_from_img(pixels) @ K[:2, :2].T + K[:2, 2] - 0.5).T[::-1]
+        inside = ((places >= 0) & (places <= [[view.height - 1], [view.width - 1]])).all(0)
         if capture.loss_mask is not None:
-            row, column = places[:, inside].round().astype(int)
-            inside[inside] = capture.loss_mask[capture.names.index(name)][row, column]
-        channels = np.moveaxis(renders[name].astype(np.float32), -1, 0)
+            mask = np.asarray(capture.loss_mask[capture.names.index(name)])
+            row, column = ((places[:, inside] + 0.5) / finer).astype(int)
+            inside[inside] = mask[row.clip(0, mask.shape[0] - 1), column.clip(0, mask.shape[1] - 1)]
+        channels = np.moveaxis(render.astype(np.float32), -1, 0)
         shown = np.stack([map_coordinates(c, places[:, inside], np.float32, mode="nearest") for c in channels], -1)
-        wanted = photo[:height, :width].reshape(-1, 3)[inside]
-        figures.append(min(psnr(shown.round().clip(0, 255).astype(np.uint8), wanted), 100.0))
-    return float(np.mean(figures)) if figures else None
+        filled = truth.copy().reshape(-1, 3)
+        filled[inside] = shown.round().clip(0, 255)
+        figures.append((min(psnr(filled[inside], truth.reshape(-1, 3)[inside]), 100.0),
+                        ssim(filled.reshape(truth.shape), np.ascontiguousarray(truth)), width, height))  # fmt: skip
+    if not figures:
+        return None
+    psnrs, ssims, widths, heights = zip(*figures, strict=True)
+    size = [int(np.median(sides)) for sides in (widths, heights)]
+    means = {"psnr": float(np.mean(psnrs)), "ssim": float(np.mean(ssims)), "size": size}
+    return means | {"per_view": {"psnr": list(psnrs), "ssim": list(ssims)}}
+
+
+def enlarged(view: View, factor: float) -> View:
+    """A camera whose picture is `factor` times as fine, rounded up to whole pixels."""
+    K = view.K * view.K.new_tensor([factor, factor, 1.0])[:, None]
+    return View(K, view.viewmat, math.ceil(view.width * factor), math.ceil(view.height * factor))
 
 
 def perceptual(path: Path) -> Lpips:

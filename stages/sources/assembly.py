@@ -23,6 +23,7 @@ from chebsplat.stages.sources.pictures import DEEP, GREY, companion, confidences
 
 WORKERS = 4
 MOST_EMPTY = 1 / 3  # of the views that see a point
+OWN_SIDE = 1600  # pixels: what photos as taken are reduced to, as in published comparisons
 COMPARED = 8  # views whose variance is held against their photos'
 
 
@@ -90,24 +91,28 @@ def assemble(listing: Listing, settings: IngestSection, class_names: tuple[str, 
         notes.append(f"Images are undistorted ({', '.join(models)}), and figures are of these where they do not say.")
         source["undistorted"] = models
     fields["variance_kept"] = float(np.mean(shares))
-    return fields | {"bent": lambda wanted: bent(frames, listing, wanted)}
+    return fields | {"altered": lambda wanted: altered(frames, listing, wanted, settings.max_side)}
 
 
-def bent(frames: list[Frame], listing: Listing, wanted: set[str]) -> Iterator[tuple[str, Camera, Any]]:
-    """Name, camera and photo of the `wanted` views whose photo a lens bends; faces of a photo are left out."""
+def altered(
+    frames: list[Frame], listing: Listing, wanted: set[str], max_side: int
+) -> Iterator[tuple[str, Camera, Any]]:
+    """Name, camera and photo of the `wanted` views whose photo is undistorted or reduced; faces of one are left out."""
     for frame in frames:
-        if frame.name in wanted and frame.camera.model in DISTORTED and frame.camera.model != EQUIRECTANGULAR:
-            with open_photo(frame.image, (frame.camera.width, frame.camera.height), listing.upright) as (image, _):
-                yield frame.name, frame.camera, image
+        camera = frame.camera
+        changed = camera.model in DISTORTED or max(camera.width, camera.height) > max_side
+        if frame.name in wanted and changed and camera.model != EQUIRECTANGULAR:
+            with open_photo(frame.image, (camera.width, camera.height), listing.upright) as (image, _):
+                yield frame.name, camera, image
 
 
-def as_taken(photos: Iterable[tuple[str, Camera, Any]], max_side: int) -> dict[str, Any]:
-    """Fields `taken` u8 [T, H, W, 3] and `lenses` of a capture: photos reduced to `max_side` as they are, each with its
+def as_taken(photos: Iterable[tuple[str, Camera, Any]]) -> dict[str, Any]:
+    """Fields `taken` u8 [T, H, W, 3] and `lenses` of a capture: photos as they are, reduced to OWN_SIDE, each with its
     name and camera; smaller ones are padded at the right and the bottom.
     """
     small, lenses = [], []
     for name, camera, image in photos:
-        factor = min(1.0, max_side / max(image.size))
+        factor = min(1.0, OWN_SIDE / max(image.size))
         width, height = (max(round(side * factor), 1) for side in image.size)
         small.append(np.asarray(image.resize((width, height), Image.Resampling.BOX)))
         held = camera.colmap

@@ -83,8 +83,9 @@ def read(path: Path, settings: IngestSection, model: PhotoModel) -> dict[str, An
         if k % step == 0:
             kept.append(assembly.variance_kept(image, images[-1], at))
 
-    def bent(wanted: set[str]) -> Iterator[tuple[str, cameras.Camera, Any]]:
-        numbers = {frame for frame, name in named.items() if name in wanted and camera.model in cameras.DISTORTED}
+    def altered(wanted: set[str]) -> Iterator[tuple[str, cameras.Camera, Any]]:
+        changed = camera.model in cameras.DISTORTED or view.factor < 1
+        numbers = {frame for frame, name in named.items() if name in wanted and changed}
         return ((named[frame], camera, image) for frame, image in _taken(file, numbers))
 
     fields = {
@@ -93,7 +94,7 @@ def read(path: Path, settings: IngestSection, model: PhotoModel) -> dict[str, An
         "Ks": np.tile(view.K, (len(images), 1, 1)),
         "cam_from_world": model.cam_from_world[rows],
         "source": {"kind": "video", "notes": notes},
-        "bent": bent,
+        "altered": altered,
         "variance_kept": float(np.mean(kept)),
     }
     return fields | points_of(Cloud(model.points, model.colors, model.errors, model.tracks), model.names, fields)

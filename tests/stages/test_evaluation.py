@@ -131,7 +131,7 @@ def test_a_test_view_without_a_pixel_that_counts_is_left_out_and_undistorted_pho
     assert found["image"]["per_view"]["psnr"] == whole["image"]["per_view"]["psnr"][1:]
     n = len(whole["names"])
     assert "no pixel" in found["left_out"][f"1 of {n} views"]
-    assert "psnr_as_taken" not in found["image"]  # its capture holds none
+    assert "as_taken" not in found["image"]  # its capture holds none
     timed = {"evaluation": "A", "gaussians": "B"}
     rows = [summary_rows(figures, None, {"milliseconds": {}}, timed)[1][0] for figures in (whole, found)]
     assert "undistorted" not in rows[0] and "of undistorted photos" in rows[1]

@@ -14,8 +14,10 @@ from benchmarks.stability.training import four_views, tiny_trainer
 from chebsplat.errors import DataFailure
 from chebsplat.settings import TrainSection
 from chebsplat.stages.training.defaults import Evidence, resolved
+from chebsplat.training import schedule as schedules
 from chebsplat.training import sh_prune
 from chebsplat.training.schedule import Schedule, rates
+from chebsplat.views import Window
 
 
 def test_closed_bands_leave_parameters_and_moments_and_the_picture_stays():
@@ -335,3 +337,36 @@ def test_pruning_masks_go_no_farther_in_long_trainings_and_nothing_else_slows():
     assert travel("sh_logits", 9000) == pytest.approx(3 * travel("sh_logits", 3000), rel=1e-2)
     timed = Schedule(decided(seconds=120.0))  # as many steps as the pace tells
     assert timed.rate("prune_logits", 0.5, timed.last_step(4000, 60.0)) == pytest.approx(3 / 8 * 0.1**0.5)
+
+
+def test_photos_larger_than_a_step_takes_are_seen_reduced_then_in_windows(monkeypatch):
+    made = tiny_trainer(steps=40, coarse_until=0.1, fine_from=0.5, densify="off")
+    height, width = made.views.images.shape[1:3]
+    monkeypatch.setattr(schedules, "STEP_SIDE", max(height, width) / 3)
+    made.schedule = Schedule(made.settings, max(height, width))
+    assert made.schedule.reduction == 3
+    seen, render = [], made.model.render
+
+    def noted(view, *arguments, **options):
+        seen.append((view.height, view.width, view.K))
+        return render(view, *arguments, **options)
+
+    monkeypatch.setattr(made.model, "render", noted)
+    for _ in made.steps():
+        pass
+    small, whole = (height // 6, width // 6), (height // 3, width // 3)
+    assert [view[:2] for view in seen] == 4 * [small] + 36 * [whole]
+    focal = [float(K[0, 0]) for _, _, K in seen]
+    assert focal[19] == pytest.approx(focal[-2] / 3, rel=0.05)  # the last one teaches features
+    assert len({tuple(K[:2, 2].tolist()) for _, _, K in seen[20:]}) > 9  # windows lie at random
+
+
+def test_a_window_shows_its_part_of_the_picture():
+    made = tiny_trainer(steps=4, densify="off")
+    window = Window(3, 5, 11, 17)
+    whole, part = (made.model.render(made.views.camera(1, 1, one), 3).rgb for one in (None, window))
+    assert (
+        part.shape[:2] == (11, 17) and (window.of(whole) - part).abs().max() < 0.01
+    )  # large Gaussians beyond the border
+    photo, _ = made.views.photo(1, window)
+    assert torch.equal(photo, made.views.images[1][3:14, 5:22])

@@ -1,10 +1,12 @@
 """COLMAP models and photos become pinhole views of one size, and nothing vanishes without a note."""
 
 import json
+from types import SimpleNamespace
 
 import numpy as np
 import pycolmap
 import pytest
+import torch
 from PIL import Image
 from scipy.ndimage import laplace
 from shared import data, run_stage
@@ -12,10 +14,11 @@ from source_folders import SETTINGS, alone, image, save, write_colmap
 
 from chebsplat.formats.artifact import read_manifest
 from chebsplat.formats.capture import Capture
-from chebsplat.stages.measuring.image_quality import psnr_as_taken
+from chebsplat.stages.measuring.image_quality import figures_as_taken
 from chebsplat.stages.settings import IngestSection, PoseSection
 from chebsplat.stages.sources import assembly, colmap, colmap_model, common, photos
 from chebsplat.stages.sources.cameras import Camera
+from chebsplat.views import View
 
 SIZE, FOCAL = (240, 180), 200.0
 MODELS = {
@@ -320,13 +323,16 @@ def test_test_photos_are_held_as_they_were_taken_and_measured_so(tmp_path, max_s
     capture = Capture.read(tmp_path / "capture")
     tests = [name for name, is_test in zip(capture.names, capture.is_test, strict=True) if is_test]
     assert [lens[0] for lens in capture.lenses] == tests
-    size = (400, 300) if max_side > 400 else (160, 120)
-    np.testing.assert_array_equal(capture.taken[0], photo.resize(size, Image.Resampling.BOX))
-    renders = {name: capture.images[capture.names.index(name)] for name in tests}
-    Ks = {name: capture.Ks[capture.names.index(name)] for name in tests}
-    right = psnr_as_taken(capture, renders, Ks)
+    np.testing.assert_array_equal(capture.taken[0], photo)  # at its own resolution, whatever is trained on
+    views = {}
+    for name, K in zip(capture.names, capture.Ks, strict=True):
+        views[name] = View(torch.tensor(K).float(), torch.eye(4), *capture.size)
+    pictures = SimpleNamespace(render=lambda view: (np.asarray(undistorted.resize((view.width, view.height))), None))
+    undistorted = Image.fromarray(np.asarray(capture.images[0]))
+    right = figures_as_taken(capture, pictures, views)
+    assert right["size"] == [400, 300] and right["psnr"] > (30 if max_side > 400 else 20)
     capture.lenses[0][2][4] *= 1.2
-    assert right > 30 and psnr_as_taken(capture, renders, Ks) < right - 3
+    assert figures_as_taken(capture, pictures, views)["psnr"] < right["psnr"] - (3 if max_side > 400 else 1)
 
 
 def test_pixels_where_a_distortion_folds_back_do_not_count(tmp_path):
