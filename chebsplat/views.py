@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Hashable
 from dataclasses import dataclass, field
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor
+
+DEVICE_BYTES = 1 << 30  # of a GPU, for features of views, and for their depth
 
 
 @dataclass
@@ -44,16 +46,16 @@ def may_be_seen(means: Tensor, view: View, reach: Tensor, margin: float = 0.15) 
     return near & inside
 
 
-def remembered(read: Callable[[int], Tensor], budget: int) -> Callable[[int], Tensor]:
+def remembered(read: Callable[[Any], Tensor], budget: int) -> Callable[[Any], Tensor]:
     """`read`, whose results stay in memory while `budget` bytes last; the others are read at every call.
 
     Choices: what came first stays. Views are visited in random order, once a round: to drop the least recently used
       for another would lose it before it is needed again.
     """
-    kept: dict[int, Tensor] = {}
+    kept: dict[Hashable, Tensor] = {}
     left = budget
 
-    def recall(index: int) -> Tensor:
+    def recall(index: Hashable) -> Tensor:
         nonlocal left
         if index in kept:
             return kept[index]
@@ -133,8 +135,16 @@ class Views:
     scaled_Ks: dict[int, Tensor] = field(default_factory=dict)  # by factor, once asked for
 
     def to(self, device: str | torch.device) -> Views:
-        """The same views on a device: photos, masks and cameras for good, the rest as each step reads it."""
+        """The same views on a device: photos, masks and cameras for good, labels for each step anew, and
+        features and depth as steps read them, of which DEVICE_BYTES each stay there.
+        """
         features, labels, depth = self.features, self.labels, self.depth
+        at_hand: dict[str, Any] = {"features": None, "depth": None}
+        if features is not None:
+            at_hand["features"] = remembered(lambda index: features(index).to(device), DEVICE_BYTES)
+        if depth is not None:
+            read = remembered(lambda key: depth(*key).to(device), DEVICE_BYTES)
+            at_hand["depth"] = lambda index, factor: read((index, factor))
 
         def labels_there(index: int) -> TaughtLabels:
             assert labels is not None
@@ -147,9 +157,9 @@ class Views:
             self.Ks.to(device),
             self.viewmats.to(device),
             None if self.masks is None else self.masks.to(device),
-            None if features is None else lambda index: features(index).to(device),
+            at_hand["features"],
             None if labels is None else labels_there,
-            None if depth is None else lambda index, factor: depth(index, factor).to(device),
+            at_hand["depth"],
         )
 
     def camera(self, index: int, factor: int, window: Window | None = None) -> View:
@@ -170,7 +180,7 @@ class Views:
         return self.scaled_Ks[factor]
 
     def photo(self, index: int, window: Window | None = None) -> tuple[Tensor, Tensor | None]:
-        """The photo u8 [H, W, 3] of a view, or a window of it, and its mask bool [H, W], None where all pixels count."""
+        """The photo u8 [H, W, 3] of a view, or a window of it, and its mask bool [H, W]; None: all pixels count."""
         image, mask = self.images[index], None if self.masks is None else self.masks[index]
         if window is None:
             return image, mask

@@ -39,8 +39,11 @@ def reorder_optimizer(optimizer: torch.optim.Optimizer, raw: dict[str, Tensor], 
 
 def drop(optimizer: torch.optim.Optimizer, raw: dict[str, Tensor], name: str) -> None:
     """One parameter less to hold and to train."""
-    optimizer.state.pop(raw.pop(name), None)
-    optimizer.param_groups[:] = [group for group in optimizer.param_groups if group.get("name") != name]
+    gone = raw.pop(name)
+    optimizer.state.pop(gone, None)
+    for group in optimizer.param_groups:
+        group["params"][:] = [parameter for parameter in group["params"] if parameter is not gone]
+    optimizer.param_groups[:] = [group for group in optimizer.param_groups if group["params"]]
 
 
 def extend_optimizer(optimizer: torch.optim.Optimizer, raw: dict[str, Tensor], rows: dict[str, Tensor]) -> None:
@@ -92,13 +95,11 @@ def _replace(
     values: dict[str, Tensor],
     moved: Callable[[Tensor], Tensor],
 ) -> None:
-    groups = {group.get("name"): group for group in optimizer.param_groups}
     for name, value in values.items():
         old = raw[name]
         raw[name] = fresh = value.clone().requires_grad_(old.requires_grad)
-        if name not in groups:
-            continue
-        groups[name]["params"][0] = fresh
+        for group in optimizer.param_groups:
+            group["params"][:] = [fresh if parameter is old else parameter for parameter in group["params"]]
         moments = {key: moved(moment) for key, moment in _moments(optimizer, old).items()}
         state = optimizer.state.pop(old, {})
         if state:

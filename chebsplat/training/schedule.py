@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from typing import Any
 
 import torch
 
@@ -42,23 +43,27 @@ def rates(settings: TrainSection) -> dict[str, float]:
 
 
 def adam(model: SceneModel, settings: TrainSection, extent: float) -> torch.optim.Adam:
-    """A group for each raw parameter of the model and one for its modules, with their `rate` before any schedule.
+    """A group for each raw parameter of the model, one for SH bands 1 to 3 together, which have one rate (each group is
+    two launches on a GPU), and one for its modules, with their `rate` before any schedule.
 
     Args: settings: the train section; extent: scene units, scales the means' rate.
     """
-    groups = []
+    groups: dict[str, dict[str, Any]] = {}
     base_rates = rates(settings)
     for name, value in model.raw.items():
         rate = base_rates[name] * (extent if name == "means" else 1)
-        groups.append({"params": [value], "rate": rate, "name": name})
+        group = "sh" if name in ("sh1", "sh2", "sh3") else name
+        groups.setdefault(group, {"params": [], "rate": rate, "name": group})["params"].append(value)
     if weights := [p for module in model.modules.values() for p in module.parameters()]:
-        groups.append({"params": weights, "rate": LR_MODULES, "name": "modules"})
-    return torch.optim.Adam(groups, eps=1e-15, fused=True)
+        groups["modules"] = {"params": weights, "rate": LR_MODULES, "name": "modules"}
+    return torch.optim.Adam(list(groups.values()), eps=1e-15, fused=True)
 
 
 class Schedule:
-    """Of a resolved train section, and photos whose longer side has `side` pixels. A budget is a number of steps, or seconds of training: then the pace is
-    the machine's, and two runs are not the same.
+    """Of a resolved train section, and photos whose longer side has `side` pixels.
+
+    A budget is a number of steps, or seconds of training: then the pace is the machine's, and no two
+    runs are the same.
     """
 
     def __init__(self, settings: TrainSection, side: int = STEP_SIDE):

@@ -215,7 +215,7 @@ class Trainer:
         return self.views.features is not None and self.step % every == 0
 
     def _window(self, share: float) -> Window | None:
-        """The part of a photo, drawn at random, that this step sees at the photo's own resolution; None: all, reduced."""
+        """The part of a photo, drawn at random, that this step sees as it is; None: the whole photo, reduced."""
         if not self.schedule.in_full(share) or self._teaches(share):
             return None
         (height, width), by = self.views.images.shape[1:3], self.schedule.reduction

@@ -279,7 +279,7 @@ def test_kernels_just_compiled_and_kernels_from_the_cache_give_the_same_bits(tmp
 def test_the_features_rate_fits_the_number_of_steps(settings, rate):
     made = tiny_trainer(lr_sh=0.0, **settings)
     groups = {group["name"]: group["rate"] for group in made.optimizer.param_groups}
-    assert groups["sh1"] == 0  # given, if nothing
+    assert groups["sh"] == 0  # given, if nothing
     assert groups["features"] == pytest.approx(rate)
 
 
