@@ -107,6 +107,6 @@ def test_what_awaits_a_gpu_runs_to_its_end_where_the_cpu_stands_in(up_to_teacher
     found = gpu.main(["--work", str(up_to_teacher), "--out", str(tmp_path)])
     assert found in (0, 1)  # by frames a second, which a busy machine decides
     rows = list(csv.DictReader((tmp_path / "gpu.csv").read_text().splitlines()))
-    assert len(rows) == len(runs) + 1 + 3 + 1
+    assert len(rows) == len(runs) + 2 + 3 + 1
     assert rows[0]["psnr"] == rows[2]["psnr"] and rows[0]["miou"] and not rows[3]["miou"]
     assert rows[-1]["same_bytes"] == "True"
