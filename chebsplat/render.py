@@ -44,12 +44,24 @@ def colors_by_degree(sh0: Tensor, shN: Tensor, directions: Tensor, degrees: Tens
     return torch.cat(parts)
 
 
-class SceneRenderer:
-    """Renders an exported scene (`formats.scene.Scene.parameters`) on a device; its depth, always on the CPU."""
+def focals(Ks: Tensor | np.ndarray) -> np.ndarray:
+    """Focal lengths [...] of K [..., 3, 3], pixels: the mean of both axes'."""
+    focal: np.ndarray = np.asarray(Ks[..., 0, 0] + Ks[..., 1, 1]) / 2
+    return focal
 
-    def __init__(self, parameters: dict[str, np.ndarray], device: str = "cpu"):
+
+class SceneRenderer:
+    """Renders an exported scene (`formats.scene.Scene.parameters`) on a device; its depth, always on the CPU.
+
+    Ks: [V, 3, 3] of the cameras that the scene was trained on. A view that is finer than all of them is
+    blurred as much as theirs were, since what was trained under their blur is too thin without; None: every
+    view has the rasterizer's own blur.
+    """
+
+    def __init__(self, parameters: dict[str, np.ndarray], device: str = "cpu", Ks: np.ndarray | None = None):
         raw = {name: torch.from_numpy(np.ascontiguousarray(values)).to(device) for name, values in parameters.items()}
         self.on_gpu = raw["means"].device.type == "cuda"
+        self.finest = math.inf if Ks is None else float(focals(Ks).max())
         means, quats, scales, opacities = activated(raw)
         if self.on_gpu:
             lights = {name: raw[name] for name in ("sh0", "shN", "features") if name in raw}
@@ -70,6 +82,7 @@ class SceneRenderer:
     @torch.no_grad()
     def render(self, view: View, with_features: bool = False) -> tuple[np.ndarray, np.ndarray | None]:
         """Image u8 [H, W, 3], and features f32 [H, W, C] where asked for and present."""
+        finer = 1.0 if self.finest == math.inf else max(float(focals(view.K)) / self.finest, 1.0)
         view = view.to(self.means.device)
         index = None if self.on_gpu else in_frustum(self.means, view, self.reach)  # nothing waits for their number
         channels = self.colors(view, index)
@@ -77,7 +90,7 @@ class SceneRenderer:
             channels = torch.cat([channels, take(self.raw["features"], index)], 1)
         gaussians = (take(part, index) for part in (self.means, self.quats, self.scales, self.opacities))
         camera = (view.viewmat[None], view.K[None], view.width, view.height)
-        options: dict[str, Any] = {"harmless": True} if self.on_gpu else {}
+        options: dict[str, Any] = {"eps2d": BLUR * finer**2} | ({"harmless": True} if self.on_gpu else {})
         render, _, _ = rasterize(*gaussians, channels, *camera, **options)
         image = (render[0, ..., :3].clamp(0, 1) * 255).round().byte().cpu().numpy()
         return image, render[0, ..., 3:].cpu().numpy() if channels.shape[1] > 3 else None

@@ -60,7 +60,7 @@ def run(job: Job) -> None:
     if not places:
         raise DataFailure("no view to evaluate has a camera and a pixel that counts; lower ingest.test_every")
     names = [scene.cameras.names[k] for k in places]
-    renderer = SceneRenderer(scene.parameters, job.device)
+    renderer = SceneRenderer(scene.parameters, job.device, scene.cameras.Ks)
     cameras = [camera(scene, k) for k in places]
     pictures: dict[str, Any] = {"truth": np.stack([capture.images[row[name]] for name in names])}
     figures: dict[str, Any] = {"names": names, "protocol": capture.protocol, "source": capture.source}

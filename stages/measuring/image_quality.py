@@ -19,7 +19,7 @@ from chebsplat.errors import InputError
 from chebsplat.evaluation.lpips import Lpips
 from chebsplat.evaluation.metrics import color_fitted, psnr
 from chebsplat.formats.capture import Capture
-from chebsplat.render import PARTS, SceneRenderer, frame_parts
+from chebsplat.render import PARTS, SceneRenderer, focals, frame_parts
 from chebsplat.training.losses import ssim
 from chebsplat.views import View
 
@@ -66,7 +66,7 @@ def figures_as_taken(capture: Capture, renderer: SceneRenderer, cameras: dict[st
         if name not in cameras:
             continue
         lens, truth = pycolmap.Camera(model=model, params=params, width=width, height=height), photo[:height, :width]
-        finer = lens.mean_focal_length() / float(cameras[name].K[[0, 1], [0, 1]].mean())
+        finer = lens.mean_focal_length() / float(focals(cameras[name].K))
         view = enlarged(cameras[name], finer)
         K, render = view.K.double().numpy(), renderer.render(view)[0]
         pixels = np.stack(np.meshgrid(np.arange(width) + 0.5, np.arange(height) + 0.5), -1).reshape(-1, 2)

@@ -100,7 +100,7 @@ class OpenedScene:
     @cached_property
     def renderer(self) -> SceneRenderer:
         """Renders all Gaussians; made on first use."""
-        return SceneRenderer(self.parameters)
+        return SceneRenderer(self.parameters, Ks=self.exported.cameras.Ks)
 
     def camera(self, name: str) -> Camera:
         """The capture's view of this name. Raises ConfigError, with the nearest names."""

@@ -20,7 +20,7 @@ from chebsplat.pipelines.planning.plan import Planner
 from chebsplat.pipelines.work import summary
 from chebsplat.render import SceneRenderer, frame_parts
 from chebsplat.stages.evaluate import camera
-from chebsplat.stages.measuring.image_quality import image_figures, perceptual
+from chebsplat.stages.measuring.image_quality import enlarged, image_figures, perceptual
 from chebsplat.stages.report import summary_rows
 from chebsplat.stages.sources import generated
 from tests.stages.test_stages import changed, inputs_of
@@ -163,6 +163,18 @@ def test_the_clocked_steps_render_the_same_frame(toy):
     for k in range(3):
         view = camera(scene, k)
         assert np.array_equal(frame_parts(renderer, view)[1], renderer.render(view)[0])
+
+
+@pytest.mark.xdist_group("toy")
+def test_a_finer_view_is_blurred_as_what_was_trained_on(toy):
+    scene, far = Scene.read(toy["export"]), []
+    for Ks in (scene.cameras.Ks, None):
+        renderer = SceneRenderer(scene.parameters, Ks=Ks)
+        view = camera(scene, 0)
+        picture = renderer.render(view)[0].astype(float)
+        fine = renderer.render(enlarged(view, 3))[0].astype(float)
+        far.append(np.abs(fine.reshape(view.height, 3, view.width, 3, 3).mean((1, 3)) - picture).mean())
+    assert far[0] < 0.85 * far[1]  # grey levels
 
 
 @pytest.mark.xdist_group("toy")
