@@ -13,7 +13,8 @@ import numpy as np
 
 BYTES = {"means": 9, "log_scales": 3, "quats": 4, "opacities": 1, "colors": 3}  # of a Gaussian
 C0 = 0.28209479177387814  # of SH band 0, from coefficients to colours
-SPAN = 10.2  # of ln scale below the largest: e⁻¹⁰ of it is below every pixel
+# ln of what a scale may be beside the longest axes: of 5 % of the Gaussians, thinner than a pixel, and of 95 %, flat
+LEAST, MOST = -4.0, 12.0
 COLORS = (-1.0, 3.0)  # of SH degree 0 in training's [0, 1]; beyond it no pixel can tell
 
 
@@ -36,8 +37,9 @@ class Packed:
 def pack(parameters: dict[str, np.ndarray], sh_degree: int = 0) -> Packed:
     """Quantise raw parameters (`formats.scene.Scene.parameters`). Raises ValueError on a degree that is not 0 or 1.
 
-    Choices: 24 bits a coordinate, so that a stray Gaussian far off costs the others nothing that shows; scales to 2 %,
-      over e^10 below the largest; activated opacities, since logits would spend their bits where nothing changes.
+    Choices: 24 bits a coordinate, so that a stray Gaussian far off costs the others nothing that shows; scales to 2 %
+      or so, and 4 % at worst: what all others have for sizes bounds those of a few; activated opacities, since logits
+      would spend their bits where nothing changes.
     """
     if sh_degree not in (0, 1):
         raise ValueError(f"a page holds SH degree 0 or 1, not {sh_degree}")
@@ -53,9 +55,9 @@ def pack(parameters: dict[str, np.ndarray], sh_degree: int = 0) -> Packed:
 
     means = levels("means", parameters["means"].astype(np.float64), (1 << 24) - 1).astype(np.uint32)
     arrays["means"] = np.stack([means >> shift & 255 for shift in (0, 8, 16)], 1).astype(np.uint8)
-    largest = parameters["log_scales"].max()
-    log_scales = parameters["log_scales"].astype(np.float64).clip(largest - SPAN)
-    arrays["log_scales"] = levels("log_scales", log_scales, 255).astype(np.uint8)
+    log_scales = parameters["log_scales"].astype(np.float64)
+    bounds = np.quantile(log_scales.max(1), (0.05, 0.95)) + (LEAST, MOST)
+    arrays["log_scales"] = levels("log_scales", log_scales.clip(*bounds), 255).astype(np.uint8)
     words = smallest_three(parameters["quats"])
     arrays["quats"] = np.stack([words >> shift & 255 for shift in (0, 8, 16, 24)]).astype(np.uint8)
     opacities = 1 / (1 + np.exp(-parameters["logit_opacities"].astype(np.float64)))
