@@ -15,8 +15,8 @@ REACH = 0.3  # metres, of neighbours
 DISTANCE, PLANE = 0.15, 0.03  # metres: standard deviations of the distance, and of that from the own plane
 COLOR, ANGLE = 0.1, 0.5  # the same of a colour's difference, of [0, 1] a channel, and of the normals' angle, rad
 HALF_EXTENT = 2.7  # metres from the middle that half of a furnished room's Gaussians lie within
-# Gaussians, every so many of all, whose distance to their 8th nearest tells the room from what lies far behind it: there
-# they lie APART times as far from one another as the nearest quarter does.
+# Gaussians, evenly of all, of which the distance to the 8th nearest tells the room from what lies far behind it: there
+# it is more than APART times what it is for the quarter that lies closest.
 SAMPLED, NTH, APART = 20_000, 8, 10.0
 ROWS = 4096  # Gaussians that are worked off at once
 
