@@ -10,6 +10,7 @@ from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
+from scipy.special import expit
 
 BYTES = {"means": 9, "log_scales": 3, "quats": 4, "opacities": 1, "colors": 3}  # of a Gaussian
 C0 = 0.28209479177387814  # of SH band 0, from coefficients to colours
@@ -56,12 +57,11 @@ def pack(parameters: dict[str, np.ndarray], sh_degree: int = 0) -> Packed:
     means = levels("means", parameters["means"].astype(np.float64), (1 << 24) - 1).astype(np.uint32)
     arrays["means"] = np.stack([means >> shift & 255 for shift in (0, 8, 16)], 1).astype(np.uint8)
     log_scales = parameters["log_scales"].astype(np.float64)
-    bounds = np.quantile(log_scales.max(1), (0.05, 0.95)) + (LEAST, MOST)
+    bounds = np.quantile(log_scales.max(1), (0.05, 0.95)) + np.array([LEAST, MOST])
     arrays["log_scales"] = levels("log_scales", log_scales.clip(*bounds), 255).astype(np.uint8)
     words = smallest_three(parameters["quats"])
     arrays["quats"] = np.stack([words >> shift & 255 for shift in (0, 8, 16, 24)]).astype(np.uint8)
-    opacities = 1 / (1 + np.exp(-parameters["logit_opacities"].astype(np.float64)))
-    arrays["opacities"] = np.round(255 * opacities).astype(np.uint8)
+    arrays["opacities"] = np.round(255 * expit(parameters["logit_opacities"].astype(np.float64))).astype(np.uint8)
     colors = (parameters["sh0"][:, 0].astype(np.float64) * C0 + 0.5).clip(*COLORS)
     arrays["colors"] = levels("colors", colors, 255).astype(np.uint8)
     if sh_degree:
@@ -110,7 +110,7 @@ def signed(rows: np.ndarray) -> tuple[np.ndarray, dict[str, list[float]]]:
 def smallest_three(quats: np.ndarray) -> np.ndarray:
     """Quaternions [N, 4] of any length as u32 [N]."""
     unit = quats.astype(np.float64)
-    unit /= np.linalg.norm(unit, axis=1, keepdims=True).clip(1e-12)
+    unit /= np.linalg.norm(unit, axis=1, keepdims=True).clip(1e-300)  # of float32, of any length
     place = np.abs(unit).argmax(1)
     rows = np.arange(len(unit))
     unit *= np.where(unit[rows, place] < 0, -1, 1)[:, None]
