@@ -16,6 +16,9 @@ BYTES = {"means": 9, "log_scales": 3, "quats": 4, "opacities": 1, "colors": 3}  
 C0 = 0.28209479177387814  # of SH band 0, from coefficients to colours
 # ln of what a scale may be beside the longest axes: of 5 % of the Gaussians, thinner than a pixel, and of 95 %, flat
 LEAST, MOST = -4.0, 12.0
+FARTHEST = (
+    1000.0  # from the middle, in extents of 90 % of the centres: what lies farther is drawn there, as small as it looks
+)
 COLORS = (-1.0, 3.0)  # of SH degree 0 in training's [0, 1]; beyond it no pixel can tell
 
 
@@ -38,9 +41,9 @@ class Packed:
 def pack(parameters: dict[str, np.ndarray], sh_degree: int = 0) -> Packed:
     """Quantise raw parameters (`formats.scene.Scene.parameters`). Raises ValueError on a degree that is not 0 or 1.
 
-    Choices: 24 bits a coordinate, so that a stray Gaussian far off costs the others nothing that shows; scales to 2 %
-      or so, and 4 % at worst: what all others have for sizes bounds those of a few; activated opacities, since logits
-      would spend their bits where nothing changes.
+    Choices: 24 bits a coordinate, and FARTHEST, so that a stray Gaussian far off costs the others nothing that shows;
+      scales to 2 % or so, and 4 % at worst: what all others have for sizes bounds those of a few; activated opacities,
+      since logits would spend their bits where nothing changes.
     """
     if sh_degree not in (0, 1):
         raise ValueError(f"a page holds SH degree 0 or 1, not {sh_degree}")
@@ -54,9 +57,12 @@ def pack(parameters: dict[str, np.ndarray], sh_degree: int = 0) -> Packed:
         integers: np.ndarray = np.round((values - low) / step).T
         return integers
 
-    means = levels("means", parameters["means"].astype(np.float64), (1 << 24) - 1).astype(np.uint32)
+    low, middle, high = np.quantile(parameters["means"].astype(np.float64), (0.05, 0.5, 0.95), axis=0)
+    away = parameters["means"] - middle
+    drawn = np.minimum(FARTHEST * ((high - low).max() or np.inf) / np.linalg.norm(away, axis=1).clip(1e-300), 1)
+    means = levels("means", middle + drawn[:, None] * away, (1 << 24) - 1).astype(np.uint32)
     arrays["means"] = np.stack([means >> shift & 255 for shift in (0, 8, 16)], 1).astype(np.uint8)
-    log_scales = parameters["log_scales"].astype(np.float64)
+    log_scales = parameters["log_scales"] + np.log(drawn)[:, None]
     bounds = np.quantile(log_scales.max(1), (0.05, 0.95)) + np.array([LEAST, MOST])
     arrays["log_scales"] = levels("log_scales", log_scales.clip(*bounds), 255).astype(np.uint8)
     words = smallest_three(parameters["quats"])
