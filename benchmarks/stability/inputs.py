@@ -163,6 +163,11 @@ def spoiled(change: Callable[[PointInputs], dict[str, np.ndarray]]) -> PointInpu
     return of._replace(**{name: values.astype(getattr(of, name).dtype) for name, values in change(of).items()})
 
 
+def filled(of: PointInputs) -> PointInputs:
+    """Inputs in which nobody is missing: the first point takes everybody's place who is not there."""
+    return of._replace(neighbors=np.maximum(of.neighbors, 0))
+
+
 ENCODE: dict[str, Callable[[], PointInputs]] = {
     "nobody near": lambda: spoiled(lambda of: {"neighbors": of.neighbors * 0 - 1}),
     "everybody in one place": lambda: spoiled(lambda of: {"means": of.means * 0}),
@@ -178,10 +183,15 @@ ENCODE: dict[str, Callable[[], PointInputs]] = {
 
 @case("encoded, {name}", name=ENCODE)
 def encodes(name: str) -> Outcome:
-    """float32 beside float64, with attention and without."""
+    """float32 beside float64, with attention and without; the plain way takes the first point where
+    nobody is.
+    """
     of = ENCODE[name]()
-    pairs = [[encoded(of, dtype, attends) for dtype in (torch.float32, torch.float64)] for attends in (True, False)]
-    return Outcome(max(relative(*pair) for pair in pairs), ENCODED)
+
+    def both(of: PointInputs, dtype: torch.dtype) -> np.ndarray:
+        return np.stack([encoded(of, dtype, attends) for attends in (True, False)])
+
+    return beside(both(of, torch.float32), lambda: both(filled(of), torch.float32), both(of, torch.float64), ENCODED)
 
 
 @case("encoded, {name}", name=["neighbours in another order", "neighbours padded", "points in another order"])

@@ -13,6 +13,7 @@ import mpmath
 import numpy as np
 
 from benchmarks.stability.case import Outcome, beside, case, relative
+from chebsplat.lifting.averages import averaged
 from chebsplat.shape.lessons import RIDGE, Sums, basis, combined, novelty, odds, scale_of, solved, summed, unexplained
 
 N, P, C = 40, 6, 3
@@ -164,6 +165,76 @@ def left(size: float) -> Outcome:
 
     found, wanted = (unexplained(each, solved(each, RIDGE)) for each in (sums, exact))
     return beside(found, plainly, wanted, ANSWERS)
+
+
+class Views(NamedTuple):
+    """What three views say of points on a wall: points [N, 3], depth [V, H, W], features [V, h, w,
+    C], poses.
+    """
+
+    means: np.ndarray
+    depth: np.ndarray
+    features: np.ndarray
+    poses: np.ndarray
+    unit: float = 1.0
+
+
+VIEW_K = np.array([[30.0, 0, 16], [0, 30.0, 12], [0, 0, 1]])
+
+
+def views(unit: float = 1.0, shift: float = 0.0, size: float = 1.0) -> Views:
+    """A wall at z = 2 from places side by side, features f16 as teachers' are kept."""
+    rng, poses = np.random.default_rng(4), np.tile(np.eye(4), (3, 1, 1))
+    poses[:, :3, 3] = -unit * np.array([[0, 0, 0], [0.1, 0, 0], [0.2, 0, 0]]) - shift
+    points = np.column_stack([rng.uniform(-0.8, 0.9, N), rng.uniform(-0.7, 0.7, N), np.full(N, 2.0)])
+    features = (size * rng.uniform(0.25, 1, (3, 24, 32, C))).astype(np.float16)
+    return Views(unit * points + shift, np.full((3, 24, 32), unit * 2.0), features, poses, unit)
+
+
+def blind(value: float) -> Views:
+    """A view whose depth is this."""
+    of = views()
+    of.depth[1] = value
+    return of
+
+
+SEEN: dict[str, Callable[[], Views]] = {
+    "in units of 1e-06": lambda: views(1e-6),
+    "in units of 1e+06": lambda: views(1e6),
+    "1e+06 from the origin": lambda: views(shift=1e6),
+    "features of 6e+04": lambda: views(size=6e4),
+    "features of 1e-06": lambda: views(size=1e-6),
+    "features of 0": lambda: views(size=0.0),
+    "a view without depth": lambda: blind(0),
+    "a view of NaN": lambda: blind(np.nan),
+    "a view of inf": lambda: blind(np.inf),
+    "a view that is covered": lambda: blind(1.0),
+    "all behind the cameras": lambda: views()._replace(means=views().means * [1, 1, -1]),
+    "no point": lambda: views()._replace(means=np.zeros((0, 3))),
+}
+
+
+@case("seen by views, {name}", name=SEEN)
+def seen(name: str) -> Outcome:
+    """Mean unit features of points against point by point; the plain way averages what lies at
+    their pixels, in f16.
+    """
+    of = SEEN[name]()
+    exact, plain = np.zeros((len(of.means), C)), np.zeros((len(of.means), C), np.float16)
+    for i, point in enumerate(of.means):
+        rows = []
+        for depth, features, pose in zip(of.depth, of.features, of.poses, strict=True):
+            x, y, z = (point + pose[:3, 3]) / of.unit
+            column, row = int(np.floor(30 * x / z + 16)), int(np.floor(30 * y / z + 12))
+            if not (z > 0 and 0 <= column < 32 and 0 <= row < 24):
+                continue
+            plain[i] += features[row, column] / np.float16(3)
+            said = features[row, column].astype(np.float64)
+            if abs(depth[row, column] / of.unit - z) < 0.03 + 0.01 * z and said.any():
+                rows.append(said / np.linalg.norm(said))
+        exact[i] = np.mean(rows, 0) if rows else 0
+    found, _ = averaged(of.means, of.depth, of.features, C, np.tile(VIEW_K, (3, 1, 1)), of.poses, unit=of.unit)
+    return beside(found, lambda: plain, exact, 1e-5)
 
 
 @case("odds of {n} points, one of a label of its own", n=[2, 1000, 1_000_000])

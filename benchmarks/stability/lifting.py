@@ -9,9 +9,9 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from benchmarks.stability.case import Outcome, beside, case
+from benchmarks.stability.case import Outcome, beside, case, relative
 from benchmarks.stability.splats import HEIGHT, WIDTH, K, gaussians
-from chebsplat.lifting.observations import NEAREST, Observations, estimate
+from chebsplat.lifting.observations import NEAREST, Observations, estimate, to_cells
 from chebsplat.rasterize import lift, reference
 
 CELLS, CHANNELS, STEPS = (HEIGHT // 4, WIDTH // 4), 5, 5
@@ -80,6 +80,46 @@ def of_a_view(name: str) -> Outcome:
         (sums / np.maximum(weights, 1e-300)[:, None])[heard],
         VIEW,
     )
+
+
+SAID: dict[str, Callable[[np.ndarray, np.ndarray], object]] = {
+    "as it is": lambda values, counts: None,
+    "half NaN": lambda values, counts: values[::2, 1:].fill(np.nan),
+    "half infinite, half counts nothing": lambda values, counts: (values[::2].fill(np.inf), counts[1::2].fill(0)),
+    "half zero, counts of 1e-30": lambda values, counts: (values[:, ::2].fill(0), counts.__imul__(1e-30)),
+    "values and counts of 1e+15": lambda values, counts: (values.__imul__(1e15), counts.__imul__(1e15)),
+}
+
+
+@case("cells of a map of {size}, {name}", size=[(1, 1), (5, 3), (7, 10), (28, 40)], name=SAID)
+def cells(size: tuple[int, int], name: str) -> Outcome:
+    """Means by area over what is said and finite, and how much that is, each over its largest,
+    against pieces that entries and cells both consist of; the plain way takes the entry at a cell's
+    middle.
+    """
+    rng = np.random.default_rng(3)
+    values, counts = rng.normal(size=(*size, CHANNELS)).astype(np.float32), rng.uniform(1, 2, size).astype(np.float32)
+    SAID[name](values, counts)
+    told = np.isfinite(values).all(-1) & values.any(-1)
+    rows, columns = (
+        np.arange(np.lcm(pixels, n)) * n // np.lcm(pixels, n) for pixels, n in zip((HEIGHT, WIDTH), size, strict=True)
+    )
+    weights = np.where(told, counts, 0).astype(np.float64)[np.ix_(rows, columns)]
+    pieces = np.where(told[..., None], values, 0).astype(np.float64)[np.ix_(rows, columns)]
+    shape = CELLS[0], len(rows) // CELLS[0], CELLS[1], len(columns) // CELLS[1]
+    share = weights.reshape(shape).mean((1, 3))
+    sums = (pieces * weights[..., None]).reshape(*shape, CHANNELS).mean((1, 3))
+    exact = sums / np.where(share > 0, share, 1)[..., None], share
+
+    def plainly() -> tuple[np.ndarray, np.ndarray]:
+        index = np.ix_(*((np.arange(n) * 2 + 1) * m // (2 * n) for n, m in zip(CELLS, size, strict=True)))
+        return values[index], counts[index]
+
+    def apart(found: tuple[np.ndarray, ...], exact: tuple[np.ndarray, ...]) -> float:
+        there = exact[1] > 0
+        return max(relative(found[0][there], exact[0][there]), relative(found[1], exact[1]))
+
+    return beside(to_cells(values, counts, (WIDTH, HEIGHT)), plainly, exact, VOTES, apart)
 
 
 class Votes(NamedTuple):

@@ -85,7 +85,7 @@ def scales(name: str) -> Outcome:
 
 
 PLACES: dict[str, tuple[Callable[[], Parameters], float]] = {
-    "one at 1e+04": (lambda: room(means=odd(1e4)), 1e-3),
+    **{f"one at {at:.0e}": (lambda at=at: room(means=odd(at)), 1e-3) for at in (1e4, 1e6, 1e18)},
     "1e+03 from the origin": (lambda: room(means=lambda v: np.add(v, 1e3, out=v)), 1e-3),
     "units of 1e-06": (lambda: room(means=lambda v: np.multiply(v, 1e-6, out=v)), 1e-9),
     "units of 1e+06": (lambda: room(means=lambda v: np.multiply(v, 1e6, out=v)), 1e3),
@@ -110,6 +110,27 @@ def places(name: str) -> Outcome:
         return float(np.abs(found.astype(float) - exact).max()) if np.isfinite(found).all() else float("inf")
 
     return beside(kept(unpack(pack(of))["means"]), plainly, kept(of["means"]), tolerance, apart)
+
+
+@case("a Gaussian that is seen at {at:.0e}", at=[1e4, 1e6, 1e18])
+def far(at: float) -> Outcome:
+    """Direction from the middle, and size over distance, relative; the plain way clips coordinates
+    at a thousand rooms.
+    """
+    of = room(means=lambda v: v[ODD].__imul__([at, -at, 2 * at]), log_scales=odd(np.log(0.01 * at)))
+    middle = np.median(of["means"].astype(np.float64), 0)
+
+    def seen(means: np.ndarray, log_scales: np.ndarray) -> np.ndarray:
+        away = means[ODD].astype(np.float64) - middle
+        distance = np.linalg.norm(away)
+        return np.append(away / distance, np.exp(log_scales[ODD].astype(np.float64)) / distance)
+
+    def plainly() -> np.ndarray:
+        return seen(of["means"].clip(-5000, 5000), of["log_scales"])
+
+    found = unpack(pack(of))
+    exact = seen(of["means"], of["log_scales"])
+    return beside(seen(found["means"], found["log_scales"]), plainly, exact, 0.04)
 
 
 @case("quaternions of length {length:.0e}", length=[1e-30, 1e-10, 1.0, 1e10, 1e30])
