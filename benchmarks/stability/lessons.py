@@ -12,7 +12,7 @@ from typing import NamedTuple
 import mpmath
 import numpy as np
 
-from benchmarks.stability.case import Outcome, beside, case, relative
+from benchmarks.stability.case import Outcome, beside, case
 from chebsplat.lifting.averages import averaged
 from chebsplat.shape.lessons import RIDGE, Sums, basis, combined, novelty, odds, scale_of, solved, summed, unexplained
 
@@ -118,16 +118,6 @@ def order(count: int) -> Outcome:
         return np.linalg.solve(gram + np.float32(RIDGE) * np.diag(np.diag(gram)), cross)
 
     return beside(found, plainly, again, ANSWERS)
-
-
-@case("a scene in {parts} parts", parts=[2, 40])
-def in_parts(parts: int) -> Outcome:
-    """Sums of parts by their weights, beside the sums of all."""
-    of = scene()
-    pieces = [Scene(*(part[k::parts] for part in of)) for k in range(parts)]
-    shares = [float(piece.weights.sum() / of.weights.sum()) for piece in pieces]
-    whole, again = summed(*of), combined([summed(*piece) for piece in pieces], shares)
-    return Outcome(max(relative(b, a) for a, b in zip(whole, again, strict=True)), ANSWERS)
 
 
 NOVEL: dict[str, tuple[Callable[[np.ndarray], np.ndarray], float]] = {

@@ -6,16 +6,13 @@ Errors of a mesh are its vertices' distances from the true surface, in voxels.
 
 from __future__ import annotations
 
-import tempfile
 from collections.abc import Callable
-from pathlib import Path
 
 import numpy as np
-from plyfile import PlyData
 from scipy.spatial import cKDTree
 
-from benchmarks.stability.case import Outcome, beside, case, relative
-from chebsplat.formats.meshes import Frame, Mesh, fused, write_mesh
+from benchmarks.stability.case import Outcome, beside, case
+from chebsplat.formats.meshes import Frame, Mesh, fused
 from chebsplat.stages.tools.mesh import away, without_edges
 from chebsplat.synthetic.rays import open3d
 
@@ -140,18 +137,3 @@ def distances(radius: float) -> Outcome:
         return float(np.median(cKDTree(coarse).query(points)[0])) / radius
 
     return beside(away(mesh, points) / radius, plainly, 0.5, 0.02)
-
-
-@case("a PLY of {what}", what=["no vertex", "labels of -1 and 2e9", "places of 1e+30"])
-def files(what: str) -> Outcome:
-    """Vertices and labels as they were."""
-    of = ball(8)
-    mesh = Mesh(of.vertices * np.float32(1e30 if "places" in what else 1), of.triangles, of.colors)
-    mesh = mesh._replace(labels=np.where(np.arange(len(of.vertices)) % 2, -1, 2_000_000_000).astype(np.int32))
-    if what == "no vertex":
-        mesh = Mesh(of.vertices[:0], of.triangles[:0], of.colors[:0], np.zeros(0, np.int32))
-    with tempfile.TemporaryDirectory() as folder:
-        write_mesh(Path(folder) / "mesh.ply", mesh)
-        read = PlyData.read(str(Path(folder) / "mesh.ply"))["vertex"]
-        places, labels = np.column_stack([read[axis] for axis in "xyz"]), np.asarray(read["label"])
-    return Outcome(max(relative(places, mesh.vertices), relative(labels, mesh.labels)), 0.0)

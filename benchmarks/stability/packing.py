@@ -13,7 +13,7 @@ from pathlib import Path
 import numpy as np
 
 from benchmarks.stability.case import Outcome, beside, case, relative
-from chebsplat.formats.packed import C0, from_bytes, pack, signed, to_bytes, unpack
+from chebsplat.formats.packed import C0, pack, unpack
 from chebsplat.formats.ply import read_ply, write_ply
 from chebsplat.formats.world import World
 
@@ -180,31 +180,6 @@ def shown(name: str) -> Outcome:
         return pixels(*map(eight_bits, given))
 
     return beside(pixels(found["logit_opacities"], found["sh0"]), plainly, pixels(*given), 0.01)
-
-
-@case("features of {size:.0e}, one of {one:.0e}", size=[1e-30, 1.0], one=[0.0, 1e30])
-def features(size: float, one: float) -> Outcome:
-    """Over each channel's largest: a step is a 127th of it; the plain way takes 127 for the largest
-    of all channels.
-    """
-    of = room(features=lambda v: np.multiply(v, size, out=v))["features"]
-    of[ODD, 0] = one or of[ODD, 0]
-    integers, steps = signed(of)
-    largest = np.abs(of).max(0)
-    return Outcome(relative(integers.T * np.array(steps["step"]) / largest, of / largest), 0.5 / 127 + 1e-6)
-
-
-@case("arrays of {what}", what=["no entry", "NaN", "the largest u32", "odd lengths"])
-def arrays(what: str) -> Outcome:
-    """Come back from their bytes, bit by bit."""
-    of = {
-        "no entry": {"a": np.zeros((3, 0), np.float32), "b": np.ones(2, np.uint8)},
-        "NaN": {"a": np.array([np.nan, np.inf, -0.0], np.float32)},
-        "the largest u32": {"a": np.array([2**32 - 1], np.uint32)},
-        "odd lengths": {"a": np.ones(3, np.uint8), "b": np.ones(5, np.uint16), "c": np.ones(1, np.float32)},
-    }[what]
-    found = from_bytes(*to_bytes(of))
-    return Outcome(float(sum(found[name].tobytes() != values.tobytes() for name, values in of.items())), 0.0)
 
 
 WORLDS = {

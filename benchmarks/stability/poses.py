@@ -17,8 +17,8 @@ import pycolmap
 from scipy.spatial.transform import Rotation
 
 from benchmarks.stability.case import Outcome, beside, case, relative
-from chebsplat.cameras import centers, common_up, upright
-from chebsplat.splats.similarity import Similarity, fitted, turned_light
+from chebsplat.cameras import centers
+from chebsplat.splats.similarity import Similarity, fitted
 from chebsplat.stages.reconstruction.adjustment import adjust, alignment, frame
 from chebsplat.stages.runtime.command import Job
 from chebsplat.stages.runtime.config import Config
@@ -112,10 +112,8 @@ def lost(share: float, by: float) -> Outcome:
     return beside(Similarity(*found[:3]), lambda: Similarity(*alignment(of.found, of.given)), true, EXACT, differ)
 
 
-def photographed(database: Path) -> tuple[list[str], np.ndarray]:
-    """Matches of 16 views of 300 points, known to half a pixel, put into a database; their names
-    and poses.
-    """
+def photographed(database: Path) -> pycolmap.Reconstruction:
+    """Sixteen views of 300 points, known to half a pixel, whose matches are put into a database."""
     pycolmap.set_random_seed(0)
     options, noise = pycolmap.SyntheticDatasetOptions(), pycolmap.SyntheticNoiseOptions()
     options.num_rigs, options.num_frames_per_rig, options.num_points3D = 1, 16, 300
@@ -124,29 +122,16 @@ def photographed(database: Path) -> tuple[list[str], np.ndarray]:
     with pycolmap.Database.open(database) as opened:
         model = pycolmap.synthesize_dataset(options, opened)
         pycolmap.synthesize_noise(noise, model, opened)
-    return posed(model)
-
-
-def posed(model: pycolmap.Reconstruction) -> tuple[list[str], np.ndarray]:
-    """Names of a model's images, in order, and their poses [V, 4, 4]."""
-    images = sorted(model.images.values(), key=lambda image: image.name)
-    poses = np.tile(np.eye(4), (len(images), 1, 1))
-    poses[:, :3] = [image.cam_from_world().matrix() for image in images]
-    return [image.name for image in images], poses
-
-
-def as_given(database: Path, poses: np.ndarray, focal: float) -> pycolmap.Reconstruction:
-    """A model of the database's cameras and images with these poses, and no points."""
-    model, params = pycolmap.Reconstruction(), [focal, focal, 512, 384]
-    with pycolmap.Database.open(database) as opened:
-        images = sorted(opened.read_all_images(), key=lambda image: image.name)
-    for image, pose in zip(images, poses, strict=True):
-        if not model.exists_camera(image.camera_id):
-            lens = pycolmap.Camera(model="PINHOLE", width=1024, height=768, params=params, camera_id=image.camera_id)
-            model.add_camera_with_trivial_rig(lens)
-        fresh = pycolmap.Image(name=image.name, camera_id=image.camera_id, image_id=image.image_id)
-        model.add_image_with_trivial_frame(fresh, pycolmap.Rigid3d(pose[:3]))
     return model
+
+
+def images_of(model: pycolmap.Reconstruction) -> list[pycolmap.Image]:
+    return sorted(model.images.values(), key=lambda image: image.name)
+
+
+def posed(model: pycolmap.Reconstruction) -> np.ndarray:
+    """Poses [V, 4, 4] of its images."""
+    return np.stack([np.vstack([image.cam_from_world().matrix(), np.eye(4)[3]]) for image in images_of(model)])
 
 
 ADJUSTED: dict[str, tuple[Similarity, float, float]] = {
@@ -168,8 +153,8 @@ def adjusted(name: str) -> Outcome:
     with tempfile.TemporaryDirectory() as root:
         folder, database = Path(root), Path(root) / "database.db"
         (folder / "images").mkdir()
-        names, poses = photographed(database)
-        exact = way.of_cameras(poses)
+        model = photographed(database)
+        names, exact = [image.name for image in images_of(model)], way.of_cameras(posed(model))
         size = np.linalg.norm(centers(exact) - centers(exact).mean(0), axis=1).mean()
         given = exact.copy()
         turns = Rotation.from_rotvec(0.5 * share * rng.normal(size=(len(names), 3))).as_matrix()
@@ -177,8 +162,10 @@ def adjusted(name: str) -> Outcome:
         given[:, :3, :3] = turns @ exact[:, :3, :3]
         given[:, :3, 3] = -np.einsum("vij,vj->vi", given[:, :3, :3], places)
         job = Job({}, Config(), folder / "out", folder)
-        model, _ = adjust(job, as_given(database, given, focal), database, names, given)
-        found = posed(model)[1]
+        for image, pose in zip(images_of(model), given, strict=True):
+            image.frame.set_cam_from_world(image.camera_id, pycolmap.Rigid3d(pose[:3]))
+            image.camera.params = [focal, focal, 512, 384]
+        found = posed(adjust(job, model, database, names, given)[0])
 
     def off(poses: np.ndarray, exact: np.ndarray) -> float:
         there = Similarity(*alignment(poses, exact)).of_points(centers(poses))
@@ -210,35 +197,3 @@ def fits(name: str) -> Outcome:
     spread = np.abs(exact - exact.mean(0)).max()
     found = fitted(points, exact).of_points(points)
     return beside(found / spread, lambda: plainly() / spread, exact / spread, EXACT)
-
-
-@case("there and back by a scale of {scale:.0e}", scale=[1e-9, 1e-3, 1e3, 1e9])
-def back(scale: float) -> Outcome:
-    """Points, and Gaussians' light, whose coefficients are turned there and back."""
-    way, points = Similarity(scale, TURN, np.array([5.0, 6, 7])), np.random.default_rng(0).normal(size=(30, 3))
-    whole = way.inverse().after(way)
-    light = turned_light(TURN.T) @ turned_light(TURN)
-    return Outcome(max(relative(whole.of_points(points), points), relative(light, np.eye(15))), 1e-6)
-
-
-@case("up of cameras rolled by {degrees} degrees, {n} views", degrees=[0, 180], n=[1, 2, 500])
-def ups(degrees: float, n: int) -> Outcome:
-    """Of cameras that turn about z, which is up, or down where all hang over; of one view nothing
-    is sure.
-    """
-    poses = np.tile(np.eye(4), (n, 1, 1))
-    turns = Rotation.from_euler("z", np.linspace(0, 2, n)[:, None]).as_matrix()
-    level = np.array([[1.0, 0, 0], [0, 0, -1], [0, 1, 0]])
-    poses[:, :3, :3] = Rotation.from_euler("z", degrees, degrees=True).as_matrix() @ level @ turns
-    up, sure = common_up(poses)
-    exact = np.array([0, 0, -1.0 if degrees else 1.0])
-    return Outcome(sure if n == 1 else max(relative(up, exact), 1 - sure), EXACT)
-
-
-@case("upright of {length:.0e}", length=[1e-150, 1e150])
-def turns(length: float) -> Outcome:
-    """A rotation that brings up to z."""
-    up = np.array([0.3, -0.8, 0.2])
-    turn = upright(length * up)
-    errors = relative(turn @ turn.T, np.eye(3)), relative(turn @ up / np.linalg.norm(up), [0, 0, 1])
-    return Outcome(max(errors), EXACT)
