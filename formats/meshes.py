@@ -18,7 +18,8 @@ from chebsplat.formats.files import atomic_path
 BLOCK = 16  # voxels along a block of the grid
 N_BLOCKS = 20_000  # that the grid begins with; it grows
 TRUNCATED = 4.0  # voxels, where the signed distance ends
-LEAST_WEIGHT = 3.0  # views that a voxel of the surface was seen by
+LEAST_WEIGHT = 3.0  # views, more than which have seen a voxel of the surface
+TOUCHED = 4  # open3d looks at every fourth pixel along each axis for blocks that a frame touches
 EASY = 100_000  # triangles that the quadric collapse takes about a second for
 PER_CELL = 0.85  # of a fused mesh's triangles that clustering in cells of its own voxels leaves
 GLTF_FLOAT, GLTF_UINT, GLTF_UBYTE, GLTF_VERTICES, GLTF_INDICES = 5126, 5125, 5121, 34962, 34963
@@ -48,8 +49,9 @@ def fused(open3d: Any, frames: Iterable[Frame], voxel: float, farthest: float) -
     """The surface that depth images show, by a truncated signed distance on voxels of this edge, scene units.
 
     Args: open3d: the module; farthest: depth beyond it is not looked at.
-    Choices: truncated at four voxels; a voxel counts that LEAST_WEIGHT views saw. open3d takes the pixel that a point
-      falls into, so that the centre of the first one is at 0.5, as ours is.
+    Choices: truncated at four voxels; a voxel counts that more than LEAST_WEIGHT views saw. open3d takes the pixel that
+      a point falls into, so that the centre of the first one is at 0.5, as ours is. A frame that touches no block would
+      be an error to it, and is passed over.
     """
     core, image = open3d.core, open3d.t.geometry.Image
     names, widths = ("tsdf", "weight", "color"), ((1,), (1,), (3,))
@@ -58,7 +60,8 @@ def fused(open3d: Any, frames: Iterable[Frame], voxel: float, farthest: float) -
     )
     n_seen = 0
     for frame in frames:
-        if not (frame.depth > 0).any():
+        touched = frame.depth[::TOUCHED, ::TOUCHED]
+        if not ((touched > 0) & (touched < farthest)).any():
             continue
         depth = image(core.Tensor(np.ascontiguousarray(frame.depth, np.float32)))
         color = image(core.Tensor(np.ascontiguousarray(frame.color, np.float32) / 255))

@@ -10,10 +10,15 @@ from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
+from scipy.special import expit
 
 BYTES = {"means": 9, "log_scales": 3, "quats": 4, "opacities": 1, "colors": 3}  # of a Gaussian
 C0 = 0.28209479177387814  # of SH band 0, from coefficients to colours
-SPAN = 10.2  # of ln scale below the largest: e⁻¹⁰ of it is below every pixel
+# ln of what a scale may be beside the longest axes: of 5 % of the Gaussians, thinner than a pixel, and of 95 %, flat
+LEAST, MOST = -4.0, 12.0
+FARTHEST = (
+    1000.0  # from the middle, in extents of 90 % of the centres: what lies farther is drawn there, as small as it looks
+)
 COLORS = (-1.0, 3.0)  # of SH degree 0 in training's [0, 1]; beyond it no pixel can tell
 
 
@@ -36,8 +41,9 @@ class Packed:
 def pack(parameters: dict[str, np.ndarray], sh_degree: int = 0) -> Packed:
     """Quantise raw parameters (`formats.scene.Scene.parameters`). Raises ValueError on a degree that is not 0 or 1.
 
-    Choices: 24 bits a coordinate, so that a stray Gaussian far off costs the others nothing that shows; scales to 2 %,
-      over e^10 below the largest; activated opacities, since logits would spend their bits where nothing changes.
+    Choices: 24 bits a coordinate, and FARTHEST, so that a stray Gaussian far off costs the others nothing that shows;
+      scales to 2 % or so, and 4 % at worst: what all others have for sizes bounds those of a few; activated opacities,
+      since logits would spend their bits where nothing changes.
     """
     if sh_degree not in (0, 1):
         raise ValueError(f"a page holds SH degree 0 or 1, not {sh_degree}")
@@ -51,15 +57,17 @@ def pack(parameters: dict[str, np.ndarray], sh_degree: int = 0) -> Packed:
         integers: np.ndarray = np.round((values - low) / step).T
         return integers
 
-    means = levels("means", parameters["means"].astype(np.float64), (1 << 24) - 1).astype(np.uint32)
+    low, middle, high = np.quantile(parameters["means"].astype(np.float64), (0.05, 0.5, 0.95), axis=0)
+    away = parameters["means"] - middle
+    drawn = np.minimum(FARTHEST * ((high - low).max() or np.inf) / np.linalg.norm(away, axis=1).clip(1e-300), 1)
+    means = levels("means", middle + drawn[:, None] * away, (1 << 24) - 1).astype(np.uint32)
     arrays["means"] = np.stack([means >> shift & 255 for shift in (0, 8, 16)], 1).astype(np.uint8)
-    largest = parameters["log_scales"].max()
-    log_scales = parameters["log_scales"].astype(np.float64).clip(largest - SPAN)
-    arrays["log_scales"] = levels("log_scales", log_scales, 255).astype(np.uint8)
+    log_scales = parameters["log_scales"] + np.log(drawn)[:, None]
+    bounds = np.quantile(log_scales.max(1), (0.05, 0.95)) + np.array([LEAST, MOST])
+    arrays["log_scales"] = levels("log_scales", log_scales.clip(*bounds), 255).astype(np.uint8)
     words = smallest_three(parameters["quats"])
     arrays["quats"] = np.stack([words >> shift & 255 for shift in (0, 8, 16, 24)]).astype(np.uint8)
-    opacities = 1 / (1 + np.exp(-parameters["logit_opacities"].astype(np.float64)))
-    arrays["opacities"] = np.round(255 * opacities).astype(np.uint8)
+    arrays["opacities"] = np.round(255 * expit(parameters["logit_opacities"].astype(np.float64))).astype(np.uint8)
     colors = (parameters["sh0"][:, 0].astype(np.float64) * C0 + 0.5).clip(*COLORS)
     arrays["colors"] = levels("colors", colors, 255).astype(np.uint8)
     if sh_degree:
@@ -108,7 +116,7 @@ def signed(rows: np.ndarray) -> tuple[np.ndarray, dict[str, list[float]]]:
 def smallest_three(quats: np.ndarray) -> np.ndarray:
     """Quaternions [N, 4] of any length as u32 [N]."""
     unit = quats.astype(np.float64)
-    unit /= np.linalg.norm(unit, axis=1, keepdims=True).clip(1e-12)
+    unit /= np.linalg.norm(unit, axis=1, keepdims=True).clip(1e-300)  # of float32, of any length
     place = np.abs(unit).argmax(1)
     rows = np.arange(len(unit))
     unit *= np.where(unit[rows, place] < 0, -1, 1)[:, None]

@@ -17,6 +17,7 @@ class Outcome(NamedTuple):
 
     error: float  # of our float32 result, relative to the oracle's largest value unless the module says otherwise
     tolerance: float
+    naive: float = float("nan")  # error of the plain way to compute the same in float32, where the case has one
 
 
 class Row(NamedTuple):
@@ -24,6 +25,7 @@ class Row(NamedTuple):
     case: str
     error: float
     tolerance: float
+    naive: float
     passed: bool
     note: str
     seconds: float
@@ -72,3 +74,16 @@ def relative(found: Any, exact: Any) -> float:
     if not found.size:
         return 0.0
     return float(np.abs(found - exact).max() / (np.abs(exact).max() or 1.0))
+
+
+def beside(
+    found: Any, naive: Callable[[], Any], exact: Any, tolerance: float, measure: Callable[[Any, Any], float] = relative
+) -> Outcome:
+    """What was found, and what the plain way finds, against what is exact; a plain way that raises is off by inf."""
+    with warnings.catch_warnings(), np.errstate(all="ignore"):
+        warnings.simplefilter("ignore")
+        try:
+            plain = measure(naive(), exact)
+        except (ArithmeticError, IndexError, RuntimeError, ValueError):  # LinAlgError is a ValueError
+            plain = float("inf")
+    return Outcome(measure(found, exact), tolerance, plain)

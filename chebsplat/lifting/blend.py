@@ -49,8 +49,7 @@ def trusted(knowledge: np.ndarray, strength: float) -> np.ndarray:
     Choices: an answer is the mean of unit vectors of a teacher over views, so that its length says how alike these
       were where shapes were like this one; small things, of which shape says least, are left to the views.
     """
-    lengths = np.linalg.norm(knowledge, axis=1).clip(0, 1)
-    return np.asarray(strength * lengths**SURE, np.float32)
+    return np.asarray(strength * lengths(knowledge).clip(0, 1) ** SURE, np.float32)
 
 
 def effective(n_views: np.ndarray) -> np.ndarray:
@@ -191,12 +190,18 @@ def confidence(
     return (np.linalg.norm(votes, axis=1) / total).clip(0, 1).astype(np.float32)  # type: ignore[no-any-return]
 
 
+def lengths(rows: np.ndarray) -> np.ndarray:
+    """Lengths of rows [N, C], f64 [N]; of float32, too, squares neither vanish nor overflow."""
+    return np.asarray(np.sqrt(np.einsum("nc,nc->n", rows, rows, dtype=np.float64)))
+
+
 def unit(rows: np.ndarray) -> np.ndarray:
     """Rows of length 1, or of zeros."""
-    return np.asarray(rows / np.linalg.norm(rows, axis=1, keepdims=True).clip(1e-12))
+    of = lengths(rows)
+    return np.asarray(rows / np.where(of > 0, of, 1)[:, None].astype(rows.dtype))
 
 
 def cosines(a: np.ndarray, b: np.ndarray) -> np.ndarray:
     """Cosine of each row's angle, f64 [N]; 0 where a row is zero."""
-    lengths = np.linalg.norm(a, axis=1).astype(np.float64) * np.linalg.norm(b, axis=1)
-    return np.einsum("nc,nc->n", a, b) / np.where(lengths > 0, lengths, 1)  # type: ignore[no-any-return]
+    both = lengths(a) * lengths(b)
+    return np.asarray(np.einsum("nc,nc->n", a, b, dtype=np.float64) / np.where(both > 0, both, 1))

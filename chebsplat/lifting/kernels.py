@@ -63,14 +63,14 @@ def _average(means, weights, lengths, first, last, chosen, steps, floor, factors
         return 0.0
     agreement = _length(direction) / total
     for _ in range(steps):
-        size = max(_length(direction), 1e-12)
+        size = max(_length(direction), 1e-12 * total)
         for row in range(first, last):
             cosine = 0.0
             for c in range(len(direction)):
                 cosine += means[row, c] * direction[c]
             cosine /= lengths[row - first] * size
             factors[row - first] = weights[row] / max(math.sqrt(max(2 - 2 * cosine, 0.0)), floor)
-        _direction(means, lengths, factors, first, last, chosen, direction)
+        total = _direction(means, lengths, factors, first, last, chosen, direction)
     for c in range(len(out)):
         direction[c] = 0.0
     total = 0.0

@@ -7,19 +7,21 @@ from typing import Any
 import torch
 from torch import Tensor
 
-GRAZING = 0.15  # cosine of the view's angle to a plane below which its depth is that of the centre
+GRAZING = 0.15  # cosine of the view's angle to a plane below which it is tilted towards the camera
 
 
 def inverse_depths(means: Tensor, normals: Tensor, K: Tensor, nearest: float) -> Tensor:
     """q [N, 3] of each Gaussian's plane, 1 / z = q · (u, v, 1) at pixel (u, v).
 
     Args: means [N, 3] and unit normals [N, 3] in the camera's frame; K [3, 3] pixels; nearest: scene units, > 0.
-    Choices: a plane that is seen at a grazing angle is taken to face the camera; its depth would be without bound.
+    Choices: a plane that is seen at a grazing angle, whose depth would be without bound, is mixed with the one through
+      its centre that faces the camera, by the square of the angle's cosine: nothing jumps, neither where the mixing
+      begins nor where a plane turns its other side.
     """
-    along, grazing = _along(means, normals, nearest)
-    planes = normals @ inverse_of(K) / torch.where(grazing, 1, along)[:, None]
+    along, limit = _along(means, normals, nearest)
+    inverse = along / torch.maximum(along.abs(), limit).square()
     facing = torch.nn.functional.pad(1 / means[:, 2:].clamp_min(nearest), (2, 0))
-    return torch.where(grazing[:, None], facing, planes)
+    return normals @ inverse_of(K) * inverse[:, None] + facing * (1 - along * inverse)[:, None]
 
 
 def inverse_of(K: Tensor) -> Tensor:
@@ -31,9 +33,8 @@ def inverse_of(K: Tensor) -> Tensor:
 
 
 def _along(means: Tensor, normals: Tensor, nearest: float) -> tuple[Tensor, Tensor]:
-    """Distance [N] of each plane from the camera, of any sign, and whether it is seen at a grazing angle."""
-    along = (normals * means).sum(-1)
-    return along, along.abs() < GRAZING * means.norm(dim=-1).clamp_min(nearest)
+    """Distance [N] of each plane from the camera, of any sign, and the least [N] at which it is not grazed."""
+    return (normals * means).sum(-1), GRAZING * means.norm(dim=-1).clamp_min(nearest)
 
 
 class _Planes(torch.autograd.Function):
@@ -56,13 +57,19 @@ class _Planes(torch.autograd.Function):
     @staticmethod
     def backward(ctx: Any, grad: Tensor) -> tuple[Tensor | None, ...]:
         where, across, normals, w, r, lengths, viewmat, K = ctx.saved_tensors
-        along, grazing = _along(where, across, ctx.nearest)
-        slope = grad @ inverse_of(K).T / torch.where(grazing, 1, along)[:, None]
-        pull = (slope * across).sum(-1, True) / torch.where(grazing, 1, along)[:, None]
-        z = where[:, 2:]
-        facing = torch.nn.functional.pad(torch.where(z > ctx.nearest, -grad[:, 2:] / z.square(), 0), (2, 0))
-        to_where = torch.where(grazing[:, None], facing, -pull * across)
-        to_normals = torch.where(grazing[:, None], 0, slope - pull * where) @ viewmat[:3, :3]
+        along, limit = _along(where, across, ctx.nearest)
+        grazing, square = along.abs() < limit, torch.maximum(along.abs(), limit).square()
+        inverse, z, norms = along / square, where[:, 2:], where.norm(dim=-1)
+        slope = grad @ inverse_of(K).T
+        pull, face = (slope * across).sum(-1), grad[:, 2] / z[:, 0].clamp_min(ctx.nearest)
+        by_along = torch.where(grazing, pull / square - 2 * face * inverse, -pull / square)
+        by_mean = -2 * GRAZING**2 * inverse * (pull - face * along) / square  # of the limit, as the distance grows
+        by_mean = torch.where(grazing & (norms > ctx.nearest), by_mean, 0)
+        facing = torch.where(grazing, 1 - along * inverse, 0)[:, None] * torch.nn.functional.pad(
+            torch.where(z > ctx.nearest, -grad[:, 2:] / z.square(), 0), (2, 0)
+        )
+        to_where = by_along[:, None] * across + by_mean[:, None] * where + facing
+        to_normals = (inverse[:, None] * slope + by_along[:, None] * where) @ viewmat[:3, :3]
         torque = torch.linalg.cross(normals, to_normals)  # of a small turn in the world
         real, imaginary = -(torque * r).sum(-1, True), w * torque + torch.linalg.cross(torque, r)
         return to_where @ viewmat[:3, :3], 2 * torch.cat([real, imaginary], -1) / lengths, None, None, None, None

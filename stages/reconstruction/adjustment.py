@@ -192,14 +192,16 @@ def localized(
 def alignment(found: np.ndarray, given: np.ndarray) -> tuple[float, np.ndarray, np.ndarray]:
     """Scale, rotation [3, 3] and shift [3] from the world of poses `found` to that of `given`, both [V, 4, 4].
 
-    Choices: the rotation is the mean over views, not that of the centres, which tell none where they lie on a line.
+    Choices: the rotation is the mean over views, not that of the centres, which tell none where they lie on a line. The
+      scale is 1 where all centres lie in one place.
     """
     U, _, Vt = np.linalg.svd(np.einsum("vji,vjk->ik", given[:, :3, :3], found[:, :3, :3]))
     rotation = U @ np.diag([1, 1, np.linalg.det(U @ Vt)]) @ Vt
     old, new = centers(given), centers(found)
     turned = new @ rotation.T
     spread = ((turned - turned.mean(0)) ** 2).sum()
-    scale = float(((old - old.mean(0)) * (turned - turned.mean(0))).sum() / spread) if spread > 0 else 1.0
+    told = spread > (1e-12 * np.abs(turned).max()) ** 2  # more than rounding
+    scale = float(((old - old.mean(0)) * (turned - turned.mean(0))).sum() / spread) if told else 1.0
     return scale, rotation, old.mean(0) - scale * turned.mean(0)
 
 

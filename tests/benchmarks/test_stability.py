@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from benchmarks.stability import case, main
-from benchmarks.stability.case import CASES, Outcome, run
+from benchmarks.stability.case import CASES, Outcome, beside, run
 
 
 @pytest.fixture(autouse=True)
@@ -43,6 +43,16 @@ def test_a_case_that_fails_gives_a_non_zero_exit_and_is_named(tmp_path, capsys, 
     with (tmp_path / "stability.csv").open() as handle:
         assert [row["passed"] for row in csv.DictReader(handle)] == ["False"]
     assert "meant to fail" in capsys.readouterr().out
+
+
+def test_a_plain_way_is_measured_beside_ours_and_fails_no_case(tmp_path, capsys, monkeypatch):
+    one = np.float32(1)
+    for name, naive in (("raises", raises), ("warns", lambda: one / np.float32(0)), ("misses", lambda: 3 * one)):
+        monkeypatch.setitem(CASES, ("none", name), lambda naive=naive: beside(one, naive, 1.0, 1e-6))
+    assert main.main(["--only", "none: ", "--out", str(tmp_path)]) == 0
+    with (tmp_path / "stability.csv").open() as handle:
+        assert [float(row["naive"]) for row in csv.DictReader(handle)] == [np.inf, np.inf, 2.0]
+    assert "misses 3 of the 3" in capsys.readouterr().out
 
 
 def test_an_unknown_case_is_a_usage_error(tmp_path):
