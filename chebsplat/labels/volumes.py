@@ -39,11 +39,14 @@ def holder(points: np.ndarray, volumes: Sequence[Volume], margin: float) -> np.n
     Args: margin: how far outside of a volume a point may lie, in the points' unit.
     Choices: of volumes that overlap the first; of those that a point lies just outside of, the nearest.
     """
-    held, best = np.full(len(points), -1, np.int32), np.full(len(points), margin)
+    held, best = np.full(len(points), -1, np.int32), np.full(len(points), np.inf)
+    columns = np.ascontiguousarray(points.T)
     for row, (faces, low, high) in enumerate(volumes):
-        near = np.flatnonzero(((points >= low - margin) & (points <= high + margin)).all(1))
+        near = np.arange(len(points))
+        for axis in (2, 0, 1):
+            values = columns[axis, near]
+            near = near[(values >= low[axis] - margin) & (values <= high[axis] + margin)]
         outside = np.maximum((points[near] @ faces[:, :3].T + faces[:, 3]).max(1), 0.0)
-        nearer = outside < np.where(held[near] < 0, np.inf, best[near])
-        nearer &= outside <= margin
+        nearer = (outside <= margin) & (outside < best[near])
         best[near[nearer]], held[near[nearer]] = outside[nearer], row
     return held
