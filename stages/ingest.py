@@ -32,6 +32,7 @@ from chebsplat.stages.sources import (
     seven_scenes,
     transforms,
     video,
+    volumes,
 )
 from chebsplat.stages.sources.assembly import as_taken
 from chebsplat.stages.sources.common import resolve_source
@@ -167,6 +168,8 @@ def run(job: Job) -> None:
     source = resolve_source(name, job.config.source)
     model = PhotoModel.read(job.inputs["model"]) if "model" in job.inputs else None
     fields = read(name, source, settings, model)
+    if settings.volumes is not None:
+        volumes.give(fields, Path(settings.volumes))
     job.facts["variance_kept"] = fields.pop("variance_kept", 1.0)  # generated views are as large as they are made
     fields["source"] = {"name": name} | fields["source"]
     for note in (*filter(None, [fields["source"].get("labels")]), *fields["source"].get("notes", [])):

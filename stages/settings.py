@@ -55,6 +55,9 @@ class IngestSection(Section):
     classes: dict[Text, list[Text]] | None = setting(
         None, "names, each with the source's classes that it stands for; what stands for none is not counted"
     )
+    volumes: Text | None = setting(
+        None, "JSON of named volumes, which label what depth shows; default: the source's own labels"
+    )
     # for studies: what real cameras do, of known strength, to the training views alone
     disturb_colors: float = number(0.0, "exposures at random, in stops; a quarter of it in white balance", 0, 8)
     disturb_degrees: float = number(0.0, "turns of the cameras at random", 0, 180)

@@ -27,6 +27,7 @@ OPTIONAL = {"av", "gsplat", "pillow_heif", "tokenizers", "transformers"}  # of e
 # Settings that say where raw files lie. Their content is hashed instead: where it lies is no matter.
 PLACES = (
     ("source", "path"),
+    ("ingest", "volumes"),
     ("channels", "model"),
     ("channels", "reference"),
     ("teacher", "model"),

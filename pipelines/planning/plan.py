@@ -213,7 +213,7 @@ class Planner:
         config = placed(configs.build(values, f"scene {shown(scene)}"))
         asked = config.source
         source = located(resolve_source(name, asked))
-        probe = self._probe(source, scene)
+        probe = self._probe(source, scene) | ({"labels": True} if config.ingest.volumes else {})
         kind, why = teacher_kind(config, source.kind, probe)
         teacher = config.teacher.model_copy(update={"kind": kind})
         if kind == "onnx" and teacher.model is None:

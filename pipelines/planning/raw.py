@@ -28,13 +28,10 @@ def raw_files(stage: str, sections: dict[str, Any]) -> tuple[Path | None, list[P
 
     Raises: InputError if there are none where there must be.
     """
-    if stage in ("pose", "ingest") and sections["source"]["kind"] != "generated":
-        folder, kind = Path(sections["source"]["path"]), sections["source"]["kind"]
-        if kind == "video" and not folder.is_dir():
-            return folder.parent, [folder]
-        if not folder.is_dir():
-            raise InputError(f"{folder} is not a folder; correct source.path")
-        return folder, import_module(f"chebsplat.stages.sources.{kind}").files(folder)
+    if stage in ("pose", "ingest"):
+        root, files = _of_source(sections["source"])
+        volumes = sections.get("ingest", {}).get("volumes")
+        return root, [*files, _named(volumes, "ingest.volumes")] if volumes else files
     if stage == "channels" and sections["channels"]["model"]:
         return None, _of_channels(sections["channels"])
     if stage == "teacher" and sections["teacher"]["model"]:
@@ -49,6 +46,18 @@ def raw_files(stage: str, sections: dict[str, Any]) -> tuple[Path | None, list[P
     if stage == "evaluate" and sections["evaluate"]["lpips_weights"]:
         return None, [_named(sections["evaluate"]["lpips_weights"], "evaluate.lpips_weights")]
     return None, []
+
+
+def _of_source(source: dict[str, Any]) -> tuple[Path | None, list[Path]]:
+    """The files of photos and what belongs to them, and their folder."""
+    if source["kind"] == "generated":
+        return None, []
+    folder, kind = Path(source["path"]), source["kind"]
+    if kind == "video" and not folder.is_dir():
+        return folder.parent, [folder]
+    if not folder.is_dir():
+        raise InputError(f"{folder} is not a folder; correct source.path")
+    return folder, import_module(f"chebsplat.stages.sources.{kind}").files(folder)
 
 
 def _of_model(model: str | None) -> list[Path]:
@@ -97,10 +106,13 @@ def hashes(files: Iterable[Path], memo: dict[str, Any]) -> Hashes:
 
 
 def content_hash(entries: Hashes, root: Path | None) -> str:
-    """One hash of files: their contents, and their paths below `root`, which tell a label from a depth image."""
+    """One hash of files: their contents, and their paths below `root`, which tell a label from a
+    depth image; of a file elsewhere its name.
+    """
     total = hashlib.sha256()
     for path, (_, digest, _) in entries.items():
-        name = os.path.basename(path) if root is None else os.path.relpath(path, root).replace(os.sep, "/")
+        below = root is not None and Path(path).is_relative_to(root)
+        name = os.path.relpath(path, root).replace(os.sep, "/") if below else os.path.basename(path)
         total.update(os.fsencode(f"{name} {digest}\n"))
     return total.hexdigest()[:16]
 

@@ -51,8 +51,9 @@ FIGURES = (
     Figure("frames_per_second", "frames/s", 1, 1, True, "rendered_on"),
     Figure("train_seconds", "training, s", 1, 1, True, "trained_on"),
 )
-OTHERS = ("miou_teacher", "classes", "pixels", "protocol", "held_in_psnr", "steps", "clock", "device",
-          "trained_on", "rendered_on", "train_key", "evaluate_key")  # fmt: skip
+OF_TEACHER = ("miou", "boundary_miou", "point_miou")  # figures of single photos, too
+OTHERS = (*(f"{key}_teacher" for key in OF_TEACHER), "classes", "pixels", "protocol", "held_in_psnr", "steps",
+          "clock", "device", "trained_on", "rendered_on", "train_key", "evaluate_key")  # fmt: skip
 IDENTITY = ("condition", "variant", "budget", "scene", "seed", "state")
 POOLED = ("miou", "miou_gain", "macc", "oa")  # what a protocol may work out over all scenes together
 COLUMNS = (*IDENTITY, *(figure.key for figure in FIGURES), *OTHERS)
@@ -137,7 +138,8 @@ def segmented(scene: dict[str, Any], teacher: dict[str, Any]) -> Row:
     """The columns that figures of a scene and of its teacher fill; a protocol measures some of them."""
     row: Row = {key: scene.get(key) for key in ("miou", "macc", "oa", "boundary_miou", "rarest_miou", "point_miou")}
     if row["miou"] is not None and teacher.get("miou") is not None:
-        row |= {"miou_teacher": teacher["miou"], "miou_gain": row["miou"] - teacher["miou"]}
+        row |= {f"{key}_teacher": teacher.get(key) for key in OF_TEACHER}
+        row["miou_gain"] = row["miou"] - teacher["miou"]
     return row
 
 

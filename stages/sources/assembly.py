@@ -6,6 +6,7 @@ import functools
 from collections.abc import Iterable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -13,8 +14,10 @@ from PIL import Image, ImageStat
 from scipy.fft import dctn, idctn
 from scipy.ndimage import map_coordinates
 
+from chebsplat.cameras import unproject
 from chebsplat.errors import DataFailure
 from chebsplat.formats.images import header
+from chebsplat.labels.agreement import project
 from chebsplat.stages.settings import IngestSection
 from chebsplat.stages.sources import labels
 from chebsplat.stages.sources.cameras import DISTORTED, EQUIRECTANGULAR, FACES, Camera, scaled, undistorted
@@ -279,7 +282,10 @@ def read_view(
     inside &= opaque  # of empty space there is no depth, nor a label
     if frame.mask is not None:
         counts &= companion(frame.mask, size, at) > 0
-    if "depth" in wanted and frame.depth is not None:
+    if "depth" in wanted and frame.depth is not None and listing.depth_offset is not None:
+        z = from_beside(frame.depth, listing, view)
+        fields["depth"] = np.where(inside, z, np.float32(np.nan))
+    elif "depth" in wanted and frame.depth is not None:
         place, field = at, size
         if listing.depth_camera is not None:
             place, field = moved(at, camera, listing.depth_camera)
@@ -296,6 +302,25 @@ def read_view(
         sure = nearest(confidences(frame.confidence), at, size)
         fields["confidence"] = np.where(inside & (fields["pseudo_labels"] > 0), sure, 0).astype(np.float16)
     return fields
+
+
+def from_beside(path: Path, listing: Listing, view: Geometry) -> np.ndarray:
+    """z-depth f32 [H, W] of a view by a depth camera beside it; nan where that does not see it.
+
+    Choices: of the depth image's pixels that fall into one of the view the nearest counts.
+    """
+    camera = listing.depth_camera
+    assert camera is not None and listing.depth_offset is not None
+    own, pose = geometry(camera, max(camera.width, camera.height)), np.eye(4)
+    stored = companion(path, (own.width, own.height), positions(camera, own), DEEP, "16-bit depth")
+    pose[:3, 3] = -listing.depth_offset
+    pixels = np.argwhere(~np.isin(stored, listing.no_depth))
+    points = unproject(stored / listing.depth_scale, own.K, pose, pixels)
+    seen = project(points, view.K, np.eye(4), (view.width, view.height))
+    columns, rows, z = seen[np.isfinite(seen[:, 0])].T
+    depth = np.full((view.height, view.width), np.nan, np.float32)
+    np.fmin.at(depth, (rows.astype(int), columns.astype(int)), z.astype(np.float32))
+    return depth
 
 
 def photo(frame: Frame, listing: Listing, view: Geometry, at: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

@@ -80,7 +80,8 @@ class Listing:
     corrections:  object id -> raw id of the label that its pixels take instead.
     pseudo_names: by id in the pseudo labels; 0 is none.
     depth_scale:  stored units in one scene unit; no_depth: stored values that mean "unknown".
-    depth_camera: a pinhole camera of the depth images, at the photo's place; None: the photo's own.
+    depth_camera: a pinhole camera of the depth images; None: the photo's own.
+    depth_offset: where it stands in the photo's camera [3], scene units; None: at its centre.
     """
 
     kind: str
@@ -94,6 +95,7 @@ class Listing:
     depth_scale: float = 1000.0
     no_depth: tuple[int, ...] = (0, 65_535)  # none, and what 16 bits hold no more of
     depth_camera: Camera | None = None
+    depth_offset: np.ndarray | None = None
     notes: list[str] = field(default_factory=list)
     empty: dict[str, np.ndarray] = field(default_factory=dict)  # by view, where its photo is transparent, once read
     upright: bool = False  # turn every image by its EXIF orientation; otherwise only where its camera asks for it

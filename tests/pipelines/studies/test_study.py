@@ -142,6 +142,7 @@ def test_figures_are_read_from_the_artifacts():
     asked = study(seeds=[3], variants={"less": {}})
     _, (row,) = finished(asked, miou=0.75, psnr=31.5, n=40, seconds=8.0)
     expected = {"state": "done", "seed": 3, "miou": 0.75, "miou_gain": 0.5, "psnr": 31.5, "n_gaussians": 40}
+    expected |= {"miou_teacher": 0.25, "boundary_miou_teacher": 0.75, "point_miou_teacher": None}
     expected |= {"sh_kept": 190 / 640, "bytes_ply": 400, "bytes_ragged": 200, "frames_per_second": 50.0}
     expected |= {"train_seconds": 8.0, "held_in_psnr": 25.0, "steps": 10, "clock": None}
     expected |= {"trained_on": "A, 2 threads", "rendered_on": "A, 2 threads"}

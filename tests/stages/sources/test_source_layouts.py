@@ -18,6 +18,8 @@ from chebsplat.formats.capture import Capture
 from chebsplat.formats.points import Points
 from chebsplat.stages.settings import IngestSection
 from chebsplat.stages.sources import colmap, common, generated, replica, scannet, seven_scenes
+from chebsplat.synthetic.rays import RayCaster
+from chebsplat.synthetic.shuffled import build
 from tests.stages.sources.test_sources import agreement
 
 KINDS = {"replica": replica, "colmap": colmap, "scannet": scannet, "seven_scenes": seven_scenes}
@@ -93,14 +95,32 @@ def test_deep_blending_or_any_colmap_folder(scene, tmp_path):
 
 @pytest.mark.parametrize("unknown", [0, 65_535])
 def test_seven_scenes(scene, tmp_path, unknown):
-    """The layout has no file for the colour camera: its focal length is 525 of 640 pixels."""
-    scene = scene | {"Ks": np.tile([[78.75, 0, 48], [0, 78.75, 36], [0, 0, 1]], (16, 1, 1))}
-    layouts.write_seven_scenes(tmp_path / "seq-01", scene, unknown=unknown)
-    compare(read(tmp_path / "seq-01", "seven_scenes"), scene, labels=False)
+    """Depth and poses are of a camera beside the photo's; no file of the layout is of the photo's."""
+    photo, depth = (78.9, 48.465, 35.535), (87.75, 48, 36)
+    Ks = np.array([[[f, 0, cx], [0, f, cy], [0, 0, 1]] for f, cx, cy in (photo, depth)])
+    beside = scene["cam_from_world"].copy()
+    beside[:, :3, 3] -= seven_scenes.OFFSET
+    soup = build("toy", 1).soup
+    caster = RayCaster(soup.vertices, soup.triangles)
+    pixels = np.stack(np.meshgrid(np.arange(96), np.arange(72)), -1).reshape(-1, 2) + 0.5
+
+    def seen(K, poses):
+        hits = [generated.trace(caster, K, pose, pixels)[0] for pose in poses]
+        return np.stack([hit.distance.reshape(72, 96) for hit in hits])
+
+    exact, stored = seen(Ks[0], scene["cam_from_world"]), seen(Ks[1], beside)
+    fields = scene | {"cam_from_world": beside, "depth": stored, "Ks": np.tile(Ks[1], (16, 1, 1))}
+    layouts.write_seven_scenes(tmp_path / "seq-01", fields, unknown=unknown)
+    first = read(tmp_path / "seq-01", "seven_scenes")
     shutil.move(tmp_path / "seq-01/camera-intrinsics.txt", tmp_path)
     found = read(tmp_path, "seven_scenes")
-    compare(found, scene, labels=False)
     assert found["names"][:2] == ["seq-01/frame-000000", "seq-01/frame-000001"]
+    assert np.array_equal(found["depth"], first["depth"], equal_nan=True)
+    compare(found, scene | {"Ks": np.tile(Ks[0], (16, 1, 1))}, labels=False, depth=False)
+    known = np.isfinite(found["depth"])
+    assert known.mean() > 0.7  # what both see
+    error = np.abs(found["depth"] / exact - 1)[known]
+    assert np.quantile(error, 0.95) < 0.015  # 0.007: slopes; 0.046 with OFFSET the other way
 
 
 def test_scannet_as_semantic_gaussians_lays_it_out(scene, tmp_path):
@@ -233,18 +253,17 @@ def test_depth_of_another_camera_is_looked_up_through_both_cameras(scene, tmp_pa
     assert np.allclose(found["depth"][0, 30], (wanted + 1000) / 1000)
 
 
-def test_depth_of_seven_scenes_has_a_narrower_field_of_view_than_colour(scene, tmp_path):
+@pytest.mark.parametrize(("metres", "first", "last"), [(1, 3, 88), (10, 5, 90)])
+def test_depth_of_seven_scenes_sees_less_than_the_photo_beside(scene, tmp_path, metres, first, last):
     layouts.write_seven_scenes(tmp_path, scene)
     (tmp_path / "camera-intrinsics.txt").unlink()
-    columns = np.tile(np.arange(96, dtype=np.uint16) + 1000, (72, 1))
     for k in range(16):
-        save(tmp_path / f"frame-{k:06d}.depth.png", columns)
+        save(tmp_path / f"frame-{k:06d}.depth.png", np.full((72, 96), 1000 * metres, np.uint16))
     found = seven_scenes.read(tmp_path, SETTINGS)
-    at = (np.arange(96) + 0.5 - 48) * 585 / 525 + 48
-    wanted = np.where((at >= 0) & (at <= 96), (np.floor(at) + 1000) / 1000, np.nan)
-    assert np.allclose(found["depth"][0, 30], wanted, equal_nan=True)
-    assert np.isnan(wanted).sum() == 10
-    assert "78.75 pixels" in found["source"]["notes"][0]
+    seen = np.isfinite(found["depth"][0, 30])
+    assert np.flatnonzero(seen).tolist() == [*range(first, last + 1)]
+    assert np.allclose(found["depth"][0, 30, seen], metres)
+    assert "78.9 pixels" in found["source"]["notes"][0]
     with pytest.raises(InputError, match="no frame"):
         seven_scenes.read(tmp_path / "..", SETTINGS)
 
