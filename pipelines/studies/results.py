@@ -41,6 +41,7 @@ FIGURES = (
     Figure("psnr", "PSNR, dB", 2),
     Figure("psnr_fit", "PSNR after a colour fit, dB", 2),
     Figure("ssim", "SSIM", 4),
+    Figure("lpips", "LPIPS", 3),
     Figure("n_gaussians", "Gaussians", 0, 1, True),
     Figure("sh_kept", "SH coefficients kept, %", 1, 100),
     Figure("mask_spread", "spread of m̂ between classes", 3),
@@ -50,8 +51,8 @@ FIGURES = (
     Figure("frames_per_second", "frames/s", 1, 1, True, "rendered_on"),
     Figure("train_seconds", "training, s", 1, 1, True, "trained_on"),
 )
-OTHERS = ("miou_teacher", "classes", "pixels", "protocol", "held_in_psnr", "steps", "clock", "device",
-          "trained_on", "rendered_on", "train_key", "evaluate_key")  # fmt: skip
+OTHERS = ("miou_teacher", "classes", "pixels", "protocol", "resolution", "split", "held_in_psnr", "steps", "clock",
+          "device", "trained_on", "rendered_on", "train_key", "evaluate_key")  # fmt: skip
 IDENTITY = ("condition", "variant", "budget", "scene", "seed", "state")
 POOLED = ("miou", "miou_gain", "macc", "oa")  # what a protocol may work out over all scenes together
 COLUMNS = (*IDENTITY, *(figure.key for figure in FIGURES), *OTHERS)
@@ -90,6 +91,8 @@ def row_of(run: Run, failed: dict[str, tuple[int, str, Path]]) -> Row:
         "psnr": figures["image"]["psnr"],
         "psnr_fit": figures["image"].get("psnr_fit"),
         "ssim": figures["image"]["ssim"],
+        "lpips": figures["image"].get("lpips"),
+        **{key: figures["protocol"][key] for key in ("resolution", "split")},
         "n_gaussians": figures["n_gaussians"],
         "sh_kept": kept / (16 * sum(counts)),
         **{key: guidance.get(key) for key in ("mask_spread", "band_spread")},
