@@ -83,8 +83,8 @@ class Table(Section):
         """The settings of the 2D teacher."""
         if not (semantic and self.teacher):
             return {}
-        labels = str(PACKAGE / f"teachers/labels/{self.labels}.txt")
-        return {"teacher": {"kind": "onnx", "model": os.environ[self.teacher], "labels": labels}}
+        labels = {"labels": str(PACKAGE / f"teachers/labels/{self.labels}.txt")} if self.labels else {}
+        return {"teacher": {"kind": "onnx", "model": os.environ[self.teacher]} | labels}
 
 
 class Study(Section):
@@ -116,8 +116,11 @@ class Study(Section):
         if self.tables.keys() != (set() if self.scenes else self.conditions.keys()):
             raise ValueError("it needs either scenes or tables, one for each of its conditions")
         for name, table in self.tables.items():
-            if unknown := [of for of in table.variants if of not in self.variants]:
-                raise ValueError(f"tables.{name}: {unknown[0]!r:.60} is none of its variants")
+            for of, row in table.variants.items():
+                if of not in self.variants:
+                    raise ValueError(f"tables.{name}: {of!r:.60} is none of the study's variants")
+                if row and row not in table.published:
+                    raise ValueError(f"tables.{name}: {row!r:.60} is no row of its published figures")
         for name, variant in self.variants.items():
             for key, value in variant.items():
                 kind = str if key == "ablation" else dict

@@ -17,9 +17,11 @@ from chebsplat.evaluation.protocols import scannet_closed, scannet_open
 from chebsplat.formats.teacher_model import read_label_set
 from chebsplat.pipelines.studies.page import write
 from chebsplat.pipelines.studies.published import published_sections
+from chebsplat.pipelines.studies.results import FIGURES
 from chebsplat.pipelines.studies.study import checked_study, expand, read_study
 from chebsplat.stages.sources import generated
 
+ROOM = {"root": "REPLICA_ROOT", "scenes": ["room0"], "published": {}}
 ROOTS = ("REPLICA_ROOT", "SCANNET_ROOT", "DEEP_BLENDING_ROOT", "LSEG_MODEL")
 
 
@@ -67,6 +69,8 @@ def test_without_any_data_the_tables_hold_the_papers_figures_and_name_what_is_la
     for section, root in zip(sections, (ROOTS[0], ROOTS[1], ROOTS[1], ROOTS[2], ROOTS[2]), strict=True):
         assert {row[-1] for row in section.table[1:] if row[1] != "-"} == {f"all: {root} is not set"}
     assert sections[0].table[4][:5] == ["Ours", "paper", "-", "81.1", "-"]
+    given = {key for table in asked.tables.values() for figures in table.published.values() for key in figures}
+    assert given <= {figure.key for figure in FIGURES}
     assert "1600 pixels at most" in sections[3].note and "592 pixels" in sections[2].note
     page = write(tmp_path, asked, [], [], "make study=paper-tables", sections)
     for text in (page.read_text(), (tmp_path / "results.md").read_text().replace("\\", "")):
@@ -104,7 +108,8 @@ def test_what_is_there_is_planned_each_table_by_its_own_protocol_and_without_a_t
     [
         ({"scenes": ["toy"]}, "either scenes or tables"),
         ({"conditions": {"other": {}}}, "either scenes or tables"),
-        ({"variants": {"full": {}}}, "'paper' is none of its variants"),
+        ({"variants": {"full": {}}}, "'paper' is none of the study's variants"),
+        ({"conditions": {"T": {}}, "tables": {"T": ROOM | {"variants": {"full": "Ours"}}}}, "'Ours' is no row"),
     ],
 )
 def test_tables_that_do_not_fit_their_study_are_refused(changes, message):
