@@ -63,7 +63,8 @@ def run(job: Job) -> None:
     renderer = SceneRenderer(scene.parameters, job.device, scene.cameras.Ks)
     cameras = [camera(scene, k) for k in places]
     pictures: dict[str, Any] = {"truth": np.stack([capture.images[row[name]] for name in names])}
-    figures: dict[str, Any] = {"names": names, "protocol": capture.protocol, "source": capture.source}
+    measured = capture.protocol | {"resolution": "x".join(map(str, capture.size))}
+    figures: dict[str, Any] = {"names": names, "protocol": measured, "source": capture.source}
     shown: dict[str, list[np.ndarray]] = {"renders": []}
     views = evaluated_views(job, renderer, dict(zip(names, cameras, strict=True)), capture, scene, shown)
     segmentation = segmented(job, protocol, views, capture, scene, renderer)

@@ -13,6 +13,14 @@ from chebsplat.formats.names import unprintable
 from chebsplat.settings import Section, number, seed, setting
 
 MAX_CHANNELS = 64  # that can be rendered
+SIDES = {  # pixels: the longest side that a protocol's views have, as its module says
+    "labels": 640,
+    "replica-f3": 640,
+    "replica-gt": 640,
+    "scannet-open": 648,
+    "scannet-closed": 592,
+    "deep-blending": 1600,
+}
 
 
 def printable(text: str) -> str:
@@ -46,7 +54,12 @@ class IngestSection(Section):
     )
     test_every: int | None = number(None, "every so many views one is tested; default: the protocol's own", 2, 10_000)
     test_offset: int | None = number(None, "the first view that is tested; default: the protocol's own", 0, 10_000)
-    max_side: int = number(640, "pixels; images are reduced to this, never enlarged", 16, 8192)
+    max_side: int = Field(
+        default_factory=lambda values: SIDES[values.get("protocol", "labels")],
+        description="pixels; images are reduced to this, never enlarged; default: the protocol's own",
+        ge=16,
+        le=8192,
+    )
     max_views: int | None = number(None, "at most so many views, evenly chosen; default: all", 2, 100_000)
     max_train_views: int | None = number(
         None, "at most so many that are trained on, evenly chosen; all test views stay", 2, 100_000

@@ -51,7 +51,7 @@ def settings(section: str | None) -> None:
         part, _, name = key.partition(".")
         section_of: Any = Config.model_fields[part].annotation
         field = schema["$defs"][section_of.__name__]["properties"][name]
-        values, meaning, default = range_of(field), field["description"], field["default"]
+        values, meaning, default = range_of(field), field["description"], field.get("default")
         if len(values) > WIDEST:
             values, meaning = "see right", f"{meaning}; one of {values}"
         shown_default = "-" if default is None else default if isinstance(default, str) else json.dumps(default)

@@ -92,7 +92,7 @@ def study(
     """Run a study (of pipelines/configs/studies, or a .toml): its table, figure and page; goes on where it stopped."""
     from chebsplat.pipelines.running import cluster
     from chebsplat.pipelines.running.run import Outcome, device_of, say
-    from chebsplat.pipelines.studies import page, results, tables
+    from chebsplat.pipelines.studies import page, published, results, tables
     from chebsplat.pipelines.studies import study as studies
 
     where, asked = cluster.checked(on), studies.read_study(name)
@@ -110,7 +110,8 @@ def study(
 
     def write(failed: dict[str, tuple[int, str, Path]]) -> Path:
         rows = [results.row_of(run, failed) for run in runs]
-        return page.write(folder, asked, runs, rows, command, tables.sections(asked, rows)).absolute()
+        more = [*published.published_sections(asked, rows), *tables.sections(asked, rows)]
+        return page.write(folder, asked, runs, rows, command, more).absolute()
 
     outcome = Outcome()
     if not no_run:

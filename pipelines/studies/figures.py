@@ -34,7 +34,7 @@ def draw(path: Path, rows: list[Row], traces: Traces, settings: dict[str, float]
         name: {"color": f"C{k % 10}", "marker": MARKERS[k % len(MARKERS)], "label": drawn(name)}
         for k, name in enumerate(variants)
     }
-    conditions = [""] if settings is not None else list(dict.fromkeys(row["condition"] for row in rows))
+    conditions = [""] if settings is not None else list(dict.fromkeys(row["condition"] for row in rows)) or [""]
     height = 3.4 * len(conditions) + 0.3 * -(-len(variants) // 5)
     color_only = settings is None and bool(done) and all(row["miou"] is None for row in done)
     scenes = list(dict.fromkeys(row["scene"] for row in done))

@@ -143,7 +143,8 @@ def markdown(parts: dict[str, Any]) -> str:
     rows = [[f"{a}<br>{f'**{b}**' if bold else b}" if b else a for a, b, bold in row] for row in shown]
     tables = [("", "", [parts["header"], *rows])]
     more = [(f"### {inert(s.heading)}", s.note, s.table) for s in parts["more"]]
-    for heading, note, table in (*more, ("### Each scene", "", parts["scenes"])):
+    each = [("### Each scene", "", parts["scenes"])] if parts["scenes"][1:] else []
+    for heading, note, table in (*more, *each):
         tables.append((heading, inert(note), [list(map(inert, row)) for row in table]))
     for heading, note, table in tables:
         text += [heading, ""] if heading else []

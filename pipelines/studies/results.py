@@ -42,6 +42,7 @@ FIGURES = (
     Figure("psnr_fit", "PSNR after a colour fit, dB", 2),
     Figure("psnr_as_taken", "PSNR on photos as taken, dB", 2),
     Figure("ssim", "SSIM", 4),
+    Figure("lpips", "LPIPS", 3),
     Figure("n_gaussians", "Gaussians", 0, 1, True),
     Figure("sh_kept", "SH coefficients kept, %", 1, 100),
     Figure("mask_spread", "spread of m̂ between classes", 3),
@@ -52,8 +53,8 @@ FIGURES = (
     Figure("train_seconds", "training, s", 1, 1, True, "trained_on"),
 )
 OF_TEACHER = ("miou", "boundary_miou", "point_miou")  # figures of single photos, too
-OTHERS = (*(f"{key}_teacher" for key in OF_TEACHER), "classes", "pixels", "protocol", "held_in_psnr", "steps",
-          "clock", "device", "trained_on", "rendered_on", "train_key", "evaluate_key")  # fmt: skip
+OTHERS = (*(f"{key}_teacher" for key in OF_TEACHER), "classes", "pixels", "protocol", "resolution", "split",
+          "held_in_psnr", "steps", "clock", "device", "trained_on", "rendered_on", "train_key", "evaluate_key")  # fmt: skip
 IDENTITY = ("condition", "variant", "budget", "scene", "seed", "state")
 POOLED = ("miou", "miou_gain", "macc", "oa")  # what a protocol may work out over all scenes together
 COLUMNS = (*IDENTITY, *(figure.key for figure in FIGURES), *OTHERS)
@@ -93,6 +94,8 @@ def row_of(run: Run, failed: dict[str, tuple[int, str, Path]]) -> Row:
         "psnr_fit": figures["image"].get("psnr_fit"),
         "psnr_as_taken": figures["image"].get("as_taken", {}).get("psnr"),
         "ssim": figures["image"]["ssim"],
+        "lpips": figures["image"].get("lpips"),
+        **{key: figures["protocol"][key] for key in ("resolution", "split")},
         "n_gaussians": figures["n_gaussians"],
         "sh_kept": kept / (16 * sum(counts)),
         **{key: guidance.get(key) for key in ("mask_spread", "band_spread")},

@@ -3,17 +3,20 @@
 from __future__ import annotations
 
 import itertools
+import os
 import threading
 import time
 from collections import defaultdict
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
+from pathlib import Path
 from typing import Annotated, Any
 
 from pydantic import AfterValidator, Field, model_validator
 
 from chebsplat.errors import ChebsplatError, ConfigError
+from chebsplat.pipelines.planning.code import PACKAGE
 from chebsplat.pipelines.planning.plan import Plan, Planner, Step, merged, suffix
 from chebsplat.pipelines.running.cluster import LOCAL
 from chebsplat.pipelines.running.run import Outcome, say, snakemake, wanted_steps
@@ -21,6 +24,7 @@ from chebsplat.pipelines.work import store
 from chebsplat.pipelines.work.scenes import read_named, read_toml, scene_values
 from chebsplat.stages.runtime.config import checked
 from chebsplat.stages.settings import Section, Text, printable
+from chebsplat.stages.sources.common import spellings
 
 LAST = "evaluate"  # a study measures; a page and an ONNX file for each of its runs would be waste
 
@@ -44,23 +48,64 @@ class Budgets(Section):
         return settings or {"": {}}
 
 
+class Table(Section):
+    """A condition that stands for a table of a paper, with scenes and variants of its own.
+
+    Scenes lie in the folder that the environment variable `root` names, or one folder below it, and
+    hold `holds`. `teacher`: the variable that names the 2D teacher's model, which is asked for the
+    label set `labels`. `variants` are some of the study's, each with the row of `published` that it
+    stands for, "" for none. `published`: figures by row, in the units that a study shows.
+    """
+
+    root: Text
+    holds: str = ""
+    teacher: str = ""
+    labels: str = ""
+    scenes: list[Text] = Field(min_length=1, max_length=1000)
+    variants: dict[Name, str] = Field(min_length=1, max_length=1000)
+    published: dict[Name, dict[str, float]]
+
+    def folder(self, scene: str) -> str:
+        """Where a scene lies, ending in "/"; "" where it does not."""
+        root = Path(os.environ.get(self.root) or os.devnull)
+        found = [top / name for top in (root, *sorted(root.glob("*/"))) for name in spellings(scene)]
+        return next((f"{path.absolute()}/" for path in found if (path / self.holds).exists()), "")
+
+    def lacks(self, scene: str, semantic: bool) -> str:
+        """Why a scene cannot run, "" where it can. semantic: its variant needs a teacher."""
+        if not os.environ.get(self.root):
+            return f"{self.root} is not set"
+        if not self.folder(scene):
+            return f"not in {self.root}" + (f" with {self.holds}/" if self.holds else "")
+        return f"{self.teacher} is not set" if semantic and self.teacher and not os.environ.get(self.teacher) else ""
+
+    def taught(self, semantic: bool) -> Sections:
+        """The settings of the 2D teacher."""
+        if not (semantic and self.teacher):
+            return {}
+        labels = {"labels": str(PACKAGE / f"teachers/labels/{self.labels}.txt")} if self.labels else {}
+        return {"teacher": {"kind": "onnx", "model": os.environ[self.teacher]} | labels}
+
+
 class Study(Section):
     """A file of `configs/studies`, alone or over another that it `extends` (`extended`). `settings`,
     conditions and variants hold config sections.
 
     Conditions are what results are averaged within (a teacher, a noise level); variants are compared, each with
-    `baseline`, under the same condition, budget, scene and seed. A variant may also name an `ablation`.
+    `baseline`, under the same condition, budget, scene and seed. A variant may also name an `ablation`. `tables` holds
+    a `Table` for each condition, in the place of `scenes`; what is not there of them does not run.
     """
 
     title: str
     about: str
-    scenes: list[Text] = Field(min_length=1, max_length=1000)
+    scenes: list[Text] = Field([], max_length=1000)
     seeds: list[Annotated[int, Field(ge=0, lt=2**31)]] = Field([0], min_length=1, max_length=1000)
     budgets: Budgets = Budgets()
     baseline: str
     settings: Sections = Field({})
     conditions: dict[Name, Sections] = Field({"": {}}, max_length=1000)
     variants: dict[Name, dict[str, Any]] = Field(min_length=1, max_length=1000)
+    tables: dict[Name, Table] = Field({}, max_length=1000)
     grows: bool = False  # each scene starts from the lessons of those before it, too, where its variant takes lessons
     against: str = ""  # section.key whose value is the figure's horizontal axis, instead of run time
 
@@ -68,12 +113,28 @@ class Study(Section):
     def _fits_together(self) -> Study:
         if self.baseline not in self.variants:
             raise ValueError(f"{self.baseline[:60]!r} is none of its variants: {', '.join(self.variants)}")
+        if self.tables.keys() != (set() if self.scenes else self.conditions.keys()):
+            raise ValueError("it needs either scenes or tables, one for each of its conditions")
+        for name, table in self.tables.items():
+            for of, row in table.variants.items():
+                if of not in self.variants:
+                    raise ValueError(f"tables.{name}: {of!r:.60} is none of the study's variants")
+                if row and row not in table.published:
+                    raise ValueError(f"tables.{name}: {row!r:.60} is no row of its published figures")
         for name, variant in self.variants.items():
             for key, value in variant.items():
                 kind = str if key == "ablation" else dict
                 if not isinstance(value, kind):
                     raise ValueError(f"variants.{name}.{key}: a {kind.__name__} is needed")
         return self
+
+    def points(self) -> Iterator[tuple[str, int, str, list[str]]]:
+        """(scene, seed, condition, variants) of all runs."""
+        for scene, seed, condition in itertools.product(self.scenes, self.seeds, self.conditions):
+            yield scene, seed, condition, list(self.variants)
+        for condition, table in self.tables.items():
+            for scene, seed in itertools.product(table.scenes, self.seeds):
+                yield scene, seed, condition, list(table.variants)
 
 
 @dataclass(frozen=True)
@@ -140,7 +201,7 @@ def extended(values: dict[str, Any], origin: str) -> dict[str, Any]:
 def expand(study: Study, running: bool = False, device: str = "cpu") -> list[Run]:
     """Every run, planned; scenes vary slowest and variants fastest, so that a study cut short has compared something.
 
-    Args: running, device: of `Planner`.
+    Args: running, device: of `Planner`. A scene of a table that is not there has no run (`lacking`).
     Raises: ConfigError, InputError.
     Choices: all runs of a condition are measured under one protocol, since figures of two must not meet in a mean.
     """
@@ -148,18 +209,24 @@ def expand(study: Study, running: bool = False, device: str = "cpu") -> list[Run
     runs: list[Run] = []
     before: dict[tuple[Any, ...], list[Plan]] = defaultdict(list)
     try:
-        for scene, seed, condition in itertools.product(study.scenes, study.seeds, study.conditions):
+        for named, seed, condition, variants in study.points():
             for budget, spent in study.budgets.settings().items():
-                for variant in study.variants:
+                for variant in variants:
                     values = merged(_values(study, condition, variant), {"train": spent})
+                    scene, table = named, study.tables.get(condition)
+                    if table is not None:
+                        if table.lacks(named, is_semantic(values)):
+                            continue
+                        scene = table.folder(named)
+                        values = merged(values, table.taught(is_semantic(values)))
                     earlier = before[seed, condition, budget, variant]
                     lessons = [one.lesson for one in earlier if one.lesson is not None and one.lesson.lessons]
                     own = {"start": "shipped"} | scene_values(scene)[1].get("knowledge", {})
                     values = merged({"knowledge": own}, merged(values, seeded(scene, values, seed)))
                     place = suffix(f"study-{variant}-seed{seed}-") if study.grows else ""
                     plan = planner.plan(scene, values=values, place=place, lessons=lessons)
-                    named = plan.title.removeprefix(place)
-                    runs.append(Run(condition, variant, budget, named, seed, plan, tuple(earlier)))
+                    title = named if table else plan.title.removeprefix(place)
+                    runs.append(Run(condition, variant, budget, title, seed, plan, tuple(earlier)))
                     earlier += [plan] * study.grows
     finally:
         planner.save()
@@ -168,6 +235,20 @@ def expand(study: Study, running: bool = False, device: str = "cpu") -> list[Run
         if len(used) > 1:
             raise ConfigError(f"scenes measured as {' and as '.join(used)} do not compare; set ingest.protocol")
     return runs
+
+
+def lacking(study: Study, condition: str, variant: str) -> dict[str, list[str]]:
+    """Scenes of a table that a variant cannot run on, by why it cannot."""
+    table, reasons = study.tables[condition], defaultdict(list)
+    semantic = is_semantic(_values(study, condition, variant))
+    for scene in table.scenes:
+        reasons[table.lacks(scene, semantic)].append(scene)
+    return {why: scenes for why, scenes in reasons.items() if why}
+
+
+def is_semantic(values: Sections) -> bool:
+    """Whether settings ask for features, so that a teacher is needed."""
+    return bool(values.get("train", {}).get("semantics", True))
 
 
 def _values(study: Study, condition: str, variant: str) -> Sections:

@@ -261,6 +261,12 @@ def masks_in(folder: Path, names: Iterable[str]) -> tuple[dict[str, Path], list[
     return found, [f"{lacking} of {len(given)} views have no mask; all their pixels count."] if held and lacking else []
 
 
+def spellings(name: str) -> tuple[str, str]:
+    """A scene's name, and with `_` before its number: `office0` is `office_0` to Semantic-NeRF."""
+    letters = name.rstrip("0123456789")
+    return name, f"{letters}_{name[len(letters) :]}"
+
+
 def resolve_source(name: str, source: SourceSection) -> SourceSection:
     """The source really meant: `named` is Replica's scene where REPLICA_ROOT holds it, else the generated one.
 
@@ -268,8 +274,7 @@ def resolve_source(name: str, source: SourceSection) -> SourceSection:
     """
     if source.kind == "named":
         root = os.environ.get("REPLICA_ROOT")
-        spellings = (name, name.rstrip("0123456789") + "_" + name[len(name.rstrip("0123456789")) :])
-        existing = [Path(root) / s for s in spellings if root and (Path(root) / s).is_dir()]
+        existing = [Path(root) / s for s in spellings(name) if root and (Path(root) / s).is_dir()]
         change = {"kind": "replica", "path": str(existing[0])} if existing else {"kind": "generated", "path": None}
         source = source.model_copy(update=change)
     if source.kind != "generated" and source.path is None:

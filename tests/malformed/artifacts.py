@@ -295,7 +295,7 @@ def _evaluation(out: Path) -> None:
     whole = {"miou": 0.5, "macc": 0.5, "oa": 0.5, "boundary_miou": None, "iou": {"wall": 0.5}}
     figures = {"names": VIEWS[:1], "image": {"psnr": 20.0, "ssim": 0.5, "per_view": {"psnr": [20.0], "ssim": [0.5]}}}
     figures["source"] = {"name": "toy", "kind": "generated", "notes": []}
-    figures["protocol"] = {"name": "labels", "split": "every third"}
+    figures["protocol"] = {"name": "labels", "split": "every third", "resolution": "32x24"}
     figures |= {"n_gaussians": N, "bytes": sizes, "frames_per_second": {}, "milliseconds": {}, "lpips": None}
     figures |= {"left_out": {}, "segmentation": {"classes": LABELS, "scene": whole, "teacher": whole}}
     labels = np.zeros((1, height, width), np.int16)

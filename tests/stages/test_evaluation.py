@@ -267,6 +267,7 @@ def test_a_scannet_scene_runs_from_its_folder_to_the_figures_of_scannet_open(tmp
     assert artifact.read_manifest(made["sfm"]).facts["how"] == "source"
     figures = Evaluation.read(made["evaluate"]).figures
     assert len(figures["names"]) == 16
+    assert (figures["protocol"]["name"], figures["protocol"]["resolution"]) == ("scannet-open", "96x72")
     matrix = np.array(figures["segmentation"]["scene"]["confusion"])
     assert matrix.shape == (20, 20) and matrix.sum() == 16 * 484 * 648
     assert figures["segmentation"]["teacher"]["miou"] > 0.3

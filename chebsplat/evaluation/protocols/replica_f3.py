@@ -1,7 +1,8 @@
 """`replica-f3` (Feature 3DGS): agreement with the teacher's own labels; no ground truth is looked at.
 
-Split: index % 8 == 2 by name. Feature 3DGS sorts its students as text and its teachers as numbers, so that unpadded
-names pair different views; here views are joined on their names. Labels: the 150 names of ADE20K without a prompt
+Resolution: 640 pixels at most, as Semantic-NeRF's renders have. Split: index % 8 == 2 by name.
+Feature 3DGS sorts its students as text and its teachers as numbers, so that unpadded names pair
+different views; here views are joined on their names. Labels: the 150 names of ADE20K without a prompt
 template; of ids that count from 1, television (90) becomes door (15), rug (29) floor (4), pillow (58) cushion (40).
 Resizing: where a view is wider than 480 pixels, features of both become 480x360, bilinear with aligned corners, which
 distorts; labels then become 159x119 by the nearest pixel. Averaging: by image, mean IoU over the 7 labels that are

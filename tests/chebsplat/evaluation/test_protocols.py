@@ -20,7 +20,7 @@ from chebsplat.evaluation.protocols import (
 )
 from chebsplat.evaluation.protocols.task import EvaluatedView, MapsByName, Task, bilinear, resized
 from chebsplat.stages.ingest import every, renamed, split, thinned
-from chebsplat.stages.settings import IngestSection
+from chebsplat.stages.settings import SIDES, IngestSection
 
 ADE = [replica_f3.SPELT.get(k, f"label_{k}") for k in range(1, 151)]
 ADE[0] = "wall"
@@ -61,6 +61,13 @@ def test_each_protocol_has_its_own_test_views(protocol, tests):
 
 def test_a_config_knows_every_protocol_and_no_other():
     assert set(get_args(IngestSection.model_fields["protocol"].annotation)) == set(protocols.ALL)
+    assert set(SIDES) == set(protocols.ALL)
+
+
+@pytest.mark.parametrize(("protocol", "side"), [("labels", 640), ("scannet-open", 648), ("deep-blending", 1600)])
+def test_a_protocol_has_a_resolution_of_its_own_which_a_config_may_change(protocol, side):
+    assert IngestSection(protocol=protocol).max_side == side
+    assert IngestSection(protocol=protocol, max_side=320).max_side == 320
 
 
 def test_only_labels_and_scannet_closed_follow_a_sources_own_split():

@@ -229,13 +229,13 @@ def test_intrinsics_of_the_whole_sensor_and_labels_of_its_size_fit_reduced_image
         save(tmp_path / f"label-filt/{10 * k}.png", ids)
     K = np.array([[1170.0, 0, 647.5, 0], [0, 1170, 483.5, 0], [0, 0, 1, 0], [0, 0, 0, 1]])
     layouts.write_text(tmp_path / "intrinsic/intrinsic_color.txt", layouts.matrix_text(K))
-    found = scannet.read(tmp_path, IngestSection(max_side=648, min_views=2))
+    found = scannet.read(tmp_path, IngestSection(protocol="scannet-open", min_views=2))
     assert np.allclose(found["Ks"][0], [[585, 0, 324], [0, 585, 242], [0, 0, 1]])
     row = [found["class_names"][k] for k in found["labels"][0, 100]]
     assert row == ["chair"] * 324 + ["shelves"] * 324
     image(tmp_path / "label-filt/10.png", (640, 640), mode="L")
     with pytest.raises(InputError, match=r"label-filt/10\.png is 640x640"):
-        scannet.read(tmp_path, IngestSection(max_side=648, min_views=2))
+        scannet.read(tmp_path, IngestSection(protocol="scannet-open", min_views=2))
 
 
 def test_depth_of_another_camera_is_looked_up_through_both_cameras(scene, tmp_path):
