@@ -104,7 +104,8 @@ class SceneModel:
             self.raw["sh_logits"] = torch.zeros(n, 3, device=device)
         for value in self.raw.values():
             value.requires_grad_(True)
-        self.replay = Replay(device.type == "cuda")
+        self.renders_all = device.type == "cuda" and backend != "reference"
+        self.replay = Replay(self.renders_all)
         self.semantic_gate: prune.SemanticGate | None = None
         if n_channels and train.prune and train.prune_semantic:
             self.semantic_gate = prune.SemanticGate(n_channels).to(device)
@@ -185,7 +186,7 @@ class SceneModel:
         Choices: on a GPU all Gaussians are rendered, since to choose those in view is to wait for their number.
         """
         index = None
-        if self.device.type != "cuda" or self.backend == "reference":
+        if not self.renders_all:
             with torch.no_grad():
                 index = in_frustum(self.raw["means"], view, _reach(self.raw))
         wanted, learned = Wanted(degree, masked, semantic, depth, (view.width, view.height)), self.learned

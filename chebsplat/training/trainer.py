@@ -57,8 +57,7 @@ class Trainer:
         self.optimizer = adam(self.model, self.settings, self.extent)
         self.order_generator = np.random.default_rng(settings.seed)
         self.generator = torch.Generator().manual_seed(settings.seed)
-        records = model.replay.records and settings.densify_semantic and not isinstance(model, PrintedScene)
-        self.replay, model.replay = Replay(records), Replay(records)  # one pass backward, as recorded
+        model.replay = Replay(model.replay.records and settings.densify_semantic)  # a recording has one pass backward
         if isinstance(model, PrintedScene):
             model.draws = self.generator
         self.order: list[int] = []  # views still to be seen before any is seen again
@@ -258,7 +257,7 @@ class Trainer:
             known |= {"delta": auxiliary.delta, "knowledge": auxiliary.knowledge}
         given = {name: value for name, value in known.items() if value is not None}
         key = factor, tuple(given), labels is not None and labels.complete
-        return rendered, self.replay(key, partial(self._losses, *key), [], list(given.values()))
+        return rendered, self.model.replay(key, partial(self._losses, *key), [], list(given.values()))
 
     def _losses(self, factor: int, names: Sequence[str], complete: bool, *tensors: Tensor) -> dict[str, Tensor]:
         """As `losses_of`, of tensors by their names there (docs/method.md, section 8)."""
