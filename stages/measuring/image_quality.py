@@ -50,8 +50,8 @@ def image_figures(
 
 
 def figures_as_taken(capture: Capture, renderer: SceneRenderer, cameras: dict[str, View]) -> dict[str, Any] | None:
-    """PSNR, dB, and SSIM on the test photos as they were taken, at their own resolution, at most 1600 pixels, and that;
-    None where photos were neither undistorted nor reduced.
+    """PSNR, dB, and SSIM on the test photos as they were taken, of up to 1600 pixels a side, and `size`, their median
+    width and height; None where none was undistorted or reduced.
 
     Args:    cameras: of the capture's views, by name.
     Choices: the scene is rendered as fine as the photo is, and interpolated, by cubic splines, where its pixels lie.
@@ -62,10 +62,11 @@ def figures_as_taken(capture: Capture, renderer: SceneRenderer, cameras: dict[st
     import pycolmap
 
     figures = []
-    for photo, (name, model, params, width, height) in zip(capture.taken[:], capture.lenses, strict=True):
+    for k, (name, model, params, width, height) in enumerate(capture.lenses):
         if name not in cameras:
             continue
-        lens, truth = pycolmap.Camera(model=model, params=params, width=width, height=height), photo[:height, :width]
+        lens = pycolmap.Camera(model=model, params=params, width=width, height=height)
+        truth = np.ascontiguousarray(capture.taken[k][:height, :width])  # one by one: photos are large
         finer = lens.mean_focal_length() / float(cameras[name].K[[0, 1], [0, 1]].mean())
         view = enlarged(cameras[name], finer)
         K, render = view.K.double().numpy(), renderer.render(view)[0]
@@ -81,7 +82,7 @@ def figures_as_taken(capture: Capture, renderer: SceneRenderer, cameras: dict[st
         filled = truth.copy().reshape(-1, 3)
         filled[inside] = shown.round().clip(0, 255)
         figures.append((min(psnr(filled[inside], truth.reshape(-1, 3)[inside]), 100.0),
-                        ssim(filled.reshape(truth.shape), np.ascontiguousarray(truth)), width, height))  # fmt: skip
+                        ssim(filled.reshape(truth.shape), truth), width, height))  # fmt: skip
     if not figures:
         return None
     psnrs, ssims, widths, heights = zip(*figures, strict=True)
