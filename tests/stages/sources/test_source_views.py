@@ -336,6 +336,20 @@ def test_test_photos_are_held_as_they_were_taken_and_measured_so(tmp_path, max_s
     assert figures_as_taken(capture, pictures, views)["psnr"] < right["psnr"] - (3 if max_side > 400 else 1)
 
 
+def test_the_size_of_photos_as_taken_is_one_that_they_have():
+    sizes, views = [(48, 32), (32, 48), (48, 32), (32, 48)], {}
+    capture = SimpleNamespace(taken=[], lenses=[], loss_mask=None)
+    for name, (width, height) in zip("abcd", sizes, strict=True):
+        capture.taken.append(np.full((48, 48, 3), 90, np.uint8))
+        capture.lenses.append([name, "PINHOLE", [40.0, 40.0, width / 2, height / 2], width, height])
+        K = torch.tensor([[20.0, 0, width / 4], [0, 20, height / 4], [0, 0, 1]])
+        views[name] = View(K, torch.eye(4), width // 2, height // 2)
+    grey = SimpleNamespace(render=lambda view: (np.full((view.height, view.width, 3), 90, np.uint8), None))
+    found = figures_as_taken(capture, grey, views)
+    assert (found["size"], found["psnr"], found["ssim"]) == ([48, 32], 100, pytest.approx(1))
+    assert figures_as_taken(capture, grey, {}) is None
+
+
 def test_pixels_where_a_distortion_folds_back_do_not_count(tmp_path):
     """r (1 - 5 r^2) turns back at r = 1 / sqrt(15): 18 pixels of 70 from the centre."""
     fields = colmap.read(write_colmap(tmp_path, "SIMPLE_RADIAL 80 60 70 40 30 -5"), SETTINGS)
