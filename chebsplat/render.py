@@ -67,7 +67,7 @@ class SceneRenderer:
             lights = {name: raw[name] for name in ("sh0", "shN", "features") if name in raw}
             flat = torch.cat([part.flatten(1) for part in lights.values()], 1)
             means, quats, scales, opacities, flat = made_harmless(means, quats, scales, opacities, flat)
-            parts = flat.split([part[0].numel() for part in lights.values()], 1)
+            parts = flat.split([part.shape[1:].numel() for part in lights.values()], 1)
             raw |= {name: part.reshape(lights[name].shape) for name, part in zip(lights, parts, strict=True)}
         self.means, self.quats, self.scales, self.opacities = means, quats, scales, opacities
         self.raw, self.reach = raw, 3 * self.scales.amax(1)
@@ -90,7 +90,9 @@ class SceneRenderer:
             channels = torch.cat([channels, take(self.raw["features"], index)], 1)
         gaussians = (take(part, index) for part in (self.means, self.quats, self.scales, self.opacities))
         camera = (view.viewmat[None], view.K[None], view.width, view.height)
-        options: dict[str, Any] = {"eps2d": BLUR * finer**2} | ({"harmless": True} if self.on_gpu else {})
+        options: dict[str, Any] = {"eps2d": BLUR * finer**2}
+        if self.on_gpu:  # what the other backends do not know
+            options["harmless"] = True
         render, _, _ = rasterize(*gaussians, channels, *camera, **options)
         image = (render[0, ..., :3].clamp(0, 1) * 255).round().byte().cpu().numpy()
         return image, render[0, ..., 3:].cpu().numpy() if channels.shape[1] > 3 else None

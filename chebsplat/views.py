@@ -136,8 +136,10 @@ class Views:
 
     def to(self, device: str | torch.device) -> Views:
         """The same views on a device: photos, masks and cameras for good, labels for each step anew, and
-        features and depth as steps read them, of which DEVICE_BYTES each stay there.
+        features and depth as steps read them, of which DEVICE_BYTES each stay there; themselves where they lie there.
         """
+        if torch.device(device) == self.Ks.device:
+            return self
         features, labels, depth = self.features, self.labels, self.depth
         at_hand: dict[str, Any] = {"features": None, "depth": None}
         if features is not None:

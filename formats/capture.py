@@ -29,8 +29,8 @@ class Capture(Record):
     depth, labels, pseudo_labels, confidence, loss_mask: of each pixel, or None. class_names[labels] names a pixel.
     points:         f32 [N, 3] in the world, where the source has its own, with point_colors u8 [N, 3] or None, and
                     tracks i32 [T, 2] (point, view), who sees them, or None.
-    taken:          u8 [T, H', W', 3], test photos as they were before undistortion, or None; lenses: of each the view's
-                    name, COLMAP's model and parameters, width and height.
+    taken:          u8 [T, H', W', 3], test photos that are undistorted or reduced, as they were taken, to 1600
+                    pixels, or None; lenses: of each the view's name, COLMAP's model and parameters, width and height.
     source:         which source, and notes about what was dropped or changed; protocol: name and parameters.
     """
 

@@ -165,8 +165,8 @@ def by_gsplat(scene: Scene) -> Callable[[View], np.ndarray]:
     def render(view: View) -> np.ndarray:
         camera = view.viewmat[None], view.K[None], view.width, view.height
         image = gsplat.rasterization(*gaussians, *camera, sh_degree=degree, packed=False)[0][0]
-        bytes_of: np.ndarray = (image.clamp(0, 1) * 255).round().byte().cpu().numpy()
-        return bytes_of
+        shown: np.ndarray = (image.clamp(0, 1) * 255).round().byte().cpu().numpy()
+        return shown
 
     return render
 
@@ -191,7 +191,7 @@ def launches(work: Path) -> dict[str, Any]:
         torch.cuda.synchronize()
     counts = {call.key: call.count / n_steps for call in profile.key_averages()}
     kernels = sum(call.self_device_time_total for call in profile.key_averages()) / n_steps
-    own = gsplats(trainer)
+    own = launches_of_gsplat(trainer)
     return {
         "what": "launches of a step",
         "device": torch.cuda.get_device_name(),
@@ -205,7 +205,7 @@ def launches(work: Path) -> dict[str, Any]:
     }
 
 
-def gsplats(trainer: Trainer) -> float:
+def launches_of_gsplat(trainer: Trainer) -> float:
     """Launches of gsplat's rasterization of the trainer's Gaussians alone, forward and backward."""
     raw = trainer.model.raw
     n, view = len(trainer.model), trainer.views.camera(0, 1)
@@ -216,7 +216,7 @@ def gsplats(trainer: Trainer) -> float:
     with torch.profiler.profile(activities=[torch.profiler.ProfilerActivity.CPU]) as profile:
         image, alpha, _ = rasterize(*leaves, *camera, backend="cuda", harmless=True)
         torch.autograd.backward([image, alpha], [torch.ones_like(image), torch.ones_like(alpha)])
-    return float(sum(call.count for call in profile.key_averages() if call.key.startswith(LAUNCHES)) - 2)
+    return float(sum(call.count for call in profile.key_averages() if call.key.startswith(LAUNCHES)) - 2)  # of ones
 
 
 def step(n: int, packed: bool | None) -> dict[str, Any]:

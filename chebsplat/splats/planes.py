@@ -25,7 +25,7 @@ def inverse_depths(means: Tensor, normals: Tensor, K: Tensor, nearest: float) ->
 
 
 def inverse_of(K: Tensor) -> Tensor:
-    """K⁻¹ [3, 3] of a camera's K, whose last row is (0, 0, 1), without the check for which a GPU would be waited."""
+    """K⁻¹ [3, 3] of a camera's K, whose last row is (0, 0, 1), without `inv`'s check, for which a GPU waits."""
     (fx, skew, cx), (_, fy, cy), (_, _, one) = K
     zero = torch.zeros_like(one)
     rows = [one / fx, -skew / (fx * fy), (skew * cy - cx * fy) / (fx * fy), zero, one / fy, -cy / fy, zero, zero, one]

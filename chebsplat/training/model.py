@@ -15,7 +15,7 @@ from chebsplat.rasterize import CELL, rasterize
 from chebsplat.rasterize.cuda import made_harmless
 from chebsplat.settings import DescribeSection, TrainSection
 from chebsplat.splats.gaussians import take
-from chebsplat.splats.planes import at_pixels, planes_in_view
+from chebsplat.splats.planes import planes_in_view
 from chebsplat.splats.sh import colors_in_view
 from chebsplat.training import prune, sh_prune
 from chebsplat.training.replay import Replay
@@ -66,11 +66,6 @@ class Rendered:
     auxiliary: Auxiliary
     planes: Tensor | None = None
 
-    @property
-    def inverse_depth(self) -> Tensor | None:
-        """[H, W] of the Gaussians' planes, Σ w_i / z_i, 1 / scene unit."""
-        return None if self.planes is None else at_pixels(self.planes)
-
 
 class SceneModel:
     """Raw parameters by name, each [N, ...] and a leaf tensor, and the semantic gate beside them.
@@ -104,7 +99,8 @@ class SceneModel:
             self.raw["sh_logits"] = torch.zeros(n, 3, device=device)
         for value in self.raw.values():
             value.requires_grad_(True)
-        self.replay = Replay(device.type == "cuda")
+        self.renders_all = device.type == "cuda" and backend != "reference"
+        self.replay = Replay(self.renders_all)
         self.semantic_gate: prune.SemanticGate | None = None
         if n_channels and train.prune and train.prune_semantic:
             self.semantic_gate = prune.SemanticGate(n_channels).to(device)
@@ -154,9 +150,9 @@ class SceneModel:
         weights = {f"{name}.{k}": w for name, module in self.modules.items() for k, w in module.named_parameters()}
         return self.raw | weights
 
-    def soft_mask(self, index: Tensor | None, features: Tensor | None) -> Tensor | None:
-        """m̂ [V] in (0, 1) of the pruning gates, None where pruning is off."""
-        return self._soft_mask(self.learned, index, features)
+    def soft_mask(self) -> Tensor | None:
+        """m̂ [N] in (0, 1) of the pruning gates of all Gaussians, None where pruning is off."""
+        return self._soft_mask(self.learned, None, self.raw.get("features"))
 
     def _soft_mask(self, learned: Mapping[str, Tensor], index: Tensor | None, features: Tensor | None) -> Tensor | None:
         if "prune_logits" not in learned:
@@ -185,7 +181,7 @@ class SceneModel:
         Choices: on a GPU all Gaussians are rendered, since to choose those in view is to wait for their number.
         """
         index = None
-        if self.device.type != "cuda" or self.backend == "reference":
+        if not self.renders_all:
             with torch.no_grad():
                 index = in_frustum(self.raw["means"], view, _reach(self.raw))
         wanted, learned = Wanted(degree, masked, semantic, depth, (view.width, view.height)), self.learned

@@ -218,11 +218,10 @@ class PrintedScene(SceneModel):
         return self.encoded(self.rows, self.n_regions)
 
     @torch.no_grad()
-    def soft_mask(self, index: Tensor | None, features: Tensor | None) -> Tensor | None:
-        """Soft mask [V] by fused features of the whole scene."""
+    def soft_mask(self) -> Tensor | None:
+        """Soft mask [N] by fused features of the whole scene."""
         whole = self.whole()
-        soft = self.masks(whole.fused, self.rows, whole.regions)[0]
-        return soft if soft is None or index is None else soft[index]
+        return self.masks(whole.fused, self.rows, whole.regions)[0]
 
     @torch.no_grad()
     def open_bands(self) -> Tensor:

@@ -31,7 +31,7 @@ from chebsplat.training.schedule import Schedule, adam
 from chebsplat.views import TaughtLabels, Views, Window, reduced
 
 WEIGHT_SSIM = 0.2  # share of SSIM in the colour loss, 3DGS's λ
-WHOLE = 4  # steps from one that looks at a whole photo to the next, while the others look at windows
+WHOLE = 4  # steps, at least, from one that looks at a whole photo to the next, while others look at windows
 READ_EVERY = 10  # steps on a GPU from one that waits for its figures to the next
 
 
@@ -41,8 +41,8 @@ class Trainer:
     Args:
       settings: resolved, nothing left open (`stages.training.defaults`).
       extent:   scene units, scales the means' learning rate.
-    The model's Gaussians say which device computes; views and cameras are to be there, too. On a GPU a step waits for
-    no number: a loss that is not finite is found within READ_EVERY steps.
+    The model's Gaussians say which device computes; views and cameras are to be there, too. On a GPU one
+    step in READ_EVERY waits for its figures, the others for nothing: within these a loss that is not finite is found.
     `state_dict()` between two steps holds all that the steps to come depend on: a trainer that loads it takes them as
     this one does, to the bit, with as many threads.
     """
@@ -57,8 +57,7 @@ class Trainer:
         self.optimizer = adam(self.model, self.settings, self.extent)
         self.order_generator = np.random.default_rng(settings.seed)
         self.generator = torch.Generator().manual_seed(settings.seed)
-        records = model.replay.records and settings.densify_semantic and not isinstance(model, PrintedScene)
-        self.replay, model.replay = Replay(records), Replay(records)  # one pass backward, as recorded
+        model.replay = Replay(model.replay.records and settings.densify_semantic)  # a recording has one pass backward
         if isinstance(model, PrintedScene):
             model.draws = self.generator
         self.order: list[int] = []  # views still to be seen before any is seen again
@@ -130,7 +129,7 @@ class Trainer:
         """Of all Gaussians, once pruning has begun."""
         if not self.schedule.prunes(share):
             return None
-        return self.model.soft_mask(self.model.rows, self.model.raw.get("features"))
+        return self.model.soft_mask()
 
     @torch.no_grad()
     def final_mask(self) -> Tensor | None:
@@ -210,7 +209,9 @@ class Trainer:
         return figures
 
     def _teaches(self, share: float) -> bool:
-        """Does this step teach features? It then looks at a whole photo: of windows, at most one step in WHOLE does."""
+        """Does this step teach features? It looks at a whole photo then, while others look at windows: one in WHOLE at
+        most.
+        """
         every = max(self.feature_every, WHOLE) if self.schedule.in_full(share) else self.feature_every
         return self.views.features is not None and self.step % every == 0
 
@@ -227,7 +228,7 @@ class Trainer:
 
         Args: index: of the view; share: of the budget that is spent; window: of the photo, None: all of it, reduced.
         """
-        settings, factor = self.settings, 1 if window else self.schedule.factor(share)
+        settings, factor = self.settings, self.schedule.factor(share) if window is None else 1
         pruning, taught = self.schedule.prunes(share), self._teaches(share)
         wanted = self.views.features(index) if taught and self.views.features is not None else None
         placed = self.views.depth if self.step % settings.depth_every == 0 else None
@@ -248,17 +249,16 @@ class Trainer:
         guidance = None if auxiliary.band_masks is None else self._guided(rendered.index)
         known = {
             "photo": photo, "mask": mask, "rgb": rendered.rgb, "wanted": wanted,
-            "features": None if wanted is None else rendered.features, "surface": surface, "planes": rendered.planes,
+            "features": rendered.features, "surface": surface, "planes": rendered.planes,
             "alpha": None if rendered.planes is None else rendered.alpha,
             "classes": labels and labels.classes, "confidence": labels and labels.confidence,
             "class_codes": labels and labels.class_codes, "guidance": guidance, "soft_mask": auxiliary.soft_mask,
             "band_masks": auxiliary.band_masks, "in_view": auxiliary.in_view,
+            "delta": auxiliary.delta, "knowledge": auxiliary.knowledge,
         }  # fmt: skip
-        if isinstance(self.model, PrintedScene):
-            known |= {"delta": auxiliary.delta, "knowledge": auxiliary.knowledge}
         given = {name: value for name, value in known.items() if value is not None}
         key = factor, tuple(given), labels is not None and labels.complete
-        return rendered, self.replay(key, partial(self._losses, *key), [], list(given.values()))
+        return rendered, self.model.replay(key, partial(self._losses, *key), [], list(given.values()))
 
     def _losses(self, factor: int, names: Sequence[str], complete: bool, *tensors: Tensor) -> dict[str, Tensor]:
         """As `losses_of`, of tensors by their names there (docs/method.md, section 8)."""

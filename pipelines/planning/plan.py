@@ -77,7 +77,7 @@ class Learned:
 
 @dataclass
 class Plan:
-    """Steps in order, with what is left out and why. `title` names the links: scene[@ablation]."""
+    """Steps in order, with what is left out and why. `title` names the links: scene[@quality+ablation+settings]."""
 
     title: str
     source: str
@@ -168,7 +168,7 @@ class Planner:
 
     Args: code: the folder of `chebsplat`; running: what is planned will run, so that the work folder is made, and a
           folder gets its name for good; device: that steps which can use a GPU run on; newer: scenes are pinned to the
-          lessons that there are now.
+          lessons that there are now; quality: a named set of settings, before ablation and settings.
     """
 
     def __init__(
@@ -200,16 +200,12 @@ class Planner:
         Raises: ConfigError, InputError.
         """
         name, own = scene_values(scene)
-        values, title = merged(own, values or {}), ""
-        if self.quality:
-            values = merged(values, read_toml("qualities", self.quality))
-            title += f"@{self.quality}"
-        if ablation:
-            values = merged(values, read_toml("ablations", ablation))
-            title += f"{'+' if title else '@'}{ablation}"
+        values = merged(own, values or {})
+        for folder, name_of in (("qualities", self.quality), ("ablations", ablation)):
+            if name_of:
+                values = merged(values, read_toml(folder, name_of))
         if settings:
             values = merged(values, overrides(settings))
-            title += f"{'+' if title else '@'}{name_part}" if (name_part := suffix(settings)) else ""
         config = placed(configs.build(values, f"scene {shown(scene)}"))
         asked = config.source
         source = located(resolve_source(name, asked))
@@ -222,7 +218,8 @@ class Planner:
         config = config.model_copy(update={"source": source, "teacher": teacher, "channels": channels})
         model = read_teacher(Path(teacher.model)) if kind == "onnx" and teacher.model else None
         left_out = left_out_stages(config, kind, why, probe) | left_out_channels(kind, model)
-        title = place + self._named(scene) + title
+        chosen = "+".join(filter(None, (self.quality, ablation, suffix(settings))))
+        title = place + self._named(scene) + (f"@{chosen}" if chosen else "")
         start = Start(why=left_out["refine"]) if "refine" in left_out else start_given(config, kind, self.running)
         left_out |= dict.fromkeys(OF_KNOWLEDGE, start.why) if start.path is None else {}
         if start.path is not None and start.lessons is None:

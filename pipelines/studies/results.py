@@ -53,8 +53,10 @@ FIGURES = (
     Figure("train_seconds", "training, s", 1, 1, True, "trained_on"),
 )
 OF_TEACHER = ("miou", "boundary_miou", "point_miou")  # figures of single photos, too
-OTHERS = (*(f"{key}_teacher" for key in OF_TEACHER), "classes", "pixels", "protocol", "resolution", "split",
-          "held_in_psnr", "steps", "clock", "device", "trained_on", "rendered_on", "train_key", "evaluate_key")  # fmt: skip
+OTHERS = (
+    *(f"{key}_teacher" for key in OF_TEACHER), "classes", "pixels", "protocol", "resolution", "split", "held_in_psnr",
+    "steps", "clock", "device", "trained_on", "rendered_on", "train_key", "evaluate_key",
+)  # fmt: skip
 IDENTITY = ("condition", "variant", "budget", "scene", "seed", "state")
 POOLED = ("miou", "miou_gain", "macc", "oa")  # what a protocol may work out over all scenes together
 COLUMNS = (*IDENTITY, *(figure.key for figure in FIGURES), *OTHERS)

@@ -23,7 +23,7 @@ VARIABLE = re.compile(r"\$\{(\w+):-([^}]*)\}")  # ${NAME:-default}
 
 
 def names(kind: str) -> list[str]:
-    """Names of our configs of a kind (scenes, ablations, sequences, studies), sorted."""
+    """Names of our configs of a kind (scenes, qualities, ablations, sequences, studies), sorted."""
     return sorted(path.stem for path in (CONFIGS / kind).glob("*.toml"))
 
 

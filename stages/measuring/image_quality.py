@@ -6,6 +6,7 @@ import math
 import pickle
 import time
 from pathlib import Path
+from statistics import mode
 from typing import Any
 
 import numba
@@ -50,8 +51,8 @@ def image_figures(
 
 
 def figures_as_taken(capture: Capture, renderer: SceneRenderer, cameras: dict[str, View]) -> dict[str, Any] | None:
-    """PSNR, dB, and SSIM on the test photos as they were taken, at their own resolution, at most 1600 pixels, and that;
-    None where photos were neither undistorted nor reduced.
+    """PSNR, dB, and SSIM on the test photos as they were taken, of up to 1600 pixels a side, and `size`, width and
+    height of most of them; None where none was undistorted or reduced.
 
     Args:    cameras: of the capture's views, by name.
     Choices: the scene is rendered as fine as the photo is, and interpolated, by cubic splines, where its pixels lie.
@@ -61,11 +62,13 @@ def figures_as_taken(capture: Capture, renderer: SceneRenderer, cameras: dict[st
         return None
     import pycolmap
 
-    figures = []
-    for photo, (name, model, params, width, height) in zip(capture.taken[:], capture.lenses, strict=True):
+    per_view: dict[str, list[float]] = {"psnr": [], "ssim": []}
+    sizes = []
+    for k, (name, model, params, width, height) in enumerate(capture.lenses):
         if name not in cameras:
             continue
-        lens, truth = pycolmap.Camera(model=model, params=params, width=width, height=height), photo[:height, :width]
+        lens = pycolmap.Camera(model=model, params=params, width=width, height=height)
+        truth = np.ascontiguousarray(capture.taken[k][:height, :width])  # one by one: photos are large
         finer = lens.mean_focal_length() / float(focals(cameras[name].K))
         view = enlarged(cameras[name], finer)
         K, render = view.K.double().numpy(), renderer.render(view)[0]
@@ -80,14 +83,13 @@ def figures_as_taken(capture: Capture, renderer: SceneRenderer, cameras: dict[st
         shown = np.stack([map_coordinates(c, places[:, inside], np.float32, mode="nearest") for c in channels], -1)
         filled = truth.copy().reshape(-1, 3)
         filled[inside] = shown.round().clip(0, 255)
-        figures.append((min(psnr(filled[inside], truth.reshape(-1, 3)[inside]), 100.0),
-                        ssim(filled.reshape(truth.shape), np.ascontiguousarray(truth)), width, height))  # fmt: skip
-    if not figures:
+        per_view["psnr"].append(min(psnr(filled[inside], truth.reshape(-1, 3)[inside]), 100.0))
+        per_view["ssim"].append(ssim(filled.reshape(truth.shape), truth))
+        sizes.append((width, height))
+    if not sizes:
         return None
-    psnrs, ssims, widths, heights = zip(*figures, strict=True)
-    size = [int(np.median(sides)) for sides in (widths, heights)]
-    means = {"psnr": float(np.mean(psnrs)), "ssim": float(np.mean(ssims)), "size": size}
-    return means | {"per_view": {"psnr": list(psnrs), "ssim": list(ssims)}}
+    means = {name: float(np.mean(values)) for name, values in per_view.items()}
+    return means | {"size": list(mode(sizes)), "per_view": per_view}
 
 
 def enlarged(view: View, factor: float) -> View:

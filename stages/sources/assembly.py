@@ -100,7 +100,7 @@ def assemble(listing: Listing, settings: IngestSection, class_names: tuple[str, 
 def altered(
     frames: list[Frame], listing: Listing, wanted: set[str], max_side: int
 ) -> Iterator[tuple[str, Camera, Any]]:
-    """Name, camera and photo of the `wanted` views whose photo is undistorted or reduced; faces of one are left out."""
+    """Name, camera and photo of the `wanted` views that are undistorted or reduced, but of no face of a photo."""
     for frame in frames:
         camera = frame.camera
         changed = camera.model in DISTORTED or max(camera.width, camera.height) > max_side

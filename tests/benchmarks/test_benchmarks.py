@@ -99,7 +99,7 @@ def test_what_awaits_a_gpu_runs_to_its_end_where_the_cpu_stands_in(up_to_teacher
     for name in ("synchronize", "reset_peak_memory_stats"):
         monkeypatch.setattr(torch.cuda, name, lambda: None)
     monkeypatch.setattr(gpu, "resolve", lambda device: None)
-    monkeypatch.setattr(gpu, "gsplats", lambda trainer: 0)
+    monkeypatch.setattr(gpu, "launches_of_gsplat", lambda trainer: 0)
     monkeypatch.setattr("chebsplat.stages.runtime.command._versions", dict)
     runs = {name: (ablation, 20, "cpu") for name, (ablation, _, _) in gpu.RUNS.items()}
     for name, value in {"DEVICE": "cpu", "SIZES": (500,), "STEPS": 60, "RUNS": runs}.items():

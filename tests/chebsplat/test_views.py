@@ -1,5 +1,7 @@
 """Features are read when they are needed, and what stays in memory is bounded."""
 
+import weakref
+
 import numpy as np
 import pytest
 import torch
@@ -41,3 +43,17 @@ def test_photos_that_do_not_fit_are_read_when_they_are_looked_at(budget):
         assert torch.equal(whole.photo(index)[0], stored.to("cpu").photo(index)[0])
         assert stored.camera(index, factor).width == 6 // factor
     assert bool(reads) == (budget < photos.nbytes)
+
+
+def test_views_on_their_device_keep_no_more_of_depth_than_its_reader_does():
+    whole = []
+
+    def depth(index, factor):
+        read = torch.zeros(4, 6)
+        whole.append(weakref.ref(read))
+        return read[::factor, ::factor]
+
+    cameras = torch.eye(3)[None], torch.eye(4)[None]
+    views = Views(["a"], torch.zeros(1, 4, 6, 3, dtype=torch.uint8), *cameras, depth=depth).to("cpu")
+    assert views.depth(0, 2).shape == (2, 3)
+    assert whole[0]() is None

@@ -301,13 +301,18 @@ def test_lifted_features_reach_the_export_and_trained_ones_do_not_wait_for_them(
     assert "features" in by_stage["train"]
 
 
-@pytest.mark.parametrize("kind", ["scenes", "ablations", "sequences"])
+@pytest.mark.parametrize("kind", ["scenes", "qualities", "ablations", "sequences"])
 def test_every_config_of_ours_can_be_planned(kind, tmp_path, monkeypatch):
     monkeypatch.setenv("CHEBSPLAT_TEST_DATA", str(tmp_path))
     assert len(names(kind)) == len(list((CONFIGS / kind).iterdir()))
     for name in names(kind):
         if kind == "ablations":
             assert Planner().plan("toy", ablation=name).title == f"toy@{name}"
+        elif kind == "qualities":
+            plan = Planner(quality=name).plan("toy", "train.steps=9", "plain")
+            assert plan.title == f"toy@{name}+plain+train.steps=9"
+            sides = {"draft": 640, "standard": 1000, "high": 1600}
+            assert plan.steps[0].sections["ingest"]["max_side"] == sides[name]
         elif kind == "sequences":
             assert set(read_toml(kind, name)["scenes"]) <= set(names("scenes"))
         elif "path" in read_toml(kind, name)["source"]:

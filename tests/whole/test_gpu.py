@@ -38,11 +38,11 @@ def test_a_recorded_step_has_the_gradients_of_a_plain_one(trainer_on):
     steps = made.steps()
     while made.step < 60:
         next(steps)
-    assert any(recording.graph is not None for recording in made.replay.recordings.values())
+    assert any(recording.graph is not None for recording in made.model.replay.recordings.values())
     for index in (0, 5):
         found = []
         for records in (True, False):
-            made.replay.records = made.model.replay.records = records
+            made.model.replay.records = records
             made.optimizer.zero_grad(set_to_none=True)
             loss = made.losses_of(index, made.share)[1]["loss"]
             loss.backward()

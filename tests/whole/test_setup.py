@@ -160,7 +160,8 @@ HOSTILE = ["Anna's room", 'a "b" room', "$5 $(shell touch x) $$ `touch x`", "'; 
            "a\nb", " # two  spaces \\", "-x;touch x", "*", "$(error no) ${HOME}", "été %s"]  # fmt: skip
 CALLED = [  # goals, variables that get the name, what the command gets of it
     ([], ["scene", "set", "stage"], ["run", "--scene={}", "--set={}", "--stage={}"]),
-    ([], ["sequence", "ablation", "knowledge"], ["run", "--sequence={}", "--ablation={}", "--knowledge={}"]),
+    ([], ["sequence", "quality", "ablation"], ["run", "--sequence={}", "--quality={}", "--ablation={}"]),
+    ([], ["scene", "knowledge"], ["run", "--scene={}", "--knowledge={}"]),
     (["plan"], ["scene"], ["plan", "--scene={}", "--device=cpu"]),
     (["plan"], ["study"], ["study", "--plan", "--device=cpu", "--", "{}"]),
     ([], ["study"], ["study", "--device=cpu", "--", "{}"]),

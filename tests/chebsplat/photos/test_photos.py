@@ -15,6 +15,7 @@ from chebsplat.formats.points import Points
 from chebsplat.photos import exposures as measuring
 from chebsplat.photos.exposures import measured_exposures, own_part, relit
 from chebsplat.settings import TrainSection
+from chebsplat.splats.planes import at_pixels
 from chebsplat.stages.ingest import displaced, recolored
 from chebsplat.stages.runtime import config
 from chebsplat.stages.runtime.command import Job
@@ -97,9 +98,9 @@ def test_depth_is_a_channel_that_changes_no_colour():
     view = made.views.camera(0, 1)
     with_depth, without = (made.model.render(view, 3, depth=wanted) for wanted in (True, False))
     torch.testing.assert_close(with_depth.rgb, without.rgb, rtol=0, atol=1e-6)
-    assert without.inverse_depth is None
+    assert without.planes is None
     covered = with_depth.alpha[..., 0] > 0.5
-    near = (with_depth.alpha[..., 0] / with_depth.inverse_depth)[covered]
+    near = (with_depth.alpha[..., 0] / at_pixels(with_depth.planes))[covered]
     assert covered.any() and near.min() > 2.5 and near.max() < 5.5  # a unit sphere four units away
 
 
@@ -120,13 +121,14 @@ def test_gaussians_go_where_depth_is_measured():
         made = tiny_trainer(steps=60, densify="off", prune=False, depth_every=2, weight_depth=weight)
         with torch.no_grad():
             shown = [made.model.render(made.views.camera(v, 1), 0, depth=True) for v in range(len(made.views.names))]
-        truths = [torch.where(r.alpha[..., 0] > 0.5, 1.1 * r.alpha[..., 0] / r.inverse_depth, torch.nan) for r in shown]
+        depths = [r.alpha[..., 0] / at_pixels(r.planes) for r in shown]
+        truths = [torch.where(r.alpha[..., 0] > 0.5, 1.1 * z, torch.nan) for r, z in zip(shown, depths, strict=True)]
         made.views.depth = lambda index, factor: truths[index][::factor, ::factor]
         losses = list(made.steps())
         assert ["loss_depth" in figures for figures in losses] == [step % 2 == 1 for step in range(60)]
         with torch.no_grad():
             r = made.model.render(made.views.camera(0, 1), 0, depth=True)
-            return float(depth_distance(r.inverse_depth, r.alpha, truths[0], None))
+            return float(depth_distance(at_pixels(r.planes), r.alpha, truths[0], None))
 
     without, pulled = distance(0.0), distance(3.0)
     assert pulled < 0.5 * without

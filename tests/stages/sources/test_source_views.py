@@ -329,10 +329,25 @@ def test_test_photos_are_held_as_they_were_taken_and_measured_so(tmp_path, max_s
         views[name] = View(torch.tensor(K).float(), torch.eye(4), *capture.size)
     pictures = SimpleNamespace(render=lambda view: (np.asarray(undistorted.resize((view.width, view.height))), None))
     undistorted = Image.fromarray(np.asarray(capture.images[0]))
+    capture.taken = dict(enumerate(capture.taken))  # which gives one at a time alone
     right = figures_as_taken(capture, pictures, views)
     assert right["size"] == [400, 300] and right["psnr"] > (30 if max_side > 400 else 20)
     capture.lenses[0][2][4] *= 1.2
     assert figures_as_taken(capture, pictures, views)["psnr"] < right["psnr"] - (3 if max_side > 400 else 1)
+
+
+def test_the_size_of_photos_as_taken_is_one_that_they_have():
+    sizes, views = [(48, 32), (32, 48), (48, 32), (32, 48)], {}
+    capture = SimpleNamespace(taken=[], lenses=[], loss_mask=None)
+    for name, (width, height) in zip("abcd", sizes, strict=True):
+        capture.taken.append(np.full((48, 48, 3), 90, np.uint8))
+        capture.lenses.append([name, "PINHOLE", [40.0, 40.0, width / 2, height / 2], width, height])
+        K = torch.tensor([[20.0, 0, width / 4], [0, 20, height / 4], [0, 0, 1]])
+        views[name] = View(K, torch.eye(4), width // 2, height // 2)
+    grey = SimpleNamespace(render=lambda view: (np.full((view.height, view.width, 3), 90, np.uint8), None))
+    found = figures_as_taken(capture, grey, views)
+    assert (found["size"], found["psnr"], found["ssim"]) == ([48, 32], 100, pytest.approx(1))
+    assert figures_as_taken(capture, grey, {}) is None
 
 
 def test_pixels_where_a_distortion_folds_back_do_not_count(tmp_path):
