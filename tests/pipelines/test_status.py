@@ -16,7 +16,7 @@ from chebsplat.pipelines.planning.plan import Planner
 from chebsplat.pipelines.running import cluster, job
 from chebsplat.pipelines.running.run import entry, plan_of
 from chebsplat.pipelines.work import store
-from chebsplat.pipelines.work.summary import table
+from chebsplat.pipelines.work.summary import as_taken, table
 
 pytestmark = pytest.mark.usefixtures("quick_plans")
 
@@ -130,3 +130,11 @@ def test_frames_a_second_of_a_finished_scene_name_the_machine_that_rendered_them
     beside = {what: detail for what, _, detail in table(toy["evaluate"])}
     assert beside["frames/s"] == f"colour alone, measured on {measured_on(manifest)}"
     assert manifest.processes[0]["processor"] in beside["frames/s"]
+
+
+@pytest.mark.parametrize(("trained", "finer"), [("640x360", "; quality=high trains on these"), ("1600x900", "")])
+def test_photos_as_taken_are_told_of_with_what_would_train_on_them(trained, finer):
+    taken = {"psnr": 30.0, "ssim": 0.8512, "size": [1600, 900]}
+    figures = {"image": {"as_taken": taken}, "protocol": {"resolution": trained}}
+    assert as_taken(figures) == f"SSIM 0.851, 1600×900 pixels{finer}"
+    assert as_taken(None) == as_taken({"image": {}}) == ""
