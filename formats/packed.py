@@ -10,7 +10,6 @@ from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
-from scipy.special import expit
 
 BYTES = {"means": 9, "log_scales": 3, "quats": 4, "opacities": 1, "colors": 3}  # of a Gaussian
 C0 = 0.28209479177387814  # of SH band 0, from coefficients to colours
@@ -67,7 +66,8 @@ def pack(parameters: dict[str, np.ndarray], sh_degree: int = 0) -> Packed:
     arrays["log_scales"] = levels("log_scales", log_scales.clip(*bounds), 255).astype(np.uint8)
     words = smallest_three(parameters["quats"])
     arrays["quats"] = np.stack([words >> shift & 255 for shift in (0, 8, 16, 24)]).astype(np.uint8)
-    arrays["opacities"] = np.round(255 * expit(parameters["logit_opacities"].astype(np.float64))).astype(np.uint8)
+    opacities = 1 / (1 + np.exp(-parameters["logit_opacities"].astype(np.float64).clip(-700, 700)))
+    arrays["opacities"] = np.round(255 * opacities).astype(np.uint8)
     colors = (parameters["sh0"][:, 0].astype(np.float64) * C0 + 0.5).clip(*COLORS)
     arrays["colors"] = levels("colors", colors, 255).astype(np.uint8)
     if sh_degree:
