@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from typing import Any
 
 import torch
@@ -11,7 +10,7 @@ from chebsplat.settings import MOST_STEPS, TrainSection
 from chebsplat.splats.sh import MAX_DEGREE
 from chebsplat.training.model import SceneModel
 
-STEP_SIDE = 640  # pixels of the longer side of what a step looks at
+STEP_SIDE = 640  # pixels of the longer side of what a step looks at, at least
 LR_OPACITIES = 5e-2  # of opacities before the sigmoid, 3DGS's
 LR_MODULES = 3e-3  # of the semantic gate
 FASTER = {"means": 0.01, "features": 0.01, "modules": 0.01}  # what a rate has fallen to at the end; 0.1 elsewhere
@@ -70,7 +69,7 @@ class Schedule:
         require_resolved(settings)
         assert settings.steps is not None
         self.settings, self.steps = settings, settings.steps
-        self.reduction = max(math.ceil(side / STEP_SIDE - 0.1), 1)
+        self.reduction = max(int(side / STEP_SIDE + 0.1), 1)
         self.seconds: float | None = settings.seconds
         self.growth = [] if settings.densify == "off" else self._while_growing(settings.n_densify)
         self.resets = self._while_growing(settings.opacity_resets)

@@ -20,7 +20,6 @@ from chebsplat.pipelines.work import store
 
 RUNS, FAILED, WAITS, LEFT, DONE = "runs", "failed", "waits", "not begun", "done"
 LINES = 5  # of a failed step's log
-FINER = 1.2  # times as many pixels a side, from which on photos are worth training on as they are
 
 
 def figures(evaluation: Path) -> Any:
@@ -76,13 +75,9 @@ def table(evaluation: Path) -> list[tuple[str, str, str]]:
 
 
 def as_taken(figures: Any) -> str:
-    """SSIM and size of test photos as they were taken, and what would train on them; empty where these are what was."""
+    """SSIM and size of test photos as they were taken; empty where these are what was trained on."""
     found = (figures or {}).get("image", {}).get("as_taken")
-    if not found:
-        return ""
-    trained = max(map(int, figures["protocol"]["resolution"].split("x")))
-    finer = "; quality=high trains on these" if max(found["size"]) > FINER * trained else ""
-    return "SSIM {:.3f}, {}×{} pixels".format(found["ssim"], *found["size"]) + finer
+    return "SSIM {:.3f}, {}×{} pixels".format(found["ssim"], *found["size"]) if found else ""
 
 
 def strangers(segmentation: Any) -> list[tuple[str, list[str]]]:
