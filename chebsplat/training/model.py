@@ -26,7 +26,7 @@ NEAREST = 0.01  # scene units, of a plane's depth: the rasterizer's near plane
 
 
 class Wanted(NamedTuple):
-    """What a picture is to show, as `SceneModel.render` is asked for it; size: (width, height)."""
+    """The contents of a picture, as `SceneModel.render` is asked for it; size: (width, height)."""
 
     degree: int
     masked: bool
@@ -185,16 +185,16 @@ class SceneModel:
             with torch.no_grad():
                 index = in_frustum(self.raw["means"], view, _reach(self.raw))
         wanted, learned = Wanted(degree, masked, semantic, depth, (view.width, view.height)), self.learned
-        seen = self.replay(
+        activated = self.replay(
             wanted,
-            partial(self._seen, wanted, tuple(learned), index),
+            partial(self._activate, wanted, tuple(learned), index),
             list(learned.values()),
             [view.viewmat, view.K],
         )
-        gaussians: list[Any] = [seen[name] for name in ("means", "quats", "scales", "opacities", "colors")]
-        auxiliary = Auxiliary(seen.get("soft_mask"), seen.get("band_masks"), in_view=seen.get("in_view"))
+        gaussians: list[Any] = [activated[name] for name in ("means", "quats", "scales", "opacities", "colors")]
+        auxiliary = Auxiliary(activated.get("soft_mask"), activated.get("band_masks"), in_view=activated.get("in_view"))
         camera = (view.viewmat[None], view.K[None], view.width, view.height)
-        features, cells = seen.get("features"), None
+        features, cells = activated.get("features"), None
         if index is None:
             render, alpha, meta = rasterize(*gaussians, *camera, backend="cuda", harmless=True)
         elif features is None or (grid is not None and wanted.size == (CELL * grid[1], CELL * grid[0])):
@@ -210,10 +210,10 @@ class SceneModel:
             rgb, alpha.squeeze(0), shown if cells is None else cells, meta, index, auxiliary, planes if depth else None
         )
 
-    def _seen(
+    def _activate(
         self, wanted: Wanted, names: tuple[str, ...], index: Tensor | None, *tensors: Tensor
     ) -> dict[str, Tensor]:
-        """What the rasterizer is given of the Gaussians `index`, and their masks, by name.
+        """Values of the Gaussians `index` as the rasterizer takes them, and their masks, by name.
 
         Args: tensors: what is `learned`, by names; then the view's viewmat and K.
         """
@@ -221,13 +221,13 @@ class SceneModel:
         means, quats = take(raw["means"], index), take(raw["quats"], index)
         scales, opacities = take(raw["log_scales"], index).exp(), take(raw["logit_opacities"], index).sigmoid()
         features = take(raw["features"], index) if "features" in raw else None
-        seen = {}
+        activated: dict[str, Tensor] = {}
         if wanted.masked and (soft := self._soft_mask(raw, index, features)) is not None:
-            seen["soft_mask"] = soft
+            activated["soft_mask"] = soft
             scales, opacities = prune.apply_mask(prune.hard_mask(soft), scales, opacities)
         masks = None
         if wanted.masked and wanted.degree > 0 and "sh_logits" in raw:
-            masks = seen["band_masks"] = sh_prune.band_mask(take(raw["sh_logits"], index))
+            masks = activated["band_masks"] = sh_prune.band_mask(take(raw["sh_logits"], index))
         eye = -viewmat[:3, :3].T @ viewmat[:3, 3]
         bands = [raw[name] for name in BANDS if name in raw]
         channels = [colors_in_view(bands, masks, index, raw["means"], eye, wanted.degree, self.backend)]
@@ -237,13 +237,13 @@ class SceneModel:
             if index is None:
                 channels.append(features)
             else:
-                seen["features"] = features
+                activated["features"] = features
         colors = channels[0] if len(channels) == 1 else torch.cat(channels, -1)
         gaussians = (means, quats, scales, opacities, colors)
         if index is None:
             gaussians = made_harmless(*gaussians)
-            seen["in_view"] = may_be_seen(raw["means"].detach(), View(K, viewmat, *wanted.size), _reach(raw))
-        return seen | dict(zip(("means", "quats", "scales", "opacities", "colors"), gaussians, strict=True))
+            activated["in_view"] = may_be_seen(raw["means"].detach(), View(K, viewmat, *wanted.size), _reach(raw))
+        return activated | dict(zip(("means", "quats", "scales", "opacities", "colors"), gaussians, strict=True))
 
 
 def _reach(raw: Mapping[str, Tensor]) -> Tensor:
