@@ -15,9 +15,8 @@ BYTES = {"means": 9, "log_scales": 3, "quats": 4, "opacities": 1, "colors": 3}  
 C0 = 0.28209479177387814  # of SH band 0, from coefficients to colours
 # ln of what a scale may be beside the longest axes: of 5 % of the Gaussians, thinner than a pixel, and of 95 %, flat
 LEAST, MOST = -4.0, 12.0
-FARTHEST = (
-    1000.0  # from the middle, in extents of 90 % of the centres: what lies farther is drawn there, as small as it looks
-)
+# From the middle, in extents of 90 % of the centres: what lies farther is drawn there, as small as it looks
+FARTHEST = 1000.0
 COLORS = (-1.0, 3.0)  # of SH degree 0 in training's [0, 1]; beyond it no pixel can tell
 
 
